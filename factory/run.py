@@ -167,7 +167,7 @@ def _run(
     say: Callable[[str], None] = print,
 ) -> int:
     from factory.graph.episodes import EpisodesWanted
-    from factory.graph.execute import execute, on_new_clusters
+    from factory.graph.execute import Execution, execute, on_new_clusters
     from factory.graph.limits import Limits
     from factory.graph.local import Claims
     from factory.setup.calibrate import calibrate, plan_text
@@ -203,19 +203,21 @@ def _run(
                 config.experts,
                 config.rounds,
                 store,
-                config.executor,
-                config.workers,
-                claims=Claims(config.gpu_share if assembled.work.draws_on_gpu else 0.0, config.graph.memory_gb),
-                fuse=config.graph.fuse,
-                isolated=isolates(config),
-                limits=Limits({**labels_limit(config), **config.graph.limit_s}, config.graph.limit_gb),
-                on_change=config.on_change,
-                retry=config.retry_failed,
-                shard_seconds=config.shard_seconds,
-                minutes=left(config.minutes, since),
-                episodes=EpisodesWanted(config.one_episode_in, prepared_episode) if config.one_episode_in else None,
-                mcap_shards=config.store.episodes == "all",
-                command=asked.words,
+                Execution(
+                    config.executor,
+                    config.workers,
+                    claims=Claims(config.gpu_share if assembled.work.draws_on_gpu else 0.0, config.graph.memory_gb),
+                    fuse=config.graph.fuse,
+                    isolated=isolates(config),
+                    limits=Limits({**labels_limit(config), **config.graph.limit_s}, config.graph.limit_gb),
+                    on_change=config.on_change,
+                    retry=config.retry_failed,
+                    shard_seconds=config.shard_seconds,
+                    minutes=left(config.minutes, since),
+                    episodes=EpisodesWanted(config.one_episode_in, prepared_episode) if config.one_episode_in else None,
+                    mcap_shards=config.store.episodes == "all",
+                    command=asked.words,
+                ),
             ),
             say,
             begun,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.store.samples import Store
 from tests.factory.toy import ToyWork, refs
 
@@ -18,7 +18,7 @@ BLOCKS = re.findall(r"^```python\n(.*?)^```$", (Path(__file__).parents[1] / "doc
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("queries")
     store = Store(folder / "runs" / "demo")
-    execute(ToyWork(), refs(4), ["recovery", "human"], 2, store, "local", say=lambda line: None)
+    execute(ToyWork(), refs(4), ["recovery", "human"], 2, store, Execution("local"), say=lambda line: None)
     return folder
 
 

@@ -59,38 +59,38 @@ class RunSummary:
     is_broken: bool = False  # by what it writes to or works on, as the message says: then no page is written
 
 
+@dataclass(frozen=True)
+class Execution:
+    """How a run is executed, and what it writes beside its rows."""
+
+    executor: Executor = "ray"
+    workers: int | None = None  # processes of a Ray cluster of its own; None: one per CPU
+    on_change: OnChange = "stop"
+    retry: bool = False  # attempts that failed by input or a bug are tried again, too
+    ray_address: str | None = None
+    claims: Claims = NO_CLAIMS  # on Ray
+    fuse: Fuse = "auto"  # whether the stages of an attempt are one task; auto: not where drawing claims a GPU
+    limits: Limits = NO_LIMITS  # of a task, beyond which it is ended
+    isolated: bool = False  # executor=local works in a process of its own, which may die
+    shard_bytes: int = SHARD_BYTES
+    shard_seconds: float = SHARD_SECONDS
+    minutes: float | None = None  # after which nothing new is begun, as after an interruption
+    episodes: EpisodesWanted | None = None  # MCAP files to be written beside the samples
+    mcap_shards: bool = False  # all samples as MCAP shards, too
+    command: Sequence[str] | None = None  # the settings as they were given, kept for `retry`
+
+
 def execute(
     work: Work,
     refs: Sequence[ClipRef],
     experts: Sequence[str],
     rounds: int,
     store: Store,
-    executor: Executor = "ray",
-    workers: int | None = None,
-    *,
-    on_change: OnChange = "stop",
-    retry: bool = False,
-    ray_address: str | None = None,
-    claims: Claims = NO_CLAIMS,
-    fuse: Fuse = "auto",
-    limits: Limits = NO_LIMITS,
-    isolated: bool = False,
-    shard_bytes: int = SHARD_BYTES,
-    shard_seconds: float = SHARD_SECONDS,
-    minutes: float | None = None,
-    episodes: EpisodesWanted | None = None,
-    mcap_shards: bool = False,
-    command: Sequence[str] | None = None,
+    how: Execution = Execution(),
     say: Callable[[str], None] = print,
 ) -> RunSummary:
     """Make the samples of `rounds` rounds for every clip and expert, as far as the store does not hold them already.
 
-    workers: processes of a local Ray cluster, None: one per CPU. retry: try failed(input | bug) attempts again too.
-    claims: on Ray. limits: of a task, beyond which it is ended. fuse: whether the stages of an attempt are one task;
-    auto: not where drawing claims a GPU. isolated: executor=local works in a process of its own, which may die.
-    minutes: after which nothing new is begun, as after an interruption. episodes: MCAP files to be written
-    beside the samples; mcap_shards: all samples as MCAP shards too. command: the settings as they were given, kept for
-    `retry`.
     Invalid arguments come back as exit code 2 with a message and nothing written.
     """
     if not refs or not experts or rounds < 1:
@@ -98,117 +98,169 @@ def execute(
     twice = [clip_id for clip_id, n in Counter(ref.clip_id for ref in refs).items() if n > 1]
     if twice or len(set(experts)) < len(experts):
         return RunSummary(BAD_CONFIG, f"named twice: clips {twice[:3]}, experts {list(experts)}")
-    digests = {expert: work.expert_digest(expert) for expert in experts}
-    identity = work.identity
-    try:
-        records = store.agree(identity, digests, on_change)
-        history = NOTHING if store.starts_over(records) else store.history(identity, digests)
-        if on_change == "stop" and records[-1]["on_change"] == "keep":
-            on_change = "keep"
-        policy = retry_policy(retry, identity.versions_json)
-        plan = make_plan(refs, experts, rounds, history, identity, on_change, policy, work.once)
-        parts: list[Beside] = [McapShards(store)] if mcap_shards else []
-        parts += [Episodes(store, episodes, refs)] if episodes else []
-        pictured = Together(parts) if parts else None
-    except ChangedRun as error:
-        return RunSummary(BAD_CONFIG, str(error))
-    except (OSError, DeltaError) as error:
-        if why_ill(error):
-            return RunSummary(INTERRUPTED, f"{one_line(error)}; {AGAIN}")
-        return RunSummary(BAD_CONFIG, f"{error}; python -m factory verify {store.location.uri} says what is damaged")
-    notes = notes_folder(store.location)
-    plan, died = counted(crash_of(notes), plan, Records(identity, digests), policy)
-    driver = Driver(identity, plan, digests, rounds, policy, work.block, work.doing)
-    if plan.frozen:
-        driver.notes.append(f"{len(plan.frozen)} clips kept as they are: their candidates come from other settings")
-    code, message, began_ms, is_broken, lost_cluster = COMPLETE, "", 0, False, False
-    try:
-        is_due = plan.todo or (pictured is not None and pictured.is_due)
-        graph: Graph | None = None
-        if is_due and executor == "local" and isolated:
-            from factory.graph.isolated import IsolatedGraph
-
-            graph = IsolatedGraph(work, store.location, lambda: driver.interrupted, fuse, limits)
-        elif is_due and executor == "local":
-            graph = LocalGraph(work, store.location, lambda: driver.interrupted, fuse)
-        elif is_due:
-            from factory.graph.on_ray.graph import RayGraph
-
-            graph = RayGraph(work, store.location, workers, ray_address, claims, fuse, limits)
-    except (BadLocation, ClusterLacks, NotReady, ConnectionError) as error:
-        return RunSummary(BAD_CONFIG, str(error))
-    except ClusterDied as error:
-        return RunSummary(INTERRUPTED, str(error), lost_cluster=error.is_ours)
-    except (MachineIll, OSError) as error:  # while kernels are compiled
-        if isinstance(error, OSError) and not why_ill(error):
-            raise
-        said = out_of_disk(error) if isinstance(error, DiskFull) else f"{one_line(error)}; {AGAIN}"
-        return RunSummary(INTERRUPTED, said)
-    except KeyboardInterrupt:
-        return RunSummary(INTERRUPTED, "stopped before anything was begun")
-    try:
-        if store.begin(records):  # another run committed while this one was getting ready
-            history = store.history(identity, digests)
-            plan = make_plan(refs, experts, rounds, history, identity, on_change, policy, work.once)
-            driver = Driver(identity, plan, digests, rounds, policy, work.block, work.doing)
-            died = []
-        store.plan({expert: 1 if work.once(expert) else rounds for expert in experts}, [ref.clip_id for ref in refs])
-        if died:
-            store.commit([], [], died)
-            driver.notes.append(f"the run before this one died at {died[0].error.partition(': ')[2]}; it comes last")
-        (notes / CRASHED).unlink(missing_ok=True)
-        if graph is not None:
-            began_ms = _announce(store, plan, experts, rounds, command)
-            metrics = RunMetrics(graph.recorder, store.location)
-            with asked_to_stop(driver.hurry), _alarm(driver.stop, minutes):
-                if pictured is not None:
-                    pictured.begin(graph)
-                driver.loop(graph, Gatherer(graph, store, shard_bytes, shard_seconds), metrics, pictured)
-                if pictured is not None:
-                    pictured.tidy()
-        code = COMPLETE_WITH_FAILURES if driver.has_failures else COMPLETE
-        if pictured is not None and pictured.errors:
-            text = f"{len(pictured.errors)} MCAP files were not written ({pictured.errors[0]})"
-            code, message = INTERRUPTED, f"{text}; run the same command again to write them"
-        if driver.interrupted:
-            code, message = INTERRUPTED, "interrupted; run the same command again to go on"
-    except DiskFull as error:
-        code, message, is_broken = INTERRUPTED, out_of_disk(error), True
-    except MachineIll as error:
-        text = f"{error}; put it right and run the same command again: no clip is blamed"
-        code, message, is_broken = INTERRUPTED, text, True
-    except (AnotherWriter, WriteFailed, ClusterDied) as error:
-        code, message, is_broken = INTERRUPTED, str(error), True
-        lost_cluster = isinstance(error, ClusterDied) and error.is_ours
-    except (OSError, DeltaError) as error:  # what holds the tables fails: a share that went away, a lost network
-        code, message, is_broken = INTERRUPTED, f"{one_line(error)}; {AGAIN}", True
-    except KeyboardInterrupt:
-        code, message = INTERRUPTED, "stopped at once; run the same command again"
-    finally:
-        if graph is not None:
-            graph.close()
-    funnel = None
-    try:
-        funnel = funnel_of(store, [ref.clip_id for ref in refs])
-    except (OSError, DeltaError) as error:
-        code, message, is_broken = INTERRUPTED, message or f"{one_line(error)}; {AGAIN}", True
-    counts = {} if funnel is None else _counts(funnel, experts)
-    summary = RunSummary(
-        *(code, message, counts, driver.executed, driver.seconds, driver.notes, funnel, began_ms),
-        lost_cluster=lost_cluster,
-        is_broken=is_broken,
-    )
-    if began_ms or code:
-        try:
-            record_summary(store, summary)
-        except OSError as error:  # the same disk or share
-            summary.exit_code, summary.is_broken = INTERRUPTED, True
-            summary.message = summary.message or (
-                out_of_disk(error) if isinstance(error, DiskFull) else f"{one_line(error)}; {AGAIN}"
-            )
+    run = _Run(work, refs, experts, rounds, store, how)
+    refused = run.plan() or run.open()
+    if refused is not None:
+        return refused
+    run.drive()
+    summary = run.close()
     for line in (*summary.notes, str(summary.executed)):
         say(line)
     return summary
+
+
+class _Run:
+    """One run in its four parts: planned against the tables, opened, driven, closed."""
+
+    def __init__(
+        self, work: Work, refs: Sequence[ClipRef], experts: Sequence[str], rounds: int, store: Store, how: Execution
+    ) -> None:
+        self._work, self._refs, self._experts, self._rounds = work, refs, experts, rounds
+        self._store, self._how = store, how
+        self._identity, self._digests = work.identity, {expert: work.expert_digest(expert) for expert in experts}
+        self._policy = retry_policy(how.retry, self._identity.versions_json)
+        self._graph: Graph | None = None
+        self._ended = RunSummary(COMPLETE)
+
+    def plan(self) -> RunSummary | None:
+        """What is left to do; how the run ends where the tables are another's, or cannot be read."""
+        try:
+            self._records = self._store.agree(self._identity, self._digests, self._how.on_change)
+            kept = self._how.on_change == "stop" and self._records[-1]["on_change"] == "keep"
+            self._on_change: OnChange = "keep" if kept else self._how.on_change
+            plan = self._planned(not self._store.starts_over(self._records))
+            parts: list[Beside] = [McapShards(self._store)] if self._how.mcap_shards else []
+            parts += [Episodes(self._store, self._how.episodes, self._refs)] if self._how.episodes else []
+            self._beside = Together(parts) if parts else None
+        except ChangedRun as error:
+            return RunSummary(BAD_CONFIG, str(error))
+        except (OSError, DeltaError) as error:
+            if why_ill(error):
+                return RunSummary(INTERRUPTED, f"{one_line(error)}; {AGAIN}")
+            damaged = f"python -m factory verify {self._store.location.uri} says what is damaged"
+            return RunSummary(BAD_CONFIG, f"{error}; {damaged}")
+        self._notes = notes_folder(self._store.location)
+        records = Records(self._identity, self._digests)
+        plan, self._died = counted(crash_of(self._notes), plan, records, self._policy)
+        self._follow(plan)
+        if plan.frozen:
+            kept_clips = f"{len(plan.frozen)} clips kept as they are"
+            self._driver.notes.append(f"{kept_clips}: their candidates come from other settings")
+        return None
+
+    def _planned(self, has_history: bool) -> RunPlan:
+        history = self._store.history(self._identity, self._digests) if has_history else NOTHING
+        wanted = (self._refs, self._experts, self._rounds)
+        return make_plan(*wanted, history, self._identity, self._on_change, self._policy, self._work.once)
+
+    def _follow(self, plan: RunPlan) -> None:
+        self._plan, work = plan, self._work
+        self._driver = Driver(self._identity, plan, self._digests, self._rounds, self._policy, work.block, work.doing)
+
+    def open(self) -> RunSummary | None:
+        """The executor, where anything is due; how the run ends where this machine or cluster is not ready for it."""
+        if not self._plan.todo and (self._beside is None or not self._beside.is_due):
+            return None
+        how, to = self._how, (self._work, self._store.location)
+        try:
+            if how.executor == "local" and how.isolated:
+                from factory.graph.isolated import IsolatedGraph
+
+                self._graph = IsolatedGraph(*to, lambda: self._driver.interrupted, how.fuse, how.limits)
+            elif how.executor == "local":
+                self._graph = LocalGraph(*to, lambda: self._driver.interrupted, how.fuse)
+            else:
+                from factory.graph.on_ray.graph import RayGraph
+
+                self._graph = RayGraph(*to, how.workers, how.ray_address, how.claims, how.fuse, how.limits)
+        except (BadLocation, ClusterLacks, NotReady, ConnectionError) as error:
+            return RunSummary(BAD_CONFIG, str(error))
+        except ClusterDied as error:
+            return RunSummary(INTERRUPTED, str(error), lost_cluster=error.is_ours)
+        except (MachineIll, OSError) as error:  # while kernels are compiled
+            if isinstance(error, OSError) and not why_ill(error):
+                raise
+            return RunSummary(INTERRUPTED, _again_after(error))
+        except KeyboardInterrupt:
+            return RunSummary(INTERRUPTED, "stopped before anything was begun")
+        return None
+
+    def drive(self) -> None:
+        """The tasks, until nothing is left or the run is to end; how it ended, and the executor is closed."""
+        ended = self._ended
+        try:
+            self._begin()
+            if self._graph is not None:
+                self._loop(self._graph)
+            ended.exit_code = COMPLETE_WITH_FAILURES if self._driver.has_failures else COMPLETE
+            if self._beside is not None and (errors := self._beside.errors):
+                text = f"{len(errors)} MCAP files were not written ({errors[0]})"
+                ended.exit_code = INTERRUPTED
+                ended.message = f"{text}; run the same command again to write them"
+            if self._driver.interrupted:
+                ended.exit_code, ended.message = INTERRUPTED, "interrupted; run the same command again to go on"
+        except KeyboardInterrupt:
+            ended.exit_code, ended.message = INTERRUPTED, "stopped at once; run the same command again"
+        except MachineIll as error:
+            self._break(f"{error}; put it right and run the same command again: no clip is blamed")
+        except (AnotherWriter, WriteFailed, ClusterDied) as error:
+            self._break(str(error))
+            ended.lost_cluster = isinstance(error, ClusterDied) and error.is_ours
+        except (OSError, DeltaError) as error:  # what holds the tables fails: a full disk, a share that went away
+            self._break(_again_after(error))
+        finally:
+            if self._graph is not None:
+                self._graph.close()
+
+    def _begin(self) -> None:
+        """The run's first words in the tables; planned again where another run committed while this one got ready."""
+        store, once = self._store, self._work.once
+        if store.begin(self._records):
+            self._follow(self._planned(True))
+            self._died = []
+        wanted = {expert: 1 if once(expert) else self._rounds for expert in self._experts}
+        store.plan(wanted, [ref.clip_id for ref in self._refs])
+        if self._died:
+            store.commit([], [], self._died)
+            died_at = self._died[0].error.partition(": ")[2]
+            self._driver.notes.append(f"the run before this one died at {died_at}; it comes last")
+        (self._notes / CRASHED).unlink(missing_ok=True)
+
+    def _loop(self, graph: Graph) -> None:
+        store, how, beside = self._store, self._how, self._beside
+        self._ended.began_ms = _announce(store, self._plan, self._experts, self._rounds, how.command)
+        metrics = RunMetrics(graph.recorder, store.location)
+        with asked_to_stop(self._driver.hurry), _alarm(self._driver.stop, how.minutes):
+            if beside is not None:
+                beside.begin(graph)
+            self._driver.loop(graph, Gatherer(graph, store, how.shard_bytes, how.shard_seconds), metrics, beside)
+            if beside is not None:
+                beside.tidy()
+
+    def _break(self, message: str) -> None:
+        self._ended.exit_code, self._ended.message, self._ended.is_broken = INTERRUPTED, message, True
+
+    def close(self) -> RunSummary:
+        """How the run ended, as last_run.json keeps it too."""
+        ended = self._ended
+        try:
+            ended.funnel = funnel_of(self._store, [ref.clip_id for ref in self._refs])
+            ended.counts = _counts(ended.funnel, self._experts)
+        except (OSError, DeltaError) as error:
+            self._break(ended.message or f"{one_line(error)}; {AGAIN}")
+        driver = self._driver
+        ended.executed, ended.seconds, ended.notes = driver.executed, driver.seconds, driver.notes
+        if ended.began_ms or ended.exit_code:
+            try:
+                record_summary(self._store, ended)
+            except OSError as error:  # the same disk or share
+                self._break(ended.message or _again_after(error))
+        return ended
+
+
+def _again_after(error: Exception) -> str:
+    """What to do where this machine, or what holds the tables, fails."""
+    return out_of_disk(error) if isinstance(error, DiskFull) else f"{one_line(error)}; {AGAIN}"
 
 
 def out_of_disk(error: DiskFull) -> str:

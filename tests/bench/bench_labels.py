@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from factory.config.run import load_config
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.setup.settings import assemble
 from factory.store.reader import SampleTable, labels_of
 from factory.store.samples import Store
@@ -37,7 +37,13 @@ def main(shared: Path, n_random: int = 20) -> None:
         run = assemble(load_config(overrides))
         store = Store(out)
         summary = execute(
-            run.work, run.index.refs, run.config.experts, 1, store, "local", shard_seconds=1e9, say=lambda line: None
+            run.work,
+            run.index.refs,
+            run.config.experts,
+            1,
+            store,
+            Execution("local", shard_seconds=1e9),
+            say=lambda line: None,
         )
         n, seconds = summary.seconds["labels"]
         table = SampleTable(out)

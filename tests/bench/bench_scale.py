@@ -30,7 +30,7 @@ import numpy as np
 
 from factory.config.arguments import answer
 from factory.exits import COMPLETE
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.graph.on_ray.cluster import ray  # with the environment that keeps it on loopback
 from factory.graph.work import Columns, Driven, Dropped, PreparedClip
 from factory.readers.base import ClipRef
@@ -131,14 +131,14 @@ def _row(request: Request, nodes: int, refs: Sequence[ClipRef], work: WaitingWor
     before, began = _cpu_s(), time.perf_counter()
     profiler = cProfile.Profile()
     with profiler if request.profile else nullcontext():
-        summary = execute(work, refs, EXPERTS, request.rounds, Store(out), "ray", say=lambda line: None)
+        summary = execute(work, refs, EXPERTS, request.rounds, Store(out), Execution("ray"), say=lambda line: None)
     if request.profile:
         print(_shares(profiler))
     took, cpu_s = time.perf_counter() - began, _cpu_s() - before
     if summary.exit_code != COMPLETE:
         raise RuntimeError(f"the run ended with {summary.exit_code}: {summary.message} {summary.counts}")
     began = time.perf_counter()
-    again = execute(work, refs, EXPERTS, request.rounds, Store(out), "ray", say=lambda line: None)
+    again = execute(work, refs, EXPERTS, request.rounds, Store(out), Execution("ray"), say=lambda line: None)
     again_s = time.perf_counter() - began
     attempts = summary.executed.attempts
     if (again.executed.attempts, again.executed.found_done) != (0, attempts):

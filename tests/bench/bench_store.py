@@ -27,7 +27,7 @@ import pyarrow as pa
 
 from factory.config.arguments import answer
 from factory.exits import COMPLETE, INTERRUPTED
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.graph.plan import make_plan
 from factory.graph.walk import retry_policy
 from factory.readers.base import ClipRef
@@ -207,7 +207,7 @@ def go_on(out: Path, minutes: float = 2.0) -> str:
     """A run of one more round, which two minutes do not end: what its driver holds, and how many it hands out."""
     store = Store(out)
     refs, before = clips(sum(file.n_rows for file in store.candidates.file_facts().values())), _attempts(store)
-    ended = execute(WORK, refs, EXPERTS, ROUNDS + 1, store, "ray", 2, minutes=minutes, say=str)
+    ended = execute(WORK, refs, EXPERTS, ROUNDS + 1, store, Execution("ray", 2, minutes=minutes), say=str)
     if ended.exit_code not in (COMPLETE, INTERRUPTED):
         raise RuntimeError(f"exit code {ended.exit_code}: {ended.message}")
     return f"{_attempts(Store(out)) - before} attempts more"

@@ -27,7 +27,7 @@ from pathlib import Path
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph.batch import SHARD_BYTES
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.store.mcap_files import McapTable
 from factory.store.reader import SampleTable
 from factory.store.samples import OnChange, Store
@@ -70,14 +70,8 @@ def before_checkpoints(out: str) -> int:
 
 
 def _run(out: str, work: ToyWork, clips: int = 1, on_change: OnChange = "stop", shard_bytes: int = 1) -> int:
-    summary = execute(
-        *(work, refs(clips), EXPERTS, 1, Store(out), "local"),
-        on_change=on_change,
-        shard_bytes=shard_bytes,
-        shard_seconds=math.inf,
-        mcap_shards=True,
-        say=str,
-    )
+    how = Execution("local", on_change=on_change, shard_bytes=shard_bytes, shard_seconds=math.inf, mcap_shards=True)
+    summary = execute(work, refs(clips), EXPERTS, 1, Store(out), how, say=str)
     print(summary.message)
     return summary.exit_code
 

@@ -34,7 +34,7 @@ import numpy as np
 import pyarrow.compute as pc
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
-from factory.graph.execute import Executor, execute, on_new_clusters
+from factory.graph.execute import Execution, Executor, execute, on_new_clusters
 from factory.graph.work import PreparedClip
 from factory.readers.base import ClipRef
 from factory.run import main as run_main
@@ -89,7 +89,8 @@ def toys(out: str, journal: str, executor: Executor = "local") -> int:
     kind, seconds = (HeavyWork, 0.02) if executor == "ray" else (ToyWork, 0.0)
     work = kind(threshold=0.4, journal=journal, seconds=seconds)
     given = work, refs(8), ["recovery", "human"], 2
-    summary = on_new_clusters(lambda: execute(*given, Store(out), executor, 2, shard_seconds=0.05, say=str), say=str)
+    how = Execution(executor, 2, shard_seconds=0.05)
+    summary = on_new_clusters(lambda: execute(*given, Store(out), how, say=str), say=str)
     if summary.message:
         print(f"error: {summary.message}", file=sys.stderr)
     return summary.exit_code

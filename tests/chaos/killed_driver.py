@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from factory.graph import batch, driver
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.store.samples import Store
 from factory.store.table import KeyedTable
 from tests.factory.toy import ToyWork, refs
@@ -59,7 +59,7 @@ MOMENTS: dict[str, Callable[[], None]] = {
 def main(out: str, executor: str, moment: str, journal: str) -> int:
     MOMENTS[moment]()
     work = ToyWork(journal=journal)
-    summary = execute(work, refs(5), EXPERTS, 2, Store(out), executor, 2, shard_seconds=0.05)  # type: ignore[arg-type]
+    summary = execute(work, refs(5), EXPERTS, 2, Store(out), Execution(executor, 2, shard_seconds=0.05))  # type: ignore[arg-type]
     return summary.exit_code
 
 

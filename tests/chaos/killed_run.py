@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.store.samples import Store
 from tests.factory.toy import ToyWork, refs
 
@@ -36,11 +36,7 @@ def drive(out: str, executor: str, journal: str, seconds: float = TASK_S, notes:
         EXPERTS,
         ROUNDS,
         Store(out),
-        executor,  # type: ignore[arg-type]
-        2,
-        ray_address=address,
-        shard_seconds=0.1,
-        mcap_shards=True,
+        Execution(executor, 2, ray_address=address, shard_seconds=0.1, mcap_shards=True),
         say=str,
     )
     return summary.exit_code

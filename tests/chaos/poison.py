@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
-from factory.graph.execute import RunSummary, execute
+from factory.graph.execute import Execution, RunSummary, execute
 from factory.graph.limits import Limits
 from factory.graph.work import Driven, Dropped, PreparedClip
 from factory.readers.base import ClipRef
@@ -100,7 +100,7 @@ def write_files(folder: Path) -> None:
 
 def run(out: Path, work: WildWork, n: int, executor: str, limits: Limits = LIMITS) -> RunSummary:
     store = Store(out)
-    return execute(work, refs(n), [HUMAN], 1, store, executor, 2, isolated=True, limits=limits, say=str)  # type: ignore[arg-type]
+    return execute(work, refs(n), [HUMAN], 1, store, Execution(executor, 2, isolated=True, limits=limits), say=str)  # type: ignore[arg-type]
 
 
 def samples_of(out: Path, without: list[str]) -> pa.Table:

@@ -16,7 +16,7 @@ import pytest
 
 from factory.exits import INTERRUPTED, asked_to_stop
 from factory.graph.apart import run_apart
-from factory.graph.execute import NEW_CLUSTERS, RunSummary, execute, on_new_clusters
+from factory.graph.execute import NEW_CLUSTERS, Execution, RunSummary, execute, on_new_clusters
 from factory.run import main as run_main
 from factory.store.samples import Store
 from factory.store.verify import verify
@@ -29,7 +29,7 @@ from tests.pages import REPOSITORY
 RUN = """
 import sys
 from factory.graph import driver
-from factory.graph.execute import execute, on_new_clusters
+from factory.graph.execute import Execution, execute, on_new_clusters
 from factory.graph.on_ray.cluster import ray
 from factory.graph.on_ray.graph import RayGraph
 from factory.store.samples import Store
@@ -51,7 +51,7 @@ def killing(kind, name, at):
 
 killing(*{"warming": (RayGraph, "_warm_every_node", 1), "working": (driver.Driver, "_take_attempt", 6)}[sys.argv[2]])
 store = Store(sys.argv[1])
-ended = on_new_clusters(lambda: execute(ToyWork(), refs(5), EXPERTS, 2, store, "ray", 1, shard_seconds=0.05))
+ended = on_new_clusters(lambda: execute(ToyWork(), refs(5), EXPERTS, 2, store, Execution("ray", 1, shard_seconds=0.05)))
 sys.exit(ended.exit_code)
 """
 START = """
@@ -240,7 +240,7 @@ def test_a_run_goes_on_where_its_own_raylet_dies(tmp_path: Path, while_: str) ->
     done = subprocess.run(words, cwd=REPOSITORY, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     assert done.stdout.count("a new cluster is started") == 1 and "Ray's raylet died" in done.stdout
-    execute(ToyWork(), refs(5), EXPERTS, 2, Store(tmp_path / "plain"), "local", say=lambda line: None)
+    execute(ToyWork(), refs(5), EXPERTS, 2, Store(tmp_path / "plain"), Execution("local"), say=lambda line: None)
     assert_same_tables(tmp_path / "out", tmp_path / "plain")
     assert verify(Store(tmp_path / "out")).damage == ()
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.store.samples import Store
 from factory.store.verify import verify
 from tests.chaos.killed_driver import EXPERTS, MOMENTS
@@ -28,7 +28,7 @@ def drive(out: Path, executor: str, moment: str, journal: Path) -> subprocess.Co
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("undisturbed") / "out"
-    execute(ToyWork(), refs(5), EXPERTS, 2, Store(out), "local", say=lambda line: None)
+    execute(ToyWork(), refs(5), EXPERTS, 2, Store(out), Execution("local"), say=lambda line: None)
     return out
 
 

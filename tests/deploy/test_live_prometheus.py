@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from deploy.grafana.build import DASHBOARDS, text_of
-from factory.graph.execute import RunSummary, execute
+from factory.graph.execute import Execution, RunSummary, execute
 from factory.store.samples import Store
 from tests.factory.toy import ToyWork, refs
 
@@ -84,7 +84,9 @@ def scraped(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scraped]:
     try:
         work = ToyWork(trouble=TROUBLE, blocks=True, seconds=0.05)
         store = Store(home / "out")
-        summary = execute(work, refs(12), EXPERTS, 3, store, "ray", 2, shard_seconds=2.0, say=lambda line: None)
+        summary = execute(
+            work, refs(12), EXPERTS, 3, store, Execution("ray", 2, shard_seconds=2.0), say=lambda line: None
+        )
         yield Scraped(f"http://127.0.0.1:{listening}", home / "out", summary)
     finally:
         process.terminate()

@@ -11,7 +11,7 @@ import pytest
 
 from factory.config.run import load_config
 from factory.exits import COMPLETE
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.readers.scenarionet.reader import ScenarioNetReader
 from factory.readers.videos import file_and_frame
 from factory.setup.settings import assemble
@@ -73,7 +73,9 @@ def test_a_run_ends_with_photos_and_with_colour_pictures_where_nobody_drove(fold
     ]  # fmt: skip
     run = assemble(load_config(settings))
     store = Store(tmp_path)
-    summary = execute(run.work, run.index.refs[:1], run.config.experts, 1, store, "local", 1, say=lambda line: None)
+    summary = execute(
+        run.work, run.index.refs[:1], run.config.experts, 1, store, Execution("local", 1), say=lambda line: None
+    )
     assert summary.exit_code == COMPLETE
     table = SampleTable(str(tmp_path))
     rows = {row["expert"]: row for row in (table[i] for i in range(len(table)))}

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from factory.config.compose import ConfigError
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.graph.steps import prepare
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table
 from factory.stages.scene_file import BadScene, read_scene, write_scene
@@ -136,7 +136,7 @@ def main(flips: int = FLIPS, word: str = "") -> None:
     logging.disable()
     folder = Path(tempfile.mkdtemp())
     out = folder / "out"
-    execute(ToyWork(), refs(3), ["recovery", "human"], 2, Store(out), "local", say=lambda line: None)
+    execute(ToyWork(), refs(3), ["recovery", "human"], 2, Store(out), Execution("local"), say=lambda line: None)
     print("| file | flips | found | the same came out | anything else |\n|---|---|---|---|---|")
     chosen = {kind: how for kind, how in kinds(out).items() if word in kind}
     for kind, (path, part, look) in chosen.items():

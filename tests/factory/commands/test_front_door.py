@@ -20,7 +20,7 @@ from factory.commands.completion import candidates, settings_of
 from factory.commands.table import COMMANDS, DOORS, PLANNERS
 from factory.exits import MEANING
 from factory.graph.episodes import EpisodesWanted
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.store.funnel import funnel_of
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import COPIES
@@ -47,9 +47,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ["recovery", "human"],
         2,
         store,
-        "local",
-        episodes=EpisodesWanted(1, prepared_episode),
-        command=given,
+        Execution("local", episodes=EpisodesWanted(1, prepared_episode), command=given),
         say=lambda line: None,
     )
     return folder
@@ -326,10 +324,10 @@ def test_retry_calls_no_code_that_a_table_alone_names(
 def test_retry_of_a_run_without_failures_or_without_a_record_does_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    execute(ToyWork(), refs(1), ["human"], 1, Store(tmp_path / "fine"), "local", say=lambda line: None)
+    execute(ToyWork(), refs(1), ["human"], 1, Store(tmp_path / "fine"), Execution("local"), say=lambda line: None)
     assert ask(capsys, "retry", f"out={tmp_path / 'fine'}")[:2] == (0, "0 failed\n")
     work = ToyWork(trouble={"log0:0:human:-1": "bug"})
-    execute(work, refs(1), ["human"], 1, Store(tmp_path / "old"), "local", say=lambda line: None)
+    execute(work, refs(1), ["human"], 1, Store(tmp_path / "old"), Execution("local"), say=lambda line: None)
     code, _, error = ask(capsys, "retry", f"out={tmp_path / 'old'}")
     assert code == 2 and "records no settings" in error
 

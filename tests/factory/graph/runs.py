@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from factory.graph.execute import RunSummary, execute
+from factory.graph.execute import Execution, RunSummary, execute
 from factory.store.samples import Store
 from tests.factory.toy import ToyWork, refs
 
@@ -18,13 +18,6 @@ def run(
     experts: Sequence[str] = EXPERTS,
     **options: object,
 ) -> RunSummary:
-    return execute(
-        work or ToyWork(),
-        refs(n),
-        experts,
-        rounds,
-        Store(out),
-        "local",
-        say=lambda line: None,
-        **options,  # type: ignore[arg-type]
-    )
+    """options: of Execution."""
+    how = Execution("local", **options)  # type: ignore[arg-type]
+    return execute(work or ToyWork(), refs(n), experts, rounds, Store(out), how, say=lambda line: None)

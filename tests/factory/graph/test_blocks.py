@@ -7,7 +7,7 @@ import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.blocks import BlockQueue, Build
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.graph.plan import ClipPlan
 from factory.readers.base import ClipRef
 from factory.store.samples import Store
@@ -53,7 +53,7 @@ def test_as_many_are_built_at_once_as_there_are_blocks_and_workers(logs: str, wo
 
 def executed(out: Path, work: ToyWork, rounds: int = 2, n: int = 4) -> int:
     experts: Sequence[str] = ["recovery", "human"]
-    return execute(work, refs(n), experts, rounds, Store(out), "local", say=lambda line: None).exit_code
+    return execute(work, refs(n), experts, rounds, Store(out), Execution("local"), say=lambda line: None).exit_code
 
 
 def test_a_run_builds_every_block_once_and_first(tmp_path: Path) -> None:

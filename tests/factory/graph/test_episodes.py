@@ -11,7 +11,7 @@ from factory.config.run import load_config
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph import episodes
 from factory.graph.episodes import EpisodesWanted
-from factory.graph.execute import RunSummary, execute
+from factory.graph.execute import Execution, RunSummary, execute
 from factory.store.location import Location
 from factory.store.mcap_files import FOLDER, episode_name, is_chosen
 from factory.store.samples import Store
@@ -26,17 +26,8 @@ EXPERTS = ["recovery", "human"]
 def run(out: Path | Store, every: int = 1, rounds: int = 2, n: int = 3, **options: Any) -> RunSummary:
     store = out if isinstance(out, Store) else Store(out)
     work = options.pop("work", FilmedWork())
-    return execute(
-        work,
-        refs(n),
-        EXPERTS,
-        rounds,
-        store,
-        "local",
-        episodes=EpisodesWanted(every, prepared_episode),
-        say=lambda line: None,
-        **options,
-    )
+    how = Execution("local", episodes=EpisodesWanted(every, prepared_episode), **options)
+    return execute(work, refs(n), EXPERTS, rounds, store, how, say=lambda line: None)
 
 
 def there(out: Path) -> dict[str, bytes]:

@@ -10,7 +10,7 @@ import pyarrow.compute as pc
 import pytest
 
 from factory.exits import COMPLETE, INTERRUPTED
-from factory.graph.execute import RunSummary, execute, on_new_clusters
+from factory.graph.execute import Execution, RunSummary, execute, on_new_clusters
 from factory.graph.steps import failure_of
 from factory.run import main as run_main
 from factory.store.disk import DiskFull, needs_disk, why_disk_full, why_unusable
@@ -51,7 +51,13 @@ def resize(folder: Path, size: str) -> None:
 def run(out: Path) -> RunSummary:
     work = ToyWork(threshold=0.4)
     return execute(
-        work, refs(8), ["recovery", "human"], 2, Store(out), "local", shard_seconds=0.0, say=lambda line: None
+        work,
+        refs(8),
+        ["recovery", "human"],
+        2,
+        Store(out),
+        Execution("local", shard_seconds=0.0),
+        say=lambda line: None,
     )
 
 
@@ -175,7 +181,7 @@ def test_a_machine_that_is_ill_while_kernels_are_compiled_is_no_bug_and_no_wrong
     tmp_path: Path, work: ToyWork, executor: str
 ) -> None:
     out, where = tmp_path / "out", "ray" if executor == "ray" else "local"
-    summary = execute(work, refs(1), ["human"], 1, Store(out), where, 1, isolated=executor == "isolated")  # type: ignore[arg-type]
+    summary = execute(work, refs(1), ["human"], 1, Store(out), Execution(where, 1, isolated=executor == "isolated"))  # type: ignore[arg-type]
     assert summary.exit_code == INTERRUPTED and not [*out.rglob("*.parquet")]
     assert COLD in summary.message and "run the same command again" in summary.message
 
@@ -191,7 +197,8 @@ def test_ray_that_cannot_begin_ends_the_run_with_one_line_that_says_how_full_its
     monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
     out, told = tmp_path / "out", list[str]()
     summary = on_new_clusters(
-        lambda: execute(ToyWork(), refs(1), ["human"], 1, Store(out), "ray", say=told.append), told.append
+        lambda: execute(ToyWork(), refs(1), ["human"], 1, Store(out), Execution("ray"), say=told.append),
+        told.append,
     )
     assert summary.exit_code == INTERRUPTED and not out.exists()
     assert [line.rpartition("; ")[2] for line in told] == [f"a new cluster is started, {i} of 3" for i in (1, 2, 3)]
@@ -215,7 +222,8 @@ def test_ray_without_space_for_its_files_is_not_begun_again(
     resize(disk, "64k")
     out, told = tmp_path / "out", list[str]()
     summary = on_new_clusters(
-        lambda: execute(ToyWork(), refs(1), ["human"], 1, Store(out), "ray", say=told.append), told.append
+        lambda: execute(ToyWork(), refs(1), ["human"], 1, Store(out), Execution("ray"), say=told.append),
+        told.append,
     )
     assert summary.exit_code == INTERRUPTED and not out.exists() and not told
     assert f"its files lie in {disk}: the disk is full, 65,536 bytes are free; free disk space" in summary.message
@@ -223,6 +231,6 @@ def test_ray_without_space_for_its_files_is_not_begun_again(
 
 @pytest.mark.ray
 def test_a_worker_that_dies_while_kernels_are_compiled_is_no_wrong_setting(tmp_path: Path) -> None:
-    summary = execute(DyingWork(), refs(1), ["human"], 1, Store(tmp_path / "out"), "ray", 1)
+    summary = execute(DyingWork(), refs(1), ["human"], 1, Store(tmp_path / "out"), Execution("ray", 1))
     assert summary.exit_code == INTERRUPTED and not (tmp_path / "out" / "samples").exists()
     assert "could not get its kernels ready" in summary.message and "run the same command again" in summary.message

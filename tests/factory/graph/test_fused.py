@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, execute
+from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, Execution, execute
 from factory.graph.local import Claims, attempt_tasks
 from factory.graph.on_ray.cluster import ray  # with the environment that keeps it on loopback
 from factory.graph.work import Columns, Driven, Dropped, PreparedClip, Underway, attempted, go_on
@@ -28,7 +28,7 @@ UNFIT = {f"log0:{start}:pdm_closed:{i}:render": "unfit" for start in (0, 2000) f
 
 
 def run(out: Path, work: ToyWork, **options: object):  # type: ignore[no-untyped-def]
-    return execute(work, refs(4), EXPERTS, 2, Store(out), say=lambda line: None, **options)  # type: ignore[arg-type]
+    return execute(work, refs(4), EXPERTS, 2, Store(out), Execution(**options), say=lambda line: None)  # type: ignore[arg-type]
 
 
 def test_the_tasks_of_an_attempt() -> None:
@@ -131,9 +131,8 @@ def test_a_real_run_makes_the_same_rows_in_one_task_here_and_in_three_on_ray(tow
     for executor, fuse in (("local", "all"), ("ray", "none")):
         stores[executor] = Store(tmp_path / executor)
         made = execute(
-            *(town, town.reader.index().refs[:1], ["pdm_closed", "human"], 1, stores[executor], executor),  # type: ignore[arg-type]
-            workers=2,
-            fuse=fuse,  # type: ignore[arg-type]
+            *(town, town.reader.index().refs[:1], ["pdm_closed", "human"], 1, stores[executor]),
+            Execution(executor, 2, fuse=fuse),  # type: ignore[arg-type]
             say=lambda line: None,
         )
         assert made.exit_code == COMPLETE and made.counts["accepted"] == 2
@@ -195,7 +194,7 @@ def test_the_town_s_pictures_are_drawn_on_the_gpu_node_and_its_drives_made_on_th
     noted = NotedWork(**{f.name: getattr(work, f.name) for f in fields(work)}, journal=str(journal))
     what = (work.reader.index().refs, ["pdm_closed", "human"], 3)
     on_two = Store(tmp_path / "ray")
-    made = execute(noted, *what, on_two, workers=2, claims=Claims(gpu_share=0.5), say=lambda line: None)
+    made = execute(noted, *what, on_two, Execution(workers=2, claims=Claims(gpu_share=0.5)), say=lambda line: None)
     assert made.exit_code == COMPLETE and made.counts["rejected"] > 0
     tasks = [json.loads(line) for line in journal.read_text().splitlines()]
     places = {name: {two_nodes[node] for task, node, *_ in tasks if task == name} for name, *_ in tasks}
@@ -204,7 +203,7 @@ def test_the_town_s_pictures_are_drawn_on_the_gpu_node_and_its_drives_made_on_th
     drives, pictures = ([span for task, _, *span in tasks if task == name] for name in ("drive", "render"))
     assert len(pictures) == made.counts["accepted"], "only what the reward accepts is drawn"
     assert any(min(pictures)[0] < began < max(pictures)[0] for began, _ in drives)
-    execute(work, *what, Store(tmp_path / "local"), "local", say=lambda line: None)
+    execute(work, *what, Store(tmp_path / "local"), Execution("local"), say=lambda line: None)
     assert_same_tables(tmp_path / "ray", tmp_path / "local")
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph import execute as execution
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.graph.work import Built, Driven, Dropped, Halted, PreparedClip, Stopped, never
 from factory.readers.base import ClipRef
 from factory.store.cache import BadCacheFile
@@ -156,7 +156,7 @@ def test_a_system_failure_is_tried_by_the_next_run_and_quarantined_after_three(
 
 
 def test_zero_inputs_and_double_ones_write_nothing(tmp_path: Path) -> None:
-    double = execute(ToyWork(), refs(2) * 2, EXPERTS, 1, Store(tmp_path / "out"), "local")
+    double = execute(ToyWork(), refs(2) * 2, EXPERTS, 1, Store(tmp_path / "out"), Execution("local"))
     assert double.exit_code == BAD_CONFIG and refs(1)[0].clip_id in double.message
     assert run(tmp_path / "out", n=0).exit_code == BAD_CONFIG
     assert run(tmp_path / "out", rounds=0).exit_code == BAD_CONFIG
@@ -224,7 +224,15 @@ def test_a_run_that_is_overtaken_stops_and_loses_nothing(tmp_path: Path, plain: 
                 run(tmp_path / "out")  # the same command, started a second time meanwhile
             return super().drive(prepared, candidate, expert)
 
-    summary = execute(Overtaking(), refs(4), EXPERTS, 2, overtaken, "local", shard_seconds=0.0, say=lambda line: None)
+    summary = execute(
+        Overtaking(),
+        refs(4),
+        EXPERTS,
+        2,
+        overtaken,
+        Execution("local", shard_seconds=0.0),
+        say=lambda line: None,
+    )
     assert summary.exit_code == INTERRUPTED and "another run has taken over" in summary.message
     assert_same_tables(tmp_path / "out", plain())
 

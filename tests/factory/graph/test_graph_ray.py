@@ -11,7 +11,7 @@ import pytest
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.episodes import EpisodesWanted
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.graph.limits import Limits
 from factory.graph.local import Claims
 from factory.graph.on_ray import cluster
@@ -29,7 +29,7 @@ EXPERTS = ["recovery", "pdm_closed", "human"]
 
 
 def run(out: Path, executor: str, work: ToyWork, rounds: int, workers: int, n: int = 5):  # type: ignore[no-untyped-def]
-    return execute(work, refs(n), EXPERTS, rounds, Store(out), executor, workers, say=lambda line: None)  # type: ignore[arg-type]
+    return execute(work, refs(n), EXPERTS, rounds, Store(out), Execution(executor, workers), say=lambda line: None)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -86,9 +86,7 @@ def test_workers_write_the_same_episodes_as_one_process(tmp_path: Path, two_cpus
             EXPERTS,
             2,
             store,
-            executor,
-            2,
-            episodes=EpisodesWanted(1, prepared_episode),
+            Execution(executor, 2, episodes=EpisodesWanted(1, prepared_episode)),
             say=lambda line: None,
         )  # type: ignore[arg-type]
     local, ray_s = (
@@ -106,7 +104,7 @@ def test_only_what_draws_claims_its_share_of_a_gpu(tmp_path: Path, two_cpus: Non
         ["recovery"],
         1,
         Store(tmp_path / "out"),
-        claims=Claims(gpu_share=0.5),
+        Execution(claims=Claims(gpu_share=0.5)),
         say=lambda line: None,
     )
     assert summary.exit_code == COMPLETE
@@ -124,7 +122,15 @@ def test_a_cluster_without_a_gpu_is_waited_for_and_then_named(
     monkeypatch.setattr(cluster, "nodes_of_cluster", lambda having="": [] if having == "GPU" else nodes(having))
     monkeypatch.setattr(cluster, "GPU_WAIT_S", 0.1)
     store = Store(tmp_path / "out")
-    summary = execute(ToyWork(), refs(1), ["human"], 1, store, claims=Claims(gpu_share=0.5), say=lambda line: None)
+    summary = execute(
+        ToyWork(),
+        refs(1),
+        ["human"],
+        1,
+        store,
+        Execution(claims=Claims(gpu_share=0.5)),
+        say=lambda line: None,
+    )
     assert summary.exit_code == BAD_CONFIG and "render.backend=cpu" in summary.message
     assert not (tmp_path / "out").exists()
 
@@ -139,7 +145,13 @@ def test_a_clip_that_kills_its_workers_hurts_nobody_else(tmp_path: Path, two_cpu
     assert failed == {"system", "input"}
     assert (
         execute(
-            ToyWork(), refs(5), EXPERTS, 2, Store(tmp_path / "out"), "local", retry=True, say=lambda line: None
+            ToyWork(),
+            refs(5),
+            EXPERTS,
+            2,
+            Store(tmp_path / "out"),
+            Execution("local", retry=True),
+            say=lambda line: None,
         ).exit_code
         == COMPLETE
     )
@@ -153,7 +165,13 @@ def test_a_loop_is_ended_on_a_worker_too_and_tried_once_a_run(tmp_path: Path, tw
     work = WildWork(wild=(("log0:0:recovery:0", "loop"),), journal=journal)
     limits = Limits(seconds={"drive": 1.0, "render": 0.0, "label": 0.0})
     summary = execute(
-        work, refs(3), EXPERTS, 1, Store(tmp_path / "out"), "ray", 2, limits=limits, say=lambda line: None
+        work,
+        refs(3),
+        EXPERTS,
+        1,
+        Store(tmp_path / "out"),
+        Execution("ray", 2, limits=limits),
+        say=lambda line: None,
     )
     assert summary.exit_code == COMPLETE_WITH_FAILURES
     (failed,) = [o for o in tables_of(tmp_path / "out")[1] if o["kind"] == "failed"]  # type: ignore[index]

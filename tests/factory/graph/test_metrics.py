@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from factory.graph import execute as execution
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.graph.local import LocalGraph
 from factory.graph.metrics import (
     BYTES,
@@ -65,7 +65,7 @@ def recorded_run(out: Path, monkeypatch: pytest.MonkeyPatch, rounds: int = 2, bl
 
     monkeypatch.setattr(execution, "LocalGraph", Watched)
     work = ToyWork(trouble=TROUBLE, blocks=blocks)
-    execute(work, refs(5), EXPERTS, rounds, Store(out), "local", say=lambda line: None)
+    execute(work, refs(5), EXPERTS, rounds, Store(out), Execution("local"), say=lambda line: None)
     return recorded
 
 

@@ -16,7 +16,7 @@ from tests.pages import REPOSITORY
 
 CODE = """
 import sys
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.store.samples import Store
 from tests.factory.graph.wild import WildWork
 from tests.factory.toy import refs
@@ -24,8 +24,8 @@ from tests.factory.toy import refs
 if __name__ == "__main__":
     out, journal, how, executor = sys.argv[1:]
     work = WildWork(wild=(("log0:0:recovery:0", how),), journal=journal)
-    ended = execute(work, refs(2), ["recovery", "human"], 1, Store(out), executor.split("+")[0], 2, shard_seconds=0.1,
-                    isolated="isolated" in executor)
+    asked = Execution(executor.split("+")[0], 2, shard_seconds=0.1, isolated="isolated" in executor)
+    ended = execute(work, refs(2), ["recovery", "human"], 1, Store(out), asked)
     sys.exit(ended.exit_code)
 """
 

@@ -12,7 +12,7 @@ import pytest
 
 from factory.config.run import BenchmarkSettings, load_config
 from factory.exits import COMPLETE
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.graph.work import Columns, Dropped, PreparedClip, attempted
 from factory.readers.base import ClipRef
 from factory.readers.settings import TownSettings
@@ -70,7 +70,7 @@ def refs(work: FactoryWork) -> Sequence[ClipRef]:
 
 def made(work: FactoryWork, refs: Sequence[ClipRef], out: Path, rounds: int) -> Store:
     store = Store(str(out))
-    assert execute(work, refs, EXPERTS, rounds, store, "local", say=lambda line: None).exit_code == COMPLETE
+    assert execute(work, refs, EXPERTS, rounds, store, Execution("local"), say=lambda line: None).exit_code == COMPLETE
     return Store(str(out))
 
 
@@ -173,7 +173,7 @@ def test_scenes_are_there_before_any_row_is(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(BenchmarkWork, "drive", killed)
-    execute(work, refs[1:2], EXPERTS, 1, Store(str(tmp_path)), "local", say=lambda line: None)
+    execute(work, refs[1:2], EXPERTS, 1, Store(str(tmp_path)), Execution("local"), say=lambda line: None)
     assert SceneFiles(Location(str(tmp_path / "scenes"))).clip_ids() == [refs[1].clip_id]
     assert not len(Store(str(tmp_path)).samples)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from factory.config.run import load_config
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
 from factory.setup.settings import assemble
 from factory.stages.pipeline import FactoryWork
@@ -28,7 +28,15 @@ def work_of(experts: Mapping[str, Expert], out: Path, *words: str) -> FactoryWor
 
 def ran(work: FactoryWork, out: Path) -> tuple[Store, Funnel]:
     store = Store(out)
-    execute(work, work.reader.index().refs[:1], [*work.experts], 2, store, "local", say=lambda line: None)
+    execute(
+        work,
+        work.reader.index().refs[:1],
+        [*work.experts],
+        2,
+        store,
+        Execution("local"),
+        say=lambda line: None,
+    )
     return store, funnel_of(store)
 
 

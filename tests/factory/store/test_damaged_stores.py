@@ -10,7 +10,7 @@ import pytest
 from factory.commands.table import COMMANDS
 from factory.exits import BAD_CONFIG, COMPLETE, DAMAGED
 from factory.graph.episodes import EpisodesWanted
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.store.location import Location
 from factory.store.mcap_files import Message, episode_bytes
 from factory.store.parquet_file import write_shard
@@ -33,7 +33,9 @@ EPISODE = episode_bytes([Message("/a", 0, {"x": 1})], {"id": "a"})
 def run(out: Path, *, clips: int = 3) -> int:
     made = EpisodesWanted(1, lambda row, clip: EPISODE)
     experts, quiet = ["recovery", "human"], lambda line: None
-    return execute(ToyWork(), refs(clips), experts, 2, Store(out), "local", say=quiet, episodes=made).exit_code
+    return execute(
+        ToyWork(), refs(clips), experts, 2, Store(out), Execution("local", episodes=made), say=quiet
+    ).exit_code
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +90,9 @@ def test_the_command_says_so_and_repairs_a_log(out: Path, golden: Path, capsys: 
 def test_a_lost_last_commit_is_noticed_by_the_run_too(out: Path, golden: Path) -> None:
     files(out, "samples/_delta_log/*.json")[-1].unlink()
     assert len(Store(out).samples) < len(Store(golden).samples)
-    summary = execute(ToyWork(), refs(3), ["recovery", "human"], 2, Store(out), "local", say=lambda line: None)
+    summary = execute(
+        ToyWork(), refs(3), ["recovery", "human"], 2, Store(out), Execution("local"), say=lambda line: None
+    )
     assert summary.exit_code == BAD_CONFIG
     assert "commit 3 is gone from the table's log; python -m factory verify out=" in summary.message
     assert check([str(out), "repair=true"]) == COMPLETE

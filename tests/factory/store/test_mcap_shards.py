@@ -17,7 +17,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from factory.config.run import load_config
 from factory.exits import COMPLETE
 from factory.graph import episodes
-from factory.graph.execute import RunSummary, execute
+from factory.graph.execute import Execution, RunSummary, execute
 from factory.store.location import Location
 from factory.store.mcap_files import McapShard, McapTable, parse, shard_bytes, source_of, varint, write_mcap_shard
 from factory.store.reader import SampleTable
@@ -163,9 +163,8 @@ def run(out: Path, shards: bool = True, **options: Any) -> RunSummary:
     work = options.pop("work", ToyWork())
     options = {"rounds": 2, "shard_seconds": 0.0, **options}
     rounds = options.pop("rounds")
-    return execute(
-        work, refs(3), ["recovery", "human"], rounds, Store(out), "local", mcap_shards=shards, say=str, **options
-    )
+    how = Execution("local", mcap_shards=shards, **options)
+    return execute(work, refs(3), ["recovery", "human"], rounds, Store(out), how, say=str)
 
 
 def assert_rows_in_step(out: Path) -> None:

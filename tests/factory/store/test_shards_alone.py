@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from deltalake import DeltaTable
 
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.store.parquet_file import Shard
 from factory.store.samples import Store
 from factory.store.verify import verify
@@ -24,7 +24,7 @@ PLACE = ["attempt_id", "expert", "round"]
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
-    execute(ToyWork(), refs(3), ["recovery", "human"], 2, Store(folder), "local", say=lambda line: None)
+    execute(ToyWork(), refs(3), ["recovery", "human"], 2, Store(folder), Execution("local"), say=lambda line: None)
     return folder
 
 

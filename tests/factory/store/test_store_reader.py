@@ -16,7 +16,7 @@ import pytest
 
 from factory.commands.table import COMMANDS, dispatch
 from factory.exits import BAD_CONFIG
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.store.reader import Format, SampleTable, image_of, labels_of, to_torch
 from factory.store.samples import Store
 from factory.store.schema import LABEL_COLUMNS
@@ -31,7 +31,7 @@ main = COMMANDS["verify"].load()
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     path = tmp_path_factory.mktemp("reader") / "out"
-    execute(ToyWork(), refs(3), ["recovery", "human"], 2, Store(path), "local", say=lambda line: None)
+    execute(ToyWork(), refs(3), ["recovery", "human"], 2, Store(path), Execution("local"), say=lambda line: None)
     yield path
 
 
@@ -56,7 +56,9 @@ def test_workers_of_a_data_loader_read_the_snapshot_that_was_opened_however_they
     from torch.utils.data import DataLoader, Subset
 
     def grown(n: int) -> None:
-        execute(ToyWork(), refs(n), ["recovery", "human"], 2, Store(tmp_path), "local", mcap_shards=True, say=len)
+        execute(
+            ToyWork(), refs(n), ["recovery", "human"], 2, Store(tmp_path), Execution("local", mcap_shards=True), say=len
+        )
 
     grown(1)
     table = SampleTable(tmp_path, format=format)
@@ -82,7 +84,9 @@ def test_the_tables_metadata_names_version_and_licences(out: Path) -> None:
 
 def test_licences_of_later_commits_are_added_to_those_that_are_named(tmp_path: Path) -> None:
     for n in (1, 3):
-        execute(ToyWork(), refs(n), ["recovery", "human"], 2, Store(tmp_path), "local", say=lambda line: None)
+        execute(
+            ToyWork(), refs(n), ["recovery", "human"], 2, Store(tmp_path), Execution("local"), say=lambda line: None
+        )
     named = set(Store(tmp_path).samples.properties["factory.licences"].split("; "))
     assert named == set(SampleTable(tmp_path).table(["licence"])["licence"].to_pylist())
 
@@ -96,7 +100,7 @@ def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 def test_a_table_of_another_version_is_named(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    execute(ToyWork(), refs(1), ["human"], 1, store, "local", say=lambda line: None)
+    execute(ToyWork(), refs(1), ["human"], 1, store, Execution("local"), say=lambda line: None)
     store.samples.set_property("factory.schema_version", "1")
     with pytest.raises(ValueError, match=f"{tmp_path}.*schema_version 1, this version reads and writes 4: make the"):
         SampleTable(tmp_path)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from factory.graph.episodes import EpisodesWanted
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.store.location import BadLocation, Location
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
@@ -33,7 +33,9 @@ def test_a_bucket_holds_the_same_rows_as_a_folder(s3: dict[str, str], tmp_path: 
     url = f"s3://{BUCKET}/runs/one"
     for rounds in (1, 3):
         for out in (Store(url, s3), Store(tmp_path)):
-            summary = execute(ToyWork(), refs(3), ["recovery", "human"], rounds, out, "local", say=lambda line: None)
+            summary = execute(
+                ToyWork(), refs(3), ["recovery", "human"], rounds, out, Execution("local"), say=lambda line: None
+            )
             assert summary.exit_code == 0
     assert summary.executed.prepared == 0
     assert_same_tables(Location.parse(url, s3), tmp_path)
@@ -54,8 +56,7 @@ def test_a_bucket_holds_the_same_episodes_as_a_folder_and_makes_up_for_lost_ones
             ["recovery"],
             1,
             out,
-            "local",
-            episodes=EpisodesWanted(1, prepared_episode),
+            Execution("local", episodes=EpisodesWanted(1, prepared_episode)),
             say=lambda line: None,
         )
     there, here = Location.parse(url, s3).child("episodes"), Location.parse(tmp_path).child("episodes")
@@ -69,8 +70,7 @@ def test_a_bucket_holds_the_same_episodes_as_a_folder_and_makes_up_for_lost_ones
         ["recovery"],
         1,
         Store(url, s3),
-        "local",
-        episodes=EpisodesWanted(1, prepared_episode),
+        Execution("local", episodes=EpisodesWanted(1, prepared_episode)),
         say=lambda line: None,
     )
     assert again.executed.episodes == 1 and there.read(names[0]) == here.read(names[0])
@@ -82,7 +82,10 @@ def test_the_dashboard_follows_a_run_in_a_bucket(s3: dict[str, str]) -> None:
     board = None
     for rounds in (1, 2):
         out = Store(url, s3)
-        assert execute(ToyWork(), refs(2), ["recovery"], rounds, out, "local", say=lambda line: None).exit_code == 0
+        assert (
+            execute(ToyWork(), refs(2), ["recovery"], rounds, out, Execution("local"), say=lambda line: None).exit_code
+            == 0
+        )
         board = board or Board(Store(url, s3), look_every_s=0.0)
         assert json.loads(board.answer("/api/overview").body)["counts"]["samples"] == len(out.samples)
     (item,) = json.loads(board.answer("/api/samples?size=1").body)["items"]

@@ -16,7 +16,7 @@ from factory.commands.dashboard import Request, awaited
 from factory.commands.table import COMMANDS
 from factory.config.arguments import Refused, parse
 from factory.config.run import load_config
-from factory.graph.execute import execute
+from factory.graph.execute import Execution, execute
 from factory.setup.settings import assemble
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
@@ -217,7 +217,7 @@ def test_the_whole_logged_drive_is_in_the_picture_and_the_episode_where_the_prep
     made += ["clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none", "vocabulary.k=2000"]
     work = assemble(load_config([*made, "experts=[pdm_closed]", f"out={tmp_path / 'out'}"])).work
     store = Store(tmp_path / "out")
-    execute(work, work.reader.index().refs[:1], ["pdm_closed"], 1, store, "local", say=lambda line: None)
+    execute(work, work.reader.index().refs[:1], ["pdm_closed"], 1, store, Execution("local"), say=lambda line: None)
     table = SampleTable(tmp_path / "out")
     row = table[table.attempt_ids[0]]
     drive = logged_drive(store, row)
