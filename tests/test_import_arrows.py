@@ -145,7 +145,7 @@ def test_only_the_graph_its_metrics_and_trainings_on_a_cluster_import_ray() -> N
         for path in (ROOT / package).rglob("*.py")
         if "ray" in imported_modules(path)
     }
-    graph = {f"factory/graph/on_ray/{name}.py" for name in ("cluster", "graph", "pool")}
+    graph = {"factory/graph/on_ray/graph.py"}
     assert users == graph | {"planners/training/on_ray.py"}
 
 

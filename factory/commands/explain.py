@@ -62,7 +62,7 @@ def explain(request: Request) -> None:
     """Compose the settings, run the clip, print and draw."""
     import cv2
 
-    from factory.graph.walk import candidate_order
+    from factory.graph.plan import candidate_order
     from factory.setup.settings import assemble
     from factory.views.bev import write_mp4
     from factory.views.drawing import attempt_picture, candidates_picture, film

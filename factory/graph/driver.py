@@ -4,29 +4,249 @@ Attempts of one walk are a chain, walks are parallel. Results go to the gatherer
 Everything the driver knows it can know again from the tables, so it can die at any moment.
 """
 
+import ctypes
+import ctypes.util
 import math
+import sys
 import threading
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
-from factory.graph.batch import Gatherer, PendingRow
-from factory.graph.blocks import BlockOf, BlockQueue, Build
+import pyarrow as pa
+
 from factory.graph.episodes import Beside
 from factory.graph.local import Graph, MachineIll, Ticket
 from factory.graph.metrics import RunMetrics
-from factory.graph.plan import CLIP_CANDIDATE, ClipPlan, RunPlan, WalkState, wants_payload
+from factory.graph.plan import (
+    CLIP_CANDIDATE,
+    Blocked,
+    ClipPlan,
+    Complete,
+    Exhausted,
+    Records,
+    RunPlan,
+    Step,
+    Stretch,
+    Try,
+    WalkState,
+    past_of,
+    stretch,
+    tries_before,
+    wants_payload,
+)
 from factory.graph.progress import Executed, ProgressLine, RunForecast, Tally, Workload
-from factory.graph.records import Records, past_of
 from factory.graph.steps import Attempted, Failure, HalfBuilt, HandedOn, Prepared, Reconstructed, Walked
-from factory.graph.walk import Blocked, Complete, Exhausted, Step, Stretch, Try, stretch, tries_before
-from factory.store.attempts import ErrorKind, Kind, Outcome, Past
+from factory.readers.base import ClipRef
+from factory.store.attempts import ClipCandidates, ErrorKind, Kind, Outcome, Past
 from factory.store.disk import DiskFull
 from factory.store.parquet_file import Shard
+from factory.store.samples import Store
 from factory.store.schema import RunIdentity, Stamp, attempt_id
 from tasks.stages import Rejected
+
+# Which clips may be prepared: each waits for the block that it is rendered from, and that is built once, as a task.
+#
+# Clips keep their order but for those that wait; as many blocks are built at once as there are workers.
+
+BlockOf = Callable[[ClipRef], str | None]
+
+
+@dataclass(frozen=True)
+class Build:
+    """The next task: the block of this clip."""
+
+    block: str
+    ref: ClipRef
+
+
+class BlockQueue:
+    """The clips of a plan, handed out one by one."""
+
+    def __init__(self, clips: Sequence[ClipPlan], block_of: BlockOf, workers: int) -> None:
+        self._ahead = deque(clips)
+        self._ready: deque[ClipPlan] = deque()  # their block is built
+        self._waiting: dict[str, list[ClipPlan]] = {}  # block that is being built -> clips
+        self._built: set[str] = set()
+        self._block_of = block_of
+        needed = {block_of(clip.ref) for clip in clips if wants_payload(clip)} - {None}
+        self.n_blocks = len(needed)
+        self.at_once = max(1, min(workers, self.n_blocks))
+
+    def __bool__(self) -> bool:
+        """Some clip has not been handed out."""
+        return bool(self._ahead or self._ready or self._waiting)
+
+    def next(self, wanted: bool) -> ClipPlan | Build | None:
+        """A clip to begin with, if one is `wanted`, or a block to build; None: nothing for now."""
+        if wanted and self._ready:
+            return self._ready.popleft()
+        while self._ahead:
+            clip = self._ahead[0]
+            block = self._block_of(clip.ref) if wants_payload(clip) else None
+            if block is None or block in self._built:
+                return self._ahead.popleft() if wanted else None
+            if block in self._waiting:
+                self._waiting[block].append(self._ahead.popleft())
+            elif len(self._waiting) < self.at_once:
+                self._waiting[block] = [self._ahead.popleft()]
+                return Build(block, clip.ref)
+            else:
+                return None
+        return None
+
+    def built(self, block: str) -> None:
+        """Its clips may go on, also where building failed: each of them will say so itself."""
+        self._built.add(block)
+        self._ready.extend(self._waiting.pop(block))
+
+
+# Results on their way to the tables: gathered by reference, written as shards by tasks, committed in groups.
+#
+# A batch closes when the rows of one partition reach 128 MB or after 30 s; its shards are written by tasks; when all
+# of them stand, the driver commits the whole batch. What is not committed when a run dies is tried again by the next
+# one.
+
+SHARD_BYTES = 128 * 2**20
+SHARD_SECONDS = 30.0
+
+
+class WriteFailed(RuntimeError):
+    """A shard could not be written."""
+
+
+@dataclass(frozen=True)
+class PendingRow:
+    """An accepted row that lies with a worker."""
+
+    result: Any
+    n_bytes: int
+    partition: tuple[int, str]  # round, expert
+    licence: str
+
+
+@dataclass
+class PendingCommit:
+    """What one commit holds."""
+
+    rows: dict[tuple[int, str], list[PendingRow]] = field(default_factory=lambda: defaultdict(list))
+    n_bytes: Counter[tuple[int, str]] = field(default_factory=Counter)  # of rows: asked on every turn of the loop
+    candidates: list[ClipCandidates] = field(default_factory=list)
+    outcomes: list[Outcome] = field(default_factory=list)
+    replaced: list[str] = field(default_factory=list)  # attempt_ids whose old rows go
+    unlisted: list[str] = field(default_factory=list)  # clip_ids whose candidate list goes
+    shards: list[Shard] = field(default_factory=list)
+    writing: int = 0
+    opened: float = 0.0
+
+    @property
+    def is_empty(self) -> bool:
+        return not (self.rows or self.candidates or self.outcomes or self.replaced or self.unlisted)
+
+    @property
+    def largest(self) -> int:
+        """Bytes of the largest partition."""
+        return max(self.n_bytes.values(), default=0)
+
+
+@cache
+def _trim() -> Callable[[int], int] | None:
+    """glibc's malloc_trim; None where the C library has none."""
+    name = ctypes.util.find_library("c") if sys.platform == "linux" else None
+    return getattr(ctypes.CDLL(name), "malloc_trim", None) if name else None
+
+
+def give_back_freed() -> None:
+    """Hand memory that is free, but kept for later, back to the machine: of the C library's many arenas and Arrow's.
+
+    A driver of days would else hold what each of its threads once needed. About a millisecond.
+    """
+    pa.default_memory_pool().release_unused()
+    if trim := _trim():
+        trim(0)
+
+
+class Gatherer:
+    """Fills the open batch, sends full ones to be written, commits the written ones."""
+
+    def __init__(
+        self,
+        graph: Graph,
+        store: Store,
+        shard_bytes: int = SHARD_BYTES,
+        shard_seconds: float = SHARD_SECONDS,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._graph, self._store, self._clock = graph, store, clock
+        self.committed: Callable[[Sequence[Shard], float], None] = lambda shards, seconds: None  # told of every commit
+        self._shard_bytes, self._shard_seconds = shard_bytes, shard_seconds
+        self._open = PendingCommit()
+        self._written_by: dict[Ticket, PendingCommit] = {}
+
+    @property
+    def n_writing(self) -> int:
+        return len({id(batch) for batch in self._written_by.values()})
+
+    def add(
+        self,
+        rows: Sequence[PendingRow] = (),
+        candidates: Sequence[ClipCandidates] = (),
+        outcomes: Sequence[Outcome] = (),
+        replaced: Sequence[str] = (),
+        unlisted: Sequence[str] = (),
+    ) -> None:
+        """Results that must become visible together."""
+        if self._open.is_empty:
+            self._open.opened = self._clock()
+        for row in rows:
+            self._open.rows[row.partition].append(row)
+            self._open.n_bytes[row.partition] += row.n_bytes
+        self._open.candidates.extend(candidates)
+        self._open.outcomes.extend(outcomes)
+        self._open.replaced.extend(replaced)
+        self._open.unlisted.extend(unlisted)
+
+    def send_if_due(self) -> None:
+        batch = self._open
+        age = self._clock() - batch.opened
+        if not batch.is_empty and (batch.largest >= self._shard_bytes or age >= self._shard_seconds):
+            self.send()
+
+    def send(self) -> None:
+        """Close the open batch and have its shards written."""
+        batch, self._open = self._open, PendingCommit()
+        for partition in sorted(batch.rows):
+            ticket = self._graph.submit("write", *(row.result for row in batch.rows[partition]))
+            self._written_by[ticket] = batch
+            batch.writing += 1
+        if not batch.writing:
+            self._commit(batch)
+
+    def finished(self, ticket: Ticket, report: Any) -> bool:
+        """Take the report of a write; False where the ticket is not one. Raises WriteFailed and the store's errors."""
+        batch = self._written_by.pop(ticket, None)
+        if batch is None:
+            return False
+        if isinstance(report, Failure):
+            said = report.error.splitlines()[-1]
+            raise WriteFailed(f"a file of samples could not be written: {said}; run the same command again to go on")
+        batch.shards.append(report)
+        batch.writing -= 1
+        if not batch.writing:
+            self._commit(batch)
+        return True
+
+    def _commit(self, batch: PendingCommit) -> None:
+        licences = {row.licence for rows in batch.rows.values() for row in rows}
+        began = time.perf_counter()
+        self._store.commit(batch.candidates, batch.shards, batch.outcomes, batch.replaced, batch.unlisted, licences)
+        self.committed(batch.shards, time.perf_counter() - began)
+        batch.rows.clear()
+        give_back_freed()
+
 
 CLIPS_PER_WORKER = 2  # open at once: one works while the next is being prepared
 WAIT_S = 0.5

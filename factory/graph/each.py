@@ -64,7 +64,7 @@ def _pool(executor: str, workers: int | None, to: Location | None) -> Iterator[t
     """What runs the function, and how many items it is to hold. What has not begun when it is left is dropped."""
     pool: Executor
     if executor == "ray":
-        from factory.graph.on_ray.pool import RayPool
+        from factory.graph.on_ray.graph import RayPool
 
         pool = RayPool(workers, to)
         most = IN_HAND * pool.parallelism

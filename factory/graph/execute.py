@@ -18,18 +18,14 @@ from deltalake.exceptions import DeltaError
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
 from factory.graph.apart import AGAIN, NEW_CLUSTERS, begun_anew
-from factory.graph.batch import SHARD_BYTES, SHARD_SECONDS, Gatherer, WriteFailed
-from factory.graph.crashes import counted, crash_of
-from factory.graph.driver import Driver
+from factory.graph.driver import SHARD_BYTES, SHARD_SECONDS, Driver, Gatherer, WriteFailed
 from factory.graph.episodes import Beside, Episodes, EpisodesWanted, McapShards, Together
 from factory.graph.guard import CRASHED
 from factory.graph.limits import NO_LIMITS, Limits, notes_folder
 from factory.graph.local import NO_CLAIMS, Claims, ClusterDied, ClusterLacks, Fuse, Graph, LocalGraph, MachineIll
 from factory.graph.metrics import RunMetrics
-from factory.graph.plan import RunPlan, make_plan
+from factory.graph.plan import Records, RunPlan, Try, counted, crash_of, make_plan, retry_policy
 from factory.graph.progress import Executed
-from factory.graph.records import Records
-from factory.graph.walk import Try, retry_policy
 from factory.graph.work import NotReady, Work
 from factory.readers.base import ClipRef
 from factory.store.attempts import NOTHING, Kind
@@ -164,7 +160,7 @@ class _Run:
         how, to = self._how, (self._work, self._store.location)
         try:
             if how.executor == "local" and how.isolated:
-                from factory.graph.isolated import IsolatedGraph
+                from factory.graph.local import IsolatedGraph
 
                 self._graph = IsolatedGraph(*to, lambda: self._driver.interrupted, how.fuse, how.limits)
             elif how.executor == "local":

@@ -1,15 +1,118 @@
 """What a run has to do: for every clip, what the tables already know about its walks, and whether anything is left."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
 
-from factory.graph.walk import Complete, Exhausted, Step, Try, candidate_order, next_step
-from factory.graph.work import HUMAN_CANDIDATE
+from factory.graph.guard import CRASHED, read_note
+from factory.graph.steps import Failure
+from factory.graph.work import HUMAN_CANDIDATE, PreparedClip
 from factory.readers.base import ClipRef
-from factory.store.attempts import History, Kind, Listed, Past
+from factory.store.attempts import QUARANTINE_AFTER, ClipCandidates, ErrorKind, History, Kind, Listed, Outcome, Past
 from factory.store.samples import WAYS_OUT, ChangedRun, OnChange
-from factory.store.schema import UNLISTED, RunIdentity
+from factory.store.schema import UNLISTED, RunIdentity, Stamp, attempt_id
+from tasks.stages import Rejected
+
+# The walk of one (clip, expert) down the clip's candidate list: what to try next, given what is known.
+#
+# A pure function of the list and of what became of its candidates, so that a resumed walk, a longer one (`rounds=5`
+# after `rounds=2`) and a fresh one are the same walk. An incident (a failed attempt) stops the walk until it is
+# fixed: going on would give later samples another round than in a run without the incident, and rows must not depend
+# on incidents.
+
+TRIED_AGAIN = (ErrorKind.MACHINE, ErrorKind.SYSTEM, ErrorKind.LIMIT)  # by the next run, by itself
+
+
+@dataclass(frozen=True)
+class Try:
+    """Attempt this candidate; if it is accepted, it is the sample of this round."""
+
+    candidate: int
+    round: int
+
+
+@dataclass(frozen=True)
+class Complete:
+    """The walk has all samples it was asked for (an expert that is tried once: its one attempt is done)."""
+
+
+@dataclass(frozen=True)
+class Exhausted:
+    """The list ended before the walk had all rounds."""
+
+    n_tried: int
+
+
+@dataclass(frozen=True)
+class Blocked:
+    """The walk stands at a failed attempt."""
+
+    candidate: int
+    reason: str
+
+
+Step = Try | Complete | Exhausted | Blocked
+
+
+def candidate_order(once: bool, n_candidates: int) -> Sequence[int]:
+    """Candidate indices in the order in which a walk tries them; once: of an expert that is tried once."""
+    return (HUMAN_CANDIDATE,) if once else range(n_candidates)
+
+
+def next_step(
+    once: bool, n_candidates: int, rounds: int, known: Mapping[int, Past], may_retry: Callable[[Past], bool]
+) -> Step:
+    """Where the walk stands. An expert that is tried `once` has one attempt in round 0 whatever `rounds` is."""
+    wanted = 1 if once else rounds
+    accepted = 0
+    for candidate in candidate_order(once, n_candidates):
+        if accepted == wanted:
+            return Complete()
+        past = known.get(candidate)
+        if past is None:
+            return Try(candidate, accepted)
+        if past.kind is Kind.FAILED:
+            return Try(candidate, accepted) if may_retry(past) else Blocked(candidate, "failed")
+        if past.kind is Kind.ACCEPTED:
+            if past.round != accepted:
+                return Blocked(candidate, f"stored as round {past.round}, the walk makes it {accepted}")
+            accepted += 1
+    return Complete() if accepted == wanted or once else Exhausted(n_candidates)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Attempts of a walk that one task makes: one after the other until one fails or enough are accepted."""
+
+    n: int  # attempts at most
+    samples: int  # accepted at most
+
+
+def stretch(once: bool, n_candidates: int, rounds: int, known: Container[int], begins: Try, most: int) -> Stretch:
+    """Up to `most` attempts that nothing is known of but the first, whatever becomes of those before them."""
+    if once:
+        return Stretch(1, 1)
+    end = min(n_candidates, begins.candidate + most)
+    n = next((i for i in range(begins.candidate + 1, end) if i in known), end) - begins.candidate
+    return Stretch(n, min(n, rounds - begins.round))
+
+
+def retry_policy(retry: bool, versions_json: str) -> Callable[[Past], bool]:
+    """Which failures of earlier runs this run tries again: those of machine, system and limits; with `retry`, or under
+    other stage versions than the failure's, all."""
+
+    def may_retry(past: Past) -> bool:
+        return retry or past.error_kind in TRIED_AGAIN or past.stage_versions != versions_json
+
+    return may_retry
+
+
+def tries_before(past: Past | None) -> int:
+    """Runs that already failed at this attempt and count against it."""
+    return past.tries if past is not None and past.error_kind in TRIED_AGAIN else 0
+
 
 Policy = Callable[[Past], bool]
 CLIP_CANDIDATE = HUMAN_CANDIDATE  # of a row about the clip as a whole (its expert is empty)
@@ -194,3 +297,123 @@ def wants_payload(clip: ClipPlan) -> bool:
     """Some walk has an attempt to make, or preparing failed before, so that the prepared clip is needed."""
     tries = any(isinstance(step, Try) for step in clip.steps.values())
     return clip.listed is None or clip.past is not None or tries
+
+
+# What a run writes down of clips and attempts: stamps, outcomes and lists of candidates, under the run's identity.
+
+
+@dataclass(frozen=True)
+class Records:
+    """Those of one run."""
+
+    identity: RunIdentity
+    digests: Mapping[str, str]  # expert -> digest of what its attempts depend on
+
+    def stamp(self, ref: ClipRef, expert: str, step: Try) -> Stamp:
+        """Of the attempt that a walk makes next."""
+        digest, vocabulary = self.digests[expert], self.identity.vocabulary_digest
+        return Stamp(
+            attempt_id(ref.clip_id, step.candidate, vocabulary, expert, digest),
+            expert,
+            digest,
+            step.round,
+            step.candidate,
+            vocabulary,
+            self.identity.settings_hash,
+            self.identity.versions_json,
+        )
+
+    def outcome(
+        self,
+        ref: ClipRef,
+        key: str,
+        expert: str,
+        candidate: int,
+        what: Rejected | Failure | Exhausted,
+        tries: int,
+        subscores: dict[str, float],
+        seconds: dict[str, float],
+    ) -> Outcome:
+        """Of what is not accepted; key: the attempt's id. A death or a limit is poison after QUARANTINE_AFTER."""
+        if isinstance(what, Rejected):
+            became = {"kind": Kind.REJECTED.value, "stage": what.stage, "reason": what.reason, "detail": what.detail}
+        elif isinstance(what, Failure):
+            tries -= what.kind is ErrorKind.MACHINE  # never counts
+            poison = what.kind in (ErrorKind.SYSTEM, ErrorKind.LIMIT) and tries + 1 >= QUARANTINE_AFTER
+            kind = ErrorKind.POISON if poison else what.kind
+            became = {"kind": Kind.FAILED.value, "stage": what.task, "error_kind": kind.value, "error": what.error}
+        else:
+            became = {"kind": Kind.EXHAUSTED.value}
+        return Outcome(
+            attempt_id=key,
+            clip_id=ref.clip_id,
+            dataset=ref.dataset,
+            log_id=ref.log_id,
+            expert=expert,
+            expert_digest=self.digests.get(expert, ""),
+            candidate_index=candidate,
+            settings_hash=self.identity.settings_hash,
+            stage_versions=self.identity.versions_json,
+            tries=tries + 1,
+            n_tried=what.n_tried if isinstance(what, Exhausted) else 0,
+            subscores=subscores,
+            seconds=seconds,
+            **became,
+        )
+
+    def candidates(self, ref: ClipRef, clip: PreparedClip) -> ClipCandidates:
+        """The list of a prepared clip."""
+        identity, dropped = self.identity, clip.dropped or Rejected("", "")
+        read = (ref.clip_id, ref.dataset, ref.log_id, clip.content_digest)
+        under = (identity.prepare_digest, identity.vocabulary_digest)
+        gates = dict(clip.gate_counts)
+        return ClipCandidates(*read, *under, gates, clip.candidates, dropped.stage, dropped.reason)
+
+
+def past_of(outcome: Outcome) -> Past:
+    """The same as the tables of a later run will tell it."""
+    kind = Kind(outcome.kind)
+    return Past(outcome.attempt_id, kind, True, -1, outcome.error_kind, outcome.tries, outcome.stage_versions)
+
+
+# A run that died at a task: the next one counts it against that clip or attempt, and comes to it last.
+
+
+def crash_of(folder: Path) -> Mapping[str, Any]:
+    """What was in hand when the last run died, as its guard wrote it; empty where none did."""
+    return read_note(folder / CRASHED) or {}
+
+
+def counted(
+    crash: Mapping[str, Any], plan: RunPlan, records: Records, may_retry: Callable[[Past], bool]
+) -> tuple[RunPlan, list[Outcome]]:
+    """The plan that knows of a crash, and the outcome to be stored before anything is begun."""
+    suspect = next((clip for clip in plan.todo if _is_of(crash, clip, records)), None)
+    if suspect is None:
+        return plan, []
+    what = Failure(ErrorKind.SYSTEM, f"the run died at it: {crash['what']}")
+    others = tuple(clip for clip in plan.todo if clip is not suspect)
+    if "expert" in crash:
+        walk = next(walk for walk in suspect.walks if walk.expert == crash["expert"])
+        candidate, key = crash["candidate"], crash["attempt_id"]
+        tries = tries_before(walk.known.get(candidate))
+        outcome = records.outcome(suspect.ref, key, walk.expert, candidate, what, tries, {}, {})
+        walk.known[candidate] = past_of(outcome)
+        return replace(plan, todo=(*others, suspect)), [outcome]
+    key = attempt_id(suspect.ref.clip_id, CLIP_CANDIDATE, records.identity.vocabulary_digest, "", "")
+    tries = tries_before(suspect.past)
+    outcome = records.outcome(suspect.ref, key, "", CLIP_CANDIDATE, what, tries, {}, {})
+    suspect.past = past_of(outcome)
+    if may_retry(suspect.past):
+        return replace(plan, todo=(*others, suspect)), [outcome]
+    suspect.failed = True
+    return replace(plan, todo=others, done=(*plan.done, suspect)), [outcome]
+
+
+def _is_of(crash: Mapping[str, Any], clip: ClipPlan, records: Records) -> bool:
+    if "expert" not in crash:
+        return bool(crash.get("clip_id") == clip.ref.clip_id)
+    if crash["expert"] not in records.digests:
+        return False
+    stamp = records.stamp(clip.ref, crash["expert"], Try(crash["candidate"], 0))
+    return bool(stamp.attempt_id == crash["attempt_id"])

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 import pyarrow as pa
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
-from factory.graph.batch import SHARD_BYTES
+from factory.graph.driver import SHARD_BYTES
 from factory.graph.execute import RunSummary, record_summary
 from factory.graph.progress import Counter, Executed
 from factory.readers.base import BadClip, failing_as

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from factory.config.run import RunConfig, load_config
-from factory.graph.walk import candidate_order
+from factory.graph.plan import candidate_order
 from factory.graph.work import Columns, attempted
 from factory.readers.base import ClipRef
 from factory.setup.settings import Run

@@ -31,7 +31,7 @@ import numpy as np
 from factory.config.arguments import answer
 from factory.exits import COMPLETE
 from factory.graph.execute import Execution, execute
-from factory.graph.on_ray.cluster import ray  # with the environment that keeps it on loopback
+from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
 from factory.graph.work import Columns, Driven, Dropped, PreparedClip
 from factory.readers.base import ClipRef
 from factory.store.samples import Store

@@ -28,8 +28,7 @@ import pyarrow as pa
 from factory.config.arguments import answer
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph.execute import Execution, execute
-from factory.graph.plan import make_plan
-from factory.graph.walk import retry_policy
+from factory.graph.plan import make_plan, retry_policy
 from factory.readers.base import ClipRef
 from factory.store.attempts import CANDIDATES, OUTCOMES
 from factory.store.parquet_file import Shard, TableSpec, write_shard

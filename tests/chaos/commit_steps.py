@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
-from factory.graph.batch import SHARD_BYTES
+from factory.graph.driver import SHARD_BYTES
 from factory.graph.execute import Execution, execute
 from factory.store.mcap_files import McapTable
 from factory.store.reader import SampleTable

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from factory.graph import batch, driver
+from factory.graph import driver
 from factory.graph.execute import Execution, execute
 from factory.store.samples import Store
 from factory.store.table import KeyedTable
@@ -47,7 +47,7 @@ def nth(n: int, condition: Callable[..., bool] = lambda *args: True) -> Callable
 MOMENTS: dict[str, Callable[[], None]] = {
     "a clip was just prepared": lambda: after(driver.Driver, "_take_prepared", nth(2)),
     "attempts are in flight": lambda: after(driver.Driver, "_take_attempt", nth(9)),
-    "shards are written, nothing is committed": lambda: after(batch.Gatherer, "_commit", nth(1), before=True),
+    "shards are written, nothing is committed": lambda: after(driver.Gatherer, "_commit", nth(1), before=True),
     "samples are committed, outcomes are not": lambda: after(
         KeyedTable, "commit", nth(2, lambda self, add, *rest: self.spec.name == "samples" and bool(add))
     ),

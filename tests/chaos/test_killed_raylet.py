@@ -30,7 +30,7 @@ RUN = """
 import sys
 from factory.graph import driver
 from factory.graph.execute import Execution, execute, on_new_clusters
-from factory.graph.on_ray.cluster import ray
+from factory.graph.on_ray.graph import ray
 from factory.graph.on_ray.graph import RayGraph
 from factory.store.samples import Store
 from tests.chaos.killed_driver import EXPERTS
@@ -59,7 +59,7 @@ import os
 import threading
 import time
 from factory.graph.local import ClusterDied
-from factory.graph.on_ray.cluster import connect
+from factory.graph.on_ray.graph import connect
 from tests.chaos.kills import PROGRAMS
 from tests.chaos.processes import below, kill
 

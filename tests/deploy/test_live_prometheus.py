@@ -59,7 +59,7 @@ def free_port() -> int:
 
 @pytest.fixture(scope="module")
 def scraped(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scraped]:
-    from factory.graph.on_ray.cluster import ray  # with the environment that keeps it on loopback
+    from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
 
     home, exported, listening = tmp_path_factory.mktemp("prometheus"), free_port(), free_port()
     config = yaml.safe_load((PROMETHEUS / "prometheus.yml").read_text())

@@ -35,7 +35,7 @@ UNSEEN = {  # declared without an import statement of ours
     "packaging": "torch.utils.cpp_extension imports it when gsplat compiles",
     "tensorboard": "torch.utils.tensorboard imports it",
 }
-RAY_ONLY = {f"factory/graph/on_ray/{name}.py" for name in ("cluster", "graph", "pool")}  # loaded by executor=ray alone
+RAY_ONLY = {"factory/graph/on_ray/graph.py"}  # loaded by executor=ray alone
 GPU_ONLY = {  # by render.backend=gsplat alone
     "tasks/render/fit/on_torch.py",
     "tasks/render/splatting/tensors.py",

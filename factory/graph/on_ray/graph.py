@@ -4,19 +4,30 @@ Large results stay in the object store and travel by reference. A worker that di
 fails becomes a steps.Failure.
 """
 
+import logging
+import os
+import secrets
+import shutil
+import signal
+import socket
+import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import ray
 from ray import exceptions
+from ray.autoscaler.sdk import request_resources
 from ray.exceptions import RayError, RayTaskError
 from ray.util.metrics import Counter, Gauge, Histogram
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from factory.exits import without_terminal
 from factory.graph.limits import NO_LIMITS, Costs, Limits, cleared, described, notes_folder, put_away, watched
 from factory.graph.local import (
     MAX_RETRIES,
@@ -24,6 +35,7 @@ from factory.graph.local import (
     STEPS,
     Claims,
     ClusterDied,
+    ClusterLacks,
     Fuse,
     MachineIll,
     Ticket,
@@ -33,25 +45,153 @@ from factory.graph.local import (
     unready,
 )
 from factory.graph.metrics import METRICS, Metric, Recorder, Type
-from factory.graph.on_ray.cluster import (
-    connect,
-    dead_part,
-    has_gpu,
-    nodes_of_cluster,
-    of_nodes,
-    on_node,
-    prove_shared,
-    tasks_at_once,
-)
+from factory.graph.plan import Stretch
 from factory.graph.steps import Failure, Walked, attempt
-from factory.graph.walk import Stretch
 from factory.graph.work import NotReady, PreparedClip, Work, never
 from factory.store.attempts import ErrorKind
-from factory.store.disk import why_ill
-from factory.store.location import Location
+from factory.store.disk import DiskFull, existing, why_ill
+from factory.store.location import BadLocation, Location
 from factory.store.schema import Stamp
 from factory.wording import one_line
 from tasks.stages import TASKS
+
+# A Ray cluster joined, or begun on this machine: whether it answers and lives, its nodes, and what they all see.
+#
+# Nothing but loopback is opened for a cluster of our own, and `ray stop` is never called.
+
+VITAL = ("raylet", "gcs_server")
+PROBE_SECONDS = 120.0
+ANSWER_S = 10.0  # for a cluster's port to be reached
+OWN_BYTES = 2**20  # of files of a cluster of our own, before it does anything: less, and another will not begin either
+GPU_WAIT_S = 900.0  # for the first node with one to come
+WORKER_ENV = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+FORWARDED_ENV = ("NUMBA_CACHE_DIR",)
+
+
+@ray.remote(num_cpus=0)
+def _sees(out: Location, name: str, token: bytes) -> bool:
+    return out.read(name) == token
+
+
+def connect(workers: int | None, address: str | None) -> bool:
+    """Join the cluster of `address` or RAY_ADDRESS, else start one in this machine (then True).
+
+    Raises ConnectionError where nothing answers there; where nothing listens at once: Ray itself tries for minutes.
+    Raises ClusterDied where one of our own does not come up, DiskFull where there is no space for its files: another
+    would wait half a minute in vain, as this one did.
+    """
+    named = address or os.environ.get("RAY_ADDRESS", "")
+    environment = WORKER_ENV | {name: os.environ[name] for name in FORWARDED_ENV if name in os.environ}
+    where = address or ("auto" if os.environ.get("RAY_ADDRESS") else "local")
+    own: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if where == "local" else {}
+    if where == "local":  # Ray warns that a cluster of our own asks for a token, as it should
+        logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
+    try:
+        must_answer(named)
+        with without_terminal(signal.SIGHUP):  # Ray keeps SIGINT from its processes itself
+            ray.init(
+                address=where,
+                runtime_env={"env_vars": environment},
+                log_to_driver=False,
+                logging_level=logging.WARNING,
+                **own,
+            )
+    except Exception as error:  # Ray has none of its own for what keeps it from beginning
+        if where == "local":
+            ray.shutdown()
+            folder, free = _files_of_ray()
+            said = f"Ray did not begin on this machine ({one_line(error)}); its files lie in {folder}"
+            if free < OWN_BYTES:
+                raise DiskFull(f"{said}: the disk is full, {free:,} bytes are free") from error
+            raise ClusterDied(f"{said}, where {free:,} bytes are free", True) from error
+        if not isinstance(error, ConnectionError):
+            raise
+        said = f"no Ray cluster answers at RAY_ADDRESS={named} ({one_line(error)})"
+        raise ConnectionError(f"{said}; unset it to run on this machine alone") from error
+    return where == "local"
+
+
+def _files_of_ray() -> tuple[str, int]:
+    """Where a cluster of our own has its files, and the bytes that are free there."""
+    folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or tempfile.gettempdir()
+    return folder, shutil.disk_usage(existing(Path(folder))).free
+
+
+def tasks_at_once(workers: int | None, is_ours: bool) -> int:
+    """Tasks: of a cluster of our own no more than it has cores, of another what was asked for, as it may grow."""
+    available = int(ray.cluster_resources().get("CPU", 1))
+    return max(1, min(workers or available, available) if is_ours else workers or available)
+
+
+def dead_part() -> str:
+    """A process of a cluster that this one began, where it has died.
+
+    Looked at before anything is asked of Ray, which ends this process when it finds the object store gone.
+    """
+    node = ray._private.worker._global_node
+    return next((name for name, _ in node.dead_processes() if name in VITAL), "") if node is not None else ""
+
+
+def must_answer(address: str) -> None:
+    """Raises ConnectionError for a host:port, or ray://host:port, at which nothing listens."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not (colon and port.isdecimal()):
+        return  # auto, local: Ray knows where
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S).close()
+    except OSError as error:
+        raise ConnectionError(str(error)) from error
+
+
+def nodes_of_cluster(having: str = "") -> list[str]:
+    return [n["NodeID"] for n in ray.nodes() if n["Alive"] and (not having or n["Resources"].get(having))]
+
+
+def of_nodes(resource: str) -> list[int]:
+    """Of each node that works: a head without cores does not."""
+    working = [node["Resources"] for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
+    return [int(resources[resource]) for resources in working if resources.get(resource)]
+
+
+def has_gpu(wait: bool) -> bool:
+    """Some node has a GPU; where none has, one is asked for and waited for."""
+    if nodes_of_cluster("GPU") or not wait:
+        return bool(nodes_of_cluster("GPU"))
+    request_resources(bundles=[{"GPU": 1}])
+    began = time.monotonic()
+    while not nodes_of_cluster("GPU"):
+        if time.monotonic() - began > GPU_WAIT_S:
+            raise ClusterLacks(
+                f"no node of the cluster has a GPU, and none came in {GPU_WAIT_S:.0f} s: start one, or draw with "
+                "render.backend=cpu"
+            )
+        time.sleep(min(2.0, GPU_WAIT_S))
+    request_resources(bundles=[])  # the attempts themselves hold it from now on
+    return True
+
+
+def on_node(node: str) -> NodeAffinitySchedulingStrategy:
+    return NodeAffinitySchedulingStrategy(node, soft=False)
+
+
+def prove_shared(out: Location, setting: str, wanted: str) -> None:
+    """Every node reads what the driver wrote under `out`. Raises BadLocation with what is `wanted` of the setting."""
+    nodes = nodes_of_cluster()
+    if len(nodes) < 2:
+        return
+    name, token = f"probe-{secrets.token_hex(8)}", secrets.token_bytes(16)
+    out.write(name, token)
+    try:
+        answers = ray.get(
+            [_sees.options(scheduling_strategy=on_node(node)).remote(out, name, token) for node in nodes],
+            timeout=PROBE_SECONDS,
+        )
+    finally:
+        out.remove(name)
+    blind = [node for node, sees in zip(nodes, answers) if not sees]
+    if blind:
+        raise BadLocation(f"{setting}={out.uri} is not the same folder on nodes {blind}: name {wanted}")
+
 
 ILL = (  # what Ray says when it is the machine that failed
     *(exceptions.NodeDiedError, exceptions.LocalRayletDiedError, exceptions.RaySystemError),
@@ -321,3 +461,66 @@ def _held(reference: list[Any]) -> Any:
         _HELD.clear()
         _HELD[key] = ray.get(reference[0])
     return _HELD[key]
+
+
+# Any function's tasks in a cluster's workers, as futures.
+
+R = TypeVar("R")
+P = ParamSpec("P")
+
+
+class RayPool(Executor):
+    """Tasks of a core each as futures, of any function. What a task raises is its future's own exception."""
+
+    def __init__(self, workers: int | None, to: Location | None) -> None:
+        """Workers as of RayGraph; to: the folder that tasks write to.
+
+        Raises BadLocation where some node does not see it, ConnectionError where no cluster answers, or none
+        begins here.
+        """
+        self._connected = not ray.is_initialized()
+        try:
+            is_ours = self._connected and connect(workers, None)
+        except ClusterDied as error:
+            raise ConnectionError(str(error)) from error
+        self.parallelism = tasks_at_once(workers, is_ours)
+        self._references: dict[Future[Any], Any] = {}
+        try:
+            if to is not None:
+                prove_shared(to, "to", "storage that all of them share")
+        except BaseException:
+            self.shutdown()
+            raise
+
+    def submit(self, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
+        """BrokenExecutor is raised by a future whose worker died, with all of its retries."""
+        reference = _call.remote(function, args, kwargs)
+        future: Future[R] = Future()
+        future.set_running_or_notify_cancel()
+        self._references[future] = reference  # by which it could be ended
+        reference.future().add_done_callback(lambda done: self._hand_on(done, future))
+        return future
+
+    def _hand_on(self, done: Future[R], future: Future[R]) -> None:
+        self._references.pop(future, None)
+        error = done.exception()
+        if error is None:
+            future.set_result(done.result())
+        elif isinstance(error, RayTaskError):  # Ray wraps what a task raised with its traceback
+            future.set_exception(error.cause)
+        else:
+            future.set_exception(BrokenExecutor(f"{type(error).__name__}: {one_line(error)}"))
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Leave the cluster; cancel_futures: end what is not done. What is done is in its future already."""
+        if cancel_futures:
+            for reference in list(self._references.values()):
+                ray.cancel(reference)
+        self._references.clear()
+        if self._connected:
+            ray.shutdown()
+
+
+@ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
+def _call(function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+    return function(*args, **kwargs)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
-from factory.graph.blocks import BlockQueue, Build
+from factory.graph.driver import BlockQueue, Build
 from factory.graph.execute import Execution, execute
 from factory.graph.plan import ClipPlan
 from factory.readers.base import ClipRef

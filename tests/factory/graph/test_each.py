@@ -44,7 +44,7 @@ def two_cpus(request: pytest.FixtureRequest) -> Iterator[None]:
     if not any(item.get_closest_marker("ray") for item in request.session.items if item.path == request.path):
         yield
         return
-    from factory.graph.on_ray.cluster import ray
+    from factory.graph.on_ray.graph import ray
 
     ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False)
     yield
@@ -105,15 +105,15 @@ def test_a_worker_that_dies_is_told_with_its_item(how: dict[str, Any]) -> None:
 @pytest.mark.ray
 def test_a_folder_that_a_node_does_not_see_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second node is this one again; what it reads is another machine's folder, where nothing is."""
-    from factory.graph.on_ray import cluster
+    from factory.graph.on_ray import graph
 
-    node = cluster.nodes_of_cluster()
-    monkeypatch.setattr(cluster, "nodes_of_cluster", lambda having="": node * 2)
+    node = graph.nodes_of_cluster()
+    monkeypatch.setattr(graph, "nodes_of_cluster", lambda having="": node * 2)
     assert list(each(squared, [3], **RAY, to=Location(str(tmp_path)))) == [9]
     with pytest.raises(BadLocation, match=rf"^to={tmp_path} is not the same folder on nodes .*storage that all"):
         list(each(squared, [3], **RAY, to=Elsewhere(str(tmp_path))))
     assert not list(tmp_path.iterdir()), "the trial file is taken away"
-    assert cluster.ray.is_initialized(), "a cluster that was there stays"
+    assert graph.ray.is_initialized(), "a cluster that was there stays"
 
 
 @pytest.mark.slow

@@ -14,8 +14,8 @@ from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import Execution, execute
 from factory.graph.limits import Limits
 from factory.graph.local import Claims
-from factory.graph.on_ray import cluster
-from factory.graph.on_ray.cluster import ray  # with the environment that keeps it on loopback
+from factory.graph.on_ray import graph
+from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
 from factory.store.samples import Store
 from factory.store.verify import verify
 from factory.views.show import prepared_episode
@@ -43,7 +43,7 @@ def two_cpus() -> Iterator[None]:
 @pytest.mark.parametrize(
     "begun",
     [
-        "import factory.graph.on_ray.cluster as m; m.connect(1, None)",
+        "import factory.graph.on_ray.graph as m; m.connect(1, None)",
         "import planners.training.on_ray as m; held = m._connected(); held.__enter__()",
     ],
 )
@@ -58,9 +58,9 @@ def test_a_cluster_that_does_not_answer_is_named_at_once(tmp_path: Path, monkeyp
     """Ray's own client tries for minutes."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"127.0.0.1:{server.getsockname()[1]}"
-        cluster.must_answer(address)
-        cluster.must_answer(f"ray://{address}")
-    cluster.must_answer("auto")
+        graph.must_answer(address)
+        graph.must_answer(f"ray://{address}")
+    graph.must_answer("auto")
     monkeypatch.setenv("RAY_ADDRESS", address)
     ended = run(tmp_path / "out", "ray", ToyWork(), 1, 1)
     assert ended.exit_code == BAD_CONFIG and f"RAY_ADDRESS={address}" in ended.message and "unset" in ended.message
@@ -118,9 +118,9 @@ def test_only_what_draws_claims_its_share_of_a_gpu(tmp_path: Path, two_cpus: Non
 def test_a_cluster_without_a_gpu_is_waited_for_and_then_named(
     tmp_path: Path, two_cpus: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    nodes = cluster.nodes_of_cluster
-    monkeypatch.setattr(cluster, "nodes_of_cluster", lambda having="": [] if having == "GPU" else nodes(having))
-    monkeypatch.setattr(cluster, "GPU_WAIT_S", 0.1)
+    nodes = graph.nodes_of_cluster
+    monkeypatch.setattr(graph, "nodes_of_cluster", lambda having="": [] if having == "GPU" else nodes(having))
+    monkeypatch.setattr(graph, "GPU_WAIT_S", 0.1)
     store = Store(tmp_path / "out")
     summary = execute(
         ToyWork(),

@@ -8,7 +8,7 @@ import pytest
 from factory.exits import COMPLETE_WITH_FAILURES
 from factory.graph import limits
 from factory.graph.on_ray import graph
-from factory.graph.on_ray.cluster import ray  # with the environment that keeps it on loopback
+from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
 from factory.store.samples import Store
 from tests.factory.graph.runs import EXPERTS, Execution, execute, refs, run
 from tests.factory.tables import assert_same_rows, assert_same_tables

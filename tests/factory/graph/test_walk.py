@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factory.graph.walk import Blocked, Complete, Exhausted, Step, Stretch, Try, next_step, retry_policy, stretch
+from factory.graph.plan import Blocked, Complete, Exhausted, Step, Stretch, Try, next_step, retry_policy, stretch
 from factory.store.attempts import ErrorKind, Kind, Past
 
 
