@@ -14,8 +14,7 @@ from PIL import Image
 from factory.readers.base import BadClip
 from factory.readers.kitti import KittiCamera, KittiDrive
 from factory.readers.pictures import header_of, without_exif
-from factory.stages.own_body import read_masks
-from factory.stages.sensors import decode_image, opened_photos
+from factory.stages.sensors import decode_image, opened_photos, read_masks
 from factory.store.reader import image_of
 from planners.data.batch import ImageLayout
 from planners.data.images import stitched

@@ -40,7 +40,7 @@ ROOMS = {
     "factory": (
         *("exits", "wording", "job", "files", "locks"),
         *("readers.settings", "readers.town.settings", "config", "readers", "store"),
-        *("exports", "graph", "stages", "setup", "imports", "views", "views.board"),
+        *("exports", "graph", "stages", "pipeline", "setup", "imports", "views", "views.board"),
         *("run", "commands", "__main__"),
     ),
     "planners": (
@@ -163,9 +163,7 @@ def loaded_by(statement: str) -> set[str]:
 
 @pytest.mark.slow
 def test_a_run_in_this_process_needs_no_ray() -> None:
-    assert "ray" not in loaded_by(
-        "import factory.run, factory.graph.execute, factory.graph.metrics, factory.stages.pipeline"
-    )
+    assert "ray" not in loaded_by("import factory.run, factory.graph.execute, factory.graph.metrics, factory.pipeline")
 
 
 def test_importing_the_science_needs_numpy_only() -> None:

@@ -18,8 +18,8 @@ import numpy as np
 
 from factory.config.run import load_config
 from factory.graph.work import HUMAN_CANDIDATE, PreparedClip
+from factory.pipeline import Drive, FactoryWork, payload_of
 from factory.setup.settings import assemble
-from factory.stages.pipeline import Drive, FactoryWork, payload_of
 from tasks.attempt import perturbed_scene, verdict
 from tasks.experts.protocol import Plan
 from tasks.hard_scenes import BEFORE_STEPS

@@ -77,7 +77,7 @@ def main(request: Request) -> int:
 
 def _verdict(out: str) -> "Verdict":
     """Of the tables and of the blocks in the cache, opened anew."""
-    from factory.stages.kept_blocks import damaged_blocks
+    from factory.stages.assets import damaged_blocks
     from factory.store.verify import Verdict, verify
 
     store = open_store(out)

@@ -43,7 +43,7 @@ READERS: Mapping[str, type[Any]] = {  # `_target_` of a built-in reader -> its s
     "factory.readers.town.reader.SyntheticReader": TownClips,
     "factory.readers.town.towns.SyntheticTownsReader": TownsClips,
 }
-RECOVERY = "factory.setup.recovery.recovery"
+RECOVERY = "factory.setup.settings.recovery"
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,21 +12,28 @@ from pathlib import Path
 from typing import Any
 
 from factory.config.classes import class_of
-from factory.config.compose import ConfigError, build
-from factory.config.run import RunConfig, VocabularyChoice, photos_alone, refuse_relative_root
+from factory.config.compose import ConfigError, build, fill
+from factory.config.run import RecoverySources, RunConfig, VocabularyChoice, photos_alone, refuse_relative_root
+from factory.pipeline import BenchmarkWork, FactoryWork
 from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef
 from factory.readers.torch_file import check_checkpoint
 from factory.readers.validate import read_clip
-from factory.setup.vocabulary import Starts, load_starts, load_vocabulary
-from factory.stages.frames import BenchmarkWork
-from factory.stages.own_body import masks_digest, refuse_unknown_masks
-from factory.stages.pipeline import FactoryWork
-from factory.stages.sensors import chosen_cameras
+from factory.setup.vocabulary import (
+    Starts,
+    build_recovery_table,
+    load_recovery_table,
+    load_starts,
+    load_vocabulary,
+    save_recovery_table,
+    train_windows,
+)
+from factory.stages.sensors import chosen_cameras, masks_digest, refuse_unknown_masks
 from factory.store.disk import why_ill
 from factory.store.schema import UNLISTED, RunIdentity, canonical_json
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Expert, tried_once
+from tasks.experts.recovery.expert import Recovery, RecoverySettings, RecoveryTable
 from tasks.render.fit.losses import BadWeights, lpips_of
 from tasks.render.rigs import RIGS
 from tasks.render.scene import engine
@@ -33,6 +41,7 @@ from tasks.render.settings import RenderMode
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling
 from tasks.rollout.policy import traffic_record
+from tasks.sealed import check
 from tasks.stages import FRAMES, stage_versions
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
@@ -272,3 +281,56 @@ def cache_folder(out: str) -> str:
     if "://" in out:
         return str(user_cache() / "assets")
     return str(Path(out).absolute() / "cache")
+
+
+# The recovery expert of a run: its table is built from the run's own clips and vocabularies where none is named.
+
+log = logging.getLogger(__name__)
+
+
+def recovery(run: RunContext, **settings: Any) -> Recovery:
+    """Of conf/expert/recovery.yaml. Raises ConfigError."""
+    where = f"expert.{run.name}"
+    sources = fill(RecoverySources, settings, where)
+    chosen = RecoverySettings(sources.smooth, sources.weights, sources.feasible)
+    if sources.table is None:
+        return Recovery(_table_of(run, sources.vocabularies), chosen)
+    if not Path(sources.table).is_file():
+        raise ConfigError(f"{where}.table={sources.table}: there is no such file")
+    if sources.vocabularies:
+        raise ConfigError(f"{where}: give table or vocabularies; a finished table takes no more trajectories")
+    return Recovery(load_recovery_table(sources.table), chosen)
+
+
+def _table_of(run: RunContext, vocabularies: Sequence[str]) -> RecoveryTable:
+    """Of all TRAIN windows and the vocabulary files, kept in the user's cache."""
+    reader, index = run.clips()
+    named = run.config.vocabulary.file
+    files = [*vocabularies, *([named] if named else [])]
+    loaded = [load_vocabulary(file) for file in dict.fromkeys(files)]
+    digests = _log_digests(reader, index)
+    if digests is None:
+        return build_recovery_table([train_windows(reader)], loaded)
+    chosen = dict(run.config.clips)  # where logs lie, and what splits them, decides which are train
+    made_of = [stage_versions()["clip"], chosen, digests, sorted(ref.clip_id for ref in index.refs)]
+    made_of.append([vocabulary.digest for vocabulary in loaded])
+    key = hashlib.sha256(canonical_json(made_of).encode()).hexdigest()[:16]
+    cached = user_cache() / "tables" / f"recovery-{key}.npz"
+    if cached.is_file():
+        try:
+            check(cached, cached.name)
+            return load_recovery_table(cached)
+        except ValueError as error:  # Damaged among them
+            log.warning("%s: %s; it is made again", cached, str(error).removeprefix(f"{cached}: "))
+    built = build_recovery_table([train_windows(reader)], loaded)
+    save_recovery_table(cached, built, {"clips": len(index.refs), "vocabularies": files}, cached.name)
+    return built
+
+
+def _log_digests(reader: ClipReader, index: ClipIndex) -> list[str] | None:
+    """Content digest of every log; None where the reader cannot tell them without reading the clips."""
+    digest = getattr(reader, "digest", None)
+    if digest is None:
+        return None
+    first_of_log = {ref.log_id: ref for ref in reversed(index.refs)}
+    return [str(digest(first_of_log[log_id])) for log_id in sorted(first_of_log)]

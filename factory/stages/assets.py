@@ -8,6 +8,8 @@ nothing half done.
 import hashlib
 import json
 import logging
+import time
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
@@ -16,29 +18,119 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.graph.work import Stopped, never
+from factory.graph.work import Halted, Stopped, never
 from factory.locks import locked
 from factory.readers.videos import file_and_frame
-from factory.stages.fitting import fitted
-from factory.stages.own_body import masks_digest, read_masks
-from factory.stages.rig import UsedRig, corrected_rig, known_of, said_again, taken_from, used_rig, wanted
+from factory.stages.rig import SAID, UsedRig, corrected_rig, known_of, said_again, taken_from, told_of, used_rig, wanted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
-from factory.stages.sensors import block_cameras, block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
-from factory.store.disk import own_place
-from tasks.render.fit.losses import lpips_of
+from factory.stages.sensors import (
+    SensorData,
+    block_cameras,
+    block_of,
+    chosen_cameras,
+    load_sensors,
+    load_sweeps,
+    masks_digest,
+    read_masks,
+    taken_by,
+)
+from factory.store.disk import own_place, whole_file
+from factory.store.location import Location
+from factory.wording import time_text
+from tasks.render.fit.losses import Lpips, lpips_of
+from tasks.render.fit.reconstruct import advance, backend_of, finish
+from tasks.render.fit.start import prepare
+from tasks.render.fit.state import FitState
 from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom, rises_of
 from tasks.render.scene.build import build_asset, lidar_asset
 from tasks.render.scene.movers import lifted
 from tasks.render.scene.sensed import own_bodies
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
-from tasks.render.settings import Backend, RenderSettings, SceneDtype, SceneFrom
+from tasks.render.settings import Backend, FitSettings, RenderSettings, SceneDtype, SceneFrom
+from tasks.sealed import Damaged, check, seal
+from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bools
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block, Clip, of_other_log, own_name
 
+# A block's scene fitted to its photos, in stretches: a killed fit goes on where the last stretch ended.
+
+STRETCH = 500  # iterations between two saves
+BEGUN, PROGRESS = ".fit.npz", ".fit.json"  # what is half done, and how far it is
+FRESH_S = 120.0  # what was said longer ago is no news
+log = logging.getLogger(__name__)
+
+
+def fitted(
+    path: Path,
+    data: SensorData,
+    agents: AgentTracks | None,
+    settings: FitSettings,
+    threads: int,
+    stopped: Stopped = never,
+    backend: Backend = Backend.CPU,
+    lpips: Lpips | None = None,
+) -> RenderAsset:
+    """The scene of a block's sensors; what is half done lies beside `path`, where the scene will be stored.
+
+    A fit that was killed or halted comes to the same bytes as one that was not. Raises Halted once it is `stopped`,
+    with all of its iterations kept, ValueError without photos to learn from, and BackendMissing.
+    """
+    drawing = backend_of(backend, threads)
+    problem, state = prepare(data.photos, data.sweeps, agents, settings, threads=threads, known=data.known)
+    begun, said = path.with_suffix(BEGUN), path.with_suffix(PROGRESS)
+    state = _resumed(begun, state)
+    first, began = state.iteration, time.monotonic()
+
+    def say(iteration: int, loss: float, psnr_db: float) -> None:
+        per_s = (iteration - first) / (time.monotonic() - began)
+        left = time_text((settings.iterations - iteration) / per_s)
+        text = f"fit {iteration}/{settings.iterations}, {per_s:.1f} iterations/s, {psnr_db:.1f} dB, ETA {left}"
+        log.info("%s: %s, loss %.4f", path.stem, text, loss)
+        said.write_text(json.dumps({"block": path.stem, "text": text}))
+
+    while state.iteration < settings.iterations:
+        advance(problem, state, settings, state.iteration + STRETCH, say, threads, stopped, drawing)
+        arrays = state.arrays()
+        with whole_file(begun, sum(array.nbytes for array in arrays.values())) as draft:
+            with draft.open("wb") as file:
+                np.savez(file, **arrays)  # type: ignore[arg-type]
+            seal(draft, begun.name)
+        if state.iteration < settings.iterations and stopped():
+            said.unlink(missing_ok=True)
+            raise Halted(f"{path.stem}: {state.iteration} of {settings.iterations} iterations are done")
+    asset = finish(problem, state, threads, lpips)
+    begun.unlink(missing_ok=True)
+    said.unlink(missing_ok=True)
+    return asset
+
+
+def fits_going_on(folder: Path) -> list[str]:
+    """How far each fit in a cache folder is, as it said itself in the last two minutes."""
+    found = []
+    for path in sorted(folder.glob(f"*{PROGRESS}")):
+        try:
+            if time.time() - path.stat().st_mtime < FRESH_S:
+                found.append(json.loads(path.read_text())["text"])
+        except (OSError, ValueError, KeyError):  # ended, or is being written, at this moment
+            continue
+    return found
+
+
+def _resumed(begun: Path, start: FitState) -> FitState:
+    if not begun.exists():
+        return start
+    try:
+        check(begun, begun.name)
+        with np.load(begun, allow_pickle=False) as arrays:
+            return FitState.from_arrays(dict(arrays))
+    except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
+        log.warning("%s is damaged (%s); the fit begins again", begun, error)
+        return start
+
+
 ASSET_VERSION = 10  # raised by hand when the same sensors give another scene, or it is kept otherwise
 PARALLAX_SHARE = 0.9  # without lidar, a photo with no other in stereo reach shows sky alone; so few may be like that
-log = logging.getLogger(__name__)
 
 
 class Sensing(Enum):
@@ -205,3 +297,28 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
         digest.update(f"{file.sensor}\x1f{Path(file.uri).name}\x1f{size}\x1f{file.time_s!r}".encode())
         digest.update(np.ascontiguousarray(file.world_from_ego).tobytes())
     return digest.hexdigest()[:16]
+
+
+# Whether what a run keeps of blocks under `out/cache` is whole: scenes, corrected rigs, half-done fits.
+
+
+def damaged_blocks(out: Location) -> dict[str, str]:
+    """File, relative to `out`, -> what is wrong with it; blocks of a URL lie elsewhere."""
+    folder = Path(out.uri, "cache")
+    found = {}
+    for path in sorted(folder.glob("block-*")) if out.is_local else ():
+        try:
+            _check(path)
+        except (Damaged, BadScene) as error:
+            problem = str(error).removeprefix(f"{path}: ")
+            found[f"cache/{path.name}"] = f"{problem}; the next run makes it again"
+    return found
+
+
+def _check(path: Path) -> None:
+    if path.name.endswith(SUFFIX):
+        read_scene(path, path.stem)
+    elif path.name.endswith(BEGUN):
+        check(path, path.name)
+    elif path.name.endswith(SAID):
+        told_of(path)

@@ -17,8 +17,8 @@ import pyarrow.compute as pc
 
 from factory.graph.steps import cache_key
 from factory.graph.work import PreparedClip
+from factory.pipeline import FactoryWork, PerturbedClip, payload_of
 from factory.readers.base import BadClip, ClipRef
-from factory.stages.pipeline import FactoryWork, PerturbedClip, payload_of
 from factory.store.attempts import Kind
 from factory.store.cache import BadCacheFile
 from factory.store.codes import equals, fixed_bytes

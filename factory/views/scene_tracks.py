@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from factory.graph.steps import cache_key
-from factory.stages.pipeline import logged_clip
+from factory.pipeline import logged_clip
 from factory.stages.scene_file import BadScene
 from factory.store.cache import BadCacheFile
 from tasks.render.scene.asset import BlockRange, RenderAsset

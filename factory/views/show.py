@@ -83,7 +83,7 @@ def label_lines(row: dict[str, Any], drawn: bool) -> Iterable[str]:
 def logged_drive(store: "Store", row: dict[str, Any]) -> "Array | None":
     """(81, 3) the log from T to T+2H, world frame, from the prepared clip; None where the cache has it no more."""
     from factory.graph.steps import cache_key
-    from factory.stages.pipeline import logged_poses
+    from factory.pipeline import logged_poses
     from factory.store.cache import BadCacheFile
 
     digests = {run["settings_hash"]: run["prepare_digest"] for run in store.runs()}
@@ -97,7 +97,7 @@ def logged_drive(store: "Store", row: dict[str, Any]) -> "Array | None":
 
 def prepared_episode(row: Mapping[str, Any], prepared: "PreparedClip") -> bytes:
     """The sample as one MCAP file, with the log's drive from its prepared clip; for workers of a run."""
-    from factory.stages.pipeline import logged_poses
+    from factory.pipeline import logged_poses
     from factory.views.episode_messages import episode_of
 
     return episode_of(row, logged_poses(prepared))

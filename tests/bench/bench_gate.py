@@ -21,10 +21,10 @@ import numpy as np
 
 from factory.config.run import load_config
 from factory.graph.work import PreparedClip
+from factory.pipeline import FactoryWork
 from factory.setup.settings import assemble
 from factory.stages.assets import asset_for
 from factory.stages.imaging import album_of, in_time_of
-from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import chosen_cameras
 from tasks.render.gate import Album, GateSettings, looked_at_size, unfit
 from tasks.render.scene.asset import RenderAsset

@@ -19,9 +19,9 @@ import numpy as np
 
 from factory.config.run import load_config
 from factory.graph.work import HUMAN_CANDIDATE
+from factory.pipeline import FactoryWork
 from factory.readers.base import ClipRef
 from factory.setup.settings import assemble
-from factory.stages.pipeline import FactoryWork
 from tasks.attempt import Judged, end_verdict, verdict
 from tasks.reward.ends import hit_after_s
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffic

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from factory.graph.work import Built, Columns, Driven, Dropped, PreparedClip, Stopped, never
+from factory.pipeline import FactoryWork
 from factory.readers.base import ClipRef
-from factory.stages.pipeline import FactoryWork
 from tasks.stages import Rejected
 from tests.factory.toy import where
 

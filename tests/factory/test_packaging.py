@@ -66,8 +66,6 @@ def test_installed_it_works_beside_a_stranger_s_tasks_py(wheel: Path, tmp_path: 
 
     assert "scenarionet" in python("-m", "factory.run", "--help")
     assert "rounds: 4" in python("-m", "factory.run", "--cfg", "rounds=4", "clips=av2", "clips.root=/logs")
-    found = python(
-        "-c", "import factory.stages.pipeline, tasks; print(factory.__file__); print(tasks.__file__)"
-    ).split()
+    found = python("-c", "import factory.pipeline, tasks; print(factory.__file__); print(tasks.__file__)").split()
     assert found == [str(target / "factory" / "__init__.py"), str(target / "tasks" / "__init__.py")]
     assert list(work.iterdir()) == [work / "tasks.py"], "nothing is written"

@@ -33,7 +33,7 @@ def test_help_and_settings_work_beside_a_stranger_s_tasks_py(strange_folder: Pat
 
 @pytest.mark.slow
 def test_the_whole_machine_loads_beside_a_stranger_s_tasks_py(strange_folder: Path) -> None:
-    loaded = python(strange_folder, "-c", "import factory.stages.pipeline, tasks; print(tasks.__file__)")
+    loaded = python(strange_folder, "-c", "import factory.pipeline, tasks; print(tasks.__file__)")
     assert loaded.stdout.strip() == str(REPOSITORY / "tasks" / "__init__.py"), loaded.stderr
 
 

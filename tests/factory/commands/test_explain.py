@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from factory import pipeline
 from factory.commands.table import COMMANDS
 from factory.config.run import load_config
 from factory.setup.settings import assemble
-from factory.stages import pipeline
 
 main = COMMANDS["explain"].load()
 

@@ -232,7 +232,7 @@ def test_an_unknown_expert_is_an_error_and_lists_the_known() -> None:
 
 
 PDM = "+expert.mine._target_=tasks.experts.pdm_closed.planner.PdmClosed.of_run"
-RECOVERY = "+expert.mine._target_=factory.setup.recovery.recovery"
+RECOVERY = "+expert.mine._target_=factory.setup.settings.recovery"
 
 
 def built(*overrides: str) -> object:

@@ -15,7 +15,7 @@ from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, Execution, e
 from factory.graph.local import Claims, attempt_tasks
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
 from factory.graph.work import Columns, Driven, Dropped, PreparedClip, Underway, attempted, go_on
-from factory.stages.pipeline import FactoryWork
+from factory.pipeline import FactoryWork
 from factory.store.samples import Store
 from tasks.stages import ATTEMPT, TASKS
 from tests.factory.noted import NotedWork

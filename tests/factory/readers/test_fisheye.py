@@ -8,9 +8,8 @@ import numpy as np
 import scenarionet_scenarios as town
 
 from factory.readers.scenarionet.reader import ScenarioNetReader
-from factory.stages.own_body import resized_mask
 from factory.stages.scene_file import read_scene, write_scene
-from factory.stages.sensors import encode_jpeg, load_photos
+from factory.stages.sensors import encode_jpeg, load_photos, resized_mask
 from factory.store.cache import ClipCache
 from factory.store.location import Location
 from tasks.render.scene.asset import RenderAsset

@@ -14,12 +14,11 @@ from factory.config.run import BenchmarkSettings, load_config
 from factory.exits import COMPLETE
 from factory.graph.execute import Execution, execute
 from factory.graph.work import Columns, Dropped, PreparedClip, attempted
+from factory.pipeline import BenchmarkWork, FactoryWork
 from factory.readers.base import ClipRef
 from factory.readers.settings import TownSettings
 from factory.setup.settings import assemble, identity_of
 from factory.stages.benchmark import benchmark_of, write_benchmark
-from factory.stages.frames import BenchmarkWork
-from factory.stages.pipeline import FactoryWork
 from factory.store.cache import BadCacheFile, SceneFiles
 from factory.store.location import Location
 from factory.store.samples import Store

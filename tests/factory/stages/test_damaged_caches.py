@@ -15,10 +15,9 @@ from factory.readers.settings import TownSettings
 from factory.readers.town.reader import SensedReader, SyntheticReader
 from factory.readers.town.towns import SyntheticTownsReader
 from factory.readers.whole_folder import SUMS
-from factory.setup.recovery import _table_of
+from factory.setup.settings import _table_of
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table, save_vocabulary
-from factory.stages.fitting import _resumed
-from factory.stages.kept_blocks import damaged_blocks
+from factory.stages.assets import _resumed, damaged_blocks
 from factory.stages.rig import SAID, _say, told_of
 from factory.stages.scene_file import BadScene, read_scene, write_scene
 from factory.stages.warm import _is_compiled, marker, tiny_clip

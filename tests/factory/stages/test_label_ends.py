@@ -7,8 +7,8 @@ from pathlib import Path
 from factory.config.run import load_config
 from factory.graph.execute import Execution, execute
 from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
+from factory.pipeline import FactoryWork
 from factory.setup.settings import assemble
-from factory.stages.pipeline import FactoryWork
 from factory.store.funnel import Funnel, funnel_of
 from factory.store.samples import Store
 from factory.views.card import card

@@ -11,11 +11,11 @@ from factory.config.compose import ConfigError
 from factory.config.run import load_config
 from factory.exits import BAD_CONFIG
 from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
+from factory.pipeline import FactoryWork
 from factory.run import main as run_main
 from factory.setup.calibrate import calibrate, measure
 from factory.setup.settings import Run, assemble
 from factory.setup.vocabulary import save_vocabulary
-from factory.stages.pipeline import FactoryWork
 from factory.store.reader import SampleTable, labels_of
 from factory.store.schema import LABEL_COLUMNS
 from factory.views.sample_picture import SCORE_COLOURS, sample_bev

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from factory.stages.own_body import masks_digest, read_masks, refuse_unknown_masks, resized_mask
 from factory.stages.scene_file import read_scene, write_scene
+from factory.stages.sensors import masks_digest, read_masks, refuse_unknown_masks, resized_mask
 from tasks.render.rig.correct import hidden_by
 from tasks.render.scene.asset import OwnBody, RenderAsset
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap

@@ -11,10 +11,10 @@ import pytest
 from factory.config.compose import ConfigError
 from factory.config.run import load_config
 from factory.graph.work import HUMAN_CANDIDATE, Columns, Dropped, PreparedClip, attempted
+from factory.pipeline import FactoryWork, WholeClip
 from factory.readers.base import BadClip
 from factory.setup.settings import assemble, identity_of, refuse_missing_backend
 from factory.stages.assets import block_id
-from factory.stages.pipeline import FactoryWork, WholeClip
 from factory.store.schema import COLUMNS, UNLISTED
 from tasks import stages
 from tasks.perturb import Perturbation, perturb

@@ -14,7 +14,7 @@ import pytest
 
 from factory.graph.work import Halted, Stopped
 from factory.readers.base import BadClip
-from factory.stages import fitting
+from factory.stages import assets
 from factory.stages.assets import Sensing, asset_for, block_id, sensing
 from factory.stages.scene_file import read_scene, stored_dtype
 from factory.stages.sensors import SAMPLING, block_of, chosen_cameras, decode_image, encode_jpeg, load_sensors
@@ -297,18 +297,18 @@ def test_a_killed_fit_goes_on_to_the_same_bytes(
     undisturbed = asset_for(clip, FITTED, tmp_path / "one")
     assert undisturbed is not None and np.isfinite(undisturbed.psnr_db) and undisturbed.n_held_out > 0
 
-    monkeypatch.setattr(fitting, "STRETCH", 8)
+    monkeypatch.setattr(assets, "STRETCH", 8)
     monkeypatch.setattr(reconstruct, "REPORT_EVERY", 10)
-    advance, starts, said = fitting.advance, [], []  # type: ignore[var-annotated]
+    advance, starts, said = assets.advance, [], []  # type: ignore[var-annotated]
 
     def killed_at_16(problem, state, *rest):  # type: ignore[no-untyped-def]
         starts.append(state.iteration)
         if starts == [0, 8, 16]:
-            said.extend(fitting.fits_going_on(tmp_path / "two"))
+            said.extend(assets.fits_going_on(tmp_path / "two"))
             raise KeyboardInterrupt
         advance(problem, state, *rest)
 
-    monkeypatch.setattr(fitting, "advance", killed_at_16)
+    monkeypatch.setattr(assets, "advance", killed_at_16)
     with pytest.raises(KeyboardInterrupt):
         asset_for(clip, FITTED, tmp_path / "two")
     begun = tmp_path / "two" / f"block-{block_id(clip, FITTED)}.fit.npz"
@@ -317,7 +317,7 @@ def test_a_killed_fit_goes_on_to_the_same_bytes(
     assert again is not None and again.digest == undisturbed.digest
     assert starts == [0, 8, 16, 16] and not begun.exists()
     assert len(said) == 1 and said[0].startswith("fit 10/20, "), "how far it is can be asked from outside"
-    assert fitting.fits_going_on(tmp_path / "two") == [], "what has ended is not going on"
+    assert assets.fits_going_on(tmp_path / "two") == [], "what has ended is not going on"
 
 
 def test_a_fit_that_is_asked_to_stop_keeps_every_iteration_and_goes_on_to_the_same_bytes(
@@ -336,7 +336,7 @@ def test_a_fit_that_is_asked_to_stop_keeps_every_iteration_and_goes_on_to_the_sa
             asset_for(clip, FITTED, tmp_path / "two", stopped=after(n))
         with np.load(begun) as arrays:
             assert arrays["iteration"] == done
-        assert fitting.fits_going_on(tmp_path / "two") == []
+        assert assets.fits_going_on(tmp_path / "two") == []
     again = asset_for(clip, FITTED, tmp_path / "two", stopped=after(8))  # the last iteration is done: nothing to leave
     assert undisturbed is not None and again is not None and again.digest == undisturbed.digest
     assert not begun.exists()

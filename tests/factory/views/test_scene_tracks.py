@@ -9,8 +9,8 @@ import pytest
 from factory.commands.table import COMMANDS
 from factory.graph.steps import cache_key
 from factory.graph.work import PreparedClip
+from factory.pipeline import PerturbedClip, bare
 from factory.readers.base import ClipRef
-from factory.stages.pipeline import PerturbedClip, bare
 from factory.stages.scene_file import read_scene, write_scene
 from factory.store.attempts import ClipCandidates
 from factory.store.samples import Store
