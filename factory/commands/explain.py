@@ -64,8 +64,7 @@ def explain(request: Request) -> None:
 
     from factory.graph.plan import candidate_order
     from factory.setup.settings import assemble
-    from factory.views.bev import write_mp4
-    from factory.views.drawing import attempt_picture, candidates_picture, film
+    from factory.views.bev import attempt_picture, candidates_picture, film, write_mp4
     from tasks.stages import Rejected
     from tasks.subscores import OF_ONE_PLAN
 

@@ -71,9 +71,7 @@ class Request:
 def main(request: Request) -> None:
     """Do it. Raises Refused for what cannot be read or makes no sense."""
     from factory.stages.scene_file import read_scene, write_scene
-    from factory.views.scene_parts import export, imported, info_text
-    from factory.views.scene_tracks import logged_vehicles
-    from factory.views.splat_files import read_splats
+    from factory.views.scene_files import export, imported, info_text, logged_vehicles, read_splats
     from factory.views.status import open_store
     from tasks.render.splatting.formats import LoggedVehicle
 

@@ -24,7 +24,7 @@ from factory.store.cache import BadCacheFile
 from factory.store.codes import equals, fixed_bytes
 from factory.store.reader import decoded
 from factory.store.samples import Store
-from factory.views.drawing import attempt_picture
+from factory.views.bev import attempt_picture
 from factory.views.sample_picture import (
     earlier_images,
     encoded,

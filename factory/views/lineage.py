@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from factory.config.arguments import Refused
-from factory.views.report_words import to_the_side, turned
-from factory.views.status import rows_where
+from factory.views.status import rows_where, to_the_side, turned
 
 if TYPE_CHECKING:
     from factory.store.samples import Store

@@ -105,7 +105,7 @@ def prepared_episode(row: Mapping[str, Any], prepared: "PreparedClip") -> bytes:
 
 def number_lines(row: dict[str, Any]) -> Iterable[str]:
     """A sample's numbers, without what is large."""
-    from factory.views.report_words import to_the_side, turned
+    from factory.views.status import to_the_side, turned
     from tasks.subscores import SUBSCORES
 
     yield f"sample        {row['attempt_id']}"

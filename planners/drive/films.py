@@ -9,9 +9,19 @@ import numpy as np
 
 from factory.store.location import Location
 from factory.store.reader import decoded
-from factory.views.bev import BACKGROUND, EXPERT, LOGGED, PERTURBED, Boxes, DrawnPath, draw_bev, write, write_mp4
+from factory.views.bev import (
+    BACKGROUND,
+    EXPERT,
+    LOGGED,
+    PERTURBED,
+    Boxes,
+    DrawnPath,
+    draw_bev,
+    map_shapes,
+    write,
+    write_mp4,
+)
 from factory.views.board.drives import FILMS
-from factory.views.drawing import map_shapes
 from factory.views.sample_picture import fitted, front_camera
 from planners.drive.loop import PLAN_STEPS, ClosedLoop
 from planners.drive.measures import measures_of

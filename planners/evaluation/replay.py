@@ -14,8 +14,7 @@ import numpy as np
 
 from factory.config.compose import ConfigError, fill
 from factory.store.reader import Sample, decoded
-from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, DrawnPath, draw_bev, write_mp4
-from factory.views.drawing import map_shapes
+from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, DrawnPath, draw_bev, map_shapes, write_mp4
 from factory.views.sample_picture import earlier_images, fitted, front_camera
 from planners.command import command
 from planners.evaluation.benchmark_folder import BenchmarkFolder

@@ -25,7 +25,7 @@ from factory.readers.town.drive import TownDrive
 from factory.readers.town.town import log_name, plan_log
 from factory.readers.town.write import write_log
 from factory.stages.sensors import block_of, load_sensors
-from factory.views.scene_quality import camera_rows
+from factory.views.scene_files import camera_rows
 from tasks.render.fit.losses import Lpips, lpips_of
 from tasks.render.fit.reconstruct import LEAST_PIXELS as LEAST_OF_CLASS
 from tasks.render.fit.reconstruct import advance, finish

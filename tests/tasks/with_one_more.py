@@ -13,7 +13,7 @@ from factory.store.reader import labels_of
 from factory.store.schema import COLUMNS as STORED
 from factory.store.schema import SAMPLES
 from factory.views.board.overview import _reasons
-from factory.views.report_words import REASON_WORDS
+from factory.views.status import REASON_WORDS
 from planners.data.batch import Needs
 from planners.data.decode import BatchBuffer
 from planners.models.gtrs_dense import GtrsDenseSettings, TrajectoryScorer

@@ -17,7 +17,7 @@ from factory.store.codes import equals
 from factory.store.funnel import Funnel
 from factory.views.board.gallery import FILTERS
 from factory.views.board.watch import Snapshot, plain
-from factory.views.report_words import GATE_WORDS, PAPER_CLIP_PERCENT, REASON_WORDS, STATUS
+from factory.views.status import GATE_WORDS, PAPER_CLIP_PERCENT, REASON_WORDS, STATUS
 from tasks.stages import STAGES
 
 QUIET_S = 900.0  # a run that commits nothing for so long is said to be quiet

@@ -8,7 +8,7 @@
 | `/api/samples/<attempt_id>` | factory.views.board.gallery.whole |
 | `/api/failed?page=1` | factory.views.board.gallery.failures |
 | `/api/drives` | factory.views.board.drives.told |
-| `/picture/<attempt_id>/<name>.jpg` | a JPEG, see factory.views.board.pictures |
+| `/picture/<attempt_id>/<name>.jpg` | a JPEG, see factory.views.board.gallery |
 | `/film/<drive_id>.mp4` | a planner's drive as a film |
 | `/episode/<attempt_id>.mcap` | the sample for Foxglove, Lichtblick or Rerun |
 
@@ -19,8 +19,11 @@ question put wrongly), 403 (asked under another host name), 404 (not there), 500
 
 import json
 import re
+import socket
 import sys
+import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -31,13 +34,62 @@ import pyarrow as pa
 from deltalake.exceptions import DeltaError
 
 from factory.store.samples import ChangedRun, Store
-from factory.views.board.connections import Connections
 from factory.views.board.drives import Drives, told
-from factory.views.board.gallery import BadRequest, NotThere, failures, gallery, whole
+from factory.views.board.gallery import BadRequest, NotThere, Pictures, failures, gallery, whole
 from factory.views.board.overview import overview
-from factory.views.board.pictures import Pictures
 from factory.views.board.watch import LOOK_EVERY_S, Watch
 from factory.wording import one_line
+
+# Who is connected to the dashboard: so many at most, and who asks nothing makes way for who comes.
+
+LOOK_AGAIN_S = 0.1
+
+
+class Connections:
+    """At most `most` at once, a thread each."""
+
+    def __init__(self, most: int) -> None:
+        self._places, self._lock = threading.Semaphore(most), threading.Lock()
+        self._idle: dict[socket.socket, None] = {}  # of which no whole request has come, the longest first
+        self._all: set[socket.socket] = set()
+
+    def come(self, connection: socket.socket) -> None:
+        """Wait for a place. The connection that has been idle for longest is closed for it."""
+        while not self._places.acquire(blocking=False):
+            self._hang_up_idlest()
+            if self._places.acquire(timeout=LOOK_AGAIN_S):
+                break
+        with self._lock:
+            self._all.add(connection)
+            self._idle[connection] = None
+
+    def asks(self, connection: socket.socket) -> None:
+        """It is being answered, and stays until it is."""
+        with self._lock:
+            self._idle.pop(connection, None)
+
+    def answered(self, connection: socket.socket) -> None:
+        """It may ask again."""
+        with self._lock:
+            self._idle[connection] = None
+
+    def gone(self, connection: socket.socket) -> None:
+        """Its place is free."""
+        with self._lock:
+            self._idle.pop(connection, None)
+            if connection in self._all:
+                self._all.remove(connection)
+                self._places.release()
+
+    def _hang_up_idlest(self) -> None:
+        """Its thread, which waits for a request, finds the connection at its end."""
+        with self._lock:
+            if self._idle:
+                idlest = next(iter(self._idle))
+                del self._idle[idlest]
+                with suppress(OSError):  # it has just been closed by who called
+                    idlest.shutdown(socket.SHUT_RDWR)
+
 
 STATIC = Path(__file__).parent / "static"
 KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}

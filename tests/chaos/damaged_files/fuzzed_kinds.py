@@ -26,7 +26,7 @@ from factory.stages.sensors import decode_image, load_sweeps
 from factory.stages.warm import tiny_clip
 from factory.store.cache import BadCacheFile, decode, encode
 from factory.store.mcap_files import Message, check_episode, episode_bytes
-from factory.views.splat_files import background_bytes, read_splats
+from factory.views.scene_files import background_bytes, read_splats
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.render.splatting.project import CLASSIC
 from tasks.world.camera import SensorFile

@@ -12,7 +12,7 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.stages.scene_file import read_scene, write_scene
-from factory.views.splat_files import read_splats, taken_back, transform_of
+from factory.views.scene_files import read_splats, taken_back, transform_of
 from tasks.render.splatting.formats import gauss_params
 from tasks.render.splatting.gaussians import Gaussians, moved
 from tests.factory.stages.test_scene_file import scene

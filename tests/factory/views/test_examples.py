@@ -14,7 +14,7 @@ from factory.graph.execute import Execution, execute
 from factory.setup.settings import Run, assemble
 from factory.store.reader import SampleTable, decoded
 from factory.store.samples import Store
-from factory.views.board.pictures import Pictures
+from factory.views.board.gallery import Pictures
 from factory.views.board.watch import Watch
 from factory.views.examples import (
     PER_VALUE,

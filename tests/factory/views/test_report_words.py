@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from factory.views.report_words import to_the_side, turned
 from factory.views.seen_again import ASIDE_M, _looks_right
+from factory.views.status import to_the_side, turned
 from tasks.world.frames import to_local
 
 

@@ -14,7 +14,7 @@ from factory.readers.base import ClipRef
 from factory.stages.scene_file import read_scene, write_scene
 from factory.store.attempts import ClipCandidates
 from factory.store.samples import Store
-from factory.views.scene_tracks import logged_vehicles
+from factory.views.scene_files import logged_vehicles
 from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom
 from tasks.render.scene.engine import Vehicles, render, vehicles_at
 from tasks.render.scene.movers import boxes_at, world_from_boxes

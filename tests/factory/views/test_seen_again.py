@@ -15,10 +15,9 @@ from factory.graph.execute import Execution, execute
 from factory.setup.settings import assemble
 from factory.store.reader import SampleTable, decoded
 from factory.store.samples import Store
-from factory.views.board.pictures import Pictures
+from factory.views.board.gallery import Pictures
 from factory.views.board.watch import Watch
 from factory.views.examples import strips_of
-from factory.views.report_words import REASON_WORDS
 from factory.views.sample_picture import sample_bev
 from factory.views.seen_again import (
     ASIDE_M,
@@ -32,6 +31,7 @@ from factory.views.seen_again import (
     real_and_rendered,
     scene_of,
 )
+from factory.views.status import REASON_WORDS
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.stages import STAGES
 

@@ -20,8 +20,8 @@ from factory.graph.execute import Execution, execute
 from factory.setup.settings import assemble
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
+from factory.views.board.gallery import Kept
 from factory.views.board.overview import QUIET_S, overview
-from factory.views.board.pictures import Kept
 from factory.views.board.server import SERVED, STATIC, Board, Server
 from factory.views.board.watch import Watch
 from factory.views.sample_picture import encoded, nearer, sample_bev

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factory.views.splat_files import zstd
+from factory.views.scene_files import zstd
 from tasks.render.splatting import sh
 from tasks.render.splatting.formats import from_spz, to_spz
 from tasks.render.splatting.gaussians import EMPTY, Gaussians, rotations_of
