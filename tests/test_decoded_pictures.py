@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from factory.datasets.kitti.reader import KittiCamera, KittiDrive
 from factory.readers.base import BadClip
-from factory.readers.kitti import KittiCamera, KittiDrive
 from factory.readers.pictures import header_of, without_exif
 from factory.stages.sensors import decode_image, opened_photos, read_masks
 from factory.store.reader import image_of

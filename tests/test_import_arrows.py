@@ -40,7 +40,7 @@ ROOMS = {
     "factory": (
         *("exits", "wording", "job", "files", "locks"),
         *("readers.settings", "readers.town.settings", "config", "readers", "store"),
-        *("exports", "graph", "stages", "pipeline", "setup", "imports", "views", "views.board"),
+        *("graph", "datasets", "stages", "pipeline", "setup", "datasets.navsim", "views", "views.board"),
         *("run", "commands", "__main__"),
     ),
     "planners": (

@@ -28,7 +28,7 @@ from factory.config.arguments import parse
 from factory.config.compose import compose, conf_dir, fill
 from factory.config.plugins import GROUPS
 from factory.config.run import load_config
-from factory.readers.town.reader import SyntheticReader
+from factory.datasets.town.reader import SyntheticReader
 from factory.run import main as run_main
 from factory.stages.warm import PARTS
 from planners.__main__ import main as planners_main

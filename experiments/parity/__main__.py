@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from factory.config.compose import ConfigError
-from factory.readers.torch_file import load_tensors
+from factory.readers.pickles import load_tensors
 from planners.published.import_planner import imported
 from planners.published.weights import read_public
 from tests.planners.published.lesson import (

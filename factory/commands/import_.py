@@ -109,8 +109,8 @@ def main(request: Request) -> int:
 
 
 def _simscale(request: Request, store: "Store") -> tuple["RunSummary", str]:
-    from factory.imports.simscale import Import, Rewards, parts_of
-    from factory.imports.table import identity_of, import_rows
+    from factory.datasets.navsim.import_table import identity_of, import_rows
+    from factory.datasets.navsim.simscale import Import, Rewards, parts_of
     from factory.setup.vocabulary import load_vocabulary
 
     parts = parts_of(Path(request.root), request.only)
@@ -130,8 +130,8 @@ def _simscale(request: Request, store: "Store") -> tuple["RunSummary", str]:
 
 
 def _navhard(request: Request, store: "Store") -> tuple["RunSummary", str]:
-    from factory.imports.navhard import NavsimFolders, import_navhard
-    from factory.readers.navsim.filters import read_selection
+    from factory.datasets.navsim.filters import read_selection
+    from factory.datasets.navsim.navhard import NavsimFolders, import_navhard
 
     logs, maps = _folder(request.logs), _folder(request.maps)
     assert logs is not None and maps is not None and request.split is not None
@@ -140,8 +140,8 @@ def _navhard(request: Request, store: "Store") -> tuple["RunSummary", str]:
 
 
 def _navtest(request: Request, store: "Store") -> tuple["RunSummary", str]:
-    from factory.imports.navtest import import_navtest
-    from factory.readers.navsim.filters import read_selection
+    from factory.datasets.navsim.filters import read_selection
+    from factory.datasets.navsim.navtest import import_navtest
 
     maps = _folder(request.maps)
     assert maps is not None and request.split is not None
@@ -151,7 +151,7 @@ def _navtest(request: Request, store: "Store") -> tuple["RunSummary", str]:
 
 def _cameras(request: Request) -> int:
     """Write the sidecars and say what each holds. Raises Refused."""
-    from factory.imports.nuscenes_cameras import import_cameras
+    from factory.datasets.scenarionet.nuscenes_cameras import import_cameras
     from factory.readers.base import BadClip
 
     root, out = Path(request.root), Path(request.out)

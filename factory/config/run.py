@@ -32,16 +32,16 @@ from tasks.settings import ExpertGate, PerturbSettings
 from tasks.stages import FRAMES, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
-AV2 = "factory.readers.av2.reader.AV2Reader"
-SCENARIONET = "factory.readers.scenarionet.reader.ScenarioNetReader"
+AV2 = "factory.datasets.av2.reader.AV2Reader"
+SCENARIONET = "factory.datasets.scenarionet.reader.ScenarioNetReader"
 LabelTraffic = Literal["replay", "idm", "navsim"]
 READERS: Mapping[str, type[Any]] = {  # `_target_` of a built-in reader -> its settings
     AV2: LogClips,
-    "factory.readers.navsim.reader.NavsimReader": NavsimClips,
-    "factory.readers.py123d.reader.Py123dReader": Py123dClips,
+    "factory.datasets.navsim.reader.NavsimReader": NavsimClips,
+    "factory.datasets.py123d.reader.Py123dReader": Py123dClips,
     SCENARIONET: ScenarioNetClips,
-    "factory.readers.town.reader.SyntheticReader": TownClips,
-    "factory.readers.town.towns.SyntheticTownsReader": TownsClips,
+    "factory.datasets.town.reader.SyntheticReader": TownClips,
+    "factory.datasets.town.reader.SyntheticTownsReader": TownsClips,
 }
 RECOVERY = "factory.setup.settings.recovery"
 

@@ -1,1 +1,1 @@
-"""Readers: one file is one data set."""
+"""What readers of all data sets share: clips out of logs, and files of strangers read as data (factory.datasets)."""

@@ -16,7 +16,7 @@ from factory.config.compose import ConfigError, build, fill
 from factory.config.run import RecoverySources, RunConfig, VocabularyChoice, photos_alone, refuse_relative_root
 from factory.pipeline import BenchmarkWork, FactoryWork
 from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef
-from factory.readers.torch_file import check_checkpoint
+from factory.readers.pickles import check_checkpoint
 from factory.readers.validate import read_clip
 from factory.setup.vocabulary import (
     Starts,

@@ -20,7 +20,7 @@ import numpy as np
 
 from factory.graph.work import Halted, Stopped, never
 from factory.locks import locked
-from factory.readers.videos import file_and_frame
+from factory.readers.pictures import file_and_frame
 from factory.stages.rig import SAID, UsedRig, corrected_rig, known_of, said_again, taken_from, told_of, used_rig, wanted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.stages.sensors import (

@@ -11,12 +11,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from factory.datasets.town.draw import Theatre, build_rig, paint, world_from_ego
+from factory.datasets.town.drive import TownDrive, TownTrack
+from factory.datasets.town.town import Town, log_name, plan_log
 from factory.readers.settings import TownSettings
-from factory.readers.town.draw import Theatre, paint
-from factory.readers.town.drive import TownDrive
-from factory.readers.town.sensors import build_rig, world_from_ego
-from factory.readers.town.town import Town, log_name, plan_log
-from factory.readers.town.traffic import TownTrack
 from factory.stages.sensors import chosen_cameras
 from tasks.render.settings import RenderSettings
 from tasks.world.agents import AgentTracks
@@ -26,7 +24,7 @@ from tasks.world.clip import STEP_S, Clip
 from tasks.world.lanes import TrafficLights
 from tasks.world.vehicle import HEADING, X, Y
 
-_LOG = re.compile(r"town-(\d+)-(\d{4})-")  # factory.readers.town.town.log_name
+_LOG = re.compile(r"town-(\d+)-(\d{4})-")  # factory.datasets.town.town.log_name
 
 
 def town_log(log_id: str) -> tuple[int, int]:

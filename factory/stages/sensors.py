@@ -9,13 +9,11 @@ from types import MappingProxyType
 import cv2
 import numpy as np
 
+from factory.datasets.av2.log import read_feather
 from factory.files import matching
-from factory.readers.av2.log import read_feather
 from factory.readers.base import BadClip
-from factory.readers.nuscenes_points import read_points
-from factory.readers.pcd import read_pcd
-from factory.readers.pictures import BadPicture, decode_grey, decode_rgb
-from factory.readers.videos import file_and_frame, video_frames
+from factory.readers.pictures import BadPicture, decode_grey, decode_rgb, file_and_frame, video_frames
+from factory.readers.points import read_pcd, read_points
 from tasks.render.scene.driven_road import driven_roads
 from tasks.render.scene.features import NOTHING_KNOWN, Known
 from tasks.render.scene.sensed import Photo, Sweep, on_ego

@@ -262,8 +262,8 @@ def _tiny_scene() -> tuple[Scene, Array]:
 
 def compile_town_kernels() -> None:
     """Writes the smallest log of the synthetic town into a folder that is thrown away."""
+    from factory.datasets.town.town import write_town
     from factory.readers.settings import TownSettings
-    from factory.readers.town.write import write_town
 
     settings = TownSettings(cameras=("ring_front_center",), width=16, height=16, lidar_beams=1, lidar_azimuths=8)
     with tempfile.TemporaryDirectory() as folder:

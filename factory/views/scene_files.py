@@ -15,7 +15,7 @@ import pyarrow as pa
 
 from factory.graph.steps import cache_key
 from factory.pipeline import logged_clip
-from factory.readers.torch_file import load_tensors
+from factory.readers.pickles import load_tensors
 from factory.stages.scene_file import SUFFIX, BadScene, described_by, read_scene, stored_dtype, stored_views
 from factory.store.cache import BadCacheFile
 from factory.wording import one_line

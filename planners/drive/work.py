@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Any
 
+from factory.datasets.town.reader import SensedReader
 from factory.readers.base import BadClip, ClipReader, ClipRef
-from factory.readers.town.reader import SensedReader
 from factory.readers.validate import read_clip
 from factory.setup.settings import cache_folder
 from factory.stages.painted import town_lights

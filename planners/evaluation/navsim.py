@@ -27,11 +27,11 @@ from pathlib import Path
 import numpy as np
 
 from factory.config.compose import ConfigError
+from factory.datasets.navsim.filters import Selection, read_selection
+from factory.datasets.navsim.navhard import NavsimFolders, import_navhard
+from factory.datasets.navsim.navtest import import_navtest
 from factory.exits import INTERRUPTED
 from factory.files import matching
-from factory.imports.navhard import NavsimFolders, import_navhard
-from factory.imports.navtest import import_navtest
-from factory.readers.navsim.filters import Selection, read_selection
 from factory.stages.benchmark import BENCHMARK_FILE
 from factory.store.disk import why_unusable
 from factory.store.location import Location

@@ -26,15 +26,22 @@ from pathlib import Path
 import numpy as np
 
 from factory.config.arguments import Refused
-from factory.exports.navsim.pickles import dumps
+from factory.datasets.navsim.filters import (
+    Choice,
+    FrameTable,
+    SceneFilter,
+    Selection,
+    read_selection,
+    table_at,
+    wanted_windows,
+)
+from factory.datasets.navsim.log import Frame, read_frames
+from factory.datasets.navsim.pickles import dumps
+from factory.datasets.navsim.reader import log_files
+from factory.datasets.navsim.road import blobs_of, rig_of
+from factory.datasets.navsim.synthetic import read_scene_pickle
 from factory.graph.progress import Counter
 from factory.readers.base import BadClip
-from factory.readers.navsim.filters import SceneFilter, Selection, read_selection
-from factory.readers.navsim.log import Frame, read_frames
-from factory.readers.navsim.reader import log_files
-from factory.readers.navsim.rig import blobs_of, rig_of
-from factory.readers.navsim.synthetic import read_scene_pickle
-from factory.readers.navsim.windows import Choice, FrameTable, table_at, wanted_windows
 from factory.stages.sensors import decode_image
 from factory.wording import one_line
 from planners.data.batch import COMMANDS

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from factory.config.compose import ConfigError
-from factory.exports.navsim.rewards import METRICS
-from factory.readers.torch_file import load_tensors
+from factory.datasets.navsim.pickles import METRICS
+from factory.readers.pickles import load_tensors
 from planners.models.diffusiondrive import POINT_FEATURES, WAYPOINTS, DiffusionDriveSettings
 from planners.models.gtrs_dense import IMITATION, GtrsDenseSettings
 from planners.models.ltf import LtfSettings

@@ -27,7 +27,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from factory.config.compose import ConfigError
-from factory.readers.torch_file import load_tensors
+from factory.readers.pickles import load_tensors
 from factory.wording import one_line
 from planners.models.planner import Planner, PlannerChoice, build_planner, planner_class
 from tasks.sealed import sealed_json, unsealed_json

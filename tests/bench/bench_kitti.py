@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.readers.kitti import read_drive, steadied
+from factory.datasets.kitti.reader import read_drive, steadied
 from factory.stages.scene_file import write_scene
 from tasks.render.fit.corrections import affine_between, corrected, exposed
 from tasks.render.fit.losses import ssim, target_of

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from factory.readers.nuplan_maps.city import City
-from factory.readers.nuplan_maps.kept import cache_file, kept_tables, load_tables
+from factory.datasets.navsim.maps import City, cache_file, kept_tables, load_tables
 from tests.factory.readers.geopackage_writer import LAYERS, ORIGIN, Row, write_geopackage
 
 BLOCK_M, CROSSING_M, WIDTH_M = 80.0, 20.0, 3.5

@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.readers.av2.reader import AV2Reader
+from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import ClipReader
-from factory.readers.scenarionet.reader import ScenarioNetReader
 from tasks.rollout.roles import stands_always
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.world.agents import AgentKind, AgentTracks

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.readers.town.reader import SyntheticReader
+from factory.datasets.town.reader import SyntheticReader
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import N_TIMES, PAST_STEPS, PreparedScene, prepare
 from tasks.rollout.lqr import track

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.readers.av2.reader import AV2Reader
+from factory.datasets.av2.reader import AV2Reader
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out, roll_out_many
 from tasks.world.clip import NOW, Scene, scene_of_clip

@@ -18,12 +18,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.readers.av2.reader import AV2Reader
+from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.town.draw import Theatre, paint
+from factory.datasets.town.drive import TownDrive
+from factory.datasets.town.town import log_name, plan_log, write_log
 from factory.readers.settings import TownSettings
-from factory.readers.town.draw import Theatre, paint
-from factory.readers.town.drive import TownDrive
-from factory.readers.town.town import log_name, plan_log
-from factory.readers.town.write import write_log
 from factory.stages.sensors import block_of, load_sensors
 from factory.views.scene_files import camera_rows
 from tasks.render.fit.losses import Lpips, lpips_of

@@ -16,11 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.readers.av2.reader import AV2Reader
+from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.town.draw import Theatre
+from factory.datasets.town.town import log_name, plan_log, write_log
 from factory.readers.settings import TownSettings
-from factory.readers.town.draw import Theatre
-from factory.readers.town.town import log_name, plan_log
-from factory.readers.town.write import write_log
 from factory.stages.assets import own_part
 from factory.stages.sensors import block_cameras, block_of, load_sensors
 from tasks.render.fit.reconstruct import advance, finish

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from factory.datasets.town.draw import Theatre, paint
+from factory.datasets.town.drive import TownDrive
+from factory.datasets.town.town import log_name, plan_log
 from factory.graph.work import PreparedClip
 from factory.pipeline import FactoryWork, payload_of
-from factory.readers.town.draw import Theatre, paint
-from factory.readers.town.drive import TownDrive
-from factory.readers.town.town import log_name, plan_log
 from factory.stages.imaging import GATE_STRIDE
 from tasks.render.gate import (
     Album,

@@ -20,12 +20,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from factory.datasets.navsim.log import read_frames
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.execute import Execution, RunSummary, execute
 from factory.graph.limits import Limits
 from factory.graph.work import Driven, Dropped, PreparedClip
 from factory.readers.base import ClipRef
-from factory.readers.navsim.log import read_frames
 from factory.stages.sensors import load_sweeps
 from factory.store.samples import Store
 from factory.store.verify import verify

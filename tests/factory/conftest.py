@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from factory.datasets.town.reader import SyntheticReader
 from factory.readers.settings import TownSettings
-from factory.readers.town.reader import SyntheticReader
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.readers.av2.reader import AV2Reader
+from factory.datasets.av2.reader import AV2Reader
 from factory.stages.assets import Sensing, asset_for, sensing
 from factory.stages.sensors import block_of, load_sweeps
 from tasks.render.scene.asset import RenderAsset

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factory.readers.av2.log import agents_at, ego_states_at, step_times
-from factory.readers.av2.reader import AV2Log, AV2Reader, log_folders, read_log
+from factory.datasets.av2.log import agents_at, ego_states_at, step_times
+from factory.datasets.av2.reader import AV2Log, AV2Reader, log_folders, read_log
 from tasks.world.agents import MOVING_KINDS
 from tasks.world.frames import wrap_angle
 from tasks.world.polygons import polygons_near

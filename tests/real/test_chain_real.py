@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from factory.readers.av2.reader import AV2Reader
+from factory.datasets.av2.reader import AV2Reader
 from tasks.attempt import ExpertGate, Judged, attempt, perturbed_scene
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings, plan_for
 from tasks.experts.protocol import Expert

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from factory.readers.av2.reader import AV2Reader
+from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import ClipReader
-from factory.readers.scenarionet.reader import ScenarioNetReader
 from tasks.attempt import ExpertGate, Judged, attempt, end_verdict, human_sample, perturbed_scene
 from tasks.experts.human import Human
 from tasks.experts.pdm_closed.planner import PdmSettings

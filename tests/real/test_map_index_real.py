@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import shapely
 
-from factory.readers.av2.map import map_file, read_map
-from factory.readers.av2.reader import log_folders
-from factory.readers.scenarionet.reader import read_log, scenario_files
+from factory.datasets.av2.reader import log_folders, map_file, read_map
+from factory.datasets.scenarionet.reader import read_log, scenario_files
 from tasks.reward.rules.area_flags import regions_at
 from tasks.reward.rules.map_index import DRIVABLE, INTERSECTION, LANE, PARTS_OF_LAYER, index_map
 from tasks.world.lanes import RoadMap

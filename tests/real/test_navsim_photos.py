@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+from factory.datasets.navsim.log import CAMERA_NAMES
+from factory.datasets.navsim.maps import open_city
+from factory.datasets.navsim.reader import NavsimReader
 from factory.readers.logs import WholeLog
-from factory.readers.navsim.log import CAMERA_NAMES
-from factory.readers.navsim.reader import NavsimReader
-from factory.readers.nuplan_maps.city import open_city
 from factory.stages.sensors import block_of, load_photos
 from tasks.render.scene.sensed import Photo
 from tasks.world.agents import AgentTracks

@@ -8,7 +8,7 @@ import pytest
 import shapely
 from reference_scenes import SCENES, loader, logged_tracks
 
-from factory.readers.av2.reader import AV2Reader, log_folders, read_log
+from factory.datasets.av2.reader import AV2Reader, log_folders, read_log
 from factory.readers.base import ClipRef
 from tasks.rollout.navsim import bodies
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out

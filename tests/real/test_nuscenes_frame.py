@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from factory.readers.restricted_pickle import load_plain
+from factory.readers.pickles import load_plain
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.build import AssetSettings, build_asset
 from tasks.render.scene.engine import NOBODY, render, vehicles_at

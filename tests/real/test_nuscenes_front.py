@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from factory.config.run import load_config
+from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.exits import COMPLETE
 from factory.graph.execute import Execution, execute
-from factory.readers.scenarionet.reader import ScenarioNetReader
-from factory.readers.videos import file_and_frame
+from factory.readers.pictures import file_and_frame
 from factory.setup.settings import assemble
 from factory.stages.assets import Sensing, sensing
 from factory.stages.imaging import PHOTO_SLACK_S, photo_at

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from reference_scenes import RECORDED_K, SCENES, loader, prepared_scene, tracks, world_poses
 
-from factory.readers.av2.reader import AV2Reader, log_folders
+from factory.datasets.av2.reader import AV2Reader, log_folders
 from factory.readers.base import ClipRef
 from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_ec
 from tasks.reward.prepare import prepare_scene

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from factory.readers.av2.reader import AV2Reader
+from factory.datasets.av2.reader import AV2Reader
 from tasks.rollout.corridor import boxes_overlap
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out, simulate
 from tasks.world.agents import AgentKind, AgentTracks

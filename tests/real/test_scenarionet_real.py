@@ -7,8 +7,8 @@ import pytest
 import shapely
 from shapely.geometry import Polygon
 
+from factory.datasets.scenarionet.reader import ScenarioNetReader, read_log, read_scenario, scenario_files
 from factory.readers.base import ClipIndex
-from factory.readers.scenarionet.reader import ScenarioNetReader, read_log, read_scenario, scenario_files
 from tasks.world.agents import AgentKind
 from tasks.world.clip import CLIP_STEPS, NOW, Clip
 from tasks.world.polygons import Rings

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from reference_scenes import loader
 
-from factory.readers.av2.reader import AV2Reader, log_folders
+from factory.datasets.av2.reader import AV2Reader, log_folders
 from factory.readers.base import ClipRef
 from planners.evaluation.frames import Pair
 from planners.evaluation.scoring import PreparedFrame, Rules, among_other_traffic, drive, prepare_frame, score_pair

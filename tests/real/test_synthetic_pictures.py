@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.readers.town.draw import Theatre, paint
-from factory.readers.town.sensors import build_rig, world_from_ego
-from factory.readers.town.town import plan_log
+from factory.datasets.town.draw import Theatre, build_rig, paint, world_from_ego
+from factory.datasets.town.town import plan_log
 
 SIZE = (800, 450)
 QUALITY = 90

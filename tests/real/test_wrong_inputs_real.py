@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-READ_WITH = ("factory.readers.av2.reader", "numba", "scipy", "shapely", "ray", "deltalake")
+READ_WITH = ("factory.datasets.av2.reader", "numba", "scipy", "shapely", "ray", "deltalake")
 
 
 def test_a_camera_that_no_rig_has_is_told_from_the_calibration_alone(shared_root: Path, tmp_path: Path) -> None:

@@ -10,16 +10,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from factory.readers.av2.reader import AV2Reader
+from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.navsim.filters import read_scene_filter, table_of
+from factory.datasets.navsim.log import read_frames
+from factory.datasets.navsim.synthetic import read_scene_pickle
+from factory.datasets.py123d.reader import Py123dReader
+from factory.datasets.scenarionet.reader import ScenarioNetReader
+from factory.datasets.town.reader import SyntheticReader
 from factory.readers.base import BadClip
-from factory.readers.navsim.filters import read_scene_filter
-from factory.readers.navsim.log import read_frames
-from factory.readers.navsim.synthetic import read_scene_pickle
-from factory.readers.navsim.windows import table_of
-from factory.readers.py123d.reader import Py123dReader
-from factory.readers.scenarionet.reader import ScenarioNetReader
 from factory.readers.settings import TownSettings
-from factory.readers.town.reader import SyntheticReader
 from factory.setup.vocabulary import load_recovery_table, load_vocabulary, save_recovery_table, save_vocabulary
 from factory.stages.scene_file import BadScene, read_scene, write_scene
 from factory.stages.sensors import decode_image, load_sweeps

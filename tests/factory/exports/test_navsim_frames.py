@@ -11,14 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from factory.exports.navsim.export import ExportSummary
-from factory.exports.navsim.frames import connector_number, log_frames
-from factory.exports.navsim.motion import derivatives, in_space
-from factory.exports.navsim.names import sample_names
-from factory.exports.navsim.pickles import dumps
-from factory.exports.navsim.pictures import shown
-from factory.exports.navsim.rig import CAMERAS, YAW_DEG
-from factory.exports.navsim.settings import CannotExport, ExportSettings
+from factory.datasets.navsim.export import ExportSummary
+from factory.datasets.navsim.frames import (
+    CannotExport,
+    ExportSettings,
+    connector_number,
+    derivatives,
+    in_space,
+    log_frames,
+    sample_names,
+)
+from factory.datasets.navsim.pickles import dumps
+from factory.datasets.navsim.pictures import CAMERAS, YAW_DEG, shown
 from tasks.world.frames import to_local, to_world
 from tests.factory.exports.navsim_samples import INSTANTS_S, ORIGIN, TOKENS, YAWS, colour, exported
 from tests.tasks.streets import SPEED_MPS

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.exports.navsim.names import hex16, source_log
-from factory.exports.navsim.pickles import dumps, write_dict
+from factory.datasets.navsim.frames import hex16, source_log
+from factory.datasets.navsim.pickles import dumps, write_dict
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from factory.commands.table import COMMANDS
-from factory.exports.navsim.names import sample_names, split_names
-from factory.exports.navsim.rig import CAMERAS
+from factory.datasets.navsim.frames import sample_names, split_names
+from factory.datasets.navsim.pictures import CAMERAS
 from factory.readers.settings import MOUNTS
 from factory.run import main as run
 from factory.store.reader import SampleTable

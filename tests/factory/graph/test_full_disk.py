@@ -167,7 +167,7 @@ def test_a_full_disk_under_the_user_s_cache_is_told_with_its_path_and_is_no_wron
     def full(*given: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("factory.readers.town.reader.write_town", full)
+    monkeypatch.setattr("factory.datasets.town.reader.write_town", full)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(user_cache()))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     assert run_main([*TOWN, f"out={tmp_path / 'out'}"]) == INTERRUPTED

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from factory.readers.av2.reader import read_log
-from factory.readers.restricted_pickle import load_plain
+from factory.datasets.av2.reader import read_log
+from factory.datasets.town.town import write_logs
+from factory.readers.pickles import load_plain
 from factory.readers.settings import TownSettings
-from factory.readers.town.write import write_logs
 from tests.factory.readers.geopackage_writer import CITIES, ORIGIN, stub_rows, town_rows, write_geopackage, write_root
 from tests.factory.readers.navsim import scene_pickles
 from tests.factory.readers.openscene_writer import Place, write_openscene

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from factory.__main__ import main
-from factory.imports.nuscenes_cameras import CHUNK, import_cameras, on_scenarionet_clock, rows_of
+from factory.datasets.scenarionet.nuscenes_cameras import CHUNK, import_cameras, on_scenarionet_clock, rows_of
+from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import BadClip
-from factory.readers.scenarionet.reader import ScenarioNetReader
 from factory.stages.assets import Sensing, sensing
 from factory.stages.sensors import block_of, encode_jpeg, load_sensors
 from tasks.render.settings import RenderSettings

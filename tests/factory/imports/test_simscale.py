@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from factory.__main__ import main as factory
+from factory.datasets.navsim import import_table as table
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
-from factory.imports import table
 from factory.store.reader import SampleTable, labels_of
 from factory.store.samples import Store
 from factory.store.verify import verify

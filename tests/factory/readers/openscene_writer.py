@@ -17,10 +17,10 @@ import pyarrow.feather
 import shapely
 from scipy.spatial.transform import Rotation
 
-from factory.readers.av2.log import step_times, world_from_ego_at
-from factory.readers.av2.reader import AV2Log
+from factory.datasets.av2.log import step_times, world_from_ego_at
+from factory.datasets.av2.reader import AV2Log
+from factory.datasets.navsim.log import CAMERA_NAMES
 from factory.readers.logs import WholeLog
-from factory.readers.navsim.log import CAMERA_NAMES
 from tasks.world.agents import AgentKind
 from tasks.world.camera import Camera
 from tasks.world.clip import STEP_S

@@ -18,7 +18,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factory.readers.av2.map import map_file, read_map
+from factory.datasets.av2.reader import map_file, read_map
 from tasks.world.lanes import RoadMap
 
 LABELS = {  # of AV2SensorBoxDetectionLabel, those that appear in the tests' logs

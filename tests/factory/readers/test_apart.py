@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.apart import Apart
 from factory.readers.base import BadClip
-from factory.readers.scenarionet.reader import ScenarioNetReader
 from tests.factory.readers.scenarionet_scenarios import nuscenes, save
 
 

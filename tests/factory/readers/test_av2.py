@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.feather
 import pytest
 
-from factory.readers.av2.reader import AV2Reader, read_cameras
+from factory.datasets.av2.reader import AV2Reader, read_cameras
 from factory.readers.base import BadClip, ClipRef
 from factory.stages.sensors import encode_jpeg, load_photos
 from tasks.world.agents import AgentKind

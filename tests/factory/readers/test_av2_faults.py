@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.readers.av2.reader import AV2Reader
+from factory.datasets.av2.reader import AV2Reader
 from factory.readers.base import BadClip, ClipRef
 from tests.factory.readers.test_av2 import START_NS, edit, edit_map, the_map, write_log, write_table
 

@@ -7,12 +7,12 @@ import pytest
 import scenarionet_scenarios as town
 from test_av2 import write_log
 
-from factory.readers.av2.reader import AV2Reader
+from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.navsim.reader import NavsimReader
+from factory.datasets.py123d.reader import Py123dReader
+from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import BadClip, ClipRef
 from factory.readers.logs import LogReader
-from factory.readers.navsim.reader import NavsimReader
-from factory.readers.py123d.reader import Py123dReader
-from factory.readers.scenarionet.reader import ScenarioNetReader
 from tests.factory.readers.navsim.small import reader_of, road_frames, write_city
 from tests.factory.readers.navsim.small import write_log as write_navsim_log
 from tests.factory.readers.py123d_logs import convert

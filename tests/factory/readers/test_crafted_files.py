@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from factory.datasets.navsim.rewards import RewardFile
 from factory.readers.base import BadClip
-from factory.readers.navsim.rewards import RewardFile
-from factory.readers.restricted_pickle import load_plain
+from factory.readers.pickles import load_plain
 from factory.wording import shown
 from tests.factory.readers.scenarionet_scenarios import nuscenes, save
 
@@ -83,7 +83,7 @@ def test_a_log_with_a_crafted_value_is_a_failed_log_and_the_others_are_sampled(t
 
 
 READER = """
-from factory.readers.scenarionet.reader import ScenarioNetReader
+from factory.datasets.scenarionet.reader import ScenarioNetReader
 from struct import error
 
 WRONG = {

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import scenarionet_scenarios as town
 
-from factory.readers.scenarionet.reader import ScenarioNetReader
+from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.stages.scene_file import read_scene, write_scene
 from factory.stages.sensors import encode_jpeg, load_photos, resized_mask
 from factory.store.cache import ClipCache

@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from factory.datasets.kitti.reader import EARTH_RADIUS_M, IMU_HEIGHT_M, KittiDrive, read_drive, steadied
 from factory.readers.base import BadClip
-from factory.readers.kitti import EARTH_RADIUS_M, IMU_HEIGHT_M, KittiDrive, read_drive, steadied
 from tests.factory.data_folders import add_companions
 
 DATE = "2011_09_26"

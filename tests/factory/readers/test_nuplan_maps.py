@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 import shapely
 
-from factory.readers.av2.map import read_map
+from factory.datasets.av2.reader import read_map
+from factory.datasets.navsim.maps import City, cache_file, kept_tables, open_city
+from factory.datasets.town.town import _vector_map, plan_log
 from factory.readers.base import BadClip
-from factory.readers.nuplan_maps.city import City, open_city
-from factory.readers.nuplan_maps.kept import cache_file, kept_tables
-from factory.readers.town.town import plan_log
-from factory.readers.town.write import _vector_map
 from tasks.world.lanes import MapLayer, RoadMap
 from tests.factory.readers.geopackage_writer import ORIGIN, Row, town_rows, write_geopackage, write_root
 

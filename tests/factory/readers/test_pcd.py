@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factory.readers.base import BadClip
-from factory.readers.pcd import read_pcd
+from factory.readers.points import read_pcd
 from factory.stages.sensors import load_sweeps
 from tasks.world.camera import SensorFile
 

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import scenarionet_scenarios as town
 
+from factory.datasets.scenarionet.photos import read_photographs
+from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import BadClip
-from factory.readers.scenarionet.photos import read_photographs
-from factory.readers.scenarionet.reader import ScenarioNetReader
-from factory.readers.videos import file_and_frame, frame_uri, video_frames
+from factory.readers.pictures import file_and_frame, frame_uri, video_frames
 from factory.stages.assets import Sensing, block_id, sensing
 from factory.stages.scene_file import read_scene, write_scene
 from factory.stages.sensors import block_of, encode_jpeg, load_photos, load_sensors

@@ -10,9 +10,9 @@ import pyarrow as pa
 import pytest
 import shapely
 
-from factory.readers.av2.reader import AV2Reader
-from factory.readers.py123d.reader import Py123dReader
-from factory.readers.py123d.sources import KINDS_OF_LABELS
+from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.py123d.arrow import KINDS_OF_LABELS
+from factory.datasets.py123d.reader import Py123dReader
 from tasks.trajectories import score_trajectories
 from tasks.world.agents import AgentKind
 from tasks.world.clip import NOW, Clip

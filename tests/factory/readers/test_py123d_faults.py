@@ -9,8 +9,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from factory.datasets.py123d.reader import Py123dReader
 from factory.readers.base import BadClip, ClipRef
-from factory.readers.py123d.reader import Py123dReader
 from tests.factory.readers.py123d_logs import Made, convert, fixed, rewrite, write
 from tests.factory.readers.test_av2 import write_log
 from tests.factory.readers.test_py123d import NUPLAN

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from factory.readers.base import BadClip
-from factory.readers.restricted_pickle import load_plain
+from factory.readers.pickles import load_plain
 
 
 def roundtrip(value, protocol=4):

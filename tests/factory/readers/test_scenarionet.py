@@ -6,10 +6,10 @@ import scenarionet_scenarios as town
 import shapely
 from shapely.geometry import Point, Polygon
 
+from factory.datasets.scenarionet.map import pieces
+from factory.datasets.scenarionet.reader import ScenarioNetReader, read_log
+from factory.datasets.scenarionet.tracks import SLOPE_STEPS, LoggedTrack, resampled, slope_velocities
 from factory.readers.base import ClipRef
-from factory.readers.scenarionet.map import pieces
-from factory.readers.scenarionet.reader import ScenarioNetReader, read_log
-from factory.readers.scenarionet.tracks import SLOPE_STEPS, LoggedTrack, resampled, slope_velocities
 from tasks.world.agents import AgentKind
 from tasks.world.clip import CLIP_STEPS, NOW
 from tasks.world.lanes import LightState

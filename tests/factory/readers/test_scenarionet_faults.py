@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import scenarionet_scenarios as town
 
+from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import BadClip, ClipRef, Unreadable
-from factory.readers.scenarionet.reader import ScenarioNetReader
 
 
 def without(*path):

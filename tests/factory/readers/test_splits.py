@@ -4,10 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from factory.readers.av2.reader import AV2Reader
-from factory.readers.base import split_of
-from factory.readers.scenarionet.reader import ScenarioNetReader
-from factory.readers.splits import NUSCENES_VAL, nuscenes_split, waymo_split
+from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.scenarionet.reader import ScenarioNetReader
+from factory.readers.base import NUSCENES_VAL, nuscenes_split, split_of, waymo_split
 from tests.factory.readers import scenarionet_scenarios as town
 from tests.factory.readers.test_av2 import write_log
 

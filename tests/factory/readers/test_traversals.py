@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.readers.av2.reader import AV2Reader
+from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.town.town import log_name, plan_log, write_log
+from factory.readers.logs import DrivenPath, OtherDrive, Traversal, joined, path_of, traversals
 from factory.readers.settings import LogClips, TownSettings
-from factory.readers.town.town import log_name, plan_log
-from factory.readers.town.write import write_log
-from factory.readers.traversals import DrivenPath, OtherDrive, Traversal, joined, path_of, traversals
 from factory.stages.assets import asset_for, block_id
 from factory.stages.sensors import block_cameras, block_of, chosen_cameras, load_photos
 from tasks.render.scene.build import held_out_rows

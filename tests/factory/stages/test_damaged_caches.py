@@ -8,12 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from factory.datasets.navsim.filters import kept_table, make_table
+from factory.datasets.navsim.maps import cache_file, kept_tables
+from factory.datasets.town.reader import SensedReader, SyntheticReader, SyntheticTownsReader
 from factory.graph.steps import Prepared, cache_key, prepare
-from factory.readers.navsim.windows import kept_table, make_table
-from factory.readers.nuplan_maps.kept import cache_file, kept_tables
 from factory.readers.settings import TownSettings
-from factory.readers.town.reader import SensedReader, SyntheticReader
-from factory.readers.town.towns import SyntheticTownsReader
 from factory.readers.whole_folder import SUMS
 from factory.setup.settings import _table_of
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table, save_vocabulary

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from factory.config.run import load_config
+from factory.datasets.town.reader import SyntheticReader
 from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
 from factory.pipeline import FactoryWork
 from factory.readers.base import BadClip
 from factory.readers.settings import TownSettings
-from factory.readers.town.reader import SyntheticReader
 from factory.setup.settings import assemble
 from factory.stages.imaging import in_time_of, photo_at, scene_lookups
 from factory.stages.sensors import block_of

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from factory.readers.av2.reader import AV2Reader
-from factory.readers.scenarionet.reader import ScenarioNetReader
+from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.stages.rows import label_columns, sample_row
 from factory.store.schema import SCHEMA
 from tasks.attempt import Judged, perturbed_scene

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from examples.csv_logs import write_log
+from factory.datasets.town.reader import SyntheticReader
 from factory.exits import BAD_CONFIG, COMPLETE
 from factory.readers.settings import TownSettings
-from factory.readers.town.reader import SyntheticReader
 from factory.stages.painted import town_lights, town_log
 from planners.drive.drive import main
 from planners.drive.eyes import NoEyes, Sight

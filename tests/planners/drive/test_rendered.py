@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from factory.datasets.town.reader import SyntheticReader
 from factory.readers.base import BadClip
 from factory.readers.settings import TownSettings
-from factory.readers.town.reader import SyntheticReader
 from planners.drive.rendered import RenderedEyes, rendered_eyes
 from planners.drive.starts import lengthened, logged_start
 from tasks.render.scene.asset import psnr

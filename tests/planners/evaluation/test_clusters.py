@@ -1,6 +1,6 @@
 """Which clips share a log, and which a town."""
 
-from factory.readers.town.town import log_name
+from factory.datasets.town.town import log_name
 from planners.evaluation.bootstrap import clusters_of, town_of
 
 

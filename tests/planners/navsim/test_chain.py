@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 
 from factory.__main__ import main as factory
-from factory.exports.navsim.names import sample_names, split_names
-from factory.imports.labels import METRICS
-from factory.readers.av2.reader import read_log
-from factory.readers.navsim.reader import NavsimReader
-from factory.readers.restricted_pickle import load_plain
+from factory.datasets.av2.reader import read_log
+from factory.datasets.navsim.frames import sample_names, split_names
+from factory.datasets.navsim.reader import NavsimReader
+from factory.datasets.navsim.simscale import METRICS
+from factory.datasets.town.town import write_logs
+from factory.readers.pickles import load_plain
 from factory.readers.settings import MOUNTS, TownSettings
-from factory.readers.town.write import write_logs
 from factory.run import main as run
 from factory.stages.sensors import decode_image, encode_jpeg
 from factory.store.reader import SampleTable, decoded, labels_of

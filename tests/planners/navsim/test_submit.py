@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from factory.datasets.navsim.filters import read_selection
 from factory.exits import BAD_CONFIG, COMPLETE
-from factory.readers.navsim.filters import read_selection
-from factory.readers.restricted_pickle import Record, load_records
+from factory.readers.pickles import Record, load_records
 from planners.__main__ import main as planners
 from planners.navsim.agent import shown
 from planners.navsim.pilot import FRONT, Pilot, seen_of

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from factory.readers.navsim.log import CAMERA_NAMES
+from factory.datasets.navsim.log import CAMERA_NAMES
 from tests.factory.readers.openscene_writer import FIRST_STAMP_US, hex16
 
 NAME = "2021.06.14.18.00.00_veh-51_00000_00100"

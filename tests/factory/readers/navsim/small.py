@@ -6,7 +6,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from factory.readers.navsim.reader import NavsimReader
+from factory.datasets.navsim.reader import NavsimReader
 from factory.stages.sensors import encode_jpeg
 from tests.factory.readers.geopackage_writer import CITIES, ORIGIN, stub_rows, write_geopackage
 from tests.factory.readers.navsim.logs import NAME, SPEED_MPS, frame

@@ -8,8 +8,8 @@ import pytest
 
 from factory.config.run import load_config
 from factory.config.words import ConfigError
+from factory.datasets.navsim.reader import NavsimReader
 from factory.readers.base import BadClip, ClipRef
-from factory.readers.navsim.reader import NavsimReader
 from factory.readers.settings import NavsimClips
 from tests.factory.readers.navsim.logs import NAME, frame
 from tests.factory.readers.openscene_writer import hex16, write_frames

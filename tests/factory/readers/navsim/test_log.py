@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from factory.datasets.navsim.log import CAMERA_NAMES, frame_of, frames_of, read_frames
 from factory.readers.base import BadClip
-from factory.readers.navsim.log import CAMERA_NAMES, frame_of, frames_of, read_frames
 from tasks.world.agents import AgentKind
 from tests.factory.readers.navsim.logs import NAME, SPEED_MPS, frame
 

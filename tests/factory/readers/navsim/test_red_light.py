@@ -7,7 +7,7 @@ the human filter, Python 3.11, numpy 1.26) for the logs, city and plans that red
 import numpy as np
 import pytest
 
-from factory.readers.navsim.reader import NavsimReader
+from factory.datasets.navsim.reader import NavsimReader
 from tasks.trajectories import score_trajectories
 from tests.factory.readers.navsim.red_light import RED, plans, write
 from tests.factory.readers.navsim.small import reader_of, write_city

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from factory.datasets.navsim.log import CAMERA_NAMES
+from factory.datasets.navsim.reader import NavsimReader
 from factory.readers.base import BadClip
-from factory.readers.navsim.log import CAMERA_NAMES
-from factory.readers.navsim.reader import NavsimReader
 from factory.readers.pictures import BadPicture, jpeg_size
 from factory.stages.sensors import block_of, load_photos, load_sweeps
 from tasks.world.clip import Clip

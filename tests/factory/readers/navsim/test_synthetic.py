@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from factory.datasets.navsim.synthetic import read_scene_pickle
 from factory.readers.base import BadClip
-from factory.readers.navsim.synthetic import read_scene_pickle
-from factory.readers.restricted_pickle import Record, load_plain, load_records
+from factory.readers.pickles import Record, load_plain, load_records
 from tasks.world.agents import AgentKind
 from tasks.world.frames import to_world
 from tests.factory.readers.navsim import scene_pickles

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.readers.av2.reader import AV2Reader, read_log
-from factory.readers.navsim.log import read_frames
-from factory.readers.navsim.reader import LICENCE, NavsimReader
+from factory.datasets.av2.reader import AV2Reader, read_log
+from factory.datasets.navsim.log import read_frames
+from factory.datasets.navsim.reader import LICENCE, NavsimReader
+from factory.datasets.town.town import write_logs
 from factory.readers.settings import TownSettings
-from factory.readers.town.write import write_logs
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW, Clip
 from tasks.world.lanes import LightState, RoadMap

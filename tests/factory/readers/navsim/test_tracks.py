@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factory.readers.navsim.log import Frame, frame_of
-from factory.readers.navsim.tracks import ego_states, lights, stretch_agents, window_agents, world_from_ego
+from factory.datasets.navsim.log import Frame, frame_of
+from factory.datasets.navsim.tracks import ego_states, lights, stretch_agents, window_agents, world_from_ego
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import NOW
 from tasks.world.lanes import LightState

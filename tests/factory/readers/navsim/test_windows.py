@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.readers.navsim.filters import SceneFilter
-from factory.readers.navsim.windows import (
+from factory.datasets.navsim.filters import (
     GAP,
     NO_BOXES,
     NO_ROUTE,
@@ -19,6 +18,7 @@ from factory.readers.navsim.windows import (
     STANDING,
     Choice,
     FrameTable,
+    SceneFilter,
     keep_table,
     kept_table,
     make_table,
@@ -113,7 +113,7 @@ def test_a_log_s_table_is_kept_until_its_file_changes(tmp_path: Path) -> None:
 PLAN = """
 import json, sys, time
 from pathlib import Path
-from factory.readers.navsim.reader import NavsimReader
+from factory.datasets.navsim.reader import NavsimReader
 root = Path(sys.argv[1])
 began = time.process_time()
 reader = NavsimReader(root / "logs", root, scene_filter=str(root / "navtrain.yaml"), cache_dir=root / "kept")

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from factory.datasets.town.town import TownFolder, write_all, write_one
 from factory.readers.settings import TownSettings
-from factory.readers.town.painters import TownFolder, write_all, write_one
 
 SMALL = TownSettings(cameras=("ring_front_center",), width=32, height=18, lidar_beams=0)
 PATIENCE_S = 60.0
@@ -81,7 +81,7 @@ def test_a_full_disk_is_told_as_one(tmp_path: Path, capfd: pytest.CaptureFixture
 INTERRUPTED = """
 import os, signal, sys
 from pathlib import Path
-from factory.readers.town.painters import TownFolder, write_all
+from factory.datasets.town.town import TownFolder, write_all
 from factory.readers.settings import TownSettings
 signal.signal(signal.SIGTERM, signal.default_int_handler)
 signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the processes it starts, too

@@ -6,13 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factory.readers.town import textures as tx
-from factory.readers.town.draw import SHADOW_SIZE, paint, sun_over
-from factory.readers.town.figures import _car as car
-from factory.readers.town.houses import plant_tree
-from factory.readers.town.mesh import Builder, merged
-from factory.readers.town.sensors import build_rig, scan, world_from_ego
-from factory.readers.town.shade import LitScene
+from factory.datasets.town import textures as tx
+from factory.datasets.town.draw import SHADOW_SIZE, build_rig, paint, scan, sun_over, world_from_ego
+from factory.datasets.town.raster import Builder, LitScene, merged
+from factory.datasets.town.scenery import _car as car
+from factory.datasets.town.scenery import plant_tree
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.start import prepare
 from tasks.render.scene.build import held_out_rows

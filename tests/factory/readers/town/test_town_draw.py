@@ -3,17 +3,27 @@
 import numpy as np
 import pytest
 
+from factory.datasets.town import textures as tx
+from factory.datasets.town.draw import (
+    MOUNT_M,
+    REAR_AXLE_Z_M,
+    SHADOW_SIZE,
+    build_rig,
+    camera_view,
+    cast,
+    look,
+    paint,
+    scan,
+    sun_over,
+    world_from_ego,
+)
+from factory.datasets.town.drive import GREEN as GREEN_LIGHT
+from factory.datasets.town.drive import RED as RED_LIGHT
+from factory.datasets.town.drive import YELLOW as YELLOW_LIGHT
+from factory.datasets.town.raster import Builder, LitScene
+from factory.datasets.town.scenery import _signal as signal_mast
+from factory.datasets.town.scenery import lamps_lit
 from factory.readers.settings import CAMERA_NAMES
-from factory.readers.town import textures as tx
-from factory.readers.town.draw import SHADOW_SIZE, camera_view, cast, look, paint, sun_over
-from factory.readers.town.mesh import Builder
-from factory.readers.town.scenery import _signal as signal_mast
-from factory.readers.town.scenery import lamps_lit
-from factory.readers.town.sensors import MOUNT_M, REAR_AXLE_Z_M, build_rig, scan, world_from_ego
-from factory.readers.town.shade import LitScene
-from factory.readers.town.traffic import GREEN as GREEN_LIGHT
-from factory.readers.town.traffic import RED as RED_LIGHT
-from factory.readers.town.traffic import YELLOW as YELLOW_LIGHT
 
 FRONT = build_rig(("ring_front_center",), 320, 180)[0]
 SIDE = build_rig(("ring_side_left",), 320, 180)[0]

@@ -6,16 +6,23 @@ import numpy as np
 import pytest
 import shapely
 
-from factory.readers.av2.reader import AV2Reader
+from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.town import curves
+from factory.datasets.town.drive import (
+    GREEN,
+    RED,
+    SCENARIOS,
+    YELLOW,
+    DrivingStyle,
+    Signals,
+    TownPath,
+    drive,
+    overlaps,
+    plan_drive,
+)
+from factory.datasets.town.streets import Streets, build_streets
+from factory.datasets.town.town import WINDOWS_PER_LOG, plan_log, write_town
 from factory.readers.settings import LOG_STEPS, TownSettings
-from factory.readers.town import curves
-from factory.readers.town.drive import plan_drive
-from factory.readers.town.ego import SCENARIOS
-from factory.readers.town.plan import build_streets
-from factory.readers.town.streets import Streets
-from factory.readers.town.town import WINDOWS_PER_LOG, plan_log
-from factory.readers.town.traffic import GREEN, RED, YELLOW, DrivingStyle, Signals, TownPath, drive, overlaps
-from factory.readers.town.write import write_town
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW
 from tasks.world.frames import box_corners, to_local

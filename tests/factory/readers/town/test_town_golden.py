@@ -2,10 +2,9 @@
 
 import pytest
 
-from factory.readers.town.draw import Theatre, paint
-from factory.readers.town.reader import TOWN_VERSION
-from factory.readers.town.sensors import build_rig, world_from_ego
-from factory.readers.town.town import plan_log
+from factory.datasets.town.draw import Theatre, build_rig, paint, world_from_ego
+from factory.datasets.town.reader import TOWN_VERSION
+from factory.datasets.town.town import plan_log
 
 # version: number of tracks of log 1, its ego at step 60 (x, y [m], heading [rad]), mean colour of its front picture
 GOLDEN = {3: (97, (2294.456, 1603.013, 7.144), (124.02, 127.04, 130.67))}

@@ -9,11 +9,10 @@ import numpy as np
 import pyarrow.feather
 import pytest
 
-import factory.readers.town.reader as reader_module
+import factory.datasets.town.reader as reader_module
+from factory.datasets.town.reader import SyntheticReader
+from factory.datasets.town.town import LICENCE, WINDOWS_PER_LOG, write_town
 from factory.readers.settings import LOG_STEPS, STEPS_PER_SWEEP, TownSettings
-from factory.readers.town.reader import SyntheticReader
-from factory.readers.town.town import WINDOWS_PER_LOG
-from factory.readers.town.write import LICENCE, write_town
 from tasks.world.clip import Clip
 from tasks.world.lanes import LightState
 

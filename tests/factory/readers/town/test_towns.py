@@ -4,13 +4,12 @@ from pathlib import Path
 
 import pytest
 
-import factory.readers.town.painters as painters_module
+import factory.datasets.town.town as painters_module
+from factory.datasets.town.drive import SCENARIOS
+from factory.datasets.town.reader import SyntheticReader, SyntheticTownsReader
+from factory.datasets.town.town import write_logs, write_town
 from factory.readers.base import BadClip, ClipRef
 from factory.readers.settings import LOGS_PER_TOWN, TownSettings
-from factory.readers.town.ego import SCENARIOS
-from factory.readers.town.reader import SyntheticReader
-from factory.readers.town.towns import SyntheticTownsReader
-from factory.readers.town.write import write_logs, write_town
 
 BLIND = TownSettings(cameras=(), lidar_beams=0)
 

@@ -1,0 +1,1 @@
+"""KITTI raw: streets for the scene engine; no clips."""

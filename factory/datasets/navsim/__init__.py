@@ -1,0 +1,6 @@
+"""NAVSIM: logs, scene filters and rig of OpenScene, which is nuPlan at 2 Hz; nuPlan's maps; SimScale's released layout.
+
+An export has logs, pictures, splits and rewards that NAVSIM and SimScale read unchanged: what is written, key by key,
+and the public line that reads it, stands in docs/navsim_format.md. Names and steps follow `OpenDriveLab/SimScale` @
+f51ad64 and `autonomousvision/navsim` @ 0a380a9.
+"""

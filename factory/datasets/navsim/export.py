@@ -1,0 +1,433 @@
+"""A run's samples into SimScale's layout: streamed, by workers, gone on with where it was stopped."""
+
+import socket
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from factory.datasets.navsim import manifest
+from factory.datasets.navsim.frames import (
+    MOTION,
+    N_HISTORY,
+    NAMING,
+    CannotExport,
+    ExportSettings,
+    Layout,
+    SplitNames,
+    is_simulated,
+    log_frames,
+    place_of,
+    sample_names,
+    split_names,
+)
+from factory.datasets.navsim.manifest import File, Journal, Written, file_of, write_file
+from factory.datasets.navsim.pickles import dumps, write_rewards
+from factory.datasets.navsim.pictures import BLACK, black_picture, shown
+from factory.store.disk import whole_file
+from factory.store.location import Location
+from factory.store.parquet_file import open_parquet
+from factory.store.reader import Sample, read_rows
+from factory.store.schema import LABEL_COLUMNS, canonical_json
+from factory.store.table import KeyedTable
+from factory.wording import rate_text, time_text
+from tasks.world.arrays import Array
+
+# Where each file of an export lies below its folder.
+
+CONFIG = "devkit/navsim/planning/script/config"  # below NAVSIM_DEVKIT_ROOT, once devkit/ is copied over it
+REWARDS = "traj_pdm_v2"  # what NAVSIM_TRAJPDM_ROOT names
+
+
+@dataclass(frozen=True)
+class Places:
+    """The paths of one split, relative to the export's folder."""
+
+    names: SplitNames
+    layout: Layout
+
+    def log(self, name: str) -> str:
+        """A log's pickle."""
+        folder = f"navsim_logs/{self.names.folder}" if self.layout == "moved" else f"{self._unpacked}/meta_datas"
+        return f"{folder}/{name}.pkl"
+
+    def picture(self, data_path: str, frame: int) -> str:
+        """A picture of a frame; the released archives keep those of the future apart."""
+        if self.layout == "moved":
+            return f"sensor_blobs/{self.names.folder}/{data_path}"
+        return f"{self._unpacked}/sensor_blobs_{'hist' if frame < N_HISTORY else 'fut'}/{data_path}"
+
+    @property
+    def scene_filter(self) -> str:
+        return f"{CONFIG}/common/train_test_split/scene_filter/{self.names.yaml}.yaml"
+
+    @property
+    def split(self) -> str:
+        return f"{CONFIG}/common/train_test_split/{self.names.yaml}.yaml"
+
+    @property
+    def log_split(self) -> str:
+        return f"{CONFIG}/training/{self.names.log_split}.yaml"
+
+    @property
+    def rewards(self) -> str:
+        return f"{REWARDS}/{self.names.rewards}"
+
+    @property
+    def _unpacked(self) -> str:
+        return f"SimScale/{self.names.folder}"
+
+
+def vocabulary(k: int) -> str:
+    """Where the released configuration looks for its trajectories (gtrs_dense_vov.yaml:23)."""
+    return f"devkit/traj_final/{k}.npy"
+
+
+PLANNED = (
+    *(*NAMING, "attempt_id", "settings_hash", "stage_versions", "split", "map_location"),
+    *("licence", "label_vocabulary", "label_traffic"),
+)
+KEPT = ("attempt_id", "candidate_index", "expert", "round", "licence", "label_vocabulary", "label_traffic")
+DRAWN = (
+    *("command", "image_source", "cameras", "light_lane_ids", "light_states", "route_roadblock_ids", "agent_ids"),
+    *("agent_kinds", "agent_boxes", "agent_velocities", "agent_valid", "agent_heights", "agent_center_z"),
+)
+SAY_EVERY_S = 10.0
+Say = Callable[[str], None]
+WriteGroup = Callable[["RowGroup"], list["Written"]]
+Each = Callable[[WriteGroup, Iterable["RowGroup"]], Generator[list["Written"], None, None]]  # in any order
+
+
+@dataclass(frozen=True)
+class RowGroup:
+    """One row group of the table, and which of its rows are wanted."""
+
+    path: str
+    partition: Mapping[str, str]
+    number: int
+    rows: tuple[int, ...]
+
+    def __str__(self) -> str:
+        return f"{self.path}, row group {self.number}"
+
+
+@dataclass(frozen=True)
+class Planned:
+    """One sample, before it is read whole."""
+
+    split: SplitNames
+    log: str
+    token: str
+    made_of: str
+    row: Sample = field(repr=False)  # its columns PLANNED, then KEPT alone
+    path: str  # of its file,
+    group: int  # its row group there,
+    number: int  # and its place in that
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return self.split.folder, self.log
+
+
+@dataclass(frozen=True)
+class ExportSummary:
+    """What an export did."""
+
+    written: int  # logs, by this call
+    logs: int  # in all
+    n_bytes: int  # of all files
+    notes: tuple[str, ...]  # what its user should know
+
+
+def one_after_the_other(write: WriteGroup, groups: Iterable[RowGroup]) -> Generator[list[Written], None, None]:
+    """In this process."""
+    yield from map(write, groups)
+
+
+def export(
+    table: KeyedTable,
+    to: Path,
+    settings: ExportSettings,
+    trajectories: Array | None = None,
+    each: Each = one_after_the_other,
+    say: Say = print,
+) -> ExportSummary:
+    """Write all samples that `settings` choose below `to`; what a call before has written stays.
+
+    trajectories (K, 40, 3): of the labels' vocabulary, where they are known. each: how row groups are dealt to workers,
+    which must see `to` by the same path. Raises CannotExport for samples that cannot be written, ValueError where `to`
+    holds another export, OSError where the disk cannot be written or is full, and what `each` does.
+    """
+    planned = plan(table, settings)
+    journal = Journal(to, asdict(settings))
+    stale = _tidy(journal, planned, settings)
+    todo = [sample for sample in planned.values() if not _is_whole(journal, sample)]
+    say(f"{len(planned):,} samples chosen, {len(planned) - len(todo):,} of them are there already")
+    if not (todo or stale or journal.interrupted) and _is_done(journal, trajectories):
+        return _summary(journal, 0, journal.facts, journal.files)
+    journal.begin()
+    _write_logs(table, journal, settings, todo, each, say)
+    logs = [journal.logs[key] for key in sorted(planned)]
+    say("splits, rewards, checksums")
+    files = [*_split_files(to, settings, logs, planned)]
+    rewards, without = _reward_files(table, to, settings, planned)
+    files += [*rewards, *_vocabulary_file(to, trajectories)]
+    facts = _facts(planned, logs, without)
+    journal.finish(facts, logs, files)
+    return _summary(journal, len(todo), facts, files)
+
+
+def plan(table: KeyedTable, settings: ExportSettings) -> dict[tuple[str, str], Planned]:
+    """Every chosen sample by its split's folder and log. Raises CannotExport where names clash or none is chosen."""
+    found: dict[tuple[str, str], Planned] = {}
+    seen: dict[str, set[str]] = defaultdict(set)
+    tokens: dict[tuple[str, str], str] = {}
+    for sample in _all_rows(table, settings.tag):
+        row = sample.row
+        for name, value in (("expert", row["expert"]), ("round", str(row["round"])), ("split", row["split"])):
+            seen[name].add(value)
+        if not _chosen(row, settings):
+            continue
+        place_of(row, settings)
+        here = (sample.split.folder, sample.token)
+        if sample.key in found or here in tokens:
+            other = tokens.get(here) or found[sample.key].row["attempt_id"]
+            raise CannotExport(
+                f"samples {other} and {row['attempt_id']} would both be {sample.token} of {sample.split.folder}: two "
+                "clips of one log at one time"
+            )
+        kept = replace(sample, row={name: row[name] for name in KEPT})
+        found[sample.key], tokens[here] = kept, row["attempt_id"]
+    if not found:
+        chosen = {"expert": settings.experts, "round": settings.rounds, "split": settings.splits}
+        asked = ", ".join(f"{name}={','.join(map(str, values))}" for name, values in chosen.items() if values)
+        there = "; ".join(f"{name}: {', '.join(sorted(values))}" for name, values in sorted(seen.items()))
+        raise CannotExport(f"no sample{' of ' + asked if asked else ''}; there are {there or 'none at all'}")
+    for expert in settings.experts:
+        if expert not in seen["expert"]:
+            raise CannotExport(f"no sample of expert {expert}; there are {', '.join(sorted(seen['expert']))}")
+    return found
+
+
+def write_group(table: Location, root: Path, settings: ExportSettings, group: RowGroup) -> list[Written]:
+    """Write the logs and pictures of one row group's wanted rows; each pickle last. For workers anywhere.
+
+    Raises CannotExport, DiskFull.
+    """
+    columns = tuple(dict.fromkeys((*PLANNED, *MOTION, *DRAWN)))
+    try:
+        file = open_parquet(table, group.path)
+    except FileNotFoundError as error:
+        here = socket.gethostname()
+        raise CannotExport(f"{table.uri}/{group.path}: not there for {here}: every worker must see the run") from error
+    rows = read_rows(file, group.number, group.partition, columns)
+    return [_write_log(root, settings, rows[i]) for i in group.rows]
+
+
+def _write_log(root: Path, settings: ExportSettings, row: Sample) -> Written:
+    names, split = sample_names(row), split_names(row, settings.tag)
+    places = Places(split, settings.layout)
+    seen = shown(row, names, settings)
+    frames = log_frames(row, names, seen.cams, settings)
+    files = [write_file(root, places.picture(p.data_path, p.frame), p.jpeg) for p in seen.pictures]
+    files.append(write_file(root, places.log(names.log), dumps(frames)))
+    return Written(
+        split.folder,
+        names.log,
+        names.token,
+        row["attempt_id"],
+        _made_of(row),
+        row["split"],
+        len(row["route_roadblock_ids"]) > 0,
+        row["image_source"],
+        seen.sizes,
+        seen.distorted,
+        seen.absent,
+        seen.left_out,
+        tuple(files),
+    )
+
+
+def _write_logs(
+    table: KeyedTable, journal: Journal, settings: ExportSettings, todo: Sequence[Planned], each: Each, say: Say
+) -> None:
+    live = table.live_files()
+    wanted: dict[tuple[str, int], list[int]] = defaultdict(list)
+    for sample in todo:
+        wanted[sample.path, sample.group].append(sample.number)
+    groups = [
+        RowGroup(path, dict(live[path]), number, tuple(sorted(rows))) for (path, number), rows in sorted(wanted.items())
+    ]
+    work = partial(write_group, table.location, journal.root, settings)
+    began = said = time.monotonic()
+    done = 0
+    with closing(each(work, groups)) as results:
+        for written in results:
+            journal.add(written)
+            done, now = done + len(written), time.monotonic()
+            if now - said > SAY_EVERY_S:
+                said, rate = now, done / (now - began)
+                left = time_text((len(todo) - done) / rate)
+                say(f"{done:,} of {len(todo):,} logs, {rate_text(rate, ' logs')}, {left} left")
+
+
+def _all_rows(table: KeyedTable, tag: str) -> Iterator[Planned]:
+    for path, partition in sorted(table.live_files().items()):
+        file = open_parquet(table.location, path)
+        for group in range(file.metadata.num_row_groups):
+            for number, row in enumerate(read_rows(file, group, partition, PLANNED)):
+                names = sample_names(row)
+                yield Planned(split_names(row, tag), names.log, names.token, _made_of(row), row, path, group, number)
+
+
+def _chosen(row: Sample, settings: ExportSettings) -> bool:
+    wanted = (settings.experts, row["expert"]), (settings.rounds, row["round"]), (settings.splits, row["split"])
+    return all(not values or value in values for values, value in wanted)
+
+
+def _made_of(row: Sample) -> str:
+    return canonical_json([row["attempt_id"], row["settings_hash"], row["stage_versions"]])
+
+
+def _is_done(journal: Journal, trajectories: Array | None) -> bool:
+    """Everything was written by an earlier call, the vocabulary too where it is known now."""
+    asked = set() if trajectories is None else {vocabulary(len(trajectories))}
+    there = {file.path for file in journal.files}
+    return bool(there) and asked <= there and all(journal.whole(file) for file in journal.files)
+
+
+def _summary(journal: Journal, written: int, facts: Mapping[str, Any], files: Sequence[File]) -> ExportSummary:
+    n_bytes = sum(file.bytes for file in (*files, *(file for log in journal.logs.values() for file in log.files)))
+    return ExportSummary(written, len(journal.logs), n_bytes, tuple(_notes(facts, [file.path for file in files])))
+
+
+def _is_whole(journal: Journal, sample: Planned) -> bool:
+    """Written before, of the same row, and its pickle is still there."""
+    log = journal.logs.get(sample.key)
+    return log is not None and log.made_of == sample.made_of and journal.whole(log.files[-1])
+
+
+def _tidy(journal: Journal, planned: Mapping[tuple[str, str], Planned], settings: ExportSettings) -> bool:
+    """Take away the logs of rows that are no more, and what a killed export had half written; whether there were."""
+    stale = sorted(journal.logs.keys() - planned.keys())
+    for key in stale:
+        for file in journal.logs.pop(key).files:
+            (journal.root / file.path).unlink(missing_ok=True)
+    if journal.interrupted:
+        for split in {sample.split for sample in planned.values()}:
+            places = Places(split, settings.layout)
+            for path in {places.log("x"), places.picture("x", 0), places.picture("x", 11)}:
+                for draft in (journal.root / path).parent.rglob(".*.tmp"):
+                    draft.unlink()
+    return bool(stale)
+
+
+def _split_files(
+    root: Path, settings: ExportSettings, logs: Sequence[Written], planned: Mapping[tuple[str, str], Planned]
+) -> Iterator[File]:
+    """The YAML files of each split, of the logs that the public loader takes, and its black picture."""
+    for split in sorted({sample.split for sample in planned.values()}):
+        places, of_split = Places(split, settings.layout), [log for log in logs if log.folder == split.folder]
+        taken = [log for log in of_split if log.has_route]
+        yield write_file(root, places.scene_filter, manifest.scene_filter(taken).encode())
+        yield write_file(root, places.split, manifest.split(split).encode())
+        yield write_file(root, places.log_split, manifest.log_split(taken).encode())
+        if settings.missing == "black" and any(log.absent_pictures for log in of_split):
+            yield write_file(root, places.picture(BLACK, 0), black_picture())
+
+
+def _reward_files(
+    table: KeyedTable, root: Path, settings: ExportSettings, planned: Mapping[tuple[str, str], Planned]
+) -> tuple[list[File], int]:
+    """The rewards of each split, those of simulated rounds with all earlier ones; how many samples have no labels."""
+    digests = {sample.row["label_vocabulary"] for sample in planned.values()} - {None}
+    if len(digests) > 1:
+        raise CannotExport(f"the samples' labels are of {len(digests)} vocabularies: {', '.join(sorted(digests))}")
+    by_split: dict[SplitNames, list[Planned]] = defaultdict(list)
+    for sample in planned.values():
+        if sample.row["label_vocabulary"] is not None:
+            by_split[sample.split].append(sample)
+    files: list[File] = []
+    earlier: dict[str, Path] = {}  # by expert, of the newest round so far
+    for split in sorted({sample.split for sample in planned.values()}, key=partial(_by_round, planned)):
+        (first, *_) = (sample.row for sample in planned.values() if sample.split == split)
+        before = earlier.get(first["expert"]) if is_simulated(first) else None
+        if not by_split[split] and before is None:
+            continue
+        path = Places(split, settings.layout).rewards
+        (root / path).parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(root / path, 0) as draft:
+            write_rewards(draft, _labelled(table, by_split[split]), before)
+        files.append(file_of(root, path))
+        earlier[first["expert"]] = root / path
+    return files, len(planned) - sum(map(len, by_split.values()))
+
+
+def _by_round(planned: Mapping[tuple[str, str], Planned], split: SplitNames) -> tuple[str, int]:
+    (first, *_) = (sample.row for sample in planned.values() if sample.split == split)
+    return first["expert"], first["round"]
+
+
+def _labelled(table: KeyedTable, samples: Iterable[Planned]) -> Iterator[tuple[str, Sample]]:
+    """Tokens and rows with their labels, one row group in memory."""
+    live = table.live_files()
+    wanted: dict[tuple[str, int], list[Planned]] = defaultdict(list)
+    for sample in samples:
+        wanted[sample.path, sample.group].append(sample)
+    for (path, group), here in sorted(wanted.items()):
+        rows = read_rows(open_parquet(table.location, path), group, live[path], ("attempt_id", *LABEL_COLUMNS))
+        yield from ((sample.token, rows[sample.number]) for sample in sorted(here, key=lambda sample: sample.number))
+
+
+def _vocabulary_file(root: Path, trajectories: Array | None) -> Iterator[File]:
+    if trajectories is not None:
+        data = BytesIO()
+        np.save(data, trajectories.astype(np.float32))
+        yield write_file(root, vocabulary(len(trajectories)), data.getvalue())
+
+
+def _facts(planned: Mapping[tuple[str, str], Planned], logs: Sequence[Written], without_rewards: int) -> dict[str, Any]:
+    """What the manifest says of all of it."""
+    rows = [sample.row for sample in planned.values()]
+    return {
+        "logs": dict(sorted(Counter(log.folder for log in logs).items())),
+        "without_route": sum(not log.has_route for log in logs),
+        "image_sources": dict(sorted(Counter(log.image_source for log in logs).items())),
+        "picture_sizes": sorted({size for log in logs for size in log.sizes}),
+        "distorted_logs": sum(log.distorted for log in logs),
+        "logs_with_absent_pictures": sum(log.absent_pictures > 0 for log in logs),
+        "cameras_left_out": sorted({name for log in logs for name in log.left_out_cameras}),
+        "licences": sorted({row["licence"] for row in rows}),
+        "vocabulary": next((row["label_vocabulary"] for row in rows if row["label_vocabulary"]), None),
+        "label_traffic": sorted({row["label_traffic"] for row in rows if row["label_traffic"]}),
+        "without_rewards": without_rewards,
+    }
+
+
+def _notes(facts: Mapping[str, Any], files: Sequence[str]) -> Iterator[str]:
+    """What a training would stumble over."""
+    rewards = any(path.startswith(REWARDS) for path in files)
+    if n := facts["without_route"]:
+        yield f"{n:,} logs have no route: the public loader leaves them out, and so do the lists of splits"
+    if n := facts["logs_with_absent_pictures"]:
+        yield f"{n:,} logs lack pictures that the released agents open"
+    if odd := [size for size in facts["picture_sizes"] if size != "1920x1080"]:
+        yield f"pictures are {', '.join(odd)}: the released agents cut them as if they were 1920x1080; see resize=true"
+    if names := facts["cameras_left_out"]:
+        yield f"cameras {', '.join(names)} stand for none of NAVSIM's eight and are left out"
+    if not rewards:
+        yield "no sample has vocabulary labels: there are no rewards, which GTRS needs and the other planners do not"
+    elif n := facts["without_rewards"]:
+        yield f"{n:,} samples have no labels: GTRS would stop at their tokens"
+    if rewards and not any(path.endswith(".npy") for path in files):
+        yield f"the trajectories of vocabulary {facts['vocabulary']} are not known here: give vocabulary=<its .npy>"
+    if answers := [mode for mode in facts["label_traffic"] if mode != "replay"]:
+        answering = f"label_traffic={', '.join(answers)}"
+        yield f"rewards are of traffic that answers ({answering}); SimScale's are of traffic that replays its log"

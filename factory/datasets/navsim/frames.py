@@ -1,0 +1,348 @@
+"""A sample as the twelve frames of an OpenScene log: a list of dictionaries, as NAVSIM's loader reads it."""
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from factory.store.schema import AGENT_STEPS, NOW_INDEX
+from tasks.render.views import pose_on_ground
+from tasks.world.arrays import Array
+from tasks.world.clip import HORIZON_STEPS, STEP_S
+from tasks.world.frames import to_local, to_world
+from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, YAW_RATE
+
+# How logs, frames, splits and files are named, so that the public code finds them and tells real from simulated.
+#
+# SimScale's own names (its scene filters): log `<source log>-<A>-00k`, sample `<B>-00k`, with A and B the frames of
+# the source log at T and at T+H, and k the round. A human sample of ours is `<source log>-<A>`, its token A.
+
+HORIZON_S = HORIZON_STEPS * STEP_S
+FRAME_S = 0.5
+N_HISTORY, N_FUTURE = 4, 8  # frames; the history's last is now
+N_FRAMES = N_HISTORY + N_FUTURE
+NOW_FRAME = N_HISTORY - 1
+HEX16 = re.compile(r"[0-9a-f]{16}")
+RELEASED = {"pdm_closed": "pdm"}  # our names of experts by which SimScale's splits go
+NAMING = ("dataset", "log_id", "clip_start_s", "now_s", "frame_tokens", "candidate_index", "expert", "round")
+
+
+def hex16(*words: object) -> str:
+    """16 hex digits of the words: the first of the SHA-256 of their texts with 0x1f between them."""
+    return hashlib.sha256("\x1f".join(map(str, words)).encode()).hexdigest()[:16]
+
+
+def is_simulated(row: Mapping[str, Any]) -> bool:
+    """Whether the sample is of an attempt at a candidate, and not of the log's own drive."""
+    return bool(row["candidate_index"] >= 0)
+
+
+def source_log(dataset: str, log_id: str) -> str:
+    """The source log's name with exactly one dash, from which WorldEngine cuts it off again.
+
+    A log named so already (nuPlan's `..._veh-35_...`) keeps its name. Of another, what is no letter, digit, dot or _
+    becomes _, and a dash and 8 digits of the hash of data set and log follow.
+    """
+    plain = re.sub(r"[^A-Za-z0-9._-]", "_", log_id)
+    if plain == log_id and log_id.count("-") == 1:
+        return log_id
+    return f"{plain.replace('-', '_')}-{hex16(dataset, log_id)[:8]}"
+
+
+def instant_token(row: Mapping[str, Any], time_s: float) -> str:
+    """The name of the source log's frame at `time_s` since its first instant: the log's own at T and T+H, else a hash.
+
+    The hash is of data set, log and milliseconds, so that overlapping windows agree on it.
+    """
+    start_s = float(row["clip_start_s"]) + float(row["now_s"]) - (HORIZON_S if is_simulated(row) else 0.0)
+    given = row["frame_tokens"]
+    if given is not None and all(HEX16.fullmatch(token) for token in given):
+        for token, at_s in zip(given, (start_s, start_s + HORIZON_S)):
+            if abs(time_s - at_s) < STEP_S / 2:
+                return str(token)
+    return hex16(row["dataset"], row["log_id"], round(1000.0 * time_s))
+
+
+@dataclass(frozen=True)
+class SampleNames:
+    """What one sample is called."""
+
+    log: str  # the pickle's stem and every frame's log_name
+    scene: str  # scene_token and log_token
+    tokens: tuple[str, ...]  # (N_FRAMES,)
+    times_s: tuple[float, ...]  # (N_FRAMES,) since the source log's first instant
+    suffix: str  # of every token: the round of a simulated sample, empty for a human one
+
+    @property
+    def token(self) -> str:
+        """Of the sample."""
+        return self.tokens[NOW_FRAME]
+
+    @property
+    def blobs(self) -> str:
+        """The folder of its pictures."""
+        return self.scene if self.suffix else self.log
+
+
+def sample_names(row: Mapping[str, Any]) -> SampleNames:
+    """Names of a row with the columns NAMING."""
+    now_s = float(row["clip_start_s"]) + float(row["now_s"])
+    times_s = tuple(now_s + (i - NOW_FRAME) * FRAME_S for i in range(N_FRAMES))
+    suffix = f"-{int(row['round']):03d}" if is_simulated(row) else ""
+    tokens = tuple(instant_token(row, time_s) + suffix for time_s in times_s)
+    scene = instant_token(row, now_s - HORIZON_S if suffix else now_s) + suffix
+    return SampleNames(f"{source_log(row['dataset'], row['log_id'])}-{scene}", scene, tokens, times_s, suffix)
+
+
+@dataclass(frozen=True, order=True)
+class SplitNames:
+    """What the samples of one expert and round are called, all together."""
+
+    folder: str  # of logs and of pictures: where SimScale's tools/move.sh puts a download
+    yaml: str  # of the scene filter and the split; its cache is <yaml>_cache
+    log_split: str  # of the training's list of logs ("reation" is how the public code spells it)
+    rewards: str  # the file below NAVSIM_TRAJPDM_ROOT
+
+
+def split_names(row: Mapping[str, Any], tag: str = "") -> SplitNames:
+    """Of a row with the columns NAMING. The rewards' file is always named 16384, whatever K is (gtrs_agent.py:232)."""
+    return _split_names(str(row["expert"]), int(row["round"]), is_simulated(row), tag)
+
+
+@cache
+def _split_names(expert: str, round_: int, simulated: bool, tag: str) -> SplitNames:
+    who = RELEASED.get(expert, expert) + (f"_{tag}" if tag else "")
+    if not simulated:
+        name = f"navtrain_{who}"
+        return SplitNames(name, name, f"default_log_split_{name}", f"ori/{name}_16384.pkl")
+    name = f"{who}_v1.0-{round_}"
+    return SplitNames(
+        f"synthetic_reaction_{name}",
+        f"navtrain_reaction_{name}",
+        f"default_log_split_synthetic_reation_{name}",
+        f"sim/simcale_16384_{name}.pkl",
+    )
+
+
+# The ego at the twelve frames of a log: poses in the plane and in space, velocities, accelerations, yaw rates.
+
+STEPS_PER_FRAME = 5
+INSTANTS = np.arange(0, AGENT_STEPS, STEPS_PER_FRAME)  # of a row's 56 steps
+DRIVEN = slice(HORIZON_STEPS - NOW_INDEX, HORIZON_STEPS, STEPS_PER_FRAME)  # of perturbed_states, before now
+MOTION = (
+    *("ego_history_10hz", "label_10hz", "now_pose", "world_from_ego", "perturbed_states", "ego_status"),
+    *("parent_states", "images"),
+)
+
+
+@dataclass(frozen=True)
+class FrameMotion:
+    """The ego at N_FRAMES instants; velocity and acceleration in ego axes, at the rear axle."""
+
+    poses: Array  # (12, 3) x, y [m], heading [rad], world
+    local: Array  # (12, 3) the same in the frame of the ego at now
+    global_from_ego: Array  # (12, 4, 4) m
+    quaternions: Array  # (12, 4) w, x, y, z of its rotation
+    dynamics: Array  # (12, 4) vx, vy [m/s], ax, ay [m/s2]
+    yaw_rates: Array  # (12,) rad/s
+
+
+def frame_motion(row: Mapping[str, Any]) -> FrameMotion:
+    """Of a row with the columns MOTION: what it holds exactly where it does, else from its poses at 10 Hz."""
+    local = np.concatenate([row["ego_history_10hz"], row["label_10hz"]]).astype(np.float64)  # (56, 3)
+    dynamics, yaw_rates = (derived[INSTANTS] for derived in derivatives(local))
+    poses = to_world(np.asarray(row["now_pose"]), local[INSTANTS])
+    poses[NOW_FRAME] = row["now_pose"]
+    dynamics[NOW_FRAME] = row["ego_status"]
+    driven = row["perturbed_states"]  # null of human rows and of imported ones, whose own log is the drive
+    if driven is not None:
+        before = np.asarray(driven)[DRIVEN]  # float64, of the very drive
+        poses[:NOW_FRAME], dynamics[:NOW_FRAME] = before[:, : HEADING + 1], before[:, [VX, VY, AX, AY]]
+        yaw_rates[: NOW_FRAME + 1] = np.append(before[:, YAW_RATE], driven[-1, YAW_RATE])
+    else:  # that log at T is now, and at T+H the last frame
+        logged = np.asarray(row["parent_states"])[:, [VX, VY, AX, AY]]
+        dynamics[[NOW_FRAME, N_FRAMES - 1]] = logged
+    matrices, quaternions = in_space(poses, known_poses(row))
+    return FrameMotion(poses, to_local(poses[NOW_FRAME], poses), matrices, quaternions, dynamics, yaw_rates)
+
+
+def derivatives(poses: Array) -> tuple[Array, Array]:
+    """Of poses (S, 3) at 10 Hz: (S, 4) vx, vy, ax, ay in the axes of each pose, and (S,) yaw rates.
+
+    Velocities are differences over one step to either side, at both ends the slope of the parabola through three
+    frames. Accelerations are second differences over a frame to either side, nearer to an end those of the nearest
+    step: a log at 2 Hz is straight between its frames, and over single steps its speed would change in one of them.
+    """
+    xy, heading = poses[:, :2], np.unwrap(poses[:, 2])
+    velocity, yaw_rate = np.gradient(xy, STEP_S, axis=0), np.gradient(heading, STEP_S)
+    n, frame_s = STEPS_PER_FRAME, STEPS_PER_FRAME * STEP_S
+    velocity[0] = (4.0 * xy[n] - 3.0 * xy[0] - xy[2 * n]) / (2.0 * frame_s)
+    velocity[-1] = (3.0 * xy[-1] - 4.0 * xy[-1 - n] + xy[-1 - 2 * n]) / (2.0 * frame_s)
+    acceleration = np.zeros_like(xy)
+    acceleration[n:-n] = (xy[2 * n :] - 2.0 * xy[n:-n] + xy[: -2 * n]) / frame_s**2
+    c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    turned = [np.hstack([c * v[:, :1] + s * v[:, 1:], c * v[:, 1:] - s * v[:, :1]]) for v in (velocity, acceleration)]
+    turned[1][:n], turned[1][-n:] = turned[1][n], turned[1][-n - 1]
+    return np.hstack(turned), yaw_rate
+
+
+def known_poses(row: Mapping[str, Any]) -> Array:
+    """(P, 4, 4) every 3-D pose of the ego that the row holds: at now, and of its pictures; level at 0 m without any."""
+    found = [] if row["world_from_ego"] is None else [np.asarray(row["world_from_ego"])]
+    found += [np.asarray(image["ego_pose"]).reshape(4, 4) for image in row["images"] or ()]
+    return np.stack(found) if found else np.eye(4)[None]
+
+
+def in_space(poses: Array, known: Array) -> tuple[Array, Array]:
+    """Planar poses (F, 3) as (F, 4, 4) matrices and (F, 4) quaternions w, x, y, z, on the plane of the nearest `known`.
+
+    The heading is what the public code reads as such, pyquaternion's `yaw_pitch_roll[0]`: the rotation is one about x,
+    then y, then z, whose last angle it is. On a slope that is not quite the direction of the forward axis in the plane.
+    """
+    states = np.zeros((len(poses), EGO_STATE_SIZE))
+    states[:, : HEADING + 1] = poses
+    matrices = pose_on_ground(known, states)
+    up = matrices[:, :3, 2]
+    pitch, roll = np.arcsin(np.clip(up[:, 0], -1.0, 1.0)), np.arctan2(-up[:, 1], up[:, 2])
+    rotation = Rotation.from_euler("XYZ", np.column_stack([roll, pitch, poses[:, HEADING]]))
+    matrices[:, :3, :3] = rotation.as_matrix()
+    return matrices, rotation.as_quat(canonical=True)[:, [3, 0, 1, 2]]
+
+
+# What an export is asked for.
+
+Layout = Literal["moved", "released"]
+Missing = Literal["refuse", "black", "none"]
+
+MAP_LOCATIONS = ("sg-one-north", "us-ma-boston", "us-nv-las-vegas-strip", "us-pa-pittsburgh-hazelwood")
+PUBLIC_SIZE = (1920, 1080)  # pixels; the released agents cut their pictures as if they were this large
+
+
+class CannotExport(ValueError):
+    """A sample, or all of them, cannot be written as asked; the message says which, why and what would help."""
+
+
+@dataclass(frozen=True)
+class ExportSettings:
+    """What is written of which samples; two exports into one folder have the same."""
+
+    experts: tuple[str, ...] = ()  # of whom; none: all
+    rounds: tuple[int, ...] = ()  # which; none: all
+    splits: tuple[str, ...] = ()  # train, val, test; none: all
+    tag: str = ""  # behind an expert's name, so that a split of ours stands beside the released one
+    layout: Layout = "moved"  # as after SimScale's tools/move.sh, or as its archives unpack
+    resize: bool = False  # pictures of other sizes, to PUBLIC_SIZE
+    missing: Missing = "refuse"  # pictures of eight cameras and four instants that a sample has not
+    map_location: str = ""  # of all samples; empty: what their maps say
+
+    def __post_init__(self) -> None:
+        if self.tag and not (self.tag.isascii() and self.tag.replace("_", "").isalnum()):
+            raise ValueError(f"tag={self.tag}: letters, digits and _ alone, as it becomes part of names")
+        if self.map_location and self.map_location not in MAP_LOCATIONS:
+            raise ValueError(
+                f"map_location={self.map_location}: the public code knows {', '.join(MAP_LOCATIONS)} "
+                "(navsim/common/dataclasses.py:441)"
+            )
+
+
+COMMANDS = ("left", "straight", "right", "unknown")  # NAVSIM's one-hot, its "forward" being our "straight"
+RED = 3
+Frame = dict[str, Any]
+
+
+def log_frames(
+    row: Mapping[str, Any], names: SampleNames, cams: tuple[Mapping[str, Any], ...], settings: ExportSettings
+) -> list[Frame]:
+    """The frames of one sample. Raises CannotExport for a place that the public code does not know."""
+    motion, place = frame_motion(row), place_of(row, settings)
+    command = np.array([row["command"] == name for name in COMMANDS], dtype=np.int64)
+    return [
+        {
+            "token": names.tokens[i],
+            "frame_idx": i,
+            "timestamp": round(1e6 * names.times_s[i]),
+            "log_name": names.log,
+            "log_token": names.scene,
+            "scene_name": names.log,
+            "scene_token": names.scene,
+            "map_location": place,
+            "roadblock_ids": [str(block) for block in row["route_roadblock_ids"]],
+            "vehicle_name": str(row["dataset"]),
+            "can_bus": _can_bus(motion, i),
+            "lidar_path": "",
+            "lidar2ego_translation": np.zeros(3),
+            "lidar2ego_rotation": [1.0, 0.0, 0.0, 0.0],
+            "ego2global_translation": motion.global_from_ego[i, :3, 3].copy(),
+            "ego2global_rotation": motion.quaternions[i].copy(),
+            "ego_dynamic_state": [float(value) for value in motion.dynamics[i]],
+            "traffic_lights": _lights(row, i),
+            "driving_command": command.copy(),
+            "cams": cams[i],
+            "sample_prev": names.tokens[i - 1] if i > 0 else None,
+            "sample_next": names.tokens[i + 1] if i + 1 < N_FRAMES else None,
+            "ego2global": motion.global_from_ego[i].copy(),
+            "lidar2ego": np.eye(4),
+            "lidar2global": motion.global_from_ego[i].copy(),
+            "anns": _annotations(row, names, motion, i),
+        }
+        for i in range(N_FRAMES)
+    ]
+
+
+def place_of(row: Mapping[str, Any], settings: ExportSettings) -> str:
+    """One of MAP_LOCATIONS. Raises CannotExport."""
+    place = settings.map_location or str(row["map_location"])
+    if place not in MAP_LOCATIONS:
+        raise CannotExport(
+            f"log {row['log_id']}: its map is of {place or 'no named place'}, and the public code knows only "
+            f"{', '.join(MAP_LOCATIONS)}: give map_location=<one of them>, and it the map of these logs in a maps root "
+            "of their own"
+        )
+    return place
+
+
+def connector_number(lane_id: str) -> int:
+    """A lane connector's id as the number that a light is keyed by: its own where it is one, else 60 bits of a hash."""
+    return int(lane_id) if lane_id.isascii() and lane_id.isdecimal() else int(hex16(lane_id)[:15], 16)
+
+
+def _can_bus(motion: FrameMotion, i: int) -> Any:
+    """(18,) position, quaternion, acceleration, velocity, angular rate, two zeros; the vectors in ego axes."""
+    vx, vy, ax, ay = motion.dynamics[i]
+    turning = [ax, ay, 0.0, vx, vy, 0.0, 0.0, 0.0, motion.yaw_rates[i], 0.0, 0.0]
+    return np.concatenate([motion.global_from_ego[i, :3, 3], motion.quaternions[i], turning])
+
+
+def _lights(row: Mapping[str, Any], i: int) -> list[tuple[int, bool]]:
+    states = np.asarray(row["light_states"])  # (S, 56)
+    ids = [connector_number(str(lane_id)) for lane_id in row["light_lane_ids"]]
+    return [(number, bool(state[INSTANTS[i]] == RED)) for number, state in zip(ids, states)]
+
+
+def _annotations(row: Mapping[str, Any], names: SampleNames, motion: FrameMotion, i: int) -> dict[str, Any]:
+    """Boxes and velocities in the frame of the ego at this instant, turned by its heading alone, as they are read."""
+    step, ego = INSTANTS[i], motion.local[i]
+    shape = (len(row["agent_ids"]), AGENT_STEPS)
+    here = np.flatnonzero(np.asarray(row["agent_valid"]).reshape(shape)[:, step])
+    stored = np.asarray(row["agent_boxes"], np.float64).reshape(*shape, 5)[here, step]
+    pose, c, s = to_local(ego, stored[:, :3]), np.cos(ego[2]), np.sin(ego[2])
+    boxes, velocities = np.zeros((len(here), 7)), np.zeros((len(here), 3))
+    boxes[:, :2], boxes[:, 3:5], boxes[:, 6] = pose[:, :2], stored[:, 3:], pose[:, 2]
+    center_z = np.asarray(row["agent_center_z"], np.float64).reshape(shape)[here, step]
+    boxes[:, 2] = center_z - motion.global_from_ego[i, 2, 3]
+    boxes[:, 5] = np.asarray(row["agent_heights"])[here]
+    of_now = np.asarray(row["agent_velocities"], np.float64).reshape(*shape, 2)[here, step]
+    velocities[:, :2] = of_now @ np.array([[c, -s], [s, c]])
+    tracks = [str(row["agent_ids"][k]) for k in here]
+    return {
+        "gt_boxes": boxes,
+        "gt_names": np.array([str(row["agent_kinds"][k]).lower() for k in here], dtype=np.str_),
+        "gt_velocity_3d": velocities,
+        "instance_tokens": [hex16(names.tokens[i], track) for track in tracks],
+        "track_tokens": tracks,
+    }

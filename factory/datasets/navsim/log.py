@@ -1,0 +1,306 @@
+"""One OpenScene log: the pickled list of 2 Hz frames that NAVSIM reads, as typed frames.
+
+Keys, units and frames are those that the public reader takes (autonomousvision/navsim @ 0a380a9,
+navsim/common/dataclasses.py); keys it does not read are not looked at. The pickle is data: nothing of it runs
+(`factory.readers.pickles`).
+"""
+
+from collections.abc import Mapping, Sequence, Sized
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from factory.readers.base import BadClip, bytes_of
+from factory.readers.pickles import id_text, load_plain
+from factory.wording import shown
+from tasks.world.agents import AgentKind
+from tasks.world.arrays import Array
+
+# Values out of a pickled dict, checked one by one: what is wrong names file, frame and key.
+
+MISSING = object()
+
+
+@dataclass(frozen=True)
+class Values:
+    """The items of one dict; `place` says where it stands in the file, as `frames[3].`."""
+
+    items: Mapping[Any, Any]
+    file: str
+    place: str = ""
+
+    def bad(self, key: str, problem: str) -> BadClip:
+        """The error that names the key."""
+        return BadClip(self.file, f"{self.place}{key}", problem)
+
+    def get(self, key: str, default: Any = MISSING) -> Any:
+        """The value as it stands, or the default where the key is missing; without one that raises BadClip."""
+        value = self.items.get(key, default)
+        if value is MISSING:
+            raise self.bad(key, "missing")
+        return value
+
+    def inner(self, key: str) -> "Values":
+        """A dict within. Raises BadClip."""
+        value = self.get(key)
+        if not isinstance(value, Mapping):
+            raise self.bad(key, f"is a {type(value).__name__}, expected a dict")
+        return Values(value, self.file, f"{self.place}{key}.")
+
+    def text(self, key: str, *, may_be_empty: bool = False) -> str:
+        """Raises BadClip where it is no text, or empty and must not be."""
+        value = self.get(key)
+        if not isinstance(value, str):
+            raise self.bad(key, f"is a {type(value).__name__}, expected text")
+        if not value and not may_be_empty:
+            raise self.bad(key, "is empty")
+        return str(value)
+
+    def integer(self, key: str) -> int:
+        """Python's or numpy's. Raises BadClip."""
+        value = self.get(key)
+        if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
+            raise self.bad(key, f"is {shown(value)}, expected a whole number")
+        return int(value)
+
+    def numbers(self, key: str, shape: tuple[int | None, ...]) -> Array:
+        """A list or an array of finite numbers as float64, never a view of another's; None: any length.
+
+        Raises BadClip.
+        """
+        value = self.get(key)
+        try:
+            array = np.array(value, np.float64)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise self.bad(key, f"holds no numbers ({shown(value)})") from error
+        if array.size == 0 and shape[0] is None:  # an empty list says nothing of its columns
+            array = array.reshape(0, *(n or 0 for n in shape[1:]))
+        if array.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, array.shape)):
+            raise self.bad(key, f"shape {array.shape}, expected ({', '.join(str(n or 'N') for n in shape)})")
+        if not np.isfinite(array).all():
+            raise self.bad(key, "holds NaN or infinity")
+        return array
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        """A list, tuple or array of text. Raises BadClip."""
+        value = self.get(key)
+        if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray):
+            raise self.bad(key, f"is a {type(value).__name__}, expected a list of text")
+        for item in value:
+            if not isinstance(item, str):
+                raise self.bad(key, f"holds {shown(item)}, expected text")
+        return tuple(map(str, value))
+
+
+CAMERA_NAMES = ("CAM_F0", "CAM_L0", "CAM_L1", "CAM_L2", "CAM_R0", "CAM_R1", "CAM_R2", "CAM_B0")
+COMMANDS = ("left", "straight", "right", "unknown")  # the one-hot's order; NAVSIM says forward for straight
+KIND_OF_NAME = {kind.value.lower(): kind for kind in AgentKind}  # vehicle, pedestrian, ..., generic_object
+LOCATION_OF_ALIAS = {"las_vegas": "us-nv-las-vegas-strip"}
+UNIT_SLACK = 1e-3  # of a quaternion's length
+
+
+@dataclass(frozen=True)
+class FrameCamera:
+    """One camera at one frame. Camera frame: x right, y down, z forward; its picture is distorted."""
+
+    name: str  # of CAMERA_NAMES
+    path: str  # of the JPEG below the folder of sensor blobs
+    intrinsics: Array  # (3, 3) pixels, of the distorted picture
+    distortion: Array  # (5,) k1, k2, p1, p2, k3
+    ego_from_camera: Array  # (4, 4); OpenScene calls it sensor2lidar, its lidar frame is the ego frame
+
+
+@dataclass(frozen=True)
+class FrameBoxes:
+    """N annotated boxes of one frame, in the ego frame (rear axle, x forward, y left, z up)."""
+
+    boxes: Array  # (N, 7) centre x, y, z, length, width, height [m], heading [rad], not wrapped
+    kinds: tuple[AgentKind, ...]  # (N,)
+    velocities: Array  # (N, 3) [m/s], over ground, along the ego's axes
+    track_tokens: tuple[str, ...]  # (N,) identity over time, unique within a frame
+    instance_tokens: tuple[str, ...]  # (N,)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One 2 Hz frame of a log."""
+
+    token: str
+    timestamp_us: int  # microseconds, Unix
+    log_name: str
+    scene_token: str
+    map_location: str
+    roadblock_ids: tuple[str, ...]  # of the planned route, in order, may repeat; empty: none is known
+    pose: Array  # (3,) rear axle x, y [m], heading [rad] in the map's UTM frame
+    world_from_ego: Array  # (4, 4) the same in space
+    dynamic_state: Array  # (4,) vx, vy [m/s], ax, ay [m/s2] of the rear axle along the ego's axes
+    lights: tuple[tuple[str, bool], ...]  # lane connector, whether it is red; yellow and unknown are not
+    command: str  # of COMMANDS
+    cameras: tuple[FrameCamera, ...]  # in the order of CAMERA_NAMES; those that the log gives a picture of
+    lidar_path: str | None  # of the merged sweep below the folder of sensor blobs
+    boxes: FrameBoxes | None  # None: nobody annotated the frame
+
+
+@dataclass(frozen=True)
+class LogFrames:
+    """The frames of one log in time order, timestamps strictly increasing."""
+
+    file: str
+    name: str
+    frames: tuple[Frame, ...]  # one or more
+
+
+def read_frames(path: Path) -> LogFrames:
+    """The log in this pickle. Raises BadClip, naming frame and key."""
+    return frames_of(load_plain(bytes_of(path), str(path)), path)
+
+
+def frames_of(value: Any, path: Path) -> LogFrames:
+    """What a log's pickle holds, checked. Raises BadClip."""
+    file = str(path)
+    if not isinstance(value, list) or not value:
+        raise BadClip(file, "frames", f"holds a {type(value).__name__}, expected a list of frames, one or more")
+    frames = tuple(frame_of(item, file, f"frames[{i}].") for i, item in enumerate(value))
+    for i, (before, frame) in enumerate(pairwise(frames), 1):
+        if frame.timestamp_us <= before.timestamp_us:
+            raise BadClip(file, f"frames[{i}].timestamp", "time does not go on")
+    for i, frame in enumerate(frames):
+        if frame.log_name != path.stem:  # NAVSIM finds logs by the one and scenes by the other
+            problem = f"is {shown(frame.log_name)}, but the file is named {path.stem!r}: rename the file"
+            raise BadClip(file, f"frames[{i}].log_name", problem)
+    if len({frame.map_location for frame in frames}) > 1:
+        raise BadClip(file, "map_location", "changes within the log")
+    tokens = [frame.token for frame in frames]
+    if len(set(tokens)) < len(tokens):
+        raise BadClip(file, "token", f"{next(t for t in tokens if tokens.count(t) > 1)} stands twice")
+    return LogFrames(file, path.stem, frames)
+
+
+def frame_of(item: Any, file: str, place: str) -> Frame:
+    """One frame's dict, checked; `place` names it in errors. Raises BadClip."""
+    if not isinstance(item, Mapping):
+        raise BadClip(file, place.rstrip("."), f"is a {type(item).__name__}, expected a dict")
+    values = Values(item, file, place)
+    translation = values.numbers("ego2global_translation", (3,))
+    pose, world_from_ego = pose_of(values, "ego2global_rotation", translation)
+    location = values.text("map_location")
+    return Frame(
+        token=values.text("token"),
+        timestamp_us=values.integer("timestamp"),
+        log_name=values.text("log_name"),
+        scene_token=values.text("scene_token"),
+        map_location=LOCATION_OF_ALIAS.get(location, location),
+        roadblock_ids=values.texts("roadblock_ids"),
+        pose=pose,
+        world_from_ego=world_from_ego,
+        dynamic_state=values.numbers("ego_dynamic_state", (4,)).astype(np.float32).astype(np.float64),  # as NAVSIM does
+        lights=lights_of(values),
+        command=command_of(values),
+        cameras=cameras_of(values.inner("cams")),
+        lidar_path=lidar_path_of(values),
+        boxes=boxes_of(values.inner("anns")) if item.get("anns") is not None else None,
+    )
+
+
+def pose_of(values: Values, key: str, translation: Array) -> tuple[Array, Array]:
+    """The pose (3,) and its matrix (4, 4) by the quaternion w, x, y, z under `key`. Raises BadClip.
+
+    The heading is the public reader's, pyquaternion's first Tait-Bryan angle of R = Rx Ry Rz. In a frame that is
+    tilted it is not the direction of the ego's forward axis on the ground, by the product of roll and pitch.
+    """
+    quaternion = values.numbers(key, (4,))
+    length = float(np.linalg.norm(quaternion))
+    if abs(length - 1.0) > UNIT_SLACK:
+        raise values.bad(key, f"a quaternion w, x, y, z of length {length:.4g}, expected 1")
+    w, x, y, z = quaternion / length
+    heading = np.arctan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (y**2 + z**2))
+    world_from_ego = np.eye(4)
+    world_from_ego[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    world_from_ego[:3, 3] = translation
+    return np.array([translation[0], translation[1], heading]), world_from_ego
+
+
+def lights_of(values: Values) -> tuple[tuple[str, bool], ...]:
+    """`traffic_lights`: (lane connector id, whether it is red) each. Raises BadClip."""
+    lights = values.get("traffic_lights")
+    if not isinstance(lights, list | tuple):
+        raise values.bad("traffic_lights", f"is a {type(lights).__name__}, expected a list")
+    out = []
+    for light in lights:
+        if not isinstance(light, list | tuple) or len(light) != 2:
+            raise values.bad("traffic_lights", f"holds {shown(light)}, expected (lane connector id, is_red)")
+        lane_id, is_red = light
+        name = id_text(lane_id)
+        if name is None or not isinstance(is_red, bool | np.bool_ | int):
+            raise values.bad("traffic_lights", f"holds {shown(light)}, expected (lane connector id, is_red)")
+        out.append((name, bool(is_red)))
+    return tuple(out)
+
+
+def command_of(values: Values) -> str:
+    """`driving_command`, the one-hot of left, forward, right, unknown. Raises BadClip."""
+    one_hot = values.numbers("driving_command", (len(COMMANDS),))
+    if sorted(one_hot.tolist()) != [0.0, 0.0, 0.0, 1.0]:
+        raise values.bad("driving_command", f"{one_hot.tolist()} is no one-hot of left, forward, right, unknown")
+    return COMMANDS[int(np.argmax(one_hot))]
+
+
+def lidar_path_of(values: Values) -> str | None:
+    """`lidar_path`; None where it is None or empty, as in logs without lidar. Raises BadClip."""
+    return None if values.get("lidar_path") is None else values.text("lidar_path", may_be_empty=True) or None
+
+
+def cameras_of(cams: Values) -> tuple[FrameCamera, ...]:
+    """`cams`: all eight, by their names in any case; those without a picture are left out. Raises BadClip."""
+    by_name = {key.upper(): key for key in cams.items if isinstance(key, str)}
+    if missing := [name for name in CAMERA_NAMES if name not in by_name]:
+        raise cams.bad(missing[0], "missing; a frame names all eight cameras, with {} for one that has no picture")
+    found = []
+    for name in CAMERA_NAMES:
+        camera = cams.inner(by_name[name])
+        named = camera.get("data_path", None)
+        if named is None or (isinstance(named, str) and not named):  # else text() says what it is
+            continue
+        ego_from_camera = np.eye(4)
+        ego_from_camera[:3, :3] = camera.numbers("sensor2lidar_rotation", (3, 3))
+        ego_from_camera[:3, 3] = camera.numbers("sensor2lidar_translation", (3,))
+        found.append(
+            FrameCamera(
+                name=name,
+                path=camera.text("data_path"),
+                intrinsics=camera.numbers("cam_intrinsic", (3, 3)),
+                distortion=camera.numbers("distortion", (5,)),
+                ego_from_camera=ego_from_camera,
+            )
+        )
+    return tuple(found)
+
+
+def boxes_of(anns: Values, names: Mapping[str, str] | None = None) -> FrameBoxes:
+    """`anns`: five keys of equal length. Raises BadClip.
+
+    names: other names of the five keys, as those of NAVSIM's own `Annotations`.
+    """
+    key = {name: (names or {}).get(name, name) for name in ("gt_boxes", "gt_names", "gt_velocity_3d")}
+    boxes = anns.numbers(key["gt_boxes"], (None, 7))
+    n = len(boxes)
+    velocities = anns.numbers(key["gt_velocity_3d"], (None, 3))
+    kinds = anns.texts(key["gt_names"]) if n else ()
+    tracks, instances = anns.texts("track_tokens"), anns.texts("instance_tokens")
+    rows: dict[str, Sized] = {key["gt_velocity_3d"]: velocities, key["gt_names"]: kinds, "track_tokens": tracks}
+    for name, column in {**rows, "instance_tokens": instances}.items():
+        if len(column) != n:
+            raise anns.bad(name, f"{len(column)} entries, but {n} boxes")
+    if unknown := sorted(set(kinds) - KIND_OF_NAME.keys()):
+        raise anns.bad(key["gt_names"], f"unknown class {', '.join(unknown)}; known: {', '.join(KIND_OF_NAME)}")
+    if not all(track.strip() for track in tracks):
+        raise anns.bad("track_tokens", "holds an empty token, which tells no objects apart")
+    if len(set(tracks)) < n:
+        raise anns.bad("track_tokens", f"{next(t for t in tracks if tracks.count(t) > 1)} stands twice in one frame")
+    if (boxes[:, 3:6] <= 0.0).any():
+        raise anns.bad(key["gt_boxes"], "a box has a size that is not positive")
+    return FrameBoxes(boxes, tuple(KIND_OF_NAME[kind] for kind in kinds), velocities, tracks, instances)

@@ -1,0 +1,340 @@
+"""Reads what 123D converted as clips, without 123D."""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from factory.datasets.av2.log import LogMotion, seconds_since, step_times, world_from_ego_at
+from factory.datasets.av2.reader import BLOCK_STEPS, BLOCK_STRIDE_STEPS
+from factory.datasets.py123d.arrow import (
+    SOURCES,
+    ArrowFile,
+    ConvertedSet,
+    check_version,
+    numbers,
+    open_file,
+    open_metadata,
+)
+from factory.datasets.py123d.log import BOXES, EGO, LIGHTS, drive_of, lights_of, matrices, read_motion
+from factory.datasets.py123d.map import read_map
+from factory.files import matching, matching_below
+from factory.readers.base import SPLITS, BadClip, ClipRef
+from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive, within
+from factory.readers.settings import Py123dClips
+from factory.wording import shown
+from tasks.world.arrays import Array
+from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import STEP_S, Block
+
+# Cameras of a log of 123D, and where its photos and sweeps lie.
+#
+# 123D keeps photos by their path under the data set's own sensor root, or packed into its tables. Only files are
+# taken: photos where `sensor_root` says where they are, sweeps where they are Argoverse 2's feathers.
+
+PINHOLE, LIDAR, SWEEP_SUFFIX = "pinhole", "lidar.lidar_merged.arrow", ".feather"
+
+
+def camera_files(folder: Path) -> tuple[Path, ...]:
+    """The tables of the log's cameras, by name."""
+    return tuple(matching(folder, "camera.*.arrow"))
+
+
+def read_rig(folder: Path) -> dict[Path, Camera]:
+    """Table -> pinhole camera; fisheyes are left out. Raises BadClip."""
+    mount = open_metadata(folder / EGO).vector("rear_axle_to_imu_se3", 7)
+    rear_from_imu = np.linalg.inv(matrices(folder / EGO, mount[None])[0])
+    files = {path: open_metadata(path) for path in camera_files(folder)}
+    return {
+        path: _camera(file, rear_from_imu) for path, file in files.items() if file.value("camera_model", str) == PINHOLE
+    }
+
+
+def has_photos(folder: Path) -> bool:
+    """Whether the log's photos are files."""
+    return any(pa.types.is_string(_data_type(open_metadata(path))) for path in camera_files(folder))
+
+
+def recorded_photos(motion: LogMotion, rig: dict[Path, Camera], sensor_root: Path) -> tuple[SensorFile, ...]:
+    """The log's photos, seconds since its first annotated frame, posed as their tables say. Raises BadClip."""
+    out: list[SensorFile] = []
+    for path, camera in rig.items():
+        file = open_file(path)
+        if pa.types.is_string(_data_type(file)) and file.table.num_rows:
+            times_s = seconds_since(motion.start_ns, file.stamps_ns())
+            out += _files(file, camera.name, sensor_root, times_s, _poses(file, camera, motion, times_s))
+    return tuple(out)
+
+
+def recorded_sweeps(motion: LogMotion, sensor_root: Path) -> tuple[SensorFile, ...]:
+    """The log's sweeps where they are Argoverse 2's files, seconds since its first annotated frame. Raises BadClip."""
+    path = motion.folder / LIDAR
+    if not path.exists():
+        return ()
+    file = open_file(path)
+    if not pa.types.is_string(_data_type(file)) or not file.table.num_rows:
+        return ()
+    times_s = seconds_since(motion.start_ns, file.stamps_ns())
+    sweeps = _files(file, "lidar", sensor_root, times_s, world_from_ego_at(motion, times_s))
+    return tuple(sweep for sweep in sweeps if sweep.uri.endswith(SWEEP_SUFFIX))
+
+
+def _camera(file: ArrowFile, rear_from_imu: Array) -> Camera:
+    fx, fy, cx, cy, skew = file.vector("intrinsics", 5)
+    if skew:
+        raise BadClip(str(file.path), "metadata.intrinsics", f"skew of {skew}, only cameras without are read")
+    flat = file.value("is_undistorted", bool) or file.metadata.get("distortion") is None
+    distortion = np.zeros(5) if flat else file.vector("distortion", 5)
+    mount = rear_from_imu @ matrices(file.path, file.vector("camera_to_imu_se3", 7)[None])[0]
+    intrinsics = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    size = file.value("width", int), file.value("height", int)
+    try:
+        return Camera(file.value("camera_name", str), *size, intrinsics, distortion, mount)
+    except ValueError as error:
+        raise BadClip(str(file.path), "metadata", str(error)) from error
+
+
+def _data_type(file: ArrowFile) -> pa.DataType:
+    name = f"{file.path.stem}.data"
+    if name not in file.table.column_names:
+        raise BadClip(str(file.path), name, "column is missing")
+    return file.table.schema.field(name).type
+
+
+def _poses(file: ArrowFile, camera: Camera, motion: LogMotion, times_s: Array) -> Array:
+    """(n, 4, 4) world from ego at each photo: from the photo's own pose, the ego's where it has none."""
+    poses = world_from_ego_at(motion, times_s)
+    column = file.table[f"{file.path.stem}.camera_to_global_se3"].combine_chunks()
+    posed = np.flatnonzero(np.asarray(column.is_valid()))
+    if len(posed):
+        own = matrices(file.path, numbers(file.path, "camera_to_global_se3", column.drop_null(), 7))
+        poses[posed] = own @ np.linalg.inv(camera.ego_from_camera)
+    return poses
+
+
+def _files(file: ArrowFile, sensor: str, root: Path, times_s: Array, poses: Array) -> list[SensorFile]:
+    """Files in time order. Raises BadClip for a path that leads out of the root."""
+    names = file.column("data").to_pylist()
+    for name in names:
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise BadClip(str(file.path), "data", f"{shown(name)} is no path under the sensor root")
+    order = np.argsort(times_s, kind="stable")
+    return [SensorFile(sensor, str(root / names[i]), float(times_s[i]), poses[i]) for i in order]
+
+
+SYNC, MAP = "sync.arrow", "map.arrow"
+
+
+@dataclass(frozen=True)
+class Py123dLog(WholeLog):
+    """One log, whole, with its rig and where its photos and sweeps lie; their times count from its first step."""
+
+    motion: LogMotion
+    cameras: tuple[Camera, ...]
+    images: tuple[SensorFile, ...]
+    sweeps: tuple[SensorFile, ...]
+
+
+class Py123dReader(LogReader[Py123dLog]):
+    """Clips of what 123D converted: of its data root, its `logs`, one split's folder, or one log.
+
+    A log's id is its folder's name.
+    """
+
+    data_set = "py123d"
+
+    def __init__(
+        self,
+        root: str | Path,
+        maps_root: str | Path | None = Py123dClips.maps_root,
+        sensor_root: str | Path | None = Py123dClips.sensor_root,
+        **windows: Any,
+    ) -> None:
+        """maps_root: None: `maps` beside `logs`; sensor_root: of the data set itself, None: no photos and sweeps.
+
+        windows: as of LogReader. Raises ValueError.
+        """
+        super().__init__(root, **windows)
+        self.maps_root, self.sensor_root = (
+            None if folder is None else Path(folder).expanduser().absolute() for folder in (maps_root, sensor_root)
+        )
+        if self.sensor_root is not None and not self.sensor_root.is_dir():
+            raise ValueError(f"clips.sensor_root={self.sensor_root}: no such folder")
+
+    @cached_property
+    def _folders(self) -> dict[str, Path]:
+        return log_folders(self.root)
+
+    def logs(self) -> dict[str, Path]:
+        """Log id -> folder, listed once. Raises ValueError where the root holds no log, or one name twice."""
+        return self._folders
+
+    def drive(self, path: Path) -> LoggedDrive | str:
+        """Ego and agents of the log in this folder; or what it lacks. Raises BadClip."""
+        header = open_header(path)
+        source = source_of(header)
+        for name in (EGO, BOXES):
+            if not (path / name).is_file():
+                return f"no {name}"
+        if not source.has_lanes:
+            return "its data set's maps have no lanes"
+        if header.metadata.get("map_metadata") is None:
+            return "converted without a map"
+        map_file(header, self.maps_root)
+        return drive_of(read_motion(path))
+
+    def load(self, path: Path) -> Py123dLog:
+        """The log in this folder. Raises BadClip."""
+        return read_log(path, self.maps_root, self.sensor_root)
+
+    def digest(self, ref: ClipRef) -> str:
+        """The clip's content digest, from the bytes of its log's files alone. Raises BadClip."""
+        return self.digest_with_others(ref, self.log_digest(self.path_of(ref)))
+
+    def log_digest(self, path: Path) -> str:
+        """sha256 of the log in this folder, but for pixels and points. Raises BadClip."""
+        header = open_header(path)
+        return content_digest(header, map_file(header, self.maps_root))
+
+    def world(self, path: Path) -> str | None:
+        """The map that the log shares with others; None where it has one of its own. Raises BadClip."""
+        header = open_header(path)
+        shares = not header.metadata["map_metadata"].get("map_is_per_log")
+        return map_file(header, self.maps_root).stem if shares else None
+
+    def block_steps(self, start: int) -> tuple[int, int]:
+        """20 s that begin at a multiple of 10 s."""
+        first = start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
+        return first, first + BLOCK_STEPS
+
+    def block(self, ref: ClipRef) -> str | None:
+        """Log and second at which the block begins that the clip is rendered from; None where there are no photos."""
+        if self.sensor_root is None or not has_photos(self.path_of(ref)):
+            return None
+        first = ref.start_ms // STEP_MS // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
+        return f"{ref.log_id}@{first * STEP_S:g}s"
+
+    def recorded(self, log: Py123dLog, start: int, stop: int) -> Recorded:
+        """Poses, rig, photos and sweeps of a window, and the block that it is rendered from."""
+        poses = world_from_ego_at(log.motion, step_times(start, stop))
+        sensed = within(log.images, start, stop), within(log.sweeps, start, stop)
+        return Recorded(poses, log.cameras, *sensed, _block(log, start) if log.images else None)
+
+
+def log_folders(root: Path) -> dict[str, Path]:
+    """Log id -> folder, sorted by id. Raises ValueError where the root holds no log of 123D, or one name twice."""
+    if not root.is_dir():
+        raise ValueError(f"{root}: no such folder")
+    above = root / "logs" if (root / "logs").is_dir() else root
+    folders: dict[str, Path] = {}
+    for folder in sorted(found.parent for found in matching_below(above, SYNC)):
+        if folder.name in folders:
+            raise ValueError(
+                f"{root}: log {folder.name} stands in {folders[folder.name].parent.name} and {folder.parent.name}: "
+                "give one split's folder as clips.root"
+            )
+        folders[folder.name] = folder
+    if not folders:
+        raise ValueError(f"{root}: no log of 123D here (a folder with {SYNC}); expected its data root, logs or a split")
+    return dict(sorted(folders.items()))
+
+
+def open_header(folder: Path) -> ArrowFile:
+    """What the log says of itself, its version checked. Raises BadClip."""
+    header = open_metadata(folder / SYNC)
+    check_version(header)
+    return header
+
+
+def source_of(header: ArrowFile) -> ConvertedSet:
+    """The data set that was converted. Raises BadClip for one that is not read."""
+    name = header.value("dataset", str)
+    if name not in SOURCES:
+        raise BadClip(str(header.path), "metadata.dataset", f"{shown(name)} is not read; {', '.join(SOURCES)} are")
+    return SOURCES[name]
+
+
+def map_file(header: ArrowFile, maps_root: Path | None) -> Path:
+    """The log's map, in its folder or among the maps of its data set. Raises BadClip where it is not there."""
+    folder = header.path.parent
+    told = header.metadata.get("map_metadata")
+    if not isinstance(told, dict) or not isinstance(told.get("dataset"), str):
+        raise BadClip(str(header.path), "metadata.map_metadata", "missing, or names no data set")
+    if told.get("map_is_per_log"):
+        paths = [folder / MAP]
+    else:
+        name = f"{told['dataset']}_{told.get('location')}.arrow"
+        if Path(name).name != name:
+            raise BadClip(str(header.path), "metadata.map_metadata", f"names an impossible file {shown(name)}")
+        roots = [maps_root] if maps_root else [parent / "maps" for parent in folder.parents[1:4]]
+        paths = [root / told["dataset"] / name for root in roots]
+    found = next((path for path in paths if path.is_file()), None)
+    if found is None:
+        raise BadClip(str(paths[0]), "file", "the log's map is missing: convert it too, or give clips.maps_root")
+    return found
+
+
+def read_log(folder: Path, maps_root: Path | None = None, sensor_root: Path | None = None) -> Py123dLog:
+    """The whole log, resampled to 0.1 s. Raises BadClip."""
+    header = open_header(folder)
+    source, path = source_of(header), map_file(header, maps_root)
+    motion = read_motion(folder)
+    drive = drive_of(motion)
+    driven = drive.ego_states[drive.segment >= 0, :3]
+    if not len(driven):
+        raise BadClip(str(folder / EGO), "imu_se3", "no continuous drive")
+    road_map = read_map(path, source, driven[:, :2])
+    rig = read_rig(folder)
+    return Py123dLog(
+        file=str(folder),
+        motion=motion,
+        ego_states=drive.ego_states,
+        agents=drive.agents,
+        road_map=road_map,
+        route=route_of_drive(road_map, driven, str(path), "lanes"),
+        lights=lights_of(motion, road_map, step_times(0, motion.n_steps)),
+        cameras=tuple(rig.values()),
+        images=recorded_photos(motion, rig, sensor_root) if sensor_root else (),
+        sweeps=recorded_sweeps(motion, sensor_root) if sensor_root else (),
+        licence=source.licence,
+        content_digest=content_digest(header, path),
+        split=split_named(header.value("split", str)),
+    )
+
+
+def split_named(name: str) -> str | None:
+    """train, val or test of 123D's `<data set>_<split>`; None for any other."""
+    split = name.rpartition("_")[2]
+    return split if split in SPLITS else None
+
+
+def content_digest(header: ArrowFile, path: Path) -> str:
+    """sha256 over what a clip is computed from: poses, boxes, lights, map, calibration; not pixels and points."""
+    folder = header.path.parent
+    digest = hashlib.sha256(repr(sorted(header.metadata.items())).encode())
+    for file in (folder / EGO, folder / BOXES, folder / LIGHTS, path):
+        if file.exists():
+            stat = file.stat()
+            digest.update(f"{file.name}\x1f{_digest_of(file, stat.st_size, stat.st_mtime_ns)}\x1f".encode())
+    for file in camera_files(folder):
+        digest.update(f"{file.name}\x1f{sorted(open_metadata(file).metadata.items())!r}\x1f".encode())
+    return digest.hexdigest()
+
+
+@lru_cache(maxsize=64)
+def _digest_of(file: Path, _size: int, _mtime_ns: int) -> str:
+    """sha256 of a file, computed once: clips of a log share its files, logs a city's map."""
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _block(log: Py123dLog, start: int) -> Block:
+    """The block of the clip that starts at step `start`: 20 s that begin at a multiple of 10 s, so that it holds it."""
+    first = start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
+    stop = min(first + BLOCK_STEPS, log.motion.n_steps)
+    sensed = within(log.images, first, stop), within(log.sweeps, first, stop)
+    return Block(first * STEP_S, present(log.agents.window(first, stop)), *sensed)

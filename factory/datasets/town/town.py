@@ -1,0 +1,432 @@
+"""The town as one object, and its logs' plans: pure functions of the seed, nothing is written here."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import cached_property, lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.feather
+import shapely
+from scipy.spatial.transform import Rotation
+
+from factory.datasets.av2.log import POSE_COLUMNS, SIZE_COLUMNS
+from factory.datasets.town.draw import MOUNT_M, REAR_AXLE_Z_M, Theatre, build_rig, paint, scan, world_from_ego
+from factory.datasets.town.drive import GREEN, RED, SCENARIOS, YELLOW, TownDrive, TownTrack, parked_cars, plan_drive
+from factory.datasets.town.scenery import Scenery, build_scenery
+from factory.datasets.town.streets import Streets, TownLane, build_streets
+from factory.exits import as_worker, without_terminal
+from factory.readers.settings import LOG_STEPS, LOGS_PER_TOWN, STEPS_PER_SWEEP, TownSettings
+from factory.readers.whole_folder import finish_whole, make_whole, mend, unfinished_folder
+from factory.wording import time_text
+from tasks.world.arrays import Array, Ints
+from tasks.world.camera import Camera
+
+WINDOWS_PER_LOG = 3  # of 9.5 s at stride 1 s
+
+
+@dataclass(frozen=True)
+class Town:
+    """Streets, what is parked there, what it looks like, and its weather."""
+
+    seed: int
+    number: int
+    streets: Streets
+    parked: tuple[TownTrack, ...]
+    sun_azimuth: float
+    sun_elevation: float
+    sky_seed: int
+
+    @property
+    def name(self) -> str:
+        """As the files of its map say it."""
+        return f"SYN{self.number:02d}"
+
+    @cached_property
+    def scenery(self) -> Scenery:
+        """Houses, trees, road marks: seconds to build, so logs that nobody sees go without."""
+        return build_scenery(self.streets, np.random.default_rng([self.seed, self.number, 2]))
+
+
+@lru_cache(maxsize=1)
+def build_town(seed: int, number: int) -> Town:
+    """Town `number` of a seed."""
+    streets = build_streets(np.random.default_rng([seed, number, 0]))
+    parked = parked_cars(streets, np.random.default_rng([seed, number, 1]))
+    rng = np.random.default_rng([seed, number, 3])
+    return Town(
+        seed,
+        number,
+        streets,
+        parked,
+        float(rng.uniform(-np.pi, np.pi)),
+        float(np.deg2rad(rng.uniform(35.0, 55.0))),
+        int(rng.integers(1 << 20)),
+    )
+
+
+def log_name(seed: int, index: int) -> str:
+    """The log's id; sorts in the order of the logs."""
+    kind = SCENARIOS[index % LOGS_PER_TOWN].kind.lower().replace(" ", "-")
+    return f"town-{seed}-{index:04d}-{kind}"
+
+
+def plan_log(seed: int, index: int) -> tuple[Town, TownDrive]:
+    """The drive of log `index`, and the town it leads through."""
+    town = build_town(seed, index // LOGS_PER_TOWN)
+    return town, plan_drive(town.streets, town.parked, SCENARIOS[index % LOGS_PER_TOWN], LOG_STEPS, [seed, index, 4])
+
+
+# Writes drives through the town as Argoverse 2 sensor logs, plus one file for the phases of the lights.
+#
+# Argoverse 2's layout (Wilson et al. 2021): annotations, ego poses, calibration, vector map, images and sweeps by
+# stamp.
+
+LICENCE = "Apache-2.0 (synthetic)"
+ANNOTATION_RANGE_M = 100.0
+MAP_RANGE_M = 260.0  # of the drive
+LIDARS = ("up_lidar", "down_lidar")  # Argoverse's two names, which converters look up; here they are one and the same
+STEP_NS = 100_000_000
+FIRST_STAMP_NS = 315_970_000_000_000_000
+LOG_SPACING_NS = 60_000_000_000
+STATE_NAMES = {GREEN: "GREEN", YELLOW: "YELLOW", RED: "RED"}
+
+
+def write_town(out: Path, n_clips: int, seed: int, settings: TownSettings, threads: int = 2) -> list[Path]:
+    """Writes the logs that hold the seed's first `n_clips` clips under `out`; returns their folders.
+
+    Logs are whole, so the last may hold up to two windows more. The same arguments give the same bytes, whatever
+    `threads`; a longer run starts with the logs of a shorter one. Raises ValueError for n_clips < 1.
+    """
+    if n_clips < 1:
+        raise ValueError(f"a town needs at least one clip, not {n_clips}")
+    return write_logs(out, range(-(-n_clips // WINDOWS_PER_LOG)), seed, settings, threads)
+
+
+def write_logs(out: Path, indices: Collection[int], seed: int, settings: TownSettings, threads: int = 2) -> list[Path]:
+    """Writes these logs of the seed under `out`; a log's bytes depend on its index, not on the others.
+
+    Logs with sensors take seconds each, so how far it is goes to stderr.
+    """
+    folders, began = [], time.monotonic()
+    for number, i in enumerate(indices, start=1):
+        folders.append(write_log(out / log_name(seed, i), *plan_log(seed, i), settings, i, threads))
+        if settings.cameras or settings.lidar_beams:
+            left = time_text((time.monotonic() - began) / number * (len(indices) - number))
+            print(f"town {seed}: log {number} of {len(indices)} painted  ETA {left}", file=sys.stderr, flush=True)
+    return folders
+
+
+def write_log(
+    folder: Path, town: Town, drive: TownDrive, settings: TownSettings, number: int = 0, threads: int = 2
+) -> Path:
+    """Writes one drive as a log folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    stamps = FIRST_STAMP_NS + number * LOG_SPACING_NS + np.arange(LOG_STEPS, dtype=np.int64) * STEP_NS
+    _feather(folder / "city_SE3_egovehicle.feather", _poses(drive, stamps))
+    _feather(folder / "annotations.feather", _annotations(drive, stamps))
+    if lights := _lights(town.streets, drive, stamps):
+        _feather(folder / "traffic_lights.feather", lights)
+    rig = build_rig(settings.cameras, settings.width, settings.height)
+    _calibration(folder, rig, LIDARS if settings.lidar_beams else ())
+    (folder / "map").mkdir(exist_ok=True)
+    content = json.dumps(_vector_map(town.streets, drive), separators=(",", ":"))
+    (folder / "map" / f"log_map_archive_{folder.name}____{town.name}_city_0.json").write_text(content, encoding="utf-8")
+    (folder / "LICENSE").write_text(
+        f"{LICENCE}\nMade by the data factory's synthetic town; test data.\n", encoding="utf-8"
+    )
+    _sensors(folder, town, drive, rig, settings, stamps, threads)
+    return folder
+
+
+def _sensors(
+    folder: Path,
+    town: Town,
+    drive: TownDrive,
+    rig: tuple[Camera, ...],
+    settings: TownSettings,
+    stamps: Ints,
+    threads: int,
+) -> None:
+    kinds = [f"cameras/{camera.name}" for camera in rig] + ["lidar"] * bool(settings.lidar_beams)
+    if not kinds:
+        return
+    theatre = Theatre(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)
+    for kind in kinds:
+        (folder / "sensors" / kind).mkdir(parents=True, exist_ok=True)
+    photographed = range(0, settings.photo_steps if rig else 0, settings.steps_per_photo)
+    swept = range(0, LOG_STEPS if settings.lidar_beams else 0, STEPS_PER_SWEEP)
+
+    def record(step: int) -> None:
+        scene, pose, stamp = theatre.at(step), world_from_ego(drive.ego[step]), int(stamps[step])
+        for camera in rig if step in photographed else ():
+            picture = cv2.cvtColor(paint(scene, camera, pose), cv2.COLOR_RGB2BGR)
+            _ok, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality])
+            (folder / "sensors" / "cameras" / camera.name / f"{stamp}.jpg").write_bytes(jpeg.tobytes())
+        if step in swept:
+            sweep = scan(scene, pose, settings.lidar_beams, settings.lidar_azimuths)
+            columns = {axis: pa.array(sweep.points[:, k]) for k, axis in enumerate("xyz")}
+            columns |= {name: pa.array(getattr(sweep, name)) for name in ("intensity", "laser_number", "offset_ns")}
+            _feather(folder / "sensors" / "lidar" / f"{stamp}.feather", columns)
+
+    with ThreadPoolExecutor(max_workers=threads) as pool:
+        list(pool.map(record, sorted({*photographed, *swept})))
+
+
+def _feather(path: Path, columns: Mapping[str, Any]) -> None:
+    pyarrow.feather.write_feather(pa.table(columns), path)
+
+
+def _yaw_columns(yaw: Array) -> dict[str, Any]:
+    zero = np.zeros(len(yaw))
+    return {"qw": np.cos(yaw / 2), "qx": zero, "qy": zero, "qz": np.sin(yaw / 2)}
+
+
+def _poses(drive: TownDrive, stamps: Ints) -> dict[str, Any]:
+    place = {"tx_m": drive.ego[:, 0], "ty_m": drive.ego[:, 1], "tz_m": np.full(len(stamps), REAR_AXLE_Z_M)}
+    return {"timestamp_ns": stamps, **_yaw_columns(drive.ego[:, 2]), **place}
+
+
+def _annotations(drive: TownDrive, stamps: Ints) -> dict[str, Any]:
+    """One row per box and frame, box pose in the ego frame of that frame."""
+    poses = np.stack([track.poses for track in drive.tracks], axis=1)
+    delta = poses[..., :2] - drive.ego[:, None, :2]
+    step, which = np.nonzero(np.hypot(delta[..., 0], delta[..., 1]) < ANNOTATION_RANGE_M)
+    heading = drive.ego[step, 2]
+    dx, dy = delta[step, which].T
+    sizes = np.array([track.size for track in drive.tracks])[which]
+    distance = np.hypot(dx, dy)
+    return {
+        "timestamp_ns": stamps[step],
+        "track_uuid": [drive.tracks[k].track_id for k in which],
+        "category": [drive.tracks[k].category for k in which],
+        **dict(zip(SIZE_COLUMNS, sizes.T)),
+        **_yaw_columns(poses[step, which, 2] - heading),
+        "tx_m": np.cos(heading) * dx + np.sin(heading) * dy,
+        "ty_m": -np.sin(heading) * dx + np.cos(heading) * dy,
+        "tz_m": sizes[:, 2] / 2 - REAR_AXLE_Z_M,
+        "num_interior_pts": np.maximum(1, 40_000 / np.maximum(distance, 4.0) ** 2).astype(np.int64),
+    }
+
+
+def _lights(streets: Streets, drive: TownDrive, stamps: Ints) -> dict[str, Any]:
+    """A row per frame and light-governed connector of the map; empty where it has none."""
+    governed = [lane for lane in _near_lanes(streets, drive) if lane.light_group >= 0]
+    if not governed:
+        return {}
+    states = {
+        group: [STATE_NAMES[drive.signals.state(group, float(t))] for t in drive.times_s]
+        for group in sorted({lane.light_group for lane in governed})
+    }
+    return {
+        "timestamp_ns": np.tile(stamps, len(governed)),
+        "lane_id": np.repeat(np.array([lane.lane_id for lane in governed], np.int64), len(stamps)),
+        "state": [state for lane in governed for state in states[lane.light_group]],
+    }
+
+
+def _calibration(folder: Path, rig: tuple[Camera, ...], lidars: tuple[str, ...]) -> None:
+    """Intrinsics of the cameras, and how cameras and lidars are mounted; nothing for a town without cameras."""
+    if not rig:
+        return
+    (folder / "calibration").mkdir(exist_ok=True)
+    names, k = {"sensor_name": [camera.name for camera in rig]}, np.array([camera.intrinsics for camera in rig])
+    intrinsics = {"fx_px": k[:, 0, 0], "fy_px": k[:, 1, 1], "cx_px": k[:, 0, 2], "cy_px": k[:, 1, 2]}
+    intrinsics |= dict.fromkeys(("k1", "k2", "k3"), np.zeros(len(rig)))
+    sides = {f"{side}_px": np.array([getattr(c, side) for c in rig], np.uint16) for side in ("height", "width")}
+    _feather(folder / "calibration" / "intrinsics.feather", names | intrinsics | sides)
+    mounts = np.array([camera.ego_from_camera for camera in rig])
+    columns = np.column_stack([Rotation.from_matrix(mounts[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]], mounts[:, :3, 3]])
+    level = np.array([[1.0, 0.0, 0.0, 0.0, *MOUNT_M]] * len(lidars)).reshape(-1, len(POSE_COLUMNS))
+    poses = {"sensor_name": [*names["sensor_name"], *lidars]}
+    poses |= dict(zip(POSE_COLUMNS, np.concatenate([columns, level]).T))
+    _feather(folder / "calibration" / "egovehicle_SE3_sensor.feather", poses)
+
+
+def _near_lanes(streets: Streets, drive: TownDrive) -> list[TownLane]:
+    middle = drive.ego[len(drive.ego) // 2, :2]
+    return [lane for lane in streets.lanes.values() if np.hypot(*(lane.center[:, :2] - middle).T).min() < MAP_RANGE_M]
+
+
+def _vector_map(streets: Streets, drive: TownDrive) -> dict[str, dict[str, Any]]:
+    """The vector map around the drive; a neighbour's or successor's id may lie outside it, as in Argoverse's crops."""
+    lanes = {
+        str(lane.lane_id): {
+            "id": lane.lane_id,
+            "is_intersection": lane.is_intersection,
+            "lane_type": lane.kind,
+            "left_lane_boundary": _points(_thinned(lane.left)),
+            "left_lane_mark_type": lane.left_mark,
+            "right_lane_boundary": _points(_thinned(lane.right)),
+            "right_lane_mark_type": lane.right_mark,
+            "successors": lane.successors,
+            "predecessors": lane.predecessors,
+            "right_neighbor_id": lane.right_neighbor,
+            "left_neighbor_id": lane.left_neighbor,
+        }
+        for lane in _near_lanes(streets, drive)
+    }
+    areas = {
+        str(1 + k): {"area_boundary": _points(_simplified(ring)), "id": 1 + k} for k, ring in enumerate(streets.areas)
+    }
+    crossings = {
+        str(501 + k): {"edge1": _points(crossing.edge1), "edge2": _points(crossing.edge2), "id": 501 + k}
+        for k, crossing in enumerate(streets.crossings)
+    }
+    return {"lane_segments": lanes, "drivable_areas": areas, "pedestrian_crossings": crossings}
+
+
+def _points(line: Array) -> list[dict[str, float]]:
+    return [{"x": round(float(x), 4), "y": round(float(y), 4), "z": 0.0} for x, y in line[:, :2]]
+
+
+def _simplified(ring: Array) -> Array:
+    """The ring without the points that lie within 1 cm of its other edges."""
+    return np.asarray(shapely.Polygon(ring).simplify(0.01).exterior.coords)[:-1]
+
+
+def _thinned(line: Array) -> Array:
+    """Every other point of more than four, both ends kept: 2 m apart."""
+    return line if len(line) <= 4 else line[np.unique(np.append(np.arange(0, len(line) - 1, 2), len(line) - 1))]
+
+
+# Several towns at once, each written by a process of its own: planning a drive is Python, and holds the interpreter.
+#
+#     python -m factory.datasets.town.town <a town as JSON>       what such a process runs
+#
+# The process that waits for them owns the folders they write in. To stop them it kills them and removes those: an
+# interrupt is an exception in Python, and one that arrives while a kernel is compiled or loaded is lost in a
+# callback. They end with it, however it ends: it holds the other end of the pipe that is their standard input.
+#
+# Only towns with sensors are worth a process, which starts in seconds: a log without cameras and lidar is written in
+# two.
+
+MOST_PAINTERS = 8  # processes; each takes half a gigabyte
+LOOK_EVERY_S = 0.1
+
+
+@dataclass(frozen=True)
+class TownFolder:
+    """The chosen logs of one seed's town, and the folder that holds them or will."""
+
+    seed: int
+    indices: tuple[int, ...]
+    root: Path
+
+    def logs(self) -> dict[str, Path]:
+        """Log id -> folder, of logs that may not be written yet."""
+        return {name: self.root / name for name in (log_name(self.seed, index) for index in self.indices)}
+
+
+def write_one(town: TownFolder, settings: TownSettings) -> None:
+    """Writes the town whole, unless it is there."""
+    make_whole(town.root, lambda folder: write_logs(folder, town.indices, town.seed, settings))
+
+
+def mend_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
+    """Makes the files of those that are there and damaged again."""
+    for town in towns:
+        if town.root.is_dir():
+            mend(town.root, partial(write_logs, indices=town.indices, seed=town.seed, settings=settings))
+
+
+def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
+    """Writes the towns that are missing, as many at once as there are cores; how far it is goes to stderr.
+
+    Raises what a process was refused a file with, a full disk say, as if the town had been written here; RuntimeError
+    where it ended otherwise, with what it said on stderr. The towns that others were writing are given up then.
+    Interrupted, it leaves whole towns and nothing else.
+    """
+    missing = [town for town in towns if not town.root.is_dir()]
+    at_once = min(len(missing), os.cpu_count() or 1, MOST_PAINTERS) if settings.cameras or settings.lidar_beams else 1
+    done, began = 0, time.monotonic()
+
+    def show(town: TownFolder) -> None:
+        nonlocal done
+        done += 1
+        left = (time.monotonic() - began) / done * (len(missing) - done)
+        told = f"town {done} of {len(missing)}: seed {town.seed}, {len(town.indices)} logs painted"
+        print(f"{told}  ETA {time_text(left)}", file=sys.stderr, flush=True)
+
+    if at_once <= 1:
+        for town in missing:
+            write_one(town, settings)
+            show(town)
+        return
+    waiting, painting, begun = deque(missing), dict[subprocess.Popen[bytes], TownFolder](), list[Path]()
+    lifeline, held = os.pipe()
+    try:
+        while waiting or painting:
+            while waiting and len(painting) < at_once:
+                town = waiting.popleft()
+                begun.append(unfinished_folder(town.root))
+                with without_terminal():
+                    painting[_painter(town, begun[-1], settings, lifeline)] = town
+            for child in [child for child in painting if child.poll() is not None]:
+                town = painting.pop(child)
+                if refused := _refused(child):
+                    raise refused
+                if child.returncode != 0:
+                    ended = f"its process ended with exit {child.returncode} and said above why"
+                    raise RuntimeError(
+                        f"town {town.seed}: {ended}; towns that are written stay, the same command goes on"
+                    )
+                show(town)
+            time.sleep(LOOK_EVERY_S)
+    finally:
+        os.close(held)
+        os.close(lifeline)
+        for child in painting:
+            child.kill()
+        for child in painting:
+            child.communicate()
+        for folder in begun:
+            shutil.rmtree(folder, ignore_errors=True)  # where its town is whole, it is gone
+
+
+def _painter(town: TownFolder, unfinished: Path, settings: TownSettings, lifeline: int) -> "subprocess.Popen[bytes]":
+    told = {"seed": town.seed, "indices": town.indices, "root": str(town.root), "settings": asdict(settings)}
+    command = [sys.executable, "-m", __name__, json.dumps(told | {"unfinished": str(unfinished)})]
+    return subprocess.Popen(command, stdin=lifeline, stdout=subprocess.PIPE)  # noqa: S603 - a list, no shell
+
+
+def _refused(ended: "subprocess.Popen[bytes]") -> OSError | None:
+    """What a painter that ended was refused, as it told."""
+    told, _ = ended.communicate()
+    return OSError(*json.loads(told)) if told else None
+
+
+def main(told: str) -> None:
+    """A painter's process: one town, on one core. Tells on standard output what it is refused."""
+    as_worker()
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    town = json.loads(told)
+    arguments = town["indices"], town["seed"], TownSettings(**town["settings"])
+    unfinished, root = Path(town["unfinished"]), Path(town["root"])
+    try:
+        finish_whole(unfinished, root, lambda folder: write_logs(folder, *arguments, threads=1))
+    except OSError as error:
+        if error.errno is None:
+            raise
+        print(json.dumps([error.errno, error.strerror, os.fspath(error.filename)]))
+
+
+def _end_with_input() -> None:
+    os.read(sys.stdin.fileno(), 1)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

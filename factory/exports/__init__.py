@@ -1,1 +1,0 @@
-"""Samples in the layouts of other people's code."""

@@ -1,1 +1,0 @@
-"""Other people's samples and benchmarks as tables of ours."""

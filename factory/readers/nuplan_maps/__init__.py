@@ -1,1 +1,0 @@
-"""nuPlan's maps: GeoPackages read once into arrays, and the part of a city around a drive as a RoadMap."""
