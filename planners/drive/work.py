@@ -15,12 +15,10 @@ from factory.stages.painted import town_lights
 from factory.store.location import Location
 from factory.store.schema import canonical_json
 from planners.drive.drivers import Driver, driver_of
-from planners.drive.eyes import Eyes, NoEyes
+from planners.drive.eyes import Eyes, NoEyes, PaintedEyes, RenderedEyes, rendered_eyes
 from planners.drive.films import write_film
 from planners.drive.loop import DRIVE_VERSION, ClosedLoop, drive
 from planners.drive.measures import measures_of
-from planners.drive.painted import PaintedEyes
-from planners.drive.rendered import RenderedEyes, rendered_eyes
 from planners.drive.settings import DriveSettings, Pictures
 from planners.drive.starts import LOGGED, DriveStart, lengthened, logged_start, perturbed_starts
 from planners.drive.table import DriveKey, DriveRow

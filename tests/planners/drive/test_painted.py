@@ -15,8 +15,7 @@ from factory.exits import BAD_CONFIG, COMPLETE
 from factory.readers.settings import TownSettings
 from factory.stages.painted import town_lights, town_log
 from planners.drive.drive import main
-from planners.drive.eyes import NoEyes, Sight
-from planners.drive.painted import PaintedEyes
+from planners.drive.eyes import NoEyes, PaintedEyes, Sight
 from planners.drive.starts import lengthened, logged_start
 from tasks.render.scene.asset import psnr
 from tasks.render.settings import Frames, RenderSettings

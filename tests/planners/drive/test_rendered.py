@@ -8,7 +8,7 @@ import pytest
 from factory.datasets.town.reader import SyntheticReader
 from factory.readers.base import BadClip
 from factory.readers.settings import TownSettings
-from planners.drive.rendered import RenderedEyes, rendered_eyes
+from planners.drive.eyes import RenderedEyes, rendered_eyes
 from planners.drive.starts import lengthened, logged_start
 from tasks.render.scene.asset import psnr
 from tasks.render.settings import Frames, PsnrGate, RenderSettings, SceneFrom

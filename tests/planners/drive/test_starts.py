@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from planners.drive.road import road_from
+from planners.drive.loop import road_from
 from planners.drive.starts import known_places, lengthened, perturbed_starts
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.rollout.settings import TrafficSettings
