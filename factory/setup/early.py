@@ -62,8 +62,8 @@ def refuse_cameras_of_no_rig(config: RunConfig) -> None:
 
 
 def _scenarionet_rig(root: Path, clips: Mapping[str, Any]) -> tuple[str, ...]:
-    from factory.datasets.scenarionet.photos import camera_names, sidecars_of
     from factory.datasets.scenarionet.reader import scenario_files
+    from factory.datasets.scenarionet.sidecars import camera_names, sidecars_of
 
     try:
         log_ids = [log_id for log_id in scenario_files(root) if not clips["only"] or log_id in clips["only"]]
@@ -73,7 +73,7 @@ def _scenarionet_rig(root: Path, clips: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _argoverse_rig(root: Path, only: Sequence[str]) -> tuple[str, ...]:
-    from factory.datasets.av2.log import camera_names, log_folders
+    from factory.datasets.av2.folders import camera_names, log_folders
 
     try:
         folders = log_folders(root)

@@ -68,7 +68,7 @@ class Location:
         try:
             with filesystem.open_input_stream(f"{base}/{name}", compression=None) as stream:
                 return bytes(stream.read())
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):  # the latter: below a file
             return None
 
     def has(self, name: str) -> bool:

@@ -14,7 +14,7 @@ from pyarrow.feather import write_feather
 
 from factory.__main__ import main
 from factory.commands.completion import settings_of
-from factory.datasets.av2.log import INTRINSICS, POSES
+from factory.datasets.av2.folders import INTRINSICS, POSES
 from tasks.render.rigs import RIGS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -109,7 +109,9 @@ WRONG = [
     run("out=ftp://host/x", says=["a URL of s3, gs"]),
     run("clips=scenarionet", "clips.root=a_folder", says=["a_folder: no scenario here"]),
     run("clips=custom", "clips._target_=factory.datasets.av2.reader.AV2Raeder", says=["did you mean AV2Reader?"]),
-    run("clips=custom", "clips._target_=factory.datasets.av3.Reader", says=["factory.datasets has no av3", "mean av2?"]),
+    run(
+        "clips=custom", "clips._target_=factory.datasets.av3.Reader", says=["factory.datasets has no av3", "mean av2?"]
+    ),
     run("clips=custom", "clips._target_=a_module.Reader", says=["a_module cannot be imported: KeyError: 'x'"]),
     run("+expert.x._target_=tasks.experts.human.Humann", "experts=[x]", says=["has no Humann; did you mean Human?"]),
     run(

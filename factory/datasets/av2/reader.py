@@ -14,17 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from factory.datasets.av2.folders import ANNOTATIONS, EXTRINSICS, INTRINSICS, POSES, log_folders
 from factory.datasets.av2.log import (
-    ANNOTATIONS,
-    EXTRINSICS,
-    INTRINSICS,
     POSE_COLUMNS,
-    POSES,
     SAME_FRAME_S,
     LogMotion,
     agents_at,
     ego_states_at,
-    log_folders,
     numbers,
     observed_at,
     read_feather,

@@ -16,14 +16,8 @@ from typing import Any
 import numpy as np
 
 from factory.datasets.scenarionet.map import road_map, traffic_lights
-from factory.datasets.scenarionet.photos import (
-    NO_PHOTOGRAPHS,
-    Photographs,
-    in_step,
-    load_sidecar,
-    read_photographs,
-    sidecars_of,
-)
+from factory.datasets.scenarionet.photos import NO_PHOTOGRAPHS, Photographs, in_step, read_photographs
+from factory.datasets.scenarionet.sidecars import load_sidecar, sidecars_of
 from factory.datasets.scenarionet.tracks import (
     SOURCES,
     Source,

@@ -77,8 +77,8 @@ def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
     ("choice", "n_least"),
     [
         *((name, 12) for name in ("synthetic", "synthetic_towns")),
-        *((f"{name} clips.root=x", 15) for name in ("av2", "scenarionet", "py123d")),
-        ("navsim clips.root=x clips.maps=x", 17),
+        *((f"{name} clips.root=x", 14) for name in ("av2", "scenarionet", "py123d")),
+        ("navsim clips.root=x clips.maps=x", 16),
     ],
 )
 def test_a_home_folder_is_one_in_every_key_that_takes_text(

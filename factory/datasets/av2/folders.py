@@ -1,0 +1,49 @@
+"""Where the logs of an Argoverse 2 folder lie, and the names of their cameras: all that can be told at once.
+
+Light: numpy is loaded where a calibration is opened, and not before.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import get_args
+
+from factory.files import folders_in
+from factory.readers.settings import Split
+
+POSES, ANNOTATIONS = "city_SE3_egovehicle.feather", "annotations.feather"
+INTRINSICS, EXTRINSICS = "calibration/intrinsics.feather", "calibration/egovehicle_SE3_sensor.feather"
+
+
+def log_folders(root: Path) -> dict[str, Path]:
+    """Log id -> folder, sorted by id. Raises ValueError where the root is no Argoverse 2 folder."""
+    if _is_log(root):
+        return {root.name: root}
+    if not root.is_dir():
+        raise ValueError(f"{root}: no such folder")
+    there = folders_in(root)
+    parents = [root / split for split in get_args(Split) if root / split in there] or [root]
+    folders = {folder.name: folder for parent in parents for folder in folders_in(parent) if _is_log(folder)}
+    if not folders:
+        raise ValueError(
+            f"{root}: no Argoverse 2 sensor log here; expected .../sensor, its train, val or test folder, or one log"
+        )
+    return dict(sorted(folders.items()))
+
+
+def camera_names(folders: Iterable[Path]) -> tuple[str, ...]:
+    """The rig of the first log with a calibration that can be read, in file order; none where no log has one.
+
+    What is wrong with the others is told when they are read.
+    """
+    from pyarrow.feather import read_table
+
+    for folder in folders:
+        try:
+            return tuple(read_table(folder / INTRINSICS, ["sensor_name"])["sensor_name"].to_pylist())
+        except (OSError, ValueError):  # Arrow's errors are of these kinds; not there, or no feather file
+            continue
+    return ()
+
+
+def _is_log(folder: Path) -> bool:
+    return any((folder / name).exists() for name in (ANNOTATIONS, POSES))
