@@ -97,10 +97,10 @@ mutants: install
 	$(PY) -m factory warm
 	$(PY) -m tests.mutants --only "$(ONLY)" -j $(or $(J),2)
 
-# All quick tables, or NAME=reward (or another tests/bench/bench_*.py) ARGS="its own": loader's threads= and table=,
-# planners' device=, render's scene file. PEER=<...> of reward, traffic and render: what runs beside; see there.
+# All quick tables, or NAME=reward (or another tests/bench/bench_*.py) ARGS="its own": planners' device=, render's scene
+# file. PEER=<...> of reward, traffic and render: what runs beside; see there.
 bench: install
-	$(if $(filter reward loader memory,$(NAME)),OMP_NUM_THREADS=1) $(PY) -m tests.bench$(if $(NAME),.bench_$(NAME)) $(ARGS)
+	$(if $(filter reward,$(NAME)),OMP_NUM_THREADS=1) $(PY) -m tests.bench$(if $(NAME),.bench_$(NAME)) $(ARGS)
 
 # Where there is a GPU: whether render.backend=gsplat agrees with the CPU, and how fast it is beside plain gsplat. PyTorch
 # with CUDA comes by TORCH=torch==2.13.0; gsplat compiles its kernels the first time (needs nvcc, some minutes).

@@ -134,5 +134,5 @@ def human_sample(
 ) -> Judged:
     """The drive from the log at T, scored under log replay and never filtered."""
     plan = expert.plan(scene, rng)
-    assert isinstance(plan, Plan), "who is tried once always has a plan"
+    assert isinstance(plan, Plan), "an expert that drives once a clip always has a plan"
     return drive_and_judge(scene, plan, TrafficSettings(mode="replay"), planner, timed)

@@ -359,7 +359,7 @@ class Driver:
                 self.notes.append(f"{in_hand} tasks did not end within {DRAIN_S:.0f} s of the signal: left undone")
                 self._deadline += WRITE_S
                 break
-            if idle and (self.interrupted or not self._queue):  # half a block is left: the next run goes on with it
+            if idle and (self.interrupted or not self._queue):  # the next run continues a half-built block
                 break
         gatherer.send()
         while time.monotonic() < self._deadline and (

@@ -240,8 +240,8 @@ def identity_of(
 ) -> RunIdentity:
     """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it.
 
-    Candidates are numbered among the vocabulary's and the clips' own starts together: with starts the vocabulary's
-    digest, and so every attempt's id, is of both.
+    Candidates of the vocabulary and start states of the clips' own share one numbering, so where there are starts the
+    vocabulary's digest, and with it every attempt's id, covers both.
     """
     science: dict[str, Any] = {
         "perturb": config.perturb,

@@ -130,7 +130,7 @@ def _resumed(begun: Path, start: FitState) -> FitState:
 
 
 ASSET_VERSION = 10  # raised by hand when the same sensors give another scene, or it is kept otherwise
-PARALLAX_SHARE = 0.9  # without lidar, a photo with no other in stereo reach shows sky alone; so few may be like that
+PARALLAX_SHARE = 0.9  # without lidar, the least share of photos with another one close enough for stereo
 
 
 class Sensing(Enum):

@@ -73,7 +73,7 @@ def parts_of(
 def compiling_ahead(parts: Sequence[str]) -> Iterator[None]:
     """Compiles beside what is done inside, and gives up what is not compiled at the end of it.
 
-    Who needs the kernels inside calls `compile_kernels` as ever: it waits for this, and tells what could not be done.
+    Code inside that needs the kernels calls `compile_kernels` as usual, which waits for these and raises what failed.
     """
     enough = Event()
 

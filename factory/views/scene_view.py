@@ -61,7 +61,7 @@ NOTHING = DrivesHere((), {})
 
 
 def drives_through(store: "Store", asset: RenderAsset) -> DrivesHere:
-    """The samples whose now lies in the scene's stretch of its log, or, of a scene of none, drawn from it."""
+    """Samples whose now lies in the scene's block of its log; of a scene without a block, those drawn from it."""
     from factory.views.show import logged_drive
 
     samples, logged = [], {}

@@ -5,7 +5,7 @@
     python -m tests.bench.bench_planners device=cuda batch=8 planners=ltf,gtrs_dense
 
 Random batches in memory: forward, backward and the optimiser's step; planning beside it. On a CPU it is CPU time.
-Memory is the most that PyTorch held on a GPU, or the process. Nothing is read from disk, see bench_loader for that.
+Memory is the most that PyTorch held on a GPU, or the process. Nothing is read from disk, see bench_decoding for that.
 """
 
 import sys
