@@ -94,7 +94,9 @@ def trained(home: Path, *words: str) -> tuple[list[str], dict[str, Any]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("page", "asked", "size"), [("README.md", 32, 9), ("docs/extend.md", 64, 3), ("docs/training.md", 32, 9)])
+@pytest.mark.parametrize(
+    ("page", "asked", "size"), [("README.md", 32, 9), ("docs/extend.md", 64, 3), ("docs/training.md", 32, 9)]
+)
 def test_the_documented_first_trainings_take_the_demo_s_table(page: str, asked: int, size: int, demo: Path) -> None:
     """Of three human samples, and of all: the batch is as large as there are, also where one is gone on with."""
     for steps in (2, 4):
