@@ -70,7 +70,7 @@ def photographed(names: Sequence[str]) -> list[list[Bytes]]:
 
 def made_up() -> list[bytes]:
     """JPEGs of 1920 x 1080 and quality 90: of the nuScenes keyframe's photos where they are at hand, else of noise."""
-    pictures = []
+    pictures: list[Bytes] = []
     for file in sorted(KEYFRAME.rglob("*.jpg")):
         photo = cv2.imread(str(file))[..., ::-1]
         pictures += [np.ascontiguousarray(photo[shift:, shift:]) for shift in range(0, 90, 30)]
@@ -182,7 +182,7 @@ def row(number: int, names: Sequence[str], jpegs: Sequence[Bytes]) -> dict[str, 
 
 def compressed(photos: Sequence[Sequence[Bytes]], layout: ImageLayout) -> None:
     """Size and CPU time of lossless ways to keep a picture, read and written from memory."""
-    pictures = []
+    pictures: list[Bytes] = []
     for jpegs in photos[:8]:
         out = np.empty((layout.height, layout.width, 3), np.uint8)
         stitch(jpegs, layout, out)
