@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from factory.config.arguments import WORD, Refused
-from factory.datasets.navsim.frames import Layout, Missing
+from factory.datasets.navsim.settings import Layout, Missing
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.views.show import find, logged_drive, open_samples
 from factory.views.status import open_store
@@ -124,7 +124,7 @@ def _export_all(request: Request) -> int:
     """All samples in SimScale's layout; the exit code. Raises Refused."""
     from factory.config.compose import need_run_extra
     from factory.datasets.navsim.export import export as export_all
-    from factory.datasets.navsim.frames import ExportSettings
+    from factory.datasets.navsim.settings import ExportSettings
     from factory.graph.each import WorkerDied, each
     from factory.graph.work import Halted
     from factory.store.location import Location

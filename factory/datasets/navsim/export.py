@@ -18,9 +18,6 @@ from factory.datasets.navsim.frames import (
     MOTION,
     N_HISTORY,
     NAMING,
-    CannotExport,
-    ExportSettings,
-    Layout,
     SplitNames,
     is_simulated,
     log_frames,
@@ -31,6 +28,7 @@ from factory.datasets.navsim.frames import (
 from factory.datasets.navsim.manifest import File, Journal, Written, file_of, write_file
 from factory.datasets.navsim.pickles import dumps, write_rewards
 from factory.datasets.navsim.pictures import BLACK, black_picture, shown
+from factory.datasets.navsim.settings import CannotExport, ExportSettings, Layout
 from factory.store.disk import whole_file
 from factory.store.location import Location
 from factory.store.parquet_file import open_parquet

@@ -9,17 +9,8 @@ import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from factory.datasets.navsim.frames import (
-    FRAME_S,
-    N_FRAMES,
-    N_HISTORY,
-    NOW_FRAME,
-    PUBLIC_SIZE,
-    CannotExport,
-    ExportSettings,
-    SampleNames,
-    hex16,
-)
+from factory.datasets.navsim.frames import FRAME_S, N_FRAMES, N_HISTORY, NOW_FRAME, SampleNames, hex16
+from factory.datasets.navsim.settings import PUBLIC_SIZE, CannotExport, ExportSettings
 from factory.store.reader import decoded
 from tasks.render.rigs import pinhole
 from tasks.world.camera import Camera

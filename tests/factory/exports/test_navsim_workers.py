@@ -12,7 +12,7 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.datasets.navsim.export import RowGroup, write_group
-from factory.datasets.navsim.frames import CannotExport, ExportSettings
+from factory.datasets.navsim.settings import CannotExport, ExportSettings
 from factory.store.samples import Store
 from tests.factory.exports.navsim_samples import exported, pictures, quiet, tree
 from tests.planners.samples import write_table

@@ -11,7 +11,8 @@ import pytest
 from factory.commands.table import COMMANDS
 from factory.stages.scene_file import write_scene
 from factory.store.samples import Store
-from factory.views.board.report import FILE, N_LOOKS, N_SAMPLES, TOLD
+from factory.views.board.report import FILE, TOLD
+from factory.views.board.still import N_LOOKS, N_SAMPLES
 from tests.factory.stages.test_scene_file import scene
 from tests.factory.views.board.runs import EVIL, counted, run, told
 
