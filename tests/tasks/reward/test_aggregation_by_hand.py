@@ -6,7 +6,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from tasks.reward.epdms import Scores, human_filtered, relative_progress, score, score_with_ec
+from tasks.reward.epdms import Scores, human_filtered, score, score_with_ec
 from tasks.reward.formula import MULTIPLIERS, WEIGHTS
 from tasks.reward.one_stage import COLUMNS, columns_of, final_score, frame_scores, means_of
 from tasks.reward.two_stage import Group, aggregate, follow_up_weights, group_scores
@@ -40,50 +40,6 @@ def test_a_frames_score_is_over_14_without_and_over_16_with_extended_comfort() -
     assert final_score(row, np.array([NONE]))[0] == pytest.approx(0.17857142857, abs=1e-11)
 
 
-def test_a_perfect_frame_is_1_either_way_and_one_zero_multiplier_makes_it_0() -> None:
-    assert final_score(one_row(), np.array([1.0]))[0] == final_score(one_row(), np.array([NONE]))[0] == 1.0
-    for name in MULTIPLIERS:
-        assert final_score(one_row(**{name: 0.0}), np.array([1.0]))[0] == 0.0
-    # (5 + 0 + 2 + 2) / 14, (5 + 0 + 2 + 2 + 2) / 16
-    assert final_score(one_row(ttc=0.0), np.array([NONE]))[0] == pytest.approx(0.64285714286, abs=1e-11)
-    assert final_score(one_row(ttc=0.0), np.array([1.0]))[0] == 0.6875
-
-
-def test_progress_is_relative_only_where_the_best_compliant_is_more_than_5_m() -> None:
-    def ep(raw: list[float], multiplier: list[float]) -> list[float]:
-        return relative_progress(np.array(raw), np.array(multiplier), False).tolist()
-
-    assert ep([5.0, 2.0], [1, 1]) == [1.0, 1.0]  # 5.0 is not more than 5
-    assert ep([5.0625, 2.53125], [1, 1]) == [1.0, 0.5]
-    assert ep([4.9375, 100.0], [1, 0]) == [1.0, 1.0]  # best compliant 4.9375: everybody 1, the offender too
-    assert ep([8.0, 10.0, 2.0], [1, 0, 0.5]) == [1.0, 1.0, 0.25]  # best 8: 8 / 8, 10 / 8 clipped, 2 / 8
-    assert ep([8.0, 20.0], [1, 0.5]) == [0.8, 1.0]  # best 20 * 0.5 = 10: 8 / 10, 20 / 10 clipped
-    assert ep([0.0, 6.0], [1, 1]) == [0.0, 1.0]
-
-
-def test_pairs_relate_each_row_to_row_0_and_itself_only() -> None:
-    raw = np.array([10.0, 20.0, 4.0])
-    good, first_offends = np.ones(3), np.array([0.0, 1.0, 1.0])
-    assert relative_progress(raw, good, False).tolist() == [0.5, 1.0, 0.2]  # of 20
-    assert relative_progress(raw, good, True).tolist() == [1.0, 1.0, 0.4]  # of 10, 20, 10
-    assert relative_progress(raw, first_offends, False).tolist() == [0.5, 1.0, 0.2]
-    assert relative_progress(raw, first_offends, True).tolist() == [1.0, 1.0, 1.0]  # of 0, 20, 4: only 20 exceeds 5
-
-
-def test_a_scored_batch_on_a_street_adds_up_as_on_paper() -> None:
-    # 4 s at 8, 4 and 10 m/s: 32, 16 and 40 m. The third drives with two wheels off the road (y = -3, road from -2).
-    scores = score(street(), np.concatenate([drive(8.0), drive(4.0), drive(10.0, y=-3.0)]))
-    np.testing.assert_allclose(scores.ep_raw_m, [32.0, 16.0, 40.0], atol=1e-9)
-    np.testing.assert_allclose(scores.ep, [1.0, 0.5, 1.0], atol=1e-12)  # of 32: the offender is clipped
-    assert scores.multiplier.tolist() == [1.0, 1.0, 0.0]
-    assert scores.lk.tolist() == [1.0, 1.0, 0.0]
-    np.testing.assert_allclose(scores.pdm_score, [1.0, 11.5 / 14, 0.0], atol=1e-12)  # 2.5 + 5 + 2 + 2
-    np.testing.assert_allclose(score_with_ec(scores, np.ones(3)), [1.0, 13.5 / 16, 0.0], atol=1e-12)
-    # Against row 0 alone nothing changes here, and with the slow one as row 0 the fast one is its own mark.
-    swapped = score(street(), np.concatenate([drive(4.0), drive(8.0)]), normalise="pairs")
-    np.testing.assert_allclose(swapped.ep, [1.0, 1.0], atol=1e-12)
-
-
 def test_the_filter_forgives_what_the_human_fails_entirely_and_nothing_else() -> None:
     # The plan: mult 0 * 0.5 = 0, so 0. The human: NC 0, DDC 0.5.
     plan, human = one_row(nc=0.0, ddc=0.5, ep=0.8, hc=0.0), one_row(nc=0.0, ddc=0.5)
@@ -108,13 +64,6 @@ def test_a_filtered_weighted_column_enters_the_sum_again() -> None:
     # Half a collision of the plan is forgiven too where the human has a whole one: 0.5 -> 1
     both = frame_scores(one_row(nc=0.5), one_row(nc=0.0), ec=1.0)
     assert (column(both.unfiltered, "score"), column(both.filtered, "score")) == (0.5, 1.0)
-
-
-def test_half_a_point_of_the_human_and_a_synthetic_frame_filter_nothing() -> None:
-    plan = one_row(nc=0.0, ddc=0.5)
-    for human in (one_row(nc=0.5, ddc=0.5), one_row(), None):
-        both = frame_scores(plan, human, ec=1.0)
-        assert np.array_equal(both.unfiltered, both.filtered)
 
 
 def test_one_stage_means_come_filtered_and_unfiltered_side_by_side() -> None:
@@ -143,6 +92,14 @@ def test_frames_to_score_are_one_plan_each() -> None:
         frame_scores(one_row(), two)
     with pytest.raises(ValueError, match="frames"):
         means_of([])
+
+
+def test_a_group_without_follow_up_frames_is_refused() -> None:
+    frame = frame_scores(one_row(), None)
+    with pytest.raises(ValueError, match="follow-up"):
+        group_scores(Group(frame, np.zeros(2), np.zeros((0, len(COLUMNS))), np.zeros((0, 2))))
+    with pytest.raises(ValueError, match="nothing"):
+        aggregate([])
 
 
 def test_follow_up_weights_are_exp_of_minus_five_distances_squared() -> None:

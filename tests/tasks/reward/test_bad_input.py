@@ -8,7 +8,6 @@ import pytest
 
 from tasks.reward.epdms import score
 from tasks.reward.prepare import prepare
-from tasks.rollout.lqr import track
 from tasks.world.lanes import MapLayer, MapPolygon
 from tests.tasks.reward.random_worlds import random_drives, random_world
 
@@ -85,21 +84,6 @@ def test_states_that_make_no_sense_are_refused_by_name(damage: Any) -> None:
     states = random_drives(7, PAST, 3)
     with pytest.raises(ValueError, match="states"):
         score(prepare(**WORLD), damage(states))
-
-
-@pytest.mark.parametrize(
-    ("state", "poses", "named"),
-    [
-        (with_nan(PAST[-1], 3), np.zeros((2, 40, 3)), "ego"),
-        (PAST[-1, :4], np.zeros((2, 40, 3)), "ego_state0"),
-        (PAST[-1], np.zeros((2, 39, 3)), "poses"),
-        (PAST[-1], np.full((2, 40, 3), np.inf), "poses"),
-        (PAST[-1], np.full((2, 40, 3), -1e300), "poses"),
-    ],
-)
-def test_a_plan_that_makes_no_sense_is_refused_by_name(state: np.ndarray, poses: np.ndarray, named: str) -> None:
-    with pytest.raises(ValueError, match=named):
-        track(state, poses)
 
 
 def test_an_unknown_way_to_relate_progress_is_refused_by_name() -> None:

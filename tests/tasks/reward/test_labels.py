@@ -12,7 +12,7 @@ from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.reward.epdms import Scores, score
 from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
-from tasks.reward.labels import Labelling, reactive_scores, vocabulary_labels
+from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, simulate
@@ -80,12 +80,6 @@ def test_labels_are_the_reward_s_scores_in_pairs_with_pdm_closed(simulated: Judg
     assert len({*np.round(labels.pdm_score(), 3)}) > 10, "a vocabulary of all kinds of drives"
 
 
-def test_in_one_batch_they_are_those_of_the_batch(simulated: Judged) -> None:
-    driven = track(simulated.scene.ego_state, to_world(simulated.scene.ego_state[:3], VOCABULARY.trajectories))
-    batch = score(simulated.prepared, np.concatenate([simulated.reference[None], driven]))
-    np.testing.assert_array_equal(labelled(simulated).ep("batch"), batch.ep[1:])
-
-
 def test_the_judged_drive_itself_is_labelled_as_it_was_judged(simulated: Judged) -> None:
     start = simulated.scene.ego_state[:3]
     local = simulated.plan.poses - [*start[:2], 0.0]  # the street runs along x and the ego with it
@@ -129,18 +123,6 @@ def test_reacting_traffic_answers_to_each_trajectory(human: Judged) -> None:
             assert getattr(labels, name)[i] == getattr(alone, name)[0], (i, name)
     replayed = labelled(human, REPLAY, some)
     assert (labels.nc[6:] > replayed.nc[6:]).any() and (labels.ttc[6:] > replayed.ttc[6:]).any()
-
-
-def test_reactive_scores_are_in_pairs_with_row_0_and_rows_do_not_see_each_other(human: Judged) -> None:
-    scene = human.scene
-    poses = to_world(scene.ego_state[:3], VOCABULARY.trajectories[:5])
-    states = np.concatenate([human.reference[None], track(scene.ego_state, poses)])
-    scores = reactive_scores(scene, states, IDM)
-    labels = labelled(human, IDM, Vocabulary(VOCABULARY.trajectories[:5]))
-    assert_labels_are(labels, scores)
-    assert labels.reference_progress_m == scores.ep_raw_m[0] * scores.multiplier[0]
-    fewer = reactive_scores(scene, states[[0, 4]], IDM)
-    assert fewer.pdm_score[1] == scores.pdm_score[4]
 
 
 def test_a_reference_at_fault_leaves_no_progress_to_be_held_against(human: Judged) -> None:

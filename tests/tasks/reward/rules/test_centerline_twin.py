@@ -140,39 +140,6 @@ def test_exactly_half_a_metre_is_not_off(origin: tuple[float, float]) -> None:
     assert not is_off(line, origin[0] + 60.5, origin[1])
 
 
-@pytest.mark.parametrize(("side", "index"), [(0.5, np.inf), (0.51, 19.0)])
-def test_lane_keeping_counts_twenty_steps_beyond_half_a_metre(side: float, index: float) -> None:
-    line = index_centerline(ALONG_X)
-    assert lane_keeping(line, body_at(np.arange(41.0), np.full(41, side))) == index
-
-
-@pytest.mark.parametrize(
-    ("on_line", "in_junction", "index"),
-    [
-        ([], range(0), 19.0),
-        ([0], range(0), 20.0),
-        ([19], range(0), 39.0),
-        ([20], range(0), 19.0),
-        ([20, 21], range(19, 30), 30.0),  # on the line inside the junction: neither counts nor interrupts
-        ([], range(5, 15), 29.0),
-        ([], range(20, 41), 19.0),
-        ([], range(19, 41), np.inf),
-        ([17, 35], range(0), np.inf),  # runs of 17, 17 and 5
-        ([40], range(21), np.inf),  # 19 counted steps, then back on the line
-        ([3], range(21), 40.0),
-    ],
-)
-def test_a_run_is_broken_by_the_line_and_not_by_a_junction(
-    on_line: list[int], in_junction: range, index: float
-) -> None:
-    y = np.full(41, 0.8)
-    y[on_line] = 0.2
-    flags = np.zeros(41, dtype=np.uint8)
-    flags[list(in_junction)] = CENTER_IN_INTERSECTION
-    body = body_at(np.arange(41.0), y)._replace(flags=flags)
-    assert lane_keeping(index_centerline(ALONG_X), body) == index
-
-
 @pytest.mark.parametrize(
     ("step_m", "ddc", "first"),
     # 11 steps in the window; steps 1.. count, so that after t steps it holds min(t, 11) of them
@@ -184,16 +151,6 @@ def test_driving_direction_sums_eleven_steps_against_traffic(step_m: float, ddc:
     assert driving_direction(body_at(0 * x, -x, ONCOMING | NON_DRIVABLE)) == (ddc, first)
     assert driving_direction(body_at(x, 0 * x, ONCOMING | CENTER_IN_INTERSECTION)) == (1.0, np.inf)
     assert driving_direction(body_at(x, 0 * x, NON_DRIVABLE)) == (1.0, np.inf)
-
-
-def test_two_short_stretches_against_traffic_add_up_only_within_one_window() -> None:
-    x = 0.5 * np.arange(41)
-    flags = np.zeros(41, dtype=np.uint8)
-    flags[[0, 5, 14, 15, 16]] = ONCOMING  # the step into index 0 is none; 5 and 16 are 12 indices: two windows
-    body = body_at(x, 0 * x)._replace(flags=flags)
-    assert driving_direction(body) == (1.0, np.inf)  # 1.5 m: 5, 14, 15 or 14, 15, 16
-    flags[6] = ONCOMING
-    assert driving_direction(body) == (0.5, 15.0)  # 5, 6, 14, 15
 
 
 def test_a_long_centreline_takes_no_more_cells_and_stays_exact() -> None:

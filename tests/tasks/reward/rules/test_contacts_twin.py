@@ -9,11 +9,10 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.kernels.compiled import kernel
 from tasks.reward.rules.contacts import first_collision, first_time_to_collision
-from tasks.reward.rules.ego import MULTIPLE_LANES, NON_DRIVABLE, Body, empty_body, place
+from tasks.reward.rules.ego import MULTIPLE_LANES, NON_DRIVABLE, empty_body, place
 from tasks.reward.rules.map_index import index_map
-from tasks.reward.rules.obstacles import Obstacles, index_obstacles, unindexed, with_objects
+from tasks.reward.rules.obstacles import Obstacles, index_obstacles, unindexed
 from tasks.world.frames import box_corners, to_world
 from tasks.world.lanes import MapLayer, MapPolygon
 from tasks.world.vehicle import HEADING, PACIFICA, VX, VY, X, Y
@@ -171,70 +170,6 @@ def test_both_rules_equal_the_numpy_version(world: World) -> None:
 def test_objects_without_an_index_give_the_same(world: World) -> None:
     plain = unindexed(world.boxes, world.is_stopped, world.collision_score)
     np.testing.assert_array_equal(contacts(world, plain), contacts(world, indexed(world)))
-
-
-@settings(max_examples=60)
-@given(world=worlds(), seed=st.integers(0, 1000))
-def test_the_order_of_objects_changes_nothing(world: World, seed: int) -> None:
-    order = np.random.default_rng(seed).permutation(len(world.is_stopped))
-    shuffled = replace(
-        world,
-        boxes=world.boxes[:, order],
-        is_stopped=world.is_stopped[order],
-        collision_score=world.collision_score[order],
-    )
-    np.testing.assert_array_equal(contacts(shuffled, indexed(shuffled)), contacts(world, indexed(world)))
-
-
-def crowd(seed: int, n_drives: int = 20, n_items: int = 40) -> World:
-    """A world without ties: nothing is aligned with anything."""
-    rng = np.random.default_rng(seed)
-    states = np.stack([drive(rng) for _ in range(n_drives)])
-    boxes = np.stack([item(rng, states[rng.integers(n_drives)]) for _ in range(n_items)], axis=1)
-    boxes[..., :2] += rng.normal(0.0, 0.1, (n_items, 2))
-    boxes[..., 2] += rng.normal(0.0, 0.1, n_items)
-    return World(
-        states=states,
-        flags=rng.choice([0, MULTIPLE_LANES], (n_drives, 41)).astype(np.uint8),
-        crossing=square(1.3, 17.05),
-        boxes=boxes,
-        is_stopped=rng.random(n_items) < 0.2,
-        collision_score=rng.choice([0.0, 0.5], n_items),
-    )
-
-
-@pytest.mark.parametrize("origin", [(1000.0, -2000.0, 0.0), (0.0, 0.0, 2.0), (-5e5, 3e6, -1.1)])
-def test_moving_the_world_changes_nothing(origin: tuple[float, float, float]) -> None:
-    for seed in range(10):
-        world = crowd(seed)
-        found = contacts(world, indexed(world))
-        assert len(np.unique(found[:, 0])) > 1 and np.isfinite(found).any(axis=0).all()
-        elsewhere = moved(world, np.array(origin))
-        np.testing.assert_array_equal(contacts(elsewhere, indexed(elsewhere)), found)
-
-
-@kernel
-def collisions_with(obstacles: Obstacles, traffic: np.ndarray, states: np.ndarray, body: Body) -> np.ndarray:
-    """Index of the first collision (K,) where trajectory k meets traffic[k] of (K, 41, N, 5)."""
-    first = np.empty(len(states))
-    ignored = np.empty(traffic.shape[2], dtype=np.bool_)
-    for k in range(len(states)):
-        met = with_objects(obstacles, traffic[k], obstacles.is_stopped)
-        first[k] = first_collision(met, states[k], body, HALF_LENGTH_M, HALF_WIDTH_M, ignored)[1]
-    return first
-
-
-def test_every_trajectory_can_meet_traffic_of_its_own() -> None:
-    states = np.zeros((3, 41, 11))
-    states[..., X], states[..., VX] = 0.5 * np.arange(41), 5.0
-    body = empty_body(41)
-    place(states[0], PACIFICA.rear_axle_to_center, body)
-    parked_at = np.array([10.0, 14.0, -50.0])
-    traffic = np.tile([0.0, 0.0, 0.0, 4.0, 2.0], (3, 41, 1, 1))
-    traffic[..., 0] += parked_at[:, None, None]
-    objects = unindexed(np.full((41, 1, 5), np.nan), np.ones(1, dtype=bool), np.zeros(1))
-    reached = np.ceil((parked_at - 2.0 - PACIFICA.front_length) / 0.5)
-    assert collisions_with(objects, traffic, states, body).tolist() == [*reached[:2], np.inf]
 
 
 def test_what_is_exactly_ahead_may_count_as_not_ahead_where_rounding_lifts_the_cosine() -> None:

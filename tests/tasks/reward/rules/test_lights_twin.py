@@ -80,18 +80,3 @@ def test_a_body_inside_a_lane_or_around_one_is_on_it_and_in_its_hole_is_not(
     lane: MapPolygon, position: tuple[float, float], is_on: bool
 ) -> None:
     assert np.isfinite(first_reds([lane], np.ones((1, 1), dtype=bool), at(*position), PACIFICA))[0] == is_on
-
-
-def test_a_lane_counts_only_while_it_is_red() -> None:
-    lane = MapPolygon("wide", MapLayer.LANE_CONNECTOR, ring(0.0, 0.0, 50.0))
-    is_red = np.zeros((41, 1), dtype=bool)
-    is_red[17:20] = True
-    states = np.repeat(at(0.0, 0.0), 41, axis=1)
-    assert first_reds([lane], is_red, states, PACIFICA).tolist() == [17.0]
-    assert first_reds([lane], is_red & False, states, PACIFICA).tolist() == [np.inf]
-
-
-def test_a_mask_for_other_lanes_is_refused() -> None:
-    lane = MapPolygon("wide", MapLayer.LANE_CONNECTOR, ring(0.0, 0.0, 50.0))
-    with pytest.raises(ValueError, match=r"mask of red lanes must be \(T, 1\), got \(41, 2\)"):
-        index_red_lanes([lane], np.ones((41, 2), dtype=bool))

@@ -1,7 +1,5 @@
 """The map's index says what shapely says of every point, and refuses rings that make no sense."""
 
-import pickle
-
 import numpy as np
 import pytest
 import shapely
@@ -68,33 +66,6 @@ def square(token: str, x: float, y: float, side: float, layer: MapLayer = MapLay
     return MapPolygon(token, layer, ring)
 
 
-@settings(max_examples=40)
-@given(small_maps(step=0.0), st.integers(0, 1000))
-def test_the_order_of_polygons_changes_nothing(polygons: list[MapPolygon], seed: int) -> None:
-    points = telling_points(polygons, seed, step=0.0)
-    order = np.random.default_rng(seed).permutation(len(polygons))
-    shuffled = [polygons[i] for i in order]
-    route = frozenset(p.token for p in polygons[::2])
-    found = regions_at(index_map(polygons, route), *np.ascontiguousarray(points.T))
-    again = regions_at(index_map(shuffled, route), *np.ascontiguousarray(points.T))
-    assert np.array_equal(found.parts, again.parts)
-
-
-@settings(max_examples=40)
-@given(small_maps(step=0.0), st.integers(0, 1000), st.sampled_from([(0.0, 4e3), (2.2, -7e3), (-0.7, 5e5)]))
-def test_moving_the_world_changes_nothing(polygons: list[MapPolygon], seed: int, motion: tuple[float, float]) -> None:
-    c, s = np.cos(motion[0]), np.sin(motion[0])
-
-    def moved(points: np.ndarray) -> np.ndarray:
-        return points @ np.array([[c, s], [-s, c]]) + np.array([motion[1], 3.0])
-
-    elsewhere = [MapPolygon(p.token, p.layer, moved(p.ring), tuple(map(moved, p.holes))) for p in polygons]
-    points = np.random.default_rng(seed).uniform(-70.0, 70.0, (500, 2))
-    before = regions_at(index_map(polygons, NOBODY), *np.ascontiguousarray(points.T))
-    after = regions_at(index_map(elsewhere, NOBODY), *np.ascontiguousarray(moved(points).T))
-    assert np.array_equal(before.parts, after.parts)
-
-
 def test_polygons_with_the_same_rings_are_one_region_that_plays_all_parts() -> None:
     polygons = [
         square("da", 0.0, 0.0, 9.0, MapLayer.DRIVABLE_AREA),
@@ -135,17 +106,6 @@ def test_a_point_is_in_a_ring_that_touches_itself_where_it_is_enclosed_once() ->
     assert not held(index, np.array([[3.0, 3.0]])).any()
 
 
-def test_a_map_without_polygons_holds_nothing() -> None:
-    assert not held(index_map([], NOBODY), np.array([[0.0, 0.0], [1e9, -3.0]])).any()
-
-
-def test_an_index_survives_pickling() -> None:
-    index = index_map([square("a", 0.0, 0.0, 4.0), square("b", 2.0, 2.0, 4.0)], NOBODY)
-    copy = pickle.loads(pickle.dumps(index))  # bytes of our own: so Ray hands an index to a task
-    points = np.random.default_rng(0).uniform(-1.0, 7.0, (200, 2))
-    assert np.array_equal(held(copy, points), held(index, points))
-
-
 BOW_TIE = [[0, 0], [4, 4], [4, 0], [0, 4]]
 HOLE_ACROSS = [[2, 2], [9, 2], [9, 3], [2, 3]]
 
@@ -173,8 +133,3 @@ def test_a_ring_that_makes_no_sense_is_refused_by_the_polygons_name(ring: list, 
     good = [square(f"g{i}", 30.0 * i, 0.0, 20.0) for i in range(70)]
     with pytest.raises(ValueError, match=f"LANE_CONNECTOR 'lane_7'.*{problem}"):
         index_map([*good, bad], NOBODY)
-
-
-def test_polygons_that_cross_each_other_are_fine() -> None:
-    index = index_map([square("a", 0.0, 0.0, 4.0), square("b", 2.0, 2.0, 4.0)], NOBODY)
-    assert held(index, np.array([[3.0, 3.0]])).sum() == 2
