@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tasks.rollout.rules import CORRIDOR_MARGIN_M, ENTER_CLEARANCE_M, LARGEST_OFFSET_M
+from tasks.rollout.idm import IdmDriver
 from tasks.rollout.simulate import (
     SHORTEST_HEADWAY_S,
     Rollouts,
@@ -19,10 +19,11 @@ from tasks.rollout.simulate import (
     roll_out,
     roll_out_many,
 )
+from tasks.rollout.traffic_state import AgentStates
 from tasks.world.agents import AgentTracks
 from tasks.world.clip import NOW, Rollout
 from tasks.world.vehicle import HEADING, PACIFICA, VX, X, Y
-from tests.tasks.rollout import slow_corridor, slow_idm, worlds
+from tests.tasks.rollout import slow_idm, worlds
 
 Array = NDArray[np.float64]
 
@@ -36,23 +37,21 @@ def slow_roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
     scene, of = traffic.scene, traffic.settings
     window = scene.agents.window(scene.step, scene.step + 41)
     assert traffic.roles is not None and traffic.paths is not None
-    paths = traffic.paths._asdict()
-    del paths["stretches"]
     heading, speed = ego_states[:, HEADING], ego_states[:, VX]
     cos, sin = np.cos(heading), np.sin(heading)
     size = np.full((41, 2), (PACIFICA.length, PACIFICA.width))
     x, y = (ego_states[:, k] + PACIFICA.rear_axle_to_center * d for k, d in ((X, cos), (Y, sin)))
     headway_s = of.headway_s if traffic.yielding is None else min(of.headway_s, SHORTEST_HEADWAY_S)
-    driver = slow_idm.IdmDriver(
+    driver = IdmDriver(
         of.min_gap_m, headway_s, of.accel_max, of.decel_max, of.exponent, of.emergency_decel, of.lookahead_m,
-        CORRIDOR_MARGIN_M, of.blend_length_m, LARGEST_OFFSET_M, ENTER_CLEARANCE_M,
+        of.blend_length_m,
     )  # fmt: skip
     boxes, velocities, valid, center_z, driven = slow_idm.drive(
         scene.step,
         slow_world(scene.clip.agents, slice(None)),
         slow_world(scene.agents, scene.step),
-        slow_idm.Roles(*traffic.roles),
-        slow_corridor.Paths(**paths),
+        traffic.roles,
+        traffic.paths,
         np.column_stack([x, y, heading, size]),
         np.column_stack([cos * speed, sin * speed]),
         driver,
@@ -62,8 +61,8 @@ def slow_roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
     return Rollout(scene.step, ego_states, agents, driven)
 
 
-def slow_world(agents: AgentTracks, steps: int | slice) -> slow_idm.AgentStates:
-    return slow_idm.AgentStates(
+def slow_world(agents: AgentTracks, steps: int | slice) -> AgentStates:
+    return AgentStates(
         *(np.ascontiguousarray(a[steps]) for a in (agents.boxes, agents.velocities, agents.valid, agents.center_z))
     )
 
@@ -144,17 +143,6 @@ def test_the_random_worlds_reach_every_rule() -> None:
                 kept_out += int((logged.valid & ~agents.valid).any(axis=0).sum())
                 answers += agents.boxes.tobytes() != rollouts[0].agents.boxes.tobytes()
     assert min(braked, waited, kept_out, answers) > 20
-
-
-def test_the_other_egos_of_a_batch_do_not_matter() -> None:
-    for traffic, egos in stages(3):
-        together = roll_out_many(traffic, egos)
-        turned = roll_out_many(traffic, egos[::-1])
-        apart = [roll_out_many(traffic, egos[b : b + 1]) for b in range(len(egos))]
-        for name in ("boxes", "velocities", "valid", "simulated"):
-            whole = getattr(together, name)
-            assert whole.tobytes() == np.ascontiguousarray(getattr(turned, name)[::-1]).tobytes()
-            assert whole.tobytes() == np.concatenate([getattr(part, name) for part in apart]).tobytes()
 
 
 def test_replay_answers_no_ego_and_copies_nothing() -> None:

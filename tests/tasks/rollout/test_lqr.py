@@ -65,15 +65,6 @@ def test_shifting_and_rotating_the_world_moves_the_states_with_it():
     np.testing.assert_allclose(there[..., 3:], here[..., 3:], atol=1e-6)
 
 
-def test_a_plan_gives_the_same_bits_alone_and_in_a_batch():
-    rng = np.random.default_rng(1)
-    plans = arc(9.0, -0.04)[None] + 0.3 * rng.normal(size=(37, 1, 3))
-    start = ego_at(3.0, 4.0, 0.5, 9.0)
-    together = track(start, plans)
-    for k in (0, 17, 36):
-        assert np.array_equal(track(start, plans[k : k + 1])[0], together[k])
-
-
 def test_no_plans_give_no_states():
     assert track(np.zeros(11), np.zeros((0, 40, 3))).shape == (0, 41, 11)
 

@@ -128,16 +128,6 @@ def test_a_policy_is_shown_the_second_before_and_nothing_of_what_comes() -> None
         assert seen.kinds == (AgentKind.VEHICLE,) * 2 and seen.road_map is scene.clip.road_map
 
 
-def test_who_is_no_vehicle_on_a_lane_does_what_its_log_does() -> None:
-    parked = Track(-30.0, 6.0)
-    walker = Track(20.0, -6.0, np.pi / 2, 1.2, AgentKind.PEDESTRIAN, (0.6, 0.6))
-    off_road = Track(0.0, -20.0, speed=4.0)
-    scene = worlds.scene(worlds.straight_road(), parked, walker, off_road)
-    rollout = roll_out(prepare_traffic(scene, by(Nervous)), parked_ego())
-    assert not rollout.simulated.any()
-    np.testing.assert_array_equal(rollout.agents.boxes, scene.agents.boxes[NOW : NOW + 41])
-
-
 def test_a_car_that_its_log_holds_is_not_asked_before_its_log_starts() -> None:
     """It stands for 1.5 s, as at a light that is in no map; then the policy's first answer moves it."""
     way = np.maximum(0.0, STEP_S * (np.arange(CLIP_STEPS) - NOW - 15) * 6.0)
@@ -145,17 +135,6 @@ def test_a_car_that_its_log_holds_is_not_asked_before_its_log_starts() -> None:
     calls = asked_in(scene, parked_ego())  # there is none while nobody is to be asked
     assert len(calls) == 40 - 16 and all(seen.asked[0] for seen in calls)
     assert (calls[0].boxes[:, 0, 0] == 0.0).all()
-
-
-def test_somebody_on_foot_waits_before_a_driven_car_and_then_goes_on_late() -> None:
-    """The walker's log steps into the car's side, of one that keeps its 8 m/s whatever it sees."""
-    walker = Track(20.0, -2.5, np.pi / 2, 0.8, AgentKind.PEDESTRIAN, (0.6, 0.6))
-    scene = worlds.scene(worlds.straight_road(), Track(5.0, speed=8.0), walker)
-    rollout = roll_out(prepare_traffic(scene, by(StraightOn)), parked_ego())
-    y = rollout.agents.boxes[:, 1, 1]
-    waited = np.flatnonzero(np.diff(y) == 0.0)
-    assert len(waited) > 3 and (np.diff(y)[-5:] > 0.07).all()
-    assert y[-1] == pytest.approx(-2.5 + 0.08 * (40 - len(waited)))
 
 
 class AnswersNan(StraightOn):

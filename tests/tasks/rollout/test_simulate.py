@@ -84,16 +84,6 @@ def test_who_was_driven_once_stays_so_also_where_a_later_rollout_drives_others()
     assert after.ever_simulated is not None and after.ever_simulated.tolist() == [True, True, False]
 
 
-def test_half_a_second_into_a_rollout_the_ego_s_history_is_of_before_and_since() -> None:
-    scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), ego=(30.0, 0.0, 0.0))
-    rollout = run(scene)
-    after = next_scene(scene, rollout, scene.centerline, steps=5)
-    assert after.step == scene.step + 5
-    np.testing.assert_array_equal(after.ego_history[:11], scene.ego_history[5:])
-    np.testing.assert_array_equal(after.ego_history[11:], rollout.ego_states[1:6])
-    np.testing.assert_array_equal(after.agents.boxes[NOW + 1 : NOW + 6], rollout.agents.boxes[1:6])
-
-
 def test_who_would_be_driven_later_is_not_when_the_rollout_is_left_before() -> None:
     """A car that waits at a junction until its log starts, 2 s from now."""
     waits = np.column_stack([np.full(CLIP_STEPS, 20.0), np.zeros(CLIP_STEPS), np.zeros(CLIP_STEPS)])
@@ -373,23 +363,6 @@ def test_a_shifted_and_turned_world_rolls_out_the_same(settings: TrafficSettings
     assert got.boxes[..., :2][got.valid] == pytest.approx(xy[expected.valid], abs=1e-6)
 
 
-def test_the_second_rollout_starts_where_the_first_ended() -> None:
-    scene = busy_scene()
-    first = run(scene)
-    after = next_scene(scene, first, scene.centerline)
-    assert after.step == NOW + 40 and after.ego_history.shape == (16, 11)
-    assert np.array_equal(after.ego_history, first.ego_states[25:])
-    assert np.array_equal(after.agents.boxes[: NOW + 1], scene.agents.boxes[: NOW + 1], equal_nan=True)
-    assert np.array_equal(after.agents.boxes[NOW + 41 :], scene.agents.boxes[NOW + 41 :], equal_nan=True)
-    assert after.ever_simulated is not None and np.array_equal(after.ever_simulated, first.simulated)
-    second = run(after)
-    assert np.array_equal(second.agents.boxes[0], first.agents.boxes[-1], equal_nan=True)
-    driven = first.simulated
-    assert second.agents.valid[:, driven].all() and second.simulated[driven].all()
-    jump = np.hypot(*(second.agents.boxes[1, driven, :2] - second.agents.boxes[0, driven, :2]).T)
-    assert jump == pytest.approx(STEP_S * np.hypot(*second.agents.velocities[0, driven].T), abs=0.05)
-
-
 def test_a_pedestrian_made_late_in_the_first_rollout_stays_late_in_the_second() -> None:
     walker = Track(30.0, -6.0, np.pi / 2, 1.5, AgentKind.PEDESTRIAN, (0.6, 0.6))
     scene = worlds.scene(worlds.straight_road(), walker)
@@ -400,14 +373,6 @@ def test_a_pedestrian_made_late_in_the_first_rollout_stays_late_in_the_second() 
     second = run(next_scene(scene, rollout, scene.centerline))
     expected = scene.agents.boxes[NOW + 30 : NOW + 71]
     assert second.agents.boxes == pytest.approx(expected)
-
-
-def test_a_prepared_scene_gives_the_same_rollout() -> None:
-    scene = busy_scene()
-    direct = run(scene)
-    prepared = prepare_traffic(scene, IDM)
-    again = roll_out(prepared, direct.ego_states)
-    assert np.array_equal(direct.agents.boxes, again.agents.boxes, equal_nan=True)
 
 
 def test_a_read_only_scene_gives_the_same_rollout() -> None:
@@ -429,11 +394,6 @@ def test_a_read_only_scene_gives_the_same_rollout() -> None:
         array.flags.writeable = False
     for rollout in (roll_out(prepared, expected.ego_states), run(scene)):
         assert np.array_equal(rollout.agents.boxes, expected.agents.boxes, equal_nan=True)
-
-
-def test_an_empty_street_rolls_out() -> None:
-    rollout = run(worlds.scene(worlds.straight_road()))
-    assert rollout.agents.boxes.shape == (41, 0, 5)
 
 
 def test_settings_that_mean_nothing_are_refused_by_name() -> None:
