@@ -14,10 +14,9 @@ from factory.datasets.av2.reader import AV2Log, AV2Reader, log_folders, read_log
 from tasks.world.agents import MOVING_KINDS
 from tasks.world.frames import wrap_angle
 from tasks.world.polygons import polygons_near
-from tasks.world.route import RouteFinder, centerline_from
+from tasks.world.route import centerline_from
 
 SCENES = ("7fab2350_20", "7fab2350_44", "7fab2350_104", "adcf7d18_64", "adcf7d18_80")
-SCORED = slice(0, 41)
 
 
 @dataclass(frozen=True)
@@ -146,10 +145,3 @@ def test_sweeps_and_rig_reach_the_clips(shared_root: Path) -> None:
     assert (front.width, front.height) == (1550, 2048)
     assert front.ego_from_camera[0, 2] > 0.99  # its optical axis points forward
     assert not clip.images
-
-
-def test_prepared_and_single_use_centerlines_agree_all_along_a_log(shared_root: Path) -> None:
-    log = log_of(shared_root / "data/av2/sensor", "adcf7d18")
-    finder = RouteFinder(log.road_map, log.route)
-    for pose in log.ego_states[::10, :3]:
-        assert np.array_equal(finder.centerline_from(pose), centerline_from(log.road_map, log.route, pose))

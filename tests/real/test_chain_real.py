@@ -127,28 +127,3 @@ def test_both_experts_are_accepted_on_some_candidates_and_rejected_for_listed_re
         assert reasons[""] >= 1, f"{expert.name}: {dict(reasons)}"
         assert sum(reasons.values()) > reasons[""], f"{expert.name} passes everywhere: is anything judged?"
         assert set(reasons) <= {"", *SUBSCORES, "no_plan"}
-
-
-def test_the_same_clip_gives_the_same_bytes_again(
-    clip: Clip, human: NDArray[np.float64], experts: tuple[Expert, ...], found: Perturbation
-) -> None:
-    again = listed(clip, human)
-    assert again.gate_counts == found.gate_counts
-    assert [c.vocabulary_index for c in again.candidates] == [c.vocabulary_index for c in found.candidates]
-    for a, b in zip(again.candidates, found.candidates, strict=True):
-        assert a.rollout.ego_states.tobytes() == b.rollout.ego_states.tobytes()
-        assert a.rollout.agents.boxes.tobytes() == b.rollout.agents.boxes.tobytes()
-    for expert in experts:
-        assert outcomes(clip, again, expert, 2) == outcomes(clip, found, expert, 2)
-
-
-def test_an_attempt_does_not_depend_on_the_ones_before(
-    clip: Clip, experts: tuple[Expert, ...], found: Perturbation
-) -> None:
-    """An attempt gives the same result second or alone: nothing is handed from one to the next."""
-    recovery = experts[1]
-    after_one = outcomes(clip, found, recovery, 2)
-    alone = perturbed_scene(clip, found.candidates[1].rollout)
-    result = attempt(alone, recovery, GATE, TRAFFIC, PDM, stream(0, clip.clip_id, "expert.recovery", 1))
-    assert not isinstance(result, Rejected)
-    assert result[0].rollout.ego_states.tobytes() == after_one[1][2]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from planners.evaluation.compare import main
 from planners.evaluation.navsim import read_table
 from tasks.reward.epdms import Scores
-from tasks.reward.one_stage import COLUMNS, FrameScores, columns_of, means_of, means_over
+from tasks.reward.one_stage import COLUMNS, FrameScores, columns_of, means_over
 from tasks.subscores import RECORDS
 
 Array = NDArray[np.float64]
@@ -79,24 +79,6 @@ def test_every_follow_up_row_is_the_formula_of_its_own_columns(shared_root: Path
     follow_ups = navhard(shared_root, name).stage_two
     assert follow_ups.shape == (5462, 10)
     np.testing.assert_allclose(formula(follow_ups), follow_ups[:, SCORE], rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", NAVHARD)
-def test_the_published_stage_one_is_the_mean_over_its_rows_in_every_column(shared_root: Path, name: str) -> None:
-    published = navhard(shared_root, name)
-    assert published.stage_one.shape == (450, 10)
-    ours = means_of(frames_of(published.stage_one)).published
-    np.testing.assert_allclose(ours, published.summary["stage_one"], rtol=0, atol=1e-12)
-
-
-def test_the_published_navtest_is_the_mean_over_its_rows_in_every_column(shared_root: Path) -> None:
-    *rows, summary = rows_of(shared_root, "ltf_sim_navtest")
-    table = table_of(rows)
-    assert table.shape == (12_146, 10)
-    assert np.isnan(table[:, EC]).any()
-    np.testing.assert_allclose(
-        means_of(frames_of(table)).published, table_of([summary])[0], rtol=0, atol=1e-12, equal_nan=False
-    )
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from factory.datasets.av2.reader import AV2Reader
 from tasks.rollout.corridor import boxes_overlap
-from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out, simulate
+from tasks.rollout.simulate import TrafficSettings, next_scene, simulate
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.frames import wrap_angle
@@ -114,17 +114,3 @@ def test_who_follows_a_stopping_ego_stops_behind_it(clips: list[Clip]) -> None:
             rear = np.array([state[0] - 0.2 * c, state[1] - 0.2 * s, state[2], 1.6, 1.8])  # the last two metres
             for box in rollout.agents.boxes[step, rollout.simulated & rollout.agents.valid[step]]:
                 assert not boxes_overlap(rear, box)
-
-
-def test_replay_is_the_log(clips: list[Clip]) -> None:
-    for scene, rollout in two_rollouts(clips[0], TrafficSettings(mode="replay")):
-        expected = clips[0].agents.window(scene.step, scene.step + HORIZON_STEPS + 1)
-        assert np.array_equal(rollout.agents.boxes, expected.boxes, equal_nan=True)
-
-
-def test_a_rollout_is_the_same_every_time(clips: list[Clip]) -> None:
-    scene = scene_of_clip(clips[-1])
-    first = simulate(scene, clips[-1].ego_states[NOW + 1 : NOW + 41, :3], TrafficSettings())
-    again = roll_out(prepare_traffic(scene, TrafficSettings()), first.ego_states)
-    for name in ("boxes", "velocities", "valid", "center_z"):
-        assert getattr(first.agents, name).tobytes() == getattr(again.agents, name).tobytes()
