@@ -63,11 +63,6 @@ class DrivePath:
         return shapely.ops.substring(self.line, start_m, stop_m)
 
 
-def path_length_m(poses: Array) -> float:
-    """Length [m] of the polyline through `poses` (P, >= 2)."""
-    return float(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).sum())
-
-
 def drive_path(poses: Array) -> DrivePath:
     """The path through `poses` (P, 3). Raises ValueError where it has no length."""
     poses = np.array(poses, dtype=np.float64)

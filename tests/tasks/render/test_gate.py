@@ -158,9 +158,3 @@ def test_every_fault_is_a_reason_of_the_render_stage() -> None:
 def test_settings_out_of_range_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"render gate {name} must be"):
         GateSettings(**{name: value})
-
-
-def test_a_scene_that_no_point_is_in_the_view_of_has_holes_not_a_frame(street_asset: RenderAsset) -> None:
-    far_off = replace(street_asset, background=street_asset.background.take(np.arange(0)), nodes={})
-    assert reason_at(far_off, street.ego_pose(3.0)) == "holes"
-    assert reason_at(street_asset, street.ego_pose(3.0, 400.0)) == "holes"

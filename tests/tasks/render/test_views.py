@@ -9,8 +9,7 @@ import street
 
 from tasks.render.map_drawing import GROUND, ROAD, SKY, WHITE, clip_near, draw_map_views, ground_height
 from tasks.render.rigs import RIGS, pinhole
-from tasks.render.scene.build import RenderAsset, psnr
-from tasks.render.views import pose_on_ground, render_views, undistorted
+from tasks.render.views import pose_on_ground, undistorted
 from tasks.world.camera import Camera
 from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap
 from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, X, Y
@@ -76,15 +75,6 @@ def test_undistorting_undoes_what_the_lens_did(distortion: list[float]) -> None:
 def test_a_photo_without_distortion_is_left_alone() -> None:
     photo = np.zeros((48, 64, 3), np.uint8)
     assert undistorted(photo, lens([0.0] * 5)) is photo
-
-
-def test_frames_show_agents_where_the_simulation_put_them(street_asset: RenderAsset) -> None:
-    rig = [Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), street.EGO_FROM_CAMERA)]
-    poses = np.stack([street.ego_pose(3.0), street.ego_pose(4.5, 0.5)])
-    images = render_views(street_asset, rig, poses, street.tracks(), [8, 11], street.WIDTH, street.HEIGHT)
-    assert images.shape == (2, 1, street.HEIGHT, street.WIDTH, 3) and images.dtype == np.uint8
-    for image, (x, y, time_s) in zip(images[:, 0], [(3.0, 0.0, 0.8), (4.5, 0.5, 1.1)]):
-        assert psnr(image, street.photo(x, y, time_s).rgb) > 24.0
 
 
 def road() -> RoadMap:

@@ -13,7 +13,6 @@ from tasks.experts.protocol import Plan
 from tasks.stages import Rejected
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import Scene
-from tasks.world.frames import to_world
 from tasks.world.vehicle import PACIFICA
 
 Road = Callable[..., Scene]
@@ -201,22 +200,6 @@ def test_a_free_proposal_inherits_the_velocity_of_a_slower_ones_lead_unless_told
     np.testing.assert_array_equal(quirk.leads[::5], clean.leads[::5])  # the slowest of a path inherits nothing
 
 
-def test_moving_the_whole_world_moves_the_plan_with_it(road: Road, objects: Objects) -> None:
-    scene = road(agents=objects([[85.0, 0.5, 0.1, *CAR]], [3.0], [AgentKind.VEHICLE]))
-    ego, line, agents = scene.ego_state, scene.centerline, scene.agents.window(scene.step, scene.step + 1)
-    shift = np.array([300.0, -120.0, 1.1])
-    moved_ego = ego.copy()
-    moved_ego[:3] = to_world(shift, ego[:3])
-    moved_boxes = agents.boxes.copy()
-    moved_boxes[..., :3] = to_world(shift, agents.boxes[..., :3])
-    turn = np.array([[np.cos(1.1), -np.sin(1.1)], [np.sin(1.1), np.cos(1.1)]])
-    moved_agents = replace(agents, boxes=moved_boxes, velocities=agents.velocities @ turn.T)
-    here = proposals(ego, line, forecast(ego, agents), None)
-    there = proposals(moved_ego, to_world(shift, line), forecast(moved_ego, moved_agents), None)
-    np.testing.assert_allclose(there.progress_velocity, here.progress_velocity, atol=1e-8)
-    np.testing.assert_allclose(there.poses, to_world(shift, here.poses), atol=1e-8)
-
-
 def test_a_route_without_length_is_a_rejection(road: Road) -> None:
     scene = replace(road(), centerline=np.zeros((3, 3)))
     result = PdmClosed().plan(scene, RNG)
@@ -239,14 +222,6 @@ def test_an_ego_state_with_a_nan_is_an_error(road: Road) -> None:
         plan_for(replace(scene, ego_history=history))
     with pytest.raises(ValueError, match=r"ego_state must be \(11,\) finite numbers"):
         plan_for(replace(scene, ego_history=history[:, :4]))
-
-
-def test_a_centerline_with_a_nan_is_an_error(road: Road) -> None:
-    scene = road()
-    line = scene.centerline.copy()
-    line[3, 1] = np.nan
-    with pytest.raises(ValueError, match="centerline holds NaN"):
-        plan_for(replace(scene, centerline=line))
 
 
 def test_a_valid_object_without_a_box_is_an_error_that_names_it(road: Road, objects: Objects) -> None:

@@ -21,21 +21,6 @@ def line_of(xy: Array) -> Array:
     return np.column_stack([xy, np.append(heading, heading[-1])])
 
 
-def test_a_repeated_point_at_a_lane_joint_changes_nothing() -> None:
-    line = np.stack([np.linspace(0, 10, 11), np.zeros(11), np.zeros(11)], axis=1)
-    doubled = np.insert(line, [0, 5, 5], line[[0, 5, 5]], axis=0)
-    at = [-1.0, 0.0, 2.5, 5.0, 9.9, 10.0, 12.0]
-    one, other = drive_paths(line, [0.0]), drive_paths(doubled, [0.0])
-    np.testing.assert_allclose(poses_at(other, at), poses_at(one, at), atol=1e-12)
-    assert project(other, 0, 5.0, 3.0) == project(one, 0, 5.0, 3.0) == 5.0
-
-
-def test_points_before_and_past_the_path_project_on_its_ends() -> None:
-    paths = drive_paths(np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [10.0, 0.0, 0.0]]), [0.0])
-    assert project(paths, 0, -3.0, 1.0) == 0.0
-    assert project(paths, 0, 12.0, -1.0) == 10.0
-
-
 def test_the_first_of_two_equally_near_points_of_a_hairpin_counts() -> None:
     hairpin = line_of(np.array([[0.0, 0.0], [20.0, 0.0], [20.0, 8.0], [0.0, 8.0]]))
     assert project(drive_paths(hairpin, [0.0]), 0, 5.0, 4.0) == 5.0

@@ -130,19 +130,6 @@ def test_the_goal_is_the_logged_pose_four_seconds_later_seen_from_the_perturbed_
     np.testing.assert_allclose(plan.poses[-1], scene.clip.ego_states[NOW + 40, :3], atol=1e-9)
 
 
-def test_the_same_scene_elsewhere_on_earth_retrieves_the_same_row(road: Road) -> None:
-    table = RecoveryTable(kinematic_trajectories(500, 1))
-    scene = road(speed=9.0, y=0.7)
-    origin = np.array([5000.0, -800.0, 2.5])
-    history, states = scene.ego_history.copy(), scene.clip.ego_states.copy()
-    history[:, :3], states[:, :3] = to_world(origin, history[:, :3]), to_world(origin, states[:, :3])
-    moved = replace(scene, ego_history=history, clip=replace(scene.clip, ego_states=states))
-    here, there = Recovery(table).plan(scene, RNG), Recovery(table).plan(moved, RNG)
-    assert isinstance(here, Plan)
-    assert isinstance(there, Plan)
-    np.testing.assert_allclose(to_local(origin, there.poses), here.poses, atol=1e-3)  # the solver's tolerance
-
-
 def test_a_clip_that_ends_before_the_goal_is_refused(road: Road) -> None:
     with pytest.raises(ValueError, match="needs the log at step 96; the clip has 96"):
         Recovery(RecoveryTable(straight(5.0)[None])).retrieve(replace(road(), step=56))

@@ -6,9 +6,7 @@ from numpy.typing import NDArray
 from slow_raster import covariances_of
 
 from tasks.render.splatting.gaussians import (
-    EMPTY,
     Gaussians,
-    concatenate,
     moved,
     quats_of,
     rotations_of,
@@ -94,21 +92,6 @@ def test_the_kernel_equals_its_slow_twin(n: int, sigma: float, screen: ScreenFil
     assert np.median(np.abs(fast.rgb - rgb)) < 1e-4
 
 
-def test_the_same_scene_gives_the_same_bytes() -> None:
-    scene = cloud(2000, seed=3)
-    first = forward(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).view
-    second = forward(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).view
-    assert first.rgb.tobytes() == second.rgb.tobytes()
-    assert first.depth.tobytes() == second.depth.tobytes()
-
-
-def test_an_empty_scene_is_its_background() -> None:
-    background = np.random.default_rng(2).uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
-    view = forward(EMPTY, INTRINSICS, np.eye(4), WIDTH, HEIGHT, background).view
-    np.testing.assert_array_equal(view.rgb, background)
-    assert not view.alpha.any() and not view.depth.any()
-
-
 def one(
     mean: tuple[float, float, float], sigma: float, opacity: float, colour: tuple[float, float, float]
 ) -> Gaussians:
@@ -135,25 +118,12 @@ def test_what_is_smaller_than_a_pixel_sheds_the_light_that_its_area_does(metres:
         assert alpha.sum() == pytest.approx(max(2.0 * np.pi * 0.99 * area - least, 0.0), rel=0.03)
 
 
-def test_the_nearer_gaussian_hides_the_farther_one_in_whatever_order_they_are_stored() -> None:
-    near, far = one((0, 0, 4), 0.5, 0.99, (1, 0, 0)), one((0, 0, 9), 3.0, 0.99, (0, 0, 1))
-    for scene in (concatenate([near, far]), concatenate([far, near])):
-        view = forward(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).view
-        assert view.rgb[22, 37, 0] > 0.95 and view.rgb[22, 37, 2] < 0.05
-        assert view.depth[22, 37] == pytest.approx(4.0, abs=0.1)
-
-
 def test_a_gaussian_lands_where_the_pinhole_equation_says() -> None:
     view = forward(one((1.5, -0.7, 8.0), 0.05, 0.9, (1, 1, 1)), INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).view
     weight = view.alpha.astype(np.float64)
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     assert (weight * u).sum() / weight.sum() == pytest.approx(60.0 * 1.5 / 8.0 + 37.0, abs=0.05)
     assert (weight * v).sum() / weight.sum() == pytest.approx(58.0 * -0.7 / 8.0 + 22.0, abs=0.05)
-
-
-def test_what_is_behind_or_before_the_near_plane_is_not_drawn() -> None:
-    scene = concatenate([one((0, 0, -5), 1.0, 0.9, (1, 1, 1)), one((0, 0, 0.2), 1.0, 0.9, (1, 1, 1))])
-    assert not forward(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).view.alpha.any()
 
 
 def test_moving_scene_and_camera_together_changes_nothing() -> None:
