@@ -69,7 +69,7 @@ def places_around(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.concatenate([on_it, near, lattice, far])
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(points=lines(), seed=st.integers(0, 2**32 - 1))
 def test_place_and_deviation_are_those_of_geos(points: np.ndarray, seed: int) -> None:
     line, shape = index_centerline(points), shapely.LineString(points)
@@ -97,7 +97,7 @@ def walks(draw: st.DrawFn, points: np.ndarray) -> Body:
 
 
 @pytest.mark.slow
-@settings(max_examples=300)
+@settings(max_examples=120)
 @given(data=st.data(), points=lines())
 def test_the_three_rules_equal_their_slow_twins(data: st.DataObject, points: np.ndarray) -> None:
     line, shape = index_centerline(points), shapely.LineString(points)

@@ -53,7 +53,7 @@ def drives(draw: st.DrawFn, n_rows: int) -> np.ndarray:
     return states
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(past=drives(4), states=drives(41))
 def test_flags_and_first_step_equal_the_slow_twin(past: np.ndarray, states: np.ndarray) -> None:
     history = comfort_history(past)

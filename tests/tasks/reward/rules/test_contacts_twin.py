@@ -14,11 +14,11 @@ from tasks.reward.rules.ego import MULTIPLE_LANES, NON_DRIVABLE, empty_body, pla
 from tasks.reward.rules.map_index import index_map
 from tasks.reward.rules.obstacles import Obstacles, index_obstacles, unindexed
 from tasks.world.frames import box_corners, to_world
+from tasks.world.geometry import ego_boxes
 from tasks.world.lanes import MapLayer, MapPolygon
 from tasks.world.vehicle import HEADING, PACIFICA, VX, VY, X, Y
 from tests.tasks.reward.slow import collisions as slow
 from tests.tasks.reward.slow.areas import EgoAreas
-from tests.tasks.reward.slow.boxes import ego_boxes
 from tests.tasks.reward.slow.prepare import Obstacles as SlowObstacles
 
 HALF_LENGTH_M, HALF_WIDTH_M = PACIFICA.half_length, PACIFICA.half_width
@@ -159,7 +159,7 @@ def worlds(draw: st.DrawFn) -> World:
 
 
 @pytest.mark.slow
-@settings(max_examples=400)
+@settings(max_examples=150)
 @given(worlds())
 def test_both_rules_equal_the_numpy_version(world: World) -> None:
     np.testing.assert_array_equal(contacts(world, indexed(world)), slow_contacts(world))

@@ -47,7 +47,7 @@ def telling_points(polygons: list[MapPolygon], seed: int, step: float) -> np.nda
 
 
 @pytest.mark.slow
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(st.data(), st.sampled_from([0.0, 0.25, 1.0]), st.integers(0, 1000))
 def test_every_point_is_in_the_regions_that_shapely_says(data: st.DataObject, step: float, seed: int) -> None:
     polygons = data.draw(small_maps(step))

@@ -16,7 +16,7 @@ from tasks.reward.rules.obstacles import (
     unindexed,
     within_reach,
 )
-from tests.tasks.reward.slow.boxes import touching
+from tasks.world.geometry import touching
 
 EGO_SIZE = (5.176, 2.297)
 RADIUS_M = 0.5 * math.hypot(*EGO_SIZE)

@@ -7,8 +7,8 @@ import pytest
 import shapely
 
 from tasks.reward.rules.obstacles import Box, apart, centroid, touching
+from tasks.world import geometry
 from tasks.world.frames import box_corners
-from tests.tasks.reward.slow import boxes as slow
 
 
 def box(x: float, y: float, heading: float, length: float, width: float) -> Box:
@@ -29,7 +29,7 @@ def test_boxes_touch_exactly_where_the_numpy_version_says_so() -> None:
     first, second = random_boxes(rng, 4000), random_boxes(rng, 4000)
     verdict = np.array([touching(box(*a), box(*b)) for a, b in zip(first, second)])
     assert 0.1 < verdict.mean() < 0.9
-    assert np.array_equal(verdict, slow.touching(first, second))
+    assert np.array_equal(verdict, geometry.touching(first, second))
 
 
 def test_boxes_of_any_heading_touch_where_their_polygons_intersect() -> None:

@@ -12,9 +12,9 @@ import shapely
 from numpy.typing import NDArray
 
 from tasks.world.frames import box_corners
+from tasks.world.geometry import touching
 from tasks.world.vehicle import HEADING, VX, VY, X, Y
 from tests.tasks.reward.slow.areas import EgoAreas
-from tests.tasks.reward.slow.boxes import circumradius, front_edges, touching
 from tests.tasks.reward.slow.prepare import Obstacles, RedLanes
 
 Array = NDArray[np.float64]
@@ -117,6 +117,21 @@ def find_contacts(obstacles: Obstacles, boxes: Array, times: Ints) -> Contacts:
         hit = touching(boxes[start + row, time], objects[time, item])
         found.append(np.stack([start + row[hit], time[hit], item[hit]]))
     return Contacts(*np.concatenate(found, axis=1))
+
+
+def front_edges(boxes: Array) -> Array:
+    """The front edge of boxes (..., 5), as boxes of length zero."""
+    heading, half_length = boxes[..., 2], boxes[..., 3] / 2.0
+    edges = boxes.copy()
+    edges[..., 0] += half_length * np.cos(heading)
+    edges[..., 1] += half_length * np.sin(heading)
+    edges[..., 3] = 0.0
+    return edges
+
+
+def circumradius(boxes: Array) -> Array:
+    """Radius (...) [m] of the circle around each box."""
+    return 0.5 * np.hypot(boxes[..., 3], boxes[..., 4])
 
 
 def angle_to(ego: Array, points: Array) -> Array:

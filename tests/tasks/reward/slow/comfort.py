@@ -1,18 +1,15 @@
 """History comfort and two-frame extended comfort (docs/reward.md 2i, 2j)."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
+from tasks.reward.rules.comfort import ExtendedComfort
 from tasks.world.clip import STEP_S
 from tasks.world.vehicle import (
     AX,
     AY,
-    EGO_STATE_SIZE,
     HEADING,
-    STEERING,
     YAW_ACCEL,
     YAW_RATE,
     Vehicle,
@@ -28,25 +25,6 @@ LON_JERK_MPS3 = 4.13
 YAW_ACCEL_RADPS2 = 1.93
 YAW_RATE_RADPS = 0.95
 EC_LIMITS = (0.7, 0.5, 0.1, 0.1)  # RMS of acceleration, jerk, yaw rate, yaw acceleration (SI)
-EC_MAX_INTERVAL_S = 0.55
-PAST_PERIOD_STEPS = 5  # the history comes at 2 Hz
-HISTORY_ROWS = 14  # -1.5 .. -0.2 s: the row at -0.1 s is missing in the public metric
-
-
-def comfort_history(past_states: Array) -> Array:
-    """Ego states (14, 11) at -1.5, -1.4 .. -0.2 s, interpolated linearly between states (4, 11) at 2 Hz.
-
-    Rates of yaw and steering are not part of the public interpolation and are 0.
-    """
-    past = past_states.copy()
-    past[:, HEADING] = np.unwrap(past[:, HEADING])
-    past[:, STEERING + 1 :] = 0.0
-    position = np.arange(HISTORY_ROWS) / PAST_PERIOD_STEPS
-    before = position.astype(np.int64)
-    share = (position - before)[:, None]
-    rows: Array = past[before] + share * (past[np.minimum(before + 1, len(past) - 1)] - past[before])
-    assert rows.shape == (HISTORY_ROWS, EGO_STATE_SIZE)
-    return rows
 
 
 def history_comfort(history: Array | None, states: Array, vehicle: Vehicle) -> tuple[Array, Bools, Array]:
@@ -87,21 +65,8 @@ def history_comfort(history: Array | None, states: Array, vehicle: Vehicle) -> t
     return np.where(np.all(flags, axis=1), 1.0, 0.0), flags, first
 
 
-@dataclass(frozen=True)
-class ExtendedComfort:
-    """EC of K plans against the plans made a moment before."""
-
-    ec: Array  # (K,) 1 where all four differences are small, else 0
-    rms: Array  # (K, 4) acceleration [m/s^2], jerk [m/s^3], yaw rate [rad/s], yaw acceleration [rad/s^2]
-
-
 def extended_comfort(now_states: Array, previous_states: Array, interval_s: float = 0.5) -> ExtendedComfort:
-    """Compare simulated states (K, 41, 11) with those (K or 1, 41, 11) of the plan made `interval_s` earlier.
-
-    Raises ValueError unless 0 < interval_s < 0.55.
-    """
-    if not 0.0 < interval_s < EC_MAX_INTERVAL_S:
-        raise ValueError(f"interval_s must lie in (0, {EC_MAX_INTERVAL_S}), got {interval_s}")
+    """Compare simulated states (K, 41, 11) with those (K or 1, 41, 11) of the plan made `interval_s` earlier."""
     shift = round(interval_s / STEP_S)
     # The overlap is cut out first and filtered then, so that the filters' edges fall inside the horizon.
     difference = _motion_features(now_states[..., :-shift, :]) - _motion_features(previous_states[..., shift:, :])

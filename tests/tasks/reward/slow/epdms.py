@@ -4,17 +4,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.reward.epdms import Normalise, Scores, relative_progress
-from tasks.world.vehicle import EGO_STATE_SIZE
+from tasks.world.geometry import ego_boxes
 from tests.tasks.reward.slow.areas import ego_areas
-from tests.tasks.reward.slow.boxes import ego_boxes
 from tests.tasks.reward.slow.collisions import no_at_fault_collision, time_to_collision, traffic_light_compliance
 from tests.tasks.reward.slow.comfort import history_comfort
-from tests.tasks.reward.slow.prepare import N_TIMES, PreparedScene
+from tests.tasks.reward.slow.prepare import PreparedScene
 from tests.tasks.reward.slow.progress import driving_direction_compliance, first_true, lane_keeping, progress_along
 
 Array = NDArray[np.float64]
-
-ROWS_AT_ONCE = 512  # bounds the memory of one pass
 
 
 def score(
@@ -25,18 +22,8 @@ def score(
     normalise: "batch" relates progress to the best compliant progress of all rows, as the public scorer does with its
     batch; "pairs" scores each row as if in a two-row batch with row 0 (its reference, usually PDM-Closed), and row 0
     as if alone. with_history=False leaves history comfort at 1, as the public passes over the human and PDM-Closed do.
-    Raises ValueError for other shapes or non-finite states.
     """
-    states = np.asarray(states, dtype=np.float64)
-    if states.ndim != 3 or states.shape[1:] != (N_TIMES, EGO_STATE_SIZE) or states.shape[0] == 0:
-        raise ValueError(f"states must be (K >= 1, {N_TIMES}, {EGO_STATE_SIZE}), got {states.shape}")
-    if not np.isfinite(states).all():
-        raise ValueError("states must be finite")
-    parts = [
-        _rules(prepared, states[start : start + ROWS_AT_ONCE], with_history)
-        for start in range(0, states.shape[0], ROWS_AT_ONCE)
-    ]
-    raw = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    raw = _rules(prepared, states, with_history)
     multiplier = np.prod([raw[name] for name in ("nc", "dac", "tlc", "ddc")], axis=0)
     ep = relative_progress(raw["ep_raw_m"], multiplier, normalise == "pairs")
     weighted = (5.0 * ep + 5.0 * raw["ttc"] + 2.0 * raw["lk"] + 2.0 * raw["hc"]) / 14.0

@@ -7,21 +7,18 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from tasks.reward.rules.comfort import comfort_history
 from tasks.world.agents import MOVING_KINDS, AgentTracks
-from tasks.world.clip import HORIZON_STEPS, Clip, Scene
+from tasks.world.clip import HORIZON_STEPS
 from tasks.world.frames import box_corners
-from tasks.world.lanes import LightState, MapLayer, MapPolygon
-from tasks.world.polygons import polygons_near
-from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA, Vehicle
-from tests.tasks.reward.slow.boxes import ego_boxes, touching
-from tests.tasks.reward.slow.comfort import comfort_history
+from tasks.world.geometry import ego_boxes, touching
+from tasks.world.lanes import MapLayer, MapPolygon
+from tasks.world.vehicle import PACIFICA, Vehicle
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 N_TIMES = HORIZON_STEPS + 1
-MAP_RADIUS_M = 100.0  # docs/reward.md 0
-PAST_STEPS = (0, 5, 10, 15)  # of the 1.5 s history at 10 Hz: -1.5, -1.0, -0.5, 0 s
 STOPPED_SPEED_MPS = 0.05
 LANE_LAYERS = frozenset({MapLayer.LANE, MapLayer.LANE_CONNECTOR})
 DRIVABLE_LAYERS = frozenset(
@@ -83,25 +80,9 @@ def prepare(
     ego_state0: Array | None = None,
     drop_touching: bool = True,
 ) -> PreparedScene:
-    """Prepare a scene given as plain arrays.
-
-    past_states: (4, 11) ego at -1.5, -1.0, -0.5, 0 s, or None to leave history comfort out; centerline: (P, >= 2) of
-    the route ahead; polygons: the map around the ego; objects: tracks of at least 41 steps, row 0 is now; red_lanes:
-    lane connectors that are red at all times, or (ids, (41, L) mask); lanes that are not among `polygons` are out of
-    reach and left out; ego_state0: (11,), by default the last past state.
-    drop_touching: objects whose box touches the ego's at step 0 are left out for good, as the public log replay does.
-    Raises ValueError for wrong shapes, and when drop_touching has no ego state to look at.
-    """
-    if past_states is not None and past_states.shape != (len(PAST_STEPS), EGO_STATE_SIZE):
-        raise ValueError(f"past_states must be (4, 11), got {past_states.shape}")
-    if centerline.ndim != 2 or centerline.shape[0] < 2 or centerline.shape[1] < 2:
-        raise ValueError(f"centerline must be (P >= 2, >= 2), got {centerline.shape}")
-    if objects.n_steps < N_TIMES:
-        raise ValueError(f"objects must span at least {N_TIMES} steps, got {objects.n_steps}")
+    """As tasks.reward.prepare.prepare, of arguments that make sense."""
     if ego_state0 is None and past_states is not None:
         ego_state0 = past_states[-1]
-    if ego_state0 is None and drop_touching:
-        raise ValueError("drop_touching needs ego_state0 or past_states")
     return PreparedScene(
         vehicle=vehicle,
         history=None if past_states is None else comfort_history(past_states),
@@ -110,41 +91,6 @@ def prepare(
         obstacles=_obstacles(objects.window(0, N_TIMES), ego_state0 if drop_touching else None, vehicle),
         red_lanes=_red_lanes(red_lanes, polygons),
     )
-
-
-def prepare_scene(
-    scene: Scene, agents: AgentTracks, vehicle: Vehicle = PACIFICA, drop_touching: bool = True
-) -> PreparedScene:
-    """Prepare step `scene.step` of a clip against `agents` (41 steps, row 0 is that step): a rollout's or the log's.
-
-    Lights are red for on-route lane connectors over steps scene.step .. scene.step + 40.
-    """
-    clip = scene.clip
-    return prepare(
-        past_states=scene.ego_history[list(PAST_STEPS)],
-        centerline=scene.centerline,
-        polygons=polygons_near(clip.road_map, ego_boxes(scene.ego_state, vehicle)[:2], MAP_RADIUS_M),
-        route_lane_ids=clip.route.lane_ids,
-        objects=agents,
-        red_lanes=_red_connectors(clip, scene.step),
-        vehicle=vehicle,
-        ego_state0=scene.ego_state,
-        drop_touching=drop_touching,
-    )
-
-
-def _red_connectors(clip: Clip, step: int) -> tuple[tuple[str, ...], Bools]:
-    """On-route lane connectors with a light, and where it is red over steps step .. step + 40: ids (L,), (41, L)."""
-    lights, lanes = clip.lights, clip.road_map.lanes
-    governed = [
-        i
-        for i, lane_id in enumerate(lights.lane_ids)
-        if lane_id in clip.route.lane_ids and lane_id in lanes and lanes[lane_id].is_intersection
-    ]
-    if not governed:
-        return (), np.zeros((N_TIMES, 0), dtype=bool)
-    states = lights.states[step : step + N_TIMES, governed]
-    return tuple(lights.lane_ids[i] for i in governed), states == LightState.RED
 
 
 def _shape(polygon: MapPolygon) -> shapely.Polygon:
@@ -205,8 +151,6 @@ def _red_lanes(red_lanes: tuple[str, ...] | tuple[tuple[str, ...], Bools], polyg
         lane_ids, is_red = red_lanes
     else:
         lane_ids, is_red = red_lanes, np.ones((N_TIMES, len(red_lanes)), dtype=bool)
-    if is_red.shape != (N_TIMES, len(lane_ids)):
-        raise ValueError(f"the mask of red lanes must be ({N_TIMES}, {len(lane_ids)}), got {is_red.shape}")
     shape_of = {polygon.token: polygon for polygon in polygons if polygon.layer in LANE_LAYERS}
     columns = [i for i, lane_id in enumerate(lane_ids) if lane_id in shape_of and is_red[:, i].any()]
     shapes = np.array([_shape(shape_of[lane_ids[i]]) for i in columns], dtype=object)
