@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from tasks.experts.pdm_closed.settings import DEFAULTS, PdmSettings
 from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
 from tasks.world.frames import box_corners, wrap_angle
-from tasks.world.vehicle import HEADING, PACIFICA, VX, Vehicle, X, Y
+from tasks.world.geometry import ego_boxes
+from tasks.world.vehicle import PACIFICA, VX, Vehicle, X, Y
 
 Array = NDArray[np.float64]
 STEP_S = 0.1
@@ -64,15 +65,11 @@ class DrivePath:
 
 
 def drive_path(poses: Array) -> DrivePath:
-    """The path through `poses` (P, 3). Raises ValueError where it has no length."""
-    poses = np.array(poses, dtype=np.float64)
-    if poses.ndim != 2 or poses.shape[1] != 3 or len(poses) < 2:
-        raise ValueError(f"a path needs poses of shape (P >= 2, 3), got {poses.shape}")
+    """The path through `poses` (P, 3)."""
+    poses = poses.copy()
     poses[:, 2] = np.unwrap(poses[:, 2])
     steps = np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
     progress = np.concatenate([[0.0], np.cumsum(steps)])
-    if progress[-1] <= MIN_PROGRESS_M:
-        raise ValueError("a path needs a length")
     return DrivePath(poses, progress, shapely.LineString(poses[:, :2]))
 
 
@@ -106,75 +103,30 @@ class Forecast:
         polygons: NDArray[np.object_] = shapely.polygons(corners)
         return polygons
 
-    def tracks(self, agents: AgentTracks, steps: int) -> AgentTracks:
-        """The forecast as (steps,) tracks for the reward; objects that touch the ego now are left out."""
-        keep = ~self.touches_ego
-        index = self.track[keep]
-        times = (np.arange(steps) // SAMPLE_STEPS) * SAMPLE_STEPS * STEP_S
-        boxes = np.repeat(self.boxes[keep][None], steps, axis=0)
-        boxes[..., :2] += times[:, None, None] * self.drift[keep][None]
-        seen = agents.velocities[0, index]  # the reward asks for the measured velocity, not the drift
-        return AgentTracks(
-            track_ids=tuple(agents.track_ids[i] for i in index),
-            kinds=tuple(agents.kinds[i] for i in index),
-            boxes=boxes,
-            velocities=np.repeat(seen[None], steps, axis=0),
-            valid=np.ones((steps, len(index)), bool),
-            center_z=np.repeat(agents.center_z[:1, index], steps, axis=0),
-            heights=agents.heights[index],
-        )
 
-
-def ego_boxes(poses: Array, vehicle: Vehicle = PACIFICA) -> Array:
-    """Footprints (..., 5) of rear-axle poses (..., 3)."""
-    heading = poses[..., 2]
-    x = poses[..., 0] + vehicle.rear_axle_to_center * np.cos(heading)
-    y = poses[..., 1] + vehicle.rear_axle_to_center * np.sin(heading)
-    size = np.broadcast_to([vehicle.length, vehicle.width], (*heading.shape, 2))
-    return np.concatenate([np.stack([x, y, heading], axis=-1), size], axis=-1)
-
-
-def forecast(
-    ego_state: Array,
-    agents: AgentTracks,
-    red_lights: tuple[shapely.Polygon, ...] = (),
-    vehicle: Vehicle = PACIFICA,
-) -> Forecast:
-    """The objects to reckon with, seen from `ego_state` (11,): `agents` at its first step, none further than 100 m.
-
-    The nearest 50 vehicles, 25 pedestrians, 10 bicycles and 50 standing objects, by the distance of their centres to
-    the ego's. Source: docs/reward.md 4.
-    """
-    ego_box = ego_boxes(ego_state[[X, Y, HEADING]], vehicle)
-    boxes, velocities = agents.boxes[0], agents.velocities[0]
-    distance = np.hypot(boxes[:, 0] - ego_box[0], boxes[:, 1] - ego_box[1])
-    near = agents.valid[0] & (distance <= RADIUS_M)
-    kinds = np.array([str(kind) for kind in agents.kinds], dtype=object)
-    moving = np.isin(kinds, [str(kind) for kind in MOVING_KINDS])
-
-    def nearest(wanted: NDArray[np.bool_], count: int) -> NDArray[np.intp]:
-        found = np.flatnonzero(wanted & near)
-        return found[np.argsort(distance[found], kind="stable")][:count]
-
-    groups = [nearest(~moving, NEAREST_STATIC)]
-    groups += [nearest(kinds == str(kind), count) for kind, count in NEAREST.items()]
-    track = np.concatenate(groups)
-    speed = np.hypot(velocities[track, 0], velocities[track, 1])
-    heading = boxes[track, 2]
-    forward = np.abs(wrap_angle(heading - np.arctan2(velocities[track, 1], velocities[track, 0]))) < np.pi / 2.0
-    direction = np.where(forward, heading, heading + np.pi)
-    drift = (speed * moving[track])[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
-    ego_polygon = shapely.polygons(box_corners(ego_box))
-    touches = shapely.intersects(ego_polygon, shapely.polygons(box_corners(boxes[track])))
+def forecast(ego_state: Array, agents: AgentTracks, red_lights: tuple[shapely.Polygon, ...] = ()) -> Forecast:
+    """What is nearest to `ego_state` (11,), object by object: the first of each kind that may be as many as it says."""
+    ego = ego_boxes(ego_state, PACIFICA)
+    body = shapely.Polygon(box_corners(ego))
+    away = {i: float(np.hypot(*(agents.boxes[0, i, :2] - ego[:2]))) for i in np.flatnonzero(agents.valid[0])}
+    near = sorted((i for i in away if away[i] <= RADIUS_M), key=lambda i: away[i])
+    track = [i for i in near if agents.kinds[i] not in MOVING_KINDS][:NEAREST_STATIC]
+    for kind, count in NEAREST.items():
+        track += [i for i in near if agents.kinds[i] == kind][:count]
+    boxes, velocities = agents.boxes[0, track].reshape(-1, 5), agents.velocities[0, track].reshape(-1, 2)
+    ahead = np.stack([np.cos(boxes[:, 2]), np.sin(boxes[:, 2])], axis=1)
+    is_agent = np.array([agents.kinds[i] in MOVING_KINDS for i in track], dtype=bool)
+    speed = np.hypot(*velocities.T)
+    along = np.where((ahead * velocities).sum(axis=1) > 0.0, speed, -speed) * is_agent
     return Forecast(
-        track=track,
-        boxes=boxes[track],
-        drift=drift,
+        track=np.array(track, dtype=np.intp),
+        boxes=boxes,
+        drift=along[:, None] * ahead,
         speed=speed,
-        is_agent=moving[track],
-        touches_ego=np.asarray(touches, dtype=bool).reshape(len(track)),
+        is_agent=is_agent,
+        touches_ego=np.array([body.intersects(shapely.Polygon(box)) for box in box_corners(boxes)], dtype=bool),
         red_lights=red_lights,
-        red_light_holds_ego=tuple(bool(shapely.within(ego_polygon, light)) for light in red_lights),
+        red_light_holds_ego=tuple(body.within(light) for light in red_lights),
     )
 
 
@@ -210,10 +162,7 @@ def proposals(
     """The proposals from `ego_state` (11,) along `centerline` (N, 3) through the forecast traffic.
 
     Each starts at the projection of the rear axle on its path with the ego's longitudinal speed.
-    Raises ValueError where the centerline has no length or the speed limit is not positive.
     """
-    if speed_limit_mps is not None and not speed_limit_mps > 0.0:
-        raise ValueError(f"a speed limit of {speed_limit_mps} m/s cannot be driven; None means unknown")
     paths = [drive_path(parallel(centerline, offset)) for offset in settings.lateral_offsets_m]
     limit = settings.fallback_speed_mps if speed_limit_mps is None else speed_limit_mps
     targets = np.tile(np.array(settings.speed_fractions) * limit, len(paths))

@@ -37,15 +37,7 @@ def track(ego_state0: Array, poses: Array, vehicle: Vehicle = PACIFICA, *, plann
     ego_state0: (11,) columns tasks.world.vehicle; poses: (K, 40, 3) world x, y, heading at 0.1 .. 4.0 s.
     planned_pose0: (K, 3) where each plan says the ego is now, when that is not the ego's own pose: the proposals of
     PDM-Closed start on their path, beside the ego.
-    Raises ValueError on other shapes or non-finite poses.
     """
-    poses = np.asarray(poses, dtype=np.float64)
-    if poses.ndim != 3 or poses.shape[1:] != (HORIZON_STEPS, 3) or np.shape(ego_state0) != (EGO_STATE_SIZE,):
-        raise ValueError(
-            f"track() needs ego_state0 (11,) and poses (K, 40, 3), got {np.shape(ego_state0)} and {poses.shape}"
-        )
-    if not (np.isfinite(poses).all() and np.isfinite(ego_state0).all()):
-        raise ValueError("track() needs finite poses and a finite ego state")
     n_plans = poses.shape[0]
     pose0 = np.asarray(ego_state0)[[X, Y, HEADING]] if planned_pose0 is None else planned_pose0
     start = np.broadcast_to(pose0, (n_plans, 3))[:, None]

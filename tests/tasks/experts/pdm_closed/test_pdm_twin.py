@@ -102,7 +102,11 @@ def assert_equals_its_slow_twin(world: World, limit: float | None, chosen: PdmSe
     seen = forecast(world.ego_state, world.agents, world.lights)
     slow_seen = slow_pdm.forecast(world.ego_state, world.agents, world.lights)
     for field in fields(slow_seen):
-        np.testing.assert_array_equal(getattr(seen, field.name), getattr(slow_seen, field.name), err_msg=field.name)
+        one, other = getattr(seen, field.name), getattr(slow_seen, field.name)
+        if field.name == "drift":  # forward or straight back, here by a sign and there by half a turn
+            np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12)
+        else:
+            np.testing.assert_array_equal(one, other, err_msg=field.name)
 
     fast = proposals(world.ego_state, world.centerline, seen, limit, chosen)
     slow = slow_pdm.proposals(world.ego_state, world.centerline, slow_seen, limit, chosen)
