@@ -110,15 +110,6 @@ def test_the_loop_over_tensors_fits_the_same_scene(prepared: tuple[Problem, FitS
         assert np.linalg.norm(apart) < 0.4 * np.linalg.norm(moved), name  # relocated ones differ by their last bits
 
 
-@pytest.mark.slow
-def test_gsplat_s_reference_fits_the_same_scene(prepared: tuple[Problem, FitState]) -> None:
-    problem, one, other = prepared[0], fresh(prepared[1]), fresh(prepared[1])
-    advance(problem, one, SETTINGS, SETTINGS.iterations)
-    advance(problem, other, SETTINGS, SETTINGS.iterations, backend=through_reference())
-    assert len(one) == len(other)
-    assert finish(problem, one).psnr_db == pytest.approx(finish(problem, other).psnr_db, abs=0.1)
-
-
 def test_a_fit_may_go_on_with_another_backend(prepared: tuple[Problem, FitState]) -> None:
     """Half done on the CPU, stored, and handed on; what tensors take they give back."""
     problem, state = prepared[0], fresh(prepared[1])

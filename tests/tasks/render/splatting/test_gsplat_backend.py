@@ -13,13 +13,12 @@ from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Backend, check, render, vehicles_at
 from tasks.render.settings import GateSettings
 from tasks.render.splatting import gsplat_backend, sh
-from tasks.render.splatting.gaussians import EMPTY, Gaussians
+from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gsplat_backend import BackendMissing, arguments, drawn_by, require, view_of
 from tasks.render.splatting.project import CLASSIC, FITTED, NEAR_M
 from tasks.render.splatting.raster import View, forward
 from tasks.render.views import render_views
 from tasks.world.camera import Camera, Pinhole
-from tests.bench import peer_gsplat
 
 POSE = street.ego_pose(3.0, 0.4) @ street.EGO_FROM_CAMERA
 FRONT = Pinhole(street.INTRINSICS, POSE, street.WIDTH, street.HEIGHT)
@@ -146,33 +145,6 @@ def test_the_cpu_needs_nothing_and_a_machine_without_gpu_is_told_so() -> None:
         pytest.skip("there is a GPU here")
     with pytest.raises(BackendMissing, match=r"needs a CUDA device; torch .* sees none"):
         check(Backend.GSPLAT)
-
-
-def test_gsplat_s_reference_draws_the_cpu_s_image(street_asset: RenderAsset) -> None:
-    """All cameras at once, of two sizes, packed and not; vehicles, a sky, colours below zero."""
-    pytest.importorskip("gsplat", reason="gsplat is not installed")
-    import torch
-
-    def draw(given: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        double = {k: torch.from_numpy(v).double() if isinstance(v, np.ndarray) else v for k, v in given.items()}
-        drawn, alpha, _ = peer_gsplat.rasterization(**double)
-        return drawn.numpy(), alpha.numpy()
-
-    half = np.diag([0.5, 0.5, 1.0]) @ FRONT.intrinsics
-    aside = replace(FRONT, world_from_camera=street.ego_pose(0.0, -1.0) @ street.EGO_FROM_CAMERA)
-    cameras = [FRONT, replace(FRONT, intrinsics=half, width=FRONT.width // 2, height=FRONT.height // 2), aside]
-    sky = [np.random.default_rng(1).random((c.height, c.width, 3)).astype(np.float32) for c in cameras]
-    dark = cloud(300, 0)
-    dark = replace(dark, colours=dark.colours - 0.4)
-    scenes = (street_asset.background.take(slice(0, 1500)), dark, cloud(300, 8), EMPTY)
-    for packed, scene in zip((True, False, True, False), scenes):
-        for view, camera, behind in zip(drawn_by(draw, scene, cameras, sky, packed=packed), cameras, sky):
-            size = (camera.width, camera.height)
-            expected = forward(scene, camera.intrinsics, camera.world_from_camera, *size, behind).view
-            np.testing.assert_allclose(view.rgb, expected.rgb, atol=2e-3)  # the light that a tile drops
-            np.testing.assert_allclose(view.alpha, expected.alpha, atol=2e-3)
-            solid = expected.alpha > 0.5
-            np.testing.assert_allclose(view.depth[solid], expected.depth[solid], rtol=5e-3)
 
 
 def test_the_gpu_draws_the_cpu_s_image(street_asset: RenderAsset) -> None:

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+import slow_raster
+import torch
 from numpy.typing import NDArray
-from slow_raster import covariances_of
 
 from tasks.render.splatting.gaussians import (
     Gaussians,
@@ -11,8 +12,8 @@ from tasks.render.splatting.gaussians import (
     quats_of,
     rotations_of,
 )
-from tasks.render.splatting.project import BESIDE, CLASSIC, FITTED, MIN_ALPHA, NEAR_M, ScreenFilter
-from tasks.render.splatting.raster import MAX_ALPHA, forward, gather, splat
+from tasks.render.splatting.project import CLASSIC, FITTED, MIN_ALPHA, ScreenFilter
+from tasks.render.splatting.raster import forward, gather, splat
 
 INTRINSICS = np.array([[60.0, 0.0, 37.0], [0.0, 58.0, 22.0], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 75, 45  # no multiple of a tile
@@ -48,34 +49,10 @@ def slow_rasterize(
     screen: ScreenFilter = FITTED,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Every Gaussian on every pixel, in float64, nearest first."""
-    camera = np.linalg.inv(scene_from_camera)
-    means = gaussians.means.astype(np.float64) @ camera[:3, :3].T + camera[:3, 3]
-    covariances = camera[:3, :3] @ covariances_of(gaussians) @ camera[:3, :3].T
-    fx, fy, cx, cy = INTRINSICS[0, 0], INTRINSICS[1, 1], INTRINSICS[0, 2], INTRINSICS[1, 2]
-    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    light, rgb, depth = np.ones((HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH))
-    for i in np.argsort(means[:, 2], kind="stable"):
-        x, y, z = means[i]
-        if z < NEAR_M:
-            continue
-        tx = np.clip(x / z, -(cx + BESIDE * WIDTH) / fx, (WIDTH - cx + BESIDE * WIDTH) / fx)
-        ty = np.clip(y / z, -(cy + BESIDE * HEIGHT) / fy, (HEIGHT - cy + BESIDE * HEIGHT) / fy)
-        jacobian = np.array([[fx / z, 0.0, -fx / z * tx], [0.0, fy / z, -fy / z * ty]])
-        sharp = jacobian @ covariances[i] @ jacobian.T
-        wider = sharp + screen.dilation_px2 * np.eye(2)
-        conic, peak = np.linalg.inv(wider), gaussians.opacities[i]
-        if screen.keeps_light:
-            peak = peak * np.sqrt(np.linalg.det(sharp) / np.linalg.det(wider))
-        du, dv = u - (fx * x / z + cx), v - (fy * y / z + cy)
-        power = -0.5 * (conic[0, 0] * du**2 + 2 * conic[0, 1] * du * dv + conic[1, 1] * dv**2)
-        alpha = np.minimum(peak * np.exp(power), MAX_ALPHA)
-        weight = np.where(alpha >= MIN_ALPHA, alpha, 0.0) * light
-        light = light - weight
-        rgb += weight[..., None] * gaussians.colours[i]
-        depth += weight * z
-    alpha = 1.0 - light
-    mean_depth = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0)
-    return rgb + light[..., None] * background, mean_depth, alpha
+    behind = torch.tensor(background, dtype=torch.float64)
+    scene = slow_raster.slow(gaussians, grad=False)
+    rgb, depth, alpha = slow_raster.slow_render(scene, INTRINSICS, scene_from_camera, behind, screen=screen)
+    return rgb.numpy(), depth.numpy(), alpha.numpy()
 
 
 @pytest.mark.parametrize("screen", [FITTED, CLASSIC])
