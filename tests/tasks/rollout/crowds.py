@@ -1,17 +1,18 @@
 """Crowds of vehicles on a map's lanes and an ego among them, and such a scene as arrays for another Python."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tasks.rollout.lqr import track
 from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import CLIP_STEPS, Clip, Scene, scene_of_clip
+from tasks.world.clip import CLIP_STEPS, Scene, scene_of_clip
 from tasks.world.frames import to_world, wrap_angle
-from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap, Route
+from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap
 from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, VX, X
+from tests.tasks.rollout import worlds
 
 Array = NDArray[np.float64]
 NEAR_M = 70.0
@@ -39,19 +40,8 @@ class Crowd:
             center_z=np.full((CLIP_STEPS, n), 0.75),
             heights=np.full(n, 1.5),
         )
-        clip = Clip(
-            clip_id="crowd",
-            dataset="crowd",
-            log_id="crowd",
-            split="train",
-            start_s=0.0,
-            ego_states=np.tile(self.ego_states[0], (CLIP_STEPS, 1)),
-            world_from_ego=np.tile(np.eye(4), (CLIP_STEPS, 1, 1)),
-            agents=agents,
-            road_map=self.road_map,
-            route=Route((), (), frozenset()),
-            centerline=np.zeros((2, 3)),
-        )
+        ego_states = np.tile(self.ego_states[0], (CLIP_STEPS, 1))
+        clip = replace(worlds.clip({}, agents), road_map=self.road_map, ego_states=ego_states)
         return scene_of_clip(clip)
 
 

@@ -11,10 +11,11 @@ from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic,
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Rollout, Scene, scene_of_clip
 from tasks.world.frames import box_corners
-from tasks.world.lanes import Lane, LightState, TrafficLights
+from tasks.world.lanes import LightState, TrafficLights
 from tasks.world.vehicle import PACIFICA
 from tests.tasks.rollout import worlds
 from tests.tasks.rollout.worlds import Track
+from tests.tasks.streets import moved
 
 IDM = TrafficSettings()
 PLAIN = TrafficSettings(yields=False)  # whoever is driven wants to go at its target speed
@@ -333,30 +334,12 @@ def test_the_order_of_the_agents_does_not_matter(settings: TrafficSettings) -> N
     assert np.array_equal(plain.simulated[order], other.simulated)
 
 
-def moved_scene(scene: Scene, angle: float, shift: tuple[float, float]) -> Scene:
-    """The whole world turned about the origin and shifted."""
-    c, s = np.cos(angle), np.sin(angle)
-    turn = np.array([[c, -s], [s, c]])
-
-    def poses(p: np.ndarray) -> np.ndarray:
-        return np.concatenate([p[..., :2] @ turn.T + shift, p[..., 2:3] + angle, p[..., 3:]], axis=-1)
-
-    def lane(of: Lane) -> Lane:
-        return replace(of, ring=of.ring @ turn.T + shift, centerline=poses(of.centerline))
-
-    clip = scene.clip
-    agents = replace(clip.agents, boxes=poses(clip.agents.boxes), velocities=clip.agents.velocities @ turn.T)
-    lanes = {k: lane(v) for k, v in clip.road_map.lanes.items()}
-    return scene_of_clip(
-        replace(clip, agents=agents, road_map=replace(clip.road_map, lanes=lanes), ego_states=poses(clip.ego_states))
-    )
-
-
 @pytest.mark.parametrize("settings", [PLAIN, IDM])
 def test_a_shifted_and_turned_world_rolls_out_the_same(settings: TrafficSettings) -> None:
     scene = busy_scene()
     angle, shift = 2.1, (3000.0, -1500.0)
-    expected, got = run(scene, settings).agents, run(moved_scene(scene, angle, shift), settings).agents
+    there = scene_of_clip(moved(scene.clip, np.array([*shift, angle])))
+    expected, got = run(scene, settings).agents, run(there, settings).agents
     assert np.array_equal(expected.valid, got.valid)
     c, s = np.cos(angle), np.sin(angle)
     xy = expected.boxes[..., :2] @ np.array([[c, s], [-s, c]]) + shift
