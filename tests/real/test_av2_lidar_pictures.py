@@ -61,9 +61,3 @@ def test_all_nine_cameras_show_the_street_as_bright_as_its_returns(clip: Clip, a
         assert alike > 0.45, f"{camera.name}: {alike:.2f}"  # 0.51 (rear left) to 0.92
         assert view.alpha[view.alpha.shape[0] // 2 :].mean() > 0.3, camera.name
         assert view.rgb.min() > 0.05 and view.rgb.std() > 0.1, camera.name
-
-
-def test_a_scene_from_lidar_alone_is_grey_and_of_unknown_quality(asset: RenderAsset) -> None:
-    assert np.isnan(asset.psnr_db) and asset.views == ()
-    assert np.ptp(asset.background.colours, axis=1).max() == 0.0
-    assert asset.block is not None and asset.block.log_id == LOG and len(asset.nodes) > 10

@@ -15,7 +15,7 @@ from factory.datasets.navsim.log import CAMERA_NAMES
 from factory.datasets.navsim.maps import open_city
 from factory.datasets.navsim.reader import NavsimReader
 from factory.readers.logs import WholeLog
-from factory.stages.sensors import block_of, load_photos
+from factory.stages.sensors import load_photos
 from tasks.render.scene.sensed import Photo
 from tasks.world.agents import AgentTracks
 from tasks.world.camera import Camera
@@ -97,27 +97,6 @@ def _log_on_the_road(maps: Path, poses: np.ndarray) -> WholeLog:
     road_map = open_city(maps, CITY).road_map(states[:, :2], 100.0)
     route = route_of_roadblocks(road_map, ["31", "33", "32"], states[NOW, :3])
     return WholeLog("photos", states, agents, road_map, route, TrafficLights((), nobody.astype(np.int8)), "", "")
-
-
-def test_every_camera_is_the_one_that_was_written(clip: Clip, drive: PhotoDrive) -> None:
-    assert [camera.name for camera in clip.cameras] == list(CAMERA_NAMES)
-    for camera in clip.cameras:
-        written = drive.cameras[camera.name]
-        assert (camera.width, camera.height) == (1920, 1080)
-        for field in ("intrinsics", "distortion", "ego_from_camera"):
-            assert (getattr(camera, field) == getattr(written, field)).all(), field
-
-
-def test_every_photo_is_its_camera_s_at_its_instant(clip: Clip, drive: PhotoDrive) -> None:
-    assert len(clip.images) == 128 and block_of(clip).images == clip.images and not clip.sweeps
-    photos = {(image.sensor, round(image.time_s / 0.5) - BARE): image for image in clip.images}
-    assert photos.keys() == {(name, k) for name in CAMERA_NAMES for k in range(16)}
-    for (name, k), image in photos.items():
-        path = Path(image.uri)
-        assert path.parts[-3:-1] == (LOG, name) and path.read_bytes() == drive.photo(name, k)
-        assert np.abs(image.world_from_ego - drive.poses[k]).max() < 1e-8
-        step = FRAME_STEPS * (BARE + k)
-        assert np.abs(clip.world_from_ego[step] - drive.poses[k]).max() < 1e-8
 
 
 def _opened(clip: Clip, name: str, instant: int) -> tuple[Photo, np.ndarray]:

@@ -81,7 +81,7 @@ def literal(graph: dict[str, list[str]], start: str, targets: list[str], max_dep
     return []
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(st.lists(st.integers(0, 6), max_size=3), min_size=7, max_size=7), st.integers(0, 6), st.integers(1, 7))
 def test_the_search_is_the_literal_one(edges: list[list[int]], goal: int, depth: int) -> None:
     graph = {str(k): [str(other) for other in row] for k, row in enumerate(edges)}
