@@ -20,7 +20,7 @@ from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_
 from tasks.world.frames import to_world
 from tasks.world.vocabulary import kinematic_trajectories
 from tests.tasks.bad_ends import Aside, Close, shift
-from tests.tasks.streets import moved, perturbed, same_poses, street_clip
+from tests.tasks.streets import moved, same_poses, street_clip
 
 GATE = ExpertGate()
 RNG = np.random.default_rng(0)  # no expert here draws from it
@@ -135,18 +135,6 @@ def test_both_experts_recover_from_beside_the_lane_s_middle(scene: Scene, table:
         assert all(getattr(judged.scores, name)[1] == 1.0 for name in GATE.full)
         assert judged.scores.ep[1] > 0.5
         assert abs(judged.rollout.ego_states[-1, 1]) < abs(scene.ego_state[1])
-
-
-def test_the_verdict_over_a_clip_s_list_agrees_with_its_scores(table: RecoveryTable) -> None:
-    clip = street_clip()
-    accepted, rejected = 0, 0
-    for candidate in perturbed(clip, 250).candidates[:12]:
-        judged, verdict_ = tried(perturbed_scene(clip, candidate.rollout), Recovery(table))
-        passes = all(getattr(judged.scores, n)[1] == 1.0 for n in GATE.full) and judged.scores.ep[1] > 0.5
-        assert (verdict_ is None) == passes
-        accepted, rejected = accepted + passes, rejected + (not passes)
-    assert accepted > 0
-    assert rejected > 0
 
 
 def test_a_route_that_has_ended_is_a_rejection_not_an_error(scene: Scene) -> None:

@@ -60,14 +60,6 @@ def test_a_follower_stops_behind_a_standing_car_with_the_minimum_gap() -> None:
     assert (boxes[:, 1] == scene.agents.boxes[NOW, 1]).all()
 
 
-def test_a_follower_brakes_for_the_ego_where_the_egos_body_is() -> None:
-    """Rear axle at 30 m: the bumper it must not touch is 1.127 m behind that."""
-    scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), ego=(30.0, 0.0, 0.0))
-    rollout = run(next_scene(scene, run(scene, PLAIN), scene.centerline), PLAIN)
-    nose = rollout.agents.boxes[-1, 0, 0] + worlds.CAR[0] / 2.0
-    assert 30.0 - 1.127 - 4.0 < nose < 30.0 - 1.127 - 0.9
-
-
 def test_the_ego_is_for_others_what_a_car_of_its_size_about_its_true_centre_is() -> None:
     size = (PACIFICA.length, PACIFICA.width)
     parked = Track(30.0 + PACIFICA.rear_axle_to_center, 0.0, 0.0, 0.0, AgentKind.VEHICLE, size)
@@ -269,14 +261,6 @@ def walk(x: float, y: float, speed: float) -> np.ndarray:
     """(96, 3) poses of one who walks along +y and is at (x, y) at NOW."""
     way = y + speed * STEP_S * (np.arange(CLIP_STEPS) - NOW)
     return np.column_stack([np.full(CLIP_STEPS, x), way, np.full(CLIP_STEPS, np.pi / 2)])
-
-
-def test_a_driven_car_stops_for_a_pedestrian_on_its_way() -> None:
-    stands = Track(25.0, 0.3, kind=AgentKind.PEDESTRIAN, size=(0.6, 0.6))
-    scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), stands)
-    first = run(scene)
-    second = run(next_scene(scene, first, scene.centerline))
-    assert overlap_area(first.agents, 0, 1) == overlap_area(second.agents, 0, 1) == 0.0
 
 
 def test_replay_returns_the_log_bit_for_bit() -> None:

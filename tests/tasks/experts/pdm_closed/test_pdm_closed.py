@@ -105,25 +105,6 @@ def test_a_leading_car_at_its_speed_is_followed_not_stopped_for(road: Road, obje
     assert plan_for(led).proposals.progress_velocity[4, 50, 1] > 6.5
 
 
-def test_a_car_that_drives_backwards_is_forecast_against_its_heading() -> None:
-    backing = AgentTracks(
-        ("a",),
-        (AgentKind.VEHICLE,),
-        np.array([[[30.0, 0.0, 0.0, *CAR]]]),
-        np.array([[[-2.0, 0.1]]]),
-        np.ones((1, 1), bool),
-        np.zeros((1, 1)),
-        np.ones(1),
-    )
-    seen = forecast(np.zeros(11), backing)
-    np.testing.assert_allclose(seen.drift, [[-np.hypot(2.0, 0.1), 0.0]], atol=1e-12)
-
-
-def test_standing_kinds_never_move_in_the_forecast(objects: Objects) -> None:
-    cone = objects([[10.0, 3.0, 0.0, 0.4, 0.4]], [5.0], [AgentKind.TRAFFIC_CONE])
-    assert (forecast(np.zeros(11), cone).drift == 0.0).all()
-
-
 def test_only_the_nearest_fifty_vehicles_within_a_hundred_metres_count(objects: Objects) -> None:
     boxes = [[5.0 + 2.0 * i, 8.0, 0.0, 1.0, 1.0] for i in range(60)]
     seen = forecast(np.zeros(11), objects(boxes, [0.0] * 60, [AgentKind.VEHICLE] * 60).window(15, 16))

@@ -148,14 +148,6 @@ def test_what_lies_on_the_road_lies_on_it_on_average(prepared: tuple[Problem, Fi
     assert np.nanmax(np.abs(away)) < SLACK_M + 1e-4
 
 
-def test_the_number_of_threads_changes_no_bit(prepared: tuple[Problem, FitState]) -> None:
-    one, two = fresh(prepared[1]), fresh(prepared[1])
-    advance(prepared[0], one, SETTINGS, 8, threads=1)
-    advance(prepared[0], two, SETTINGS, 8, threads=2)
-    for name, array in one.arrays().items():
-        np.testing.assert_array_equal(array, two.arrays()[name], err_msg=name)
-
-
 def test_a_picture_is_shown_with_the_exposure_that_was_learned_for_its_camera(
     prepared: tuple[Problem, FitState],
 ) -> None:
@@ -322,14 +314,6 @@ def test_a_vehicle_s_gradients_are_turned_into_its_own_frame(prepared: tuple[Pro
         assert np.linalg.norm(turned[name][mine] - wanted) < 0.01 * size, name  # float32, and discs as thin as paper
         rest = np.delete(own[name], mine, axis=0)
         np.testing.assert_allclose(np.delete(turned[name], mine, axis=0), rest, atol=0.01 * abs(rest).max())
-
-
-def test_road_gaussians_stay_on_the_road(prepared: tuple[Problem, FitState]) -> None:
-    problem, state = prepared[0], fresh(prepared[1])
-    advance(problem, state, SETTINGS, 12)
-    heights = state.learned["means"].values[state.road, 2]
-    assert state.road.sum() > 100
-    assert np.abs(heights + problem.origin[2]).max() < SLACK_M + 0.01
 
 
 def test_progress_is_told_and_photos_are_needed() -> None:

@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-import street
 
-from tasks.render.scene.build import AssetSettings, build_asset
 from tasks.render.scene.depth import see
 from tasks.render.scene.features import Points
 from tasks.render.scene.sensed import Photo, Tracks
@@ -28,13 +26,3 @@ def test_a_road_that_is_known_lies_behind_a_car_and_not_on_it() -> None:
     assert free[38, 48] == pytest.approx(1.5 * 60.0 / 6.5, rel=0.1)  # 14 m, the road there
     assert hidden[38, 48] != pytest.approx(free[38, 48], rel=0.2)
     assert hidden[60, 48] == pytest.approx(free[60, 48], rel=1e-6)  # in front of the car nothing changes
-
-
-@pytest.mark.slow
-def test_without_lidar_the_street_is_recognised_though_less_well() -> None:
-    photos, sweeps = street.drive()
-    settings = AssetSettings(hold_out_every=6)
-    alone = build_asset(photos, [], street.tracks(), settings)
-    both = build_asset(photos, sweeps, street.tracks(), settings)
-    assert len(alone.background) > 1000
-    assert 20.0 < alone.psnr_db < both.psnr_db  # 21.7 and 26.4 as measured

@@ -53,13 +53,6 @@ def test_without_its_box_the_car_leaves_no_trail(street_asset: RenderAsset) -> N
     assert psnr(drawn, truth.rgb) > 26.0
 
 
-def test_what_the_car_hid_is_the_road_behind_it(street_asset: RenderAsset) -> None:
-    hidden = red(street.photo(4.5, 0.0, 1.125).rgb)
-    truth = street.photo(4.5, 0.0, 1.125, with_car=False)
-    drawn = rendered(street_asset, truth, with_car=False)
-    assert psnr(drawn[hidden], truth.rgb[hidden]) > 18.0
-
-
 def test_a_track_nobody_photographed_is_a_visible_box(street_asset: RenderAsset) -> None:
     box = np.array([14.0, -2.0, 0.8, 0.0, *street.CAR])
     view = street.photo(4.5, 0.0, 1.125, with_car=False)

@@ -32,19 +32,6 @@ def test_boxes_touch_exactly_where_the_numpy_version_says_so() -> None:
     assert np.array_equal(verdict, geometry.touching(first, second))
 
 
-def test_boxes_of_any_heading_touch_where_their_polygons_intersect() -> None:
-    rng = np.random.default_rng(2)
-    first, second = (
-        np.concatenate(
-            [rng.uniform(-4, 4, (4000, 2)), rng.uniform(-7, 7, (4000, 1)), rng.uniform(0.2, 5, (4000, 2))], 1
-        )
-        for _ in range(2)
-    )
-    polygons = shapely.polygons(box_corners(first)), shapely.polygons(box_corners(second))
-    verdict = [touching(box(*a), box(*b)) for a, b in zip(first, second)]
-    assert np.array_equal(verdict, shapely.intersects(*polygons))
-
-
 def test_boxes_that_are_apart_never_touch_and_the_others_nearly_always_do() -> None:
     rng = np.random.default_rng(3)
     pairs = [(box(*a), box(*b)) for a, b in zip(random_boxes(rng, 4000), random_boxes(rng, 4000))]
