@@ -101,7 +101,7 @@ def test_the_traffic_equals_its_slow_twin(yields: bool, seed: int) -> None:
 @given(
     seed=seeds, blend_length_m=st.sampled_from([0.5, 3.0, 20.0]), lookahead_m=st.sampled_from([3.0, 25.0, 200.0])
 )  # fmt: skip
-@settings(max_examples=15)
+@settings(max_examples=8)
 def test_so_it_does_under_other_settings(yields: bool, seed: int, blend_length_m: float, lookahead_m: float) -> None:
     """Also where the corridor reaches beyond the path's end."""
     of = TrafficSettings(
@@ -113,7 +113,7 @@ def test_so_it_does_under_other_settings(yields: bool, seed: int, blend_length_m
 
 @BOTH
 @given(seed=seeds)
-@settings(max_examples=25)
+@settings(max_examples=12)
 def test_each_of_many_rollouts_is_that_of_its_ego_alone(yields: bool, seed: int) -> None:
     for traffic, egos in stages(seed, TrafficSettings(yields=yields)):
         rollouts = roll_out_many(traffic, egos)

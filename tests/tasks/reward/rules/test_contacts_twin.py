@@ -165,7 +165,7 @@ def test_both_rules_equal_the_numpy_version(world: World) -> None:
     np.testing.assert_array_equal(contacts(world, indexed(world)), slow_contacts(world))
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(worlds())
 def test_objects_without_an_index_give_the_same(world: World) -> None:
     plain = unindexed(world.boxes, world.is_stopped, world.collision_score)
