@@ -29,7 +29,6 @@ from tasks.world.clip import Block
 SIZE = (400, 225)
 EVERY = 8  # of the photos one is held out, as `hold_out_every` has it
 Pair = tuple[SensorFile, SensorFile]  # as given and as corrected
-Corrected = tuple[Block, tuple[Camera, ...], Correction | None]
 SETTINGS = replace(FitSettings(), iterations=1500, start_gaussians=120_000, most_gaussians=160_000, stereo_photos=6)
 
 

@@ -11,8 +11,8 @@ from tasks.reward.prepare import prepare
 from tasks.world.lanes import MapLayer, MapPolygon
 from tests.tasks.reward.random_worlds import random_drives, random_world
 
-BOW_TIE = np.array([[0.0, 0.0], [4.0, 4.0], [4.0, 0.0], [0.0, 4.0], [0.0, 0.0]])
 SQUARE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.0]])
+BOW_TIE = np.array([[0.0, 0.0], [4.0, 4.0], [4.0, 0.0], [0.0, 4.0], [0.0, 0.0]])
 
 
 def with_value(values: np.ndarray, value: float, *index: int) -> np.ndarray:
@@ -43,22 +43,14 @@ SEEN = tuple(np.argwhere(OBJECTS.valid)[0])  # a step and an object
         ({"ego_state0": PAST[-1, :5]}, "ego_state0"),
         ({"past_states": None}, "drop_touching"),
         ({"centerline": with_nan(LINE, 5, 1)}, "centerline"),
-        ({"centerline": np.empty((0, 3))}, "centerline"),
-        ({"centerline": LINE[:1]}, "centerline"),
-        ({"centerline": LINE[0]}, "centerline"),
-        ({"centerline": np.repeat(LINE[:1], 4, axis=0)}, "centerline"),
         ({"polygons": polygon(BOW_TIE)}, "odd one"),
-        ({"polygons": polygon(with_nan(SQUARE, 2, 0))}, "odd one"),
-        ({"polygons": polygon(SQUARE[[0, 1, 0]])}, "odd one"),
-        ({"polygons": polygon(SQUARE * [1.0, 0.0])}, "odd one"),
+        ({"polygons": polygon(SQUARE + 1e9)}, "odd one"),
         ({"objects": OBJECTS.window(0, 30)}, "objects"),
         ({"objects": replace(OBJECTS, boxes=OBJECTS.boxes[..., :4])}, "objects"),
         ({"objects": replace(OBJECTS, velocities=OBJECTS.velocities[:, :0])}, "objects"),
         ({"red_lanes": (("l0",), np.ones((5, 1), dtype=bool))}, "red lanes"),
         ({"red_lanes": (("l0",), np.ones((41, 1)))}, "red lanes must be bool"),
         ({"past_states": with_value(PAST, 1e300, 3, 2)}, "past_states"),
-        ({"centerline": with_value(LINE, 1e300, 5, 1)}, "centerline"),
-        ({"polygons": polygon(SQUARE + 1e9)}, "odd one"),
         ({"objects": replace(OBJECTS, kinds=OBJECTS.kinds[:-1])}, "objects.kinds"),
         ({"objects": replace(OBJECTS, boxes=with_value(OBJECTS.boxes, np.inf, *SEEN, 0))}, "objects.boxes"),
         ({"objects": replace(OBJECTS, boxes=with_value(OBJECTS.boxes, -4.0, *SEEN, 3))}, "objects.boxes"),

@@ -28,11 +28,6 @@ def pair() -> list[Photo]:
     return [left, developed(right, DARKER)]
 
 
-def test_a_row_is_taken_back_by_its_inverse() -> None:
-    rgb = np.random.default_rng(0).uniform(0, 1, (5, 3)).astype(np.float32)
-    np.testing.assert_allclose(exposed(exposed(rgb, DARKER), inverse(DARKER)), rgb, atol=1e-6)
-
-
 def test_an_instant_holds_each_camera_once() -> None:
     at = [("a", 0.00), ("b", 0.01), ("a", 0.02), ("b", 0.10), ("a", 0.12)]
     photos = [replace(pair()[0], camera=name, time_s=time) for name, time in at]
