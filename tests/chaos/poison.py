@@ -31,8 +31,8 @@ from factory.store.samples import Store
 from factory.store.verify import verify
 from tasks.stages import Rejected
 from tasks.world.camera import SensorFile
+from tests.factory.datasets.navsim.openscene_writer import merged_pcd
 from tests.factory.graph.wild import WildWork
-from tests.factory.readers.openscene_writer import merged_pcd
 from tests.factory.toy import refs
 
 HUMAN = "human"

@@ -10,8 +10,8 @@ import pytest
 
 from factory.exits import BAD_CONFIG, COMPLETE
 from tests.chaos.file_steps import compiler
+from tests.factory.datasets.navsim import simscale_writer
 from tests.factory.graph.runs import run
-from tests.factory.imports import simscale_writer
 from tests.pages import REPOSITORY
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="links are refused on Linux, with a C compiler")

@@ -22,8 +22,8 @@ from tasks.world.camera import Camera
 from tasks.world.clip import CLIP_STEPS, NOW, Clip
 from tasks.world.lanes import TrafficLights
 from tasks.world.roadblocks import route_of_roadblocks
-from tests.factory.readers.geopackage_writer import CITIES, ORIGIN, stub_rows, write_geopackage
-from tests.factory.readers.openscene_writer import FRAME_STEPS, Place, Sensed, write_openscene
+from tests.factory.datasets.navsim.geopackage_writer import CITIES, ORIGIN, stub_rows, write_geopackage
+from tests.factory.datasets.navsim.openscene_writer import FRAME_STEPS, Place, Sensed, write_openscene
 
 pytestmark = pytest.mark.slow
 

@@ -31,12 +31,12 @@ from tasks.render.splatting.project import CLASSIC
 from tasks.world.camera import SensorFile
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.chaos.damaged_files.mutants_of_files import Rng, of_bytes, of_json, of_pickle, of_text
-from tests.factory.readers import scenarionet_scenarios
-from tests.factory.readers.navsim import scene_pickles
-from tests.factory.readers.navsim.logs import NAME, frame
-from tests.factory.readers.navsim.test_filters import FILTER
-from tests.factory.readers.openscene_writer import merged_pcd, write_frames
-from tests.factory.readers.py123d_logs import convert
+from tests.factory.datasets.navsim import scene_pickles
+from tests.factory.datasets.navsim.logs import NAME, frame
+from tests.factory.datasets.navsim.openscene_writer import merged_pcd, write_frames
+from tests.factory.datasets.navsim.test_filters import FILTER
+from tests.factory.datasets.py123d.py123d_logs import convert
+from tests.factory.datasets.scenarionet import scenarionet_scenarios
 from tests.factory.stages.test_scene_file import scene
 
 TOWN = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=4, lidar_azimuths=30)

@@ -10,7 +10,7 @@ import pytest
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.apart import Apart
 from factory.readers.base import BadClip
-from tests.factory.readers.scenarionet_scenarios import nuscenes, save
+from tests.factory.datasets.scenarionet.scenarionet_scenarios import nuscenes, save
 
 
 def pid_of(_: int) -> int:

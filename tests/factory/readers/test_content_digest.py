@@ -4,7 +4,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import scenarionet_scenarios as town
 from test_av2 import write_log
 
 from factory.datasets.av2.reader import AV2Reader
@@ -13,9 +12,10 @@ from factory.datasets.py123d.reader import Py123dReader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import BadClip, ClipRef
 from factory.readers.logs import LogReader
-from tests.factory.readers.navsim.small import reader_of, road_frames, write_city
-from tests.factory.readers.navsim.small import write_log as write_navsim_log
-from tests.factory.readers.py123d_logs import convert
+from tests.factory.datasets.navsim.small import reader_of, road_frames, write_city
+from tests.factory.datasets.navsim.small import write_log as write_navsim_log
+from tests.factory.datasets.py123d.py123d_logs import convert
+from tests.factory.datasets.scenarionet import scenarionet_scenarios as town
 
 
 def av2(folder: Path) -> tuple[AV2Reader, Path]:

@@ -15,7 +15,7 @@ from factory.datasets.navsim.rewards import RewardFile
 from factory.readers.base import BadClip
 from factory.readers.pickles import load_plain
 from factory.wording import shown
-from tests.factory.readers.scenarionet_scenarios import nuscenes, save
+from tests.factory.datasets.scenarionet.scenarionet_scenarios import nuscenes, save
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 MEMORY_BYTES = 6 << 30

@@ -17,10 +17,10 @@ from factory.files import folders_in, matching_below
 from factory.readers.whole_folder import SUMS, make_whole, mend
 from factory.store.reader import SampleTable
 from tests.factory.data_folders import add_companions, put_behind_links
-from tests.factory.imports import simscale_writer
-from tests.factory.readers import scenarionet_scenarios
-from tests.factory.readers.navsim.small import road_frames, write_blobs, write_city, write_log
-from tests.factory.readers.py123d_logs import convert
+from tests.factory.datasets.navsim import simscale_writer
+from tests.factory.datasets.navsim.small import road_frames, write_blobs, write_city, write_log
+from tests.factory.datasets.py123d.py123d_logs import convert
+from tests.factory.datasets.scenarionet import scenarionet_scenarios
 from tests.pages import REPOSITORY
 
 SIMULATED = "synthetic_reaction_pdm_v1.0-0"

@@ -7,8 +7,8 @@ import pytest
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import NUSCENES_VAL, nuscenes_split, split_of, waymo_split
-from tests.factory.readers import scenarionet_scenarios as town
-from tests.factory.readers.test_av2 import write_log
+from tests.factory.datasets.av2.test_av2 import write_log
+from tests.factory.datasets.scenarionet import scenarionet_scenarios as town
 
 
 @pytest.mark.parametrize("named", ["train", "val", "test"])

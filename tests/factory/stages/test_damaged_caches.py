@@ -28,9 +28,9 @@ from tasks.kernels.compiled import kernel
 from tasks.sealed import SEAL_BYTES, Damaged, seal, sealed, sealed_json, unsealed_json
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.factory.damage import damaged
-from tests.factory.readers.geopackage_writer import stub_rows, write_root
-from tests.factory.readers.navsim.logs import NAME, frame
-from tests.factory.readers.openscene_writer import write_frames
+from tests.factory.datasets.navsim.geopackage_writer import stub_rows, write_root
+from tests.factory.datasets.navsim.logs import NAME, frame
+from tests.factory.datasets.navsim.openscene_writer import write_frames
 from tests.factory.stages.test_scene_file import scene
 from tests.factory.toy import ToyWork, refs
 

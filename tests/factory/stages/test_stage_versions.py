@@ -41,8 +41,8 @@ from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_
 from tasks.world.frames import to_world
 from tasks.world.vehicle import EGO_STATE_SIZE, VX, Y
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
-from tests.factory.readers.scenarionet_scenarios import nuscenes, save
-from tests.factory.readers.test_av2 import write_log
+from tests.factory.datasets.av2.test_av2 import write_log
+from tests.factory.datasets.scenarionet.scenarionet_scenarios import nuscenes, save
 from tests.factory.stages.golden import GOLDEN, Golden, Sums
 from tests.tasks.render import street
 from tests.tasks.streets import street_clip

@@ -8,7 +8,7 @@ import yaml
 
 from planners.evaluation.evaluate import main
 from planners.evaluation.navsim import IN_DEVKIT, read_table
-from tests.factory.imports.navsim_town import NOW, TOKENS, frames_of, write_installation
+from tests.factory.datasets.navsim.navsim_town import NOW, TOKENS, frames_of, write_installation
 
 pytestmark = pytest.mark.slow  # a town, a city's map, PDM-Closed
 

@@ -36,9 +36,9 @@ from tasks.trajectories import score_trajectories
 from tasks.world.clip import Clip
 from tasks.world.frames import to_world
 from tasks.world.lanes import LightState
-from tests.factory.exports.openscene_reader import Scene, read_rewards, read_scenes, read_split
-from tests.factory.readers.geopackage_writer import ORIGIN, town_rows, write_root
-from tests.factory.readers.openscene_writer import Place, Sensed, sensed_by_town, write_openscene
+from tests.factory.datasets.navsim.geopackage_writer import ORIGIN, town_rows, write_root
+from tests.factory.datasets.navsim.openscene_reader import Scene, read_rewards, read_scenes, read_split
+from tests.factory.datasets.navsim.openscene_writer import Place, Sensed, sensed_by_town, write_openscene
 from tests.planners.navsim import agent_inputs
 from tests.planners.navsim.agent_inputs import DISTORTION, AgentInput, Cameras, EgoStatus
 

@@ -18,8 +18,8 @@ from planners.__main__ import main as planners
 from planners.navsim.agent import shown
 from planners.navsim.pilot import FRONT, Pilot, seen_of
 from planners.navsim.submit import Team, scenes_of, submission_bytes
-from tests.factory.readers.navsim import scene_pickles
-from tests.factory.readers.openscene_writer import write_frames
+from tests.factory.datasets.navsim import scene_pickles
+from tests.factory.datasets.navsim.openscene_writer import write_frames
 from tests.planners.navsim import agent_inputs
 from tests.planners.navsim.agent_inputs import AgentInput, Camera, Cameras, EgoStatus
 from tests.planners.navsim.trained import made, saved

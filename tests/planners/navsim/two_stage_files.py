@@ -11,10 +11,10 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from tests.factory.readers.geopackage_writer import ORIGIN, stub_rows, write_root
-from tests.factory.readers.navsim import scene_pickles
-from tests.factory.readers.navsim.logs import NAME, frame
-from tests.factory.readers.openscene_writer import write_frames
+from tests.factory.datasets.navsim import scene_pickles
+from tests.factory.datasets.navsim.geopackage_writer import ORIGIN, stub_rows, write_root
+from tests.factory.datasets.navsim.logs import NAME, frame
+from tests.factory.datasets.navsim.openscene_writer import write_frames
 from tests.planners.navsim.agent_inputs import DISTORTION, YAWS, looking, photo, pinhole
 
 SIZE = (160, 90)

@@ -1,0 +1,301 @@
+"""Writes second-stage scenes as NAVSIM's `Scene.save_to_disk` does, without nuPlan: classes of the same names, pickled.
+
+Field by field as the real ones: points in space and time have slots, TrackedObjectType carries a second value, a
+StaticObject has no velocity.
+"""
+
+import enum
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from tests.factory.datasets.navsim.openscene_writer import numpy_1_pickle
+
+STATE = "nuplan.common.actor_state.state_representation"
+TOKEN, ORIGINAL, BEFORE = "0000000000005a00c", "000000000000a00c", "000000000000a004"
+CAMERAS = ("cam_f0", "cam_l0", "cam_l1", "cam_l2", "cam_r0", "cam_r1", "cam_r2", "cam_b0")
+
+
+class _Thing:
+    def __init__(self, **fields: Any) -> None:
+        self.__dict__.update(fields)
+
+
+def _kind(number: int) -> Any:
+    return TYPES["nuplan.common.actor_state.tracked_objects_types TrackedObjectType"](number)
+
+
+class TrafficLightStatusType(enum.IntEnum):
+    GREEN = 0
+    YELLOW = 1
+    RED = 2
+    UNKNOWN = 3
+
+
+class TrackedObjectType(enum.Enum):
+    VEHICLE = 0, "vehicle"
+    PEDESTRIAN = 1, "pedestrian"
+    BICYCLE = 2, "bicycle"
+    TRAFFIC_CONE = 3, "traffic_cone"
+    BARRIER = 4, "barrier"
+    CZONE_SIGN = 5, "czone_sign"
+    GENERIC_OBJECT = 6, "generic_object"
+    EGO = 7, "ego"
+
+    def __new__(cls, value: int, name: str) -> "TrackedObjectType":
+        member = object.__new__(cls)
+        member._value_ = value
+        return member
+
+
+def _slotted(name: str, *slots: str) -> Any:
+    """A class without a dictionary of its fields."""
+
+    def begin(self: Any, *values: Any, **fields: Any) -> None:
+        for key, value in (*zip(slots, values), *fields.items()):
+            setattr(self, key, value)
+
+    return type(name, (), {"__slots__": slots, "__init__": begin})
+
+
+TimePoint = _slotted("TimePoint", "time_us")
+SLOTTED = (_slotted("StateSE2", "x", "y", "heading"), _slotted("StateVector2D", "_x", "_y", "_array"), TimePoint)
+TYPES: dict[str, Any] = {
+    f"{module} {name}": type(name, (_Thing,), {})
+    for module, names in {
+        "nuplan.common.maps.maps_datatypes": ("TrafficLightStatuses", "TrafficLightStatusData"),
+        "nuplan.planning.simulation.observation.observation_type": ("DetectionsTracks",),
+        "nuplan.common.actor_state.tracked_objects": ("TrackedObjects",),
+        "nuplan.common.actor_state.agent": ("Agent",),
+        "nuplan.common.actor_state.static_object": ("StaticObject",),
+        "nuplan.common.actor_state.scene_object": ("SceneObjectMetadata",),
+        "nuplan.common.actor_state.oriented_box": ("OrientedBox",),
+    }.items()
+    for name in names
+}
+TYPES["nuplan.common.maps.maps_datatypes TrafficLightStatusType"] = TrafficLightStatusType
+TYPES["nuplan.common.actor_state.tracked_objects_types TrackedObjectType"] = TrackedObjectType
+TYPES |= {f"{STATE} {kind.__name__}": kind for kind in SLOTTED}
+
+
+@contextmanager
+def importable() -> Iterator[None]:
+    """The classes under nuPlan's names, for as long as something is pickled by reference to them."""
+    modules: dict[str, ModuleType] = {}
+    for words, kind in TYPES.items():
+        module, name = words.split(" ")
+        for i in range(1, module.count(".") + 2):
+            part = ".".join(module.split(".")[:i])
+            modules.setdefault(part, ModuleType(part))
+        setattr(modules[module], name, kind)
+        kind.__module__, kind.__qualname__ = module, name
+    sys.modules.update(modules)
+    try:
+        yield
+    finally:
+        for name in modules:
+            del sys.modules[name]
+
+
+def _new(name: str, **fields: Any) -> Any:
+    return next(kind for words, kind in TYPES.items() if words.endswith(f" {name}"))(**fields)
+
+
+def ego_pose(i: int) -> np.ndarray:
+    """Of frame i, 8 m/s northwards and turning."""
+    return np.array([331_000.0, 4_690_000.0 + 4.0 * i, 1.5 + 0.01 * i])
+
+
+def world_box(i: int, k: int) -> np.ndarray:
+    """x, y, heading of object k at frame i."""
+    return np.array([331_002.0 + 3.0 * k, 4_690_020.0 + (2.0 - k) * i, 1.4 + 0.1 * k])
+
+
+def scene(n_future: int = 8) -> dict[str, Any]:
+    """The dictionary that is pickled: a vehicle, a pedestrian and a cone."""
+    return {
+        "scene_metadata": {
+            "log_name": "2021.05.12.19.36.12_veh-35_00005_00204",
+            "scene_token": TOKEN,
+            "map_name": "us-ma-boston",
+            "initial_token": TOKEN,
+            "num_history_frames": 4,
+            "num_future_frames": 0,
+            "corresponding_original_scene": ORIGINAL,
+            "corresponding_original_initial_token": BEFORE,
+        },
+        "frames": [_frame(i) for i in range(4)],
+        "extended_traffic_light_data": [_lights(i) for i in range(4, 4 + n_future)],
+        "extended_detections_tracks": [_tracks(i) for i in range(4, 4 + n_future)],
+    }
+
+
+def _frame(i: int) -> dict[str, Any]:
+    pose = ego_pose(i)
+    camera = {
+        "data_path": Path("veh-35") / "CAM_F0" / f"{i:016x}.jpg",
+        "sensor2lidar_rotation": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+        "sensor2lidar_translation": np.array([1.6, 0.0, 1.5]),
+        "cam_intrinsic": np.array([[1545.0, 0.0, 960.0], [0.0, 1545.0, 560.0], [0.0, 0.0, 1.0]]),
+        "distortion": np.zeros(5),
+    }
+    return {
+        "token": TOKEN if i == 3 else f"{0x5A000 + i:016x}",
+        "timestamp": 1_620_000_000_000_000 + 500_000 * i,
+        "roadblock_ids": ["10", "20"],
+        "traffic_lights": [(21, False)],
+        "annotations": {
+            "boxes": np.array([[20.0, 1.0, 0.8, 4.6, 1.9, 1.6, 0.1]]),
+            "names": np.array(["vehicle"]),
+            "velocity_3d": np.array([[5.0, 0.0, 0.0]]),
+            "instance_tokens": [f"{0xB000 + i:016x}"],
+            "track_tokens": [f"{0xC000:016x}"],
+        },
+        "ego_status": {
+            "ego_pose": pose,
+            "ego_velocity": np.array([8.0, 0.1], np.float32),
+            "ego_acceleration": np.array([0.2, -0.1], np.float32),
+            "driving_command": np.array([0, 1, 0, 0]),
+            "in_global_frame": True,
+        },
+        "lidar_path": None,
+        "camera_dict": {name: camera if name == "cam_f0" else {} for name in CAMERAS},
+    }
+
+
+def _lights(i: int) -> Any:
+    status = [TrafficLightStatusType.GREEN, TrafficLightStatusType.YELLOW, TrafficLightStatusType.RED]
+    return _statuses([(21 + k, s) for k, s in enumerate(status)], 1_620_000_000_000_000 + 500_000 * i)
+
+
+def _statuses(lights: list[tuple[int, TrafficLightStatusType]], stamp_us: int) -> Any:
+    stamp = TimePoint(stamp_us)
+    return _new(
+        "TrafficLightStatuses",
+        traffic_lights=[
+            _new("TrafficLightStatusData", status=s, lane_connector_id=lane_id, timestamp=stamp)
+            for lane_id, s in lights
+        ],
+    )
+
+
+def _tracks(i: int) -> Any:
+    """A vehicle, a pedestrian and a cone."""
+    things = [
+        (number, f"{0xC000 + k:016x}", world_box(i, k), (4.0, 2.0, 1.5), (0.5 * k, 3.0))
+        for k, number in enumerate((0, 1, 3))
+    ]
+    return _detections(things, f"{0xB000 + i:016x}")
+
+
+def _detections(things: list[tuple[int, str, np.ndarray, Any, Any]], token: str) -> Any:
+    """Of kind, track token, x y heading, length width height, velocity each."""
+    found = []
+    for number, track, pose, sizes, velocity in things:
+        x, y, heading = map(np.float64, pose)
+        names = {"token": token, "track_id": None, "track_token": track, "category_name": None}
+        center = _new("StateSE2", x=x, y=y, heading=heading)
+        fields = {
+            "_metadata": _new("SceneObjectMetadata", timestamp_us=0, **names),
+            "instance_token": None,
+            "_tracked_object_type": _kind(number),
+            "_box": _new("OrientedBox", _center=center, **dict(zip(("_length", "_width", "_height"), sizes))),
+        }
+        moving = {"_velocity": _new("StateVector2D", _x=velocity[0], _y=velocity[1], _array=np.array(velocity))}
+        found.append(_new("StaticObject", **fields) if number >= 3 else _new("Agent", **fields, **moving))
+    return _new("DetectionsTracks", tracked_objects=_new("TrackedObjects", tracked_objects=found))
+
+
+def scene_of_log(frames: list[dict[str, Any]], at: int, token: str, cameras: bool = False) -> dict[str, Any]:
+    """A log's own frames (as OpenScene's dicts) around frame `at`, as if somebody had simulated them.
+
+    cameras: with the log's pictures, by their paths.
+    """
+    now = frames[at]
+    about = {
+        "log_name": now["log_name"],
+        "scene_token": token,
+        "map_name": now["map_location"],
+        "initial_token": token,
+        "num_history_frames": 4,
+        "num_future_frames": 0,
+        "corresponding_original_scene": now["token"],
+        "corresponding_original_initial_token": frames[at - 8]["token"] if at >= 8 else None,
+    }
+    return {
+        "scene_metadata": about,
+        "frames": [
+            _log_frame(frame, token if frame is now else frame["token"], cameras) for frame in frames[at - 3 : at + 1]
+        ],
+        "extended_traffic_light_data": [
+            _statuses(
+                [(lane, TrafficLightStatusType.RED if red else TrafficLightStatusType.GREEN) for lane, red in lights],
+                0,
+            )
+            for lights in (frame["traffic_lights"] for frame in frames[at + 1 : at + 9])
+        ],
+        "extended_detections_tracks": [_log_tracks(frame) for frame in frames[at + 1 : at + 9]],
+    }
+
+
+def _heading(frame: dict[str, Any]) -> float:
+    w, x, y, z = frame["ego2global_rotation"]
+    return float(np.arctan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (y**2 + z**2)))
+
+
+def _log_frame(frame: dict[str, Any], token: str, cameras: bool) -> dict[str, Any]:
+    anns, motion = frame["anns"], np.array(frame["ego_dynamic_state"], np.float32)
+    return {
+        "token": token,
+        "timestamp": frame["timestamp"],
+        "roadblock_ids": frame["roadblock_ids"],
+        "traffic_lights": frame["traffic_lights"],
+        "annotations": {
+            "boxes": anns["gt_boxes"],
+            "names": anns["gt_names"],
+            "velocity_3d": anns["gt_velocity_3d"],
+            "instance_tokens": anns["instance_tokens"],
+            "track_tokens": anns["track_tokens"],
+        },
+        "ego_status": {
+            "ego_pose": np.array([*frame["ego2global_translation"][:2], _heading(frame)]),
+            "ego_velocity": motion[:2],
+            "ego_acceleration": motion[2:],
+            "driving_command": frame["driving_command"],
+            "in_global_frame": True,
+        },
+        "lidar_path": None,
+        "camera_dict": {
+            name: {**frame["cams"][name.upper()], "data_path": Path(frame["cams"][name.upper()]["data_path"])}
+            if cameras
+            else {}
+            for name in CAMERAS
+        },
+    }
+
+
+def _log_tracks(frame: dict[str, Any]) -> Any:
+    anns, heading = frame["anns"], _heading(frame)
+    c, s = np.cos(heading), np.sin(heading)
+    numbers = {kind.name.lower(): kind.value for kind in TrackedObjectType}
+    things = []
+    for box, name, velocity, track in zip(
+        anns["gt_boxes"], anns["gt_names"], anns["gt_velocity_3d"], anns["track_tokens"]
+    ):
+        x, y = np.array([[c, -s], [s, c]]) @ box[:2] + frame["ego2global_translation"][:2]
+        vx, vy = np.array([[c, -s], [s, c]]) @ velocity[:2]
+        things.append((numbers[str(name)], track, np.array([x, y, box[6] + heading]), box[3:6], (vx, vy)))
+    return _detections(things, frame["token"])
+
+
+def write_scene(folder: Path, value: dict[str, Any]) -> Path:
+    """The pickle, named by its scene."""
+    path = folder / f"{value['scene_metadata']['scene_token']}.pkl"
+    with importable():
+        path.write_bytes(numpy_1_pickle(value))
+    return path

@@ -1,0 +1,124 @@
+"""The whole export by processes and on Ray: the bytes of one process, killed, interrupted and gone on with."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from factory.commands.table import COMMANDS
+from factory.datasets.navsim.export import RowGroup, write_group
+from factory.datasets.navsim.settings import CannotExport, ExportSettings
+from factory.store.samples import Store
+from tests.factory.datasets.navsim.navsim_samples import exported, pictures, quiet, tree
+from tests.planners.samples import write_table
+
+ROOT = Path(__file__).resolve().parents[4]
+main = COMMANDS["export"].load()
+
+
+EXECUTORS = [
+    pytest.param(["executor=local", "workers=2"], id="local"),
+    pytest.param(["executor=ray", "workers=2"], id="ray", marks=pytest.mark.ray),
+]
+
+
+@pytest.fixture(scope="module")
+def long_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A run of twelve rounds, a row group each, and its export without a disturbance."""
+    run, to = (tmp_path_factory.mktemp("long") / name for name in ("run", "to"))
+    write_table(run, [exported(i, "pdm_closed", i) for i in range(12)], group_rows=1)
+    quiet(run, to)
+    return run, to
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", EXECUTORS)
+def test_processes_and_ray_write_what_one_process_writes(
+    long_run: tuple[Path, Path], tmp_path: Path, how: list[str]
+) -> None:
+    assert main(["navsim", f"out={long_run[0]}", f"to={tmp_path / 'to'}", *how]) == 0
+    assert tree(tmp_path / "to") == tree(long_run[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", EXECUTORS)
+def test_a_killed_export_goes_on_to_the_same_bytes(long_run: tuple[Path, Path], tmp_path: Path, how: list[str]) -> None:
+    """Killed between logs and amid them, with half a line in the journal and half a picture beside the others."""
+    (run, undisturbed), to = long_run, tmp_path / "to"
+    killed = begun(run, to, how)
+    killed.send_signal(signal.SIGKILL)
+    killed.communicate()
+    settled(to)
+    journal = to / ".journal.jsonl"
+    assert journal.exists() and not (to / "manifest.jsonl").exists(), "it was to be killed on its way"
+    with journal.open("a") as file:
+        file.write('{"log": {"folder": "half a')
+    half = next(to.rglob("*.jpg")).with_name(".half.jpg.1234.tmp")
+    half.write_bytes(b"half")
+    quiet(run, to)
+    assert tree(to) == tree(undisturbed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", EXECUTORS)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
+def test_an_interrupted_export_ends_what_is_in_hand_and_says_how_it_goes_on(
+    long_run: tuple[Path, Path], tmp_path: Path, how: list[str], number: int
+) -> None:
+    """Ctrl-C goes to all of its processes, SIGTERM to the one that was started."""
+    (run, undisturbed), to = long_run, tmp_path / "to"
+    stopped = begun(run, to, how)
+    (os.killpg if number == signal.SIGINT else os.kill)(stopped.pid, number)
+    _, said = stopped.communicate(timeout=120)
+    assert (stopped.returncode, said) == (4, "interrupted; run the same command again to go on\n")
+    n_written = len((to / ".journal.jsonl").read_text().splitlines()) - 1
+    assert n_written == len(list(to.glob("navsim_logs/*/*.pkl"))) < 12, "every log that was begun is whole and noted"
+    assert quiet(run, to).written == 12 - n_written
+    assert tree(to) == tree(undisturbed)
+
+
+def begun(run: Path, to: Path, how: list[str]) -> "subprocess.Popen[str]":
+    """An export that has written its first log, in a session of its own."""
+    command = [sys.executable, "-m", "factory", "export", "navsim", f"out={run}", f"to={to}", *how]
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    export = subprocess.Popen(
+        command, cwd=ROOT, env=env, text=True, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
+    while not list(to.glob("navsim_logs/*/*.pkl")):
+        assert export.poll() is None, export.communicate()
+        time.sleep(0.001)
+    return export
+
+
+def settled(to: Path) -> None:
+    """Workers of a killed driver may still finish what they have in hand; what they write appears, or is renamed."""
+    before = None
+    while before != (now := sorted(map(str, to.rglob("*")))):
+        before = now
+        time.sleep(2.0)
+
+
+@pytest.mark.slow
+@pytest.mark.ray
+def test_a_sample_that_cannot_be_written_is_named_on_ray_as_here(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [exported(0, "human"), exported(1, "pdm_closed", 0, **pictures(times_s=(0.0,)))]
+    write_table(tmp_path / "run", rows, group_rows=1)
+    said = []
+    for executor in ("local", "ray"):
+        assert main(["navsim", f"out={tmp_path / 'run'}", f"to={tmp_path / executor}", f"executor={executor}"]) == 2
+        said.append(capsys.readouterr().err)
+    assert said[0].startswith("error: sample attempt00001: ") and said[0] == said[1]
+
+
+def test_a_worker_that_does_not_see_the_run_says_so(street_run: Path, tmp_path: Path) -> None:
+    elsewhere = replace(Store(street_run).samples.location, uri=str(tmp_path / "not_mounted"))
+    group = RowGroup("round=0/part.parquet", {}, 0, (0,))
+    with pytest.raises(CannotExport, match=r"not_mounted/round=0/part.parquet: not there for .*: every worker"):
+        write_group(elsewhere, tmp_path, ExportSettings(), group)

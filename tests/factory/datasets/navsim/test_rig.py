@@ -1,0 +1,243 @@
+"""The eight cameras and the blobs of a clip: what is read, what may be absent, and what is told as damage."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from factory.datasets.navsim.log import CAMERA_NAMES
+from factory.datasets.navsim.reader import NavsimReader
+from factory.readers.base import BadClip
+from factory.readers.pictures import BadPicture, jpeg_size
+from factory.stages.sensors import block_of, load_photos, load_sweeps
+from tasks.world.clip import Clip
+from tests.factory.datasets.navsim.logs import NAME
+from tests.factory.datasets.navsim.small import (
+    FRAMES,
+    HEIGHT,
+    WIDTH,
+    blob,
+    picture,
+    reader_of,
+    road_frames,
+    write_blobs,
+    write_city,
+    write_log,
+)
+
+OTHER = "2021.06.14.18.00.00_veh-51_00100_00200"
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two logs of one window each, with all their blobs; read only."""
+    root = tmp_path_factory.mktemp("rig")
+    write_city(root)
+    for name in (NAME, OTHER):
+        write_log(root, road_frames(name))
+        write_blobs(root, road_frames(name))
+    return root
+
+
+@pytest.fixture
+def root(written: Path, tmp_path: Path) -> Path:
+    """The same, to damage; the map is one file for all."""
+    for folder in ("navsim_logs", "sensor_blobs"):
+        shutil.copytree(written / folder, tmp_path / folder)
+    (tmp_path / "maps").symlink_to(written / "maps")
+    return tmp_path
+
+
+def read(reader: NavsimReader, name: str = NAME) -> Clip:
+    (ref,) = (ref for ref in reader.index().refs if ref.log_id == name)
+    return reader.read(ref)
+
+
+def test_a_clip_has_the_cameras_photos_and_sweeps_of_its_frames(written: Path) -> None:
+    clip, frames = read(reader_of(written)), road_frames()
+    assert [(c.name, c.width, c.height) for c in clip.cameras] == [(name, WIDTH, HEIGHT) for name in CAMERA_NAMES]
+    one = frames[0]["cams"]["CAM_F0"]
+    for camera in clip.cameras:
+        assert (camera.intrinsics == one["cam_intrinsic"]).all() and (camera.distortion == one["distortion"]).all()
+        assert (camera.ego_from_camera[:3, :3] == one["sensor2lidar_rotation"]).all()
+        assert (camera.ego_from_camera[:3, 3] == one["sensor2lidar_translation"]).all()
+    expected = [(n, str(blob(written, f["cams"][n]["data_path"]))) for f in frames for n in CAMERA_NAMES]
+    assert [(image.sensor, image.uri) for image in clip.images] == expected
+    assert [sweep.uri for sweep in clip.sweeps] == [str(blob(written, f["lidar_path"])) for f in frames]
+    assert [sweep.time_s for sweep in clip.sweeps] == [0.5 * k for k in range(FRAMES)]
+    for k, sweep in enumerate(clip.sweeps):
+        assert (sweep.world_from_ego[:3, 3] == frames[k]["ego2global_translation"]).all()
+    assert block_of(clip).images == clip.images and len(load_sweeps(clip.sweeps, with_intensity=True)) == FRAMES
+
+
+def test_without_a_folder_of_sensors_a_clip_has_none(written: Path) -> None:
+    clip = read(reader_of(written, sensors=None))
+    assert (clip.cameras, clip.images, clip.sweeps, clip.block) == ((), (), (), None)
+
+
+def test_frames_whose_blobs_were_not_downloaded_have_none(root: Path) -> None:
+    frames = road_frames()
+    for made in frames[4:]:
+        for path in [made["lidar_path"], *(c["data_path"] for c in made["cams"].values())]:
+            blob(root, path).unlink()
+    clip = read(reader_of(root))
+    assert len(clip.images) == 4 * 8 and len(clip.sweeps) == 4 and len(clip.cameras) == 8
+
+
+def test_photos_without_sweeps_are_a_clip_and_so_are_sweeps_without_photos(root: Path) -> None:
+    shutil.rmtree(blob(root, NAME) / "MergedPointCloud")
+    clip = read(reader_of(root))
+    assert clip.sweeps == () and len(clip.images) == FRAMES * 8
+    for name in CAMERA_NAMES:
+        shutil.rmtree(blob(root, OTHER) / name)
+    clip = read(reader_of(root), OTHER)
+    assert (clip.cameras, clip.images) == ((), ()) and len(clip.sweeps) == FRAMES
+
+
+def test_a_photo_that_is_missing_beside_others_is_named_and_hurts_no_other_log(root: Path) -> None:
+    lost = blob(root, road_frames()[7]["cams"]["CAM_L1"]["data_path"])
+    lost.unlink()
+    with pytest.raises(BadClip, match=r"missing, though 7 of the frame's 8 pictures are there: restore it") as refused:
+        read(reader_of(root))
+    assert (refused.value.file, refused.value.field) == (str(lost), "image")
+    assert len(read(reader_of(root), OTHER).images) == FRAMES * 8
+
+
+def test_a_log_without_any_blob_says_how_to_read_it_without(root: Path) -> None:
+    shutil.rmtree(blob(root, NAME))
+    with pytest.raises(BadClip, match=rf"no picture of the frames 0 to 19 of {NAME} is here; clips\.sensors=null"):
+        read(reader_of(root))
+    assert len(read(reader_of(root), OTHER).cameras) == 8
+
+
+def test_a_camera_that_the_log_gives_no_picture_of_is_not_in_the_rig(root: Path) -> None:
+    frames = road_frames()
+    for made in frames:
+        made["cams"]["CAM_B0"] = {"data_path": None}
+    write_log(root, frames)
+    clip = read(reader_of(root))
+    assert [camera.name for camera in clip.cameras] == [name for name in CAMERA_NAMES if name != "CAM_B0"]
+
+
+def _without_a_camera(frames: list[dict[str, Any]]) -> None:
+    del frames[5]["cams"]["CAM_R2"]
+
+
+def _without_distortion(frames: list[dict[str, Any]]) -> None:
+    del frames[5]["cams"]["CAM_R2"]["distortion"]
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (_without_a_camera, r"frames\[5\]\.cams\.CAM_R2: missing; a frame names all eight cameras"),
+        (_without_distortion, r"frames\[5\]\.cams\.CAM_R2\.distortion: missing"),
+    ],
+)
+def test_a_log_that_lacks_a_camera_is_listed_as_broken_and_hurts_no_other(root: Path, damage: Any, says: str) -> None:
+    frames = road_frames()
+    damage(frames)
+    path = write_log(root, frames)
+    reader = reader_of(root)
+    index = reader.index()
+    assert [ref.log_id for ref in index.refs] == [OTHER]
+    ((ref, problem),) = index.broken.items()
+    assert ref.log_id == NAME and problem.startswith(str(path))
+    with pytest.raises(BadClip, match=says):
+        reader.read(ref)
+    assert len(read(reader, OTHER).images) == FRAMES * 8
+
+
+@pytest.mark.parametrize("path", ["../../../secret.jpg", "/etc/secret.jpg"])
+def test_a_log_s_paths_do_not_leave_the_folder_of_blobs(root: Path, path: str) -> None:
+    frames = road_frames()
+    frames[2]["cams"]["CAM_F0"]["data_path"] = path
+    write_log(root, frames)
+    with pytest.raises(BadClip, match="sensor paths lie below the folder of sensor blobs") as refused:
+        read(reader_of(root))
+    assert refused.value.field == path
+
+
+def test_a_camera_that_can_be_none_is_named(root: Path) -> None:
+    frames = road_frames()
+    for made in frames:
+        made["cams"]["CAM_L0"]["cam_intrinsic"] = np.zeros((3, 3))
+    path = write_log(root, frames)
+    with pytest.raises(BadClip, match="focal lengths must be positive") as refused:
+        read(reader_of(root))
+    assert (refused.value.file, refused.value.field) == (str(path), "cams.CAM_L0")
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n", picture(WIDTH, HEIGHT)[:100]])
+def test_a_first_photo_whose_size_cannot_be_told_is_named(root: Path, content: bytes) -> None:
+    bad = blob(root, road_frames()[0]["cams"]["CAM_R1"]["data_path"])
+    bad.write_bytes(content)
+    with pytest.raises(BadClip, match=r"image: (the file is empty|a (JPEG|PNG) that is cut off)") as refused:
+        read(reader_of(root))
+    assert refused.value.file == str(bad)
+
+
+@pytest.mark.parametrize(
+    ("content", "field"), [(picture(WIDTH, HEIGHT)[:-40], "image"), (picture(WIDTH, HEIGHT - 2), "size")]
+)
+def test_a_photo_that_is_half_there_or_of_another_size_is_named_where_it_is_opened(
+    root: Path, content: bytes, field: str
+) -> None:
+    bad = blob(root, road_frames()[9]["cams"]["CAM_R1"]["data_path"])
+    bad.write_bytes(content)
+    clip = read(reader_of(root))
+    with pytest.raises(BadClip) as refused:
+        load_photos(clip.images, clip.cameras, WIDTH, HEIGHT)
+    assert (refused.value.file, refused.value.field) == (str(bad), field)
+    others = [image for image in clip.images if image.sensor != "CAM_R1"]
+    assert len(load_photos(others, clip.cameras, WIDTH, HEIGHT)) == FRAMES * 7
+
+
+@pytest.mark.parametrize(("old", "new", "field"), [(b"", b"", "DATA"), (b"DATA binary", b"DATA ascii", "DATA")])
+def test_a_sweep_that_is_cut_off_or_text_is_named_where_it_is_opened(
+    root: Path, old: bytes, new: bytes, field: str
+) -> None:
+    bad = blob(root, road_frames()[9]["lidar_path"])
+    bad.write_bytes(bad.read_bytes().replace(old, new, 1) if old else bad.read_bytes()[:-60])
+    clip = read(reader_of(root))
+    with pytest.raises(BadClip) as refused:
+        load_sweeps(clip.sweeps)
+    assert (refused.value.file, refused.value.field) == (str(bad), field)
+
+
+@pytest.mark.parametrize("progressive", [0, 1])
+def test_a_jpeg_s_size_is_its_picture_s_and_a_cut_header_is_told(progressive: int) -> None:
+    """Whatever stands before the header: padding, a comment, a preview."""
+    _, encoded = cv2.imencode(".jpg", np.zeros((21, 34, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive])
+    whole = encoded.tobytes()
+    preview = picture(WIDTH, HEIGHT)
+    comment = b"\xff\xff\xff\xfe" + (len(preview) + 2).to_bytes(2) + preview
+    data = whole[:2] + comment + whole[2:]
+    frame_header = 2 + len(comment) + whole[2:].index(b"\xff\xc2" if progressive else b"\xff\xc0")
+    for length in [*range(12), *range(len(comment) - 2, frame_header + 40, 3), len(data)]:
+        if length >= frame_header + 19:
+            assert jpeg_size(data[:length]) == (34, 21)
+        else:
+            with pytest.raises(BadPicture, match=r"cut off|empty|not a JPEG"):
+                jpeg_size(data[:length])
+
+
+@pytest.mark.parametrize("length", [0, 1])
+def test_a_segment_shorter_than_its_own_length_is_no_jpeg(length: int) -> None:
+    with pytest.raises(BadPicture, match="cut off"):
+        jpeg_size(b"\xff\xd8\xff\xe0" + length.to_bytes(2) + bytes(50))
+
+
+def test_a_block_takes_in_another_log_of_the_same_place(written: Path) -> None:
+    alone, reader = read(reader_of(written)), reader_of(written, traversals=1)
+    clip = read(reader)
+    (ref,) = (ref for ref in reader.index().refs if ref.log_id == NAME)
+    assert clip.content_digest == reader.digest(ref) != alone.content_digest
+    block, own = block_of(clip), block_of(alone)
+    assert [f.sensor for f in block.images[len(own.images) :]] == [f"{OTHER}/{f.sensor}" for f in own.images]
+    assert {camera.name for camera in block.other_cameras} == {f"{OTHER}/{name}" for name in CAMERA_NAMES}
+    assert [c.name for c in clip.cameras] == [c.name for c in alone.cameras]
+    assert min(f.time_s for f in block.images[len(own.images) :]) > block.own_s

@@ -1,0 +1,202 @@
+"""The synthetic town as OpenScene and GeoPackage, read back: the same clips as the native reader's, and scores.
+
+The native clip is thinned to 2 Hz and brought back by the slow twin; what thinning alone changes is tested too.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factory.datasets.av2.reader import AV2Reader, read_log
+from factory.datasets.navsim.log import read_frames
+from factory.datasets.navsim.reader import LICENCE, NavsimReader
+from factory.datasets.town.town import write_logs
+from factory.readers.settings import TownSettings
+from tasks.trajectories import score_trajectories
+from tasks.world.clip import NOW, Clip
+from tasks.world.lanes import LightState, RoadMap
+from tasks.world.route import RouteFinder, driving_command
+from tasks.world.vocabulary import kinematic_trajectories
+from tests.factory.datasets.navsim.geopackage_writer import (
+    CITIES,
+    ORIGIN,
+    stub_rows,
+    town_rows,
+    write_geopackage,
+    write_root,
+)
+from tests.factory.datasets.navsim.openscene_writer import Place, write_openscene
+from tests.factory.datasets.navsim.twin import thinned
+
+LOGS = (1, 2, 3, 5)  # of the town's kinds; three windows each. None drives a full circle: nuPlan's routes end there
+FLAGS = ("nc", "dac", "ddc", "tlc", "ttc", "lk", "hc")
+DIGITS_M = 2e-6  # of a GeoPackage's degrees
+
+
+@dataclass(frozen=True)
+class Towns:
+    """The same logs twice."""
+
+    native: AV2Reader
+    navsim: NavsimReader
+    root: Path
+    block_number: dict[str, dict[str, str]]  # log -> our roadblock id -> nuPlan's
+
+    def pairs(self) -> list[tuple[Clip, Clip]]:
+        """Native clips, moved to where nuPlan has them, and NAVSIM's, window by window."""
+        names = {log: log for log in self.native.logs()}
+        refs = {(ref.log_id, ref.start_ms): ref for ref in self.native.index().refs}
+        return [
+            (moved(self.native.read(refs[names[ref.log_id], ref.start_ms])), self.navsim.read(ref))
+            for ref in self.navsim.index().refs
+        ]
+
+
+@pytest.fixture(scope="module")
+def towns(tmp_path_factory: pytest.TempPathFactory) -> Towns:
+    """Each log in a city of its own, since logs carry crops of their town's map."""
+    root = tmp_path_factory.mktemp("towns")
+    bare = TownSettings(cameras=(), lidar_beams=0)
+    numbers: dict[str, dict[str, str]] = {}
+    write_root(root / "maps", "sg-one-north", stub_rows())
+    for location, folder in zip(CITIES, write_logs(root / "av2", LOGS, 0, bare)):
+        log = read_log(folder)
+        rows = town_rows(log.road_map)
+        version, zone = CITIES[location]
+        (root / "maps" / location / version / "map.gpkg").unlink()
+        write_geopackage(root / "maps" / location / version / "map.gpkg", rows, zone)
+        blocks = log.road_map.roadblock_of
+        number = {blocks[str(row["fid"])]: str(row["lane_group_fid"]) for row in rows["lanes_polygons"]}
+        number |= {blocks[str(row["fid"])]: str(row["lane_group_connector_fid"]) for row in rows["lane_connectors"]}
+        place = Place(location, np.append(ORIGIN, 0.0), roadblock_number=number.__getitem__)
+        write_openscene(root, "mini", folder.name, log, place)
+        numbers[folder.name] = number
+    navsim = NavsimReader(root / "navsim_logs" / "mini", root / "maps", cache_dir=root / "kept")
+    return Towns(AV2Reader(root / "av2"), navsim, root, numbers)
+
+
+def moved(clip: Clip) -> Clip:
+    """The clip at nuPlan's coordinates, on as much of its map as a GeoPackage holds."""
+    shift = lambda points: points + np.append(ORIGIN, np.zeros(points.shape[-1] - 2))  # noqa: E731
+    poses = clip.world_from_ego.copy()
+    poses[:, :2, 3] += ORIGIN
+    agents = replace(clip.agents, boxes=shift(clip.agents.boxes))
+    states = shift(clip.ego_states)
+    road_map = _moved_map(clip.road_map)
+    line = RouteFinder(road_map, clip.route).centerline_from(states[NOW, :3])
+    return replace(clip, ego_states=states, world_from_ego=poses, agents=agents, centerline=line, road_map=road_map)
+
+
+def _moved_map(road_map: RoadMap) -> RoadMap:
+    """Without the links from lane to lane and from connector to connector, which a GeoPackage cannot hold."""
+    shift = lambda points: points + np.append(ORIGIN, np.zeros(points.shape[-1] - 2))  # noqa: E731
+    lanes = {
+        lane_id: replace(
+            lane,
+            ring=shift(lane.ring),
+            centerline=shift(lane.centerline),
+            successors=tuple(
+                after
+                for after in lane.successors
+                if after in road_map.lanes and road_map.lanes[after].is_intersection != lane.is_intersection
+            ),
+        )
+        for lane_id, lane in road_map.lanes.items()
+    }
+    areas = tuple(replace(area, ring=shift(area.ring)) for area in road_map.drivable_areas)
+    return replace(road_map, lanes=lanes, drivable_areas=areas)
+
+
+@pytest.mark.slow
+def test_the_clips_are_the_native_reader_s_thinned_to_2_hz_and_back(towns: Towns) -> None:
+    pairs = towns.pairs()
+    assert len(pairs) == 12
+    for native, read in pairs:
+        twin = thinned(native)
+        assert (read.log_id, read.start_s, read.licence) == (native.log_id, native.start_s, LICENCE)
+        np.testing.assert_allclose(read.ego_states, twin.ego_states, atol=2e-8)
+        np.testing.assert_allclose(read.world_from_ego[::5], native.world_from_ego[::5], atol=1e-8)
+        assert len(read.agents) == len(twin.agents)
+        kinds = list(zip(read.agents.kinds, read.agents.valid.sum(axis=0).tolist()))
+        assert sorted(kinds) == sorted(zip(twin.agents.kinds, twin.agents.valid.sum(axis=0).tolist()))
+        for mine, theirs in zip(_by_place(read), _by_place(twin)):
+            np.testing.assert_allclose(mine, theirs, atol=1e-7)
+        assert _red(read) == {lane: steps for lane, steps in _red(twin).items() if lane in read.road_map.lanes}
+
+
+@pytest.mark.slow
+def test_the_map_s_topology_and_the_route_are_the_native_reader_s(towns: Towns) -> None:
+    for native, read in towns.pairs():
+        number, theirs = towns.block_number[native.log_id], native.road_map.lanes
+        for lane_id, lane in read.road_map.lanes.items():
+            native_lane = theirs[lane_id]
+            assert lane.is_intersection == native_lane.is_intersection
+            assert number[native.road_map.roadblock_of[lane_id]] == read.road_map.roadblock_of[lane_id]
+            if lane.is_intersection:
+                assert (
+                    lane.predecessors == native_lane.predecessors[:1] and lane.successors == native_lane.successors[:1]
+                )
+            np.testing.assert_allclose(lane.ring[:, :2], native_lane.ring, atol=DIGITS_M)
+        on_map = {lane_id for lane_id in native.route.lane_ids if lane_id in read.road_map.lanes}
+        assert read.route.lane_ids <= native.route.lane_ids and on_map == read.route.lane_ids
+        np.testing.assert_allclose(read.centerline[:, :2], native.centerline[:, :2], atol=DIGITS_M)
+
+
+@pytest.mark.slow
+def test_every_sub_score_is_the_native_reader_s(towns: Towns) -> None:
+    """256 trajectories in 12 scenes, 0 differences."""
+    plans, different, worst = kinematic_trajectories(256, 0), dict.fromkeys(FLAGS, 0), 0.0
+    seen = {name: set[float]() for name in FLAGS}
+    for native, read in towns.pairs():
+        twin = thinned(native)
+        mine, theirs = score_trajectories(read, plans), score_trajectories(twin, plans)
+        for name in FLAGS:
+            different[name] += int((getattr(mine, name) != getattr(theirs, name)).sum())
+            seen[name].update(getattr(theirs, name).tolist())
+        worst = max(
+            worst, float(np.abs(mine.ep - theirs.ep).max()), float(np.abs(mine.pdm_score - theirs.pdm_score).max())
+        )
+    assert not any(different.values()) and worst < 1e-6, (different, worst)
+    assert all(len(values) > 1 for name, values in seen.items() if name != "tlc"), seen
+
+
+@pytest.mark.slow
+def test_thinning_moves_what_turns_and_brakes_by_centimetres(towns: Towns) -> None:
+    """What differs from native clips without the twin: chords of bends, velocities held linear; frames do not."""
+    for native, read in towns.pairs():
+        apart = np.hypot(*(read.ego_states - native.ego_states)[:, :2].T)
+        assert apart[::5].max() < 1e-8 and apart.max() < 0.1
+        assert np.abs(read.ego_states - native.ego_states)[:, 3:5].max() < 0.1
+
+
+@pytest.mark.slow
+def test_the_command_computed_from_the_route_is_the_log_s_own(towns: Towns) -> None:
+    """But where the route ends at a lane that follows a lane directly, which a GeoPackage cannot hold."""
+    seen, compared = set(), 0
+    for _, read in towns.pairs():
+        frames = {frame.token: frame for frame in read_frames(towns.navsim.logs()[read.log_id]).frames}
+        command = frames[read.frame_tokens[0]].command
+        computed = driving_command(read.centerline, read.ego_states[NOW, :3])
+        if computed != "unknown":
+            assert computed == command
+            seen.add(command)
+            compared += 1
+    assert len(seen) > 1 and compared >= 6, (seen, compared)
+
+
+def _by_place(clip: Clip) -> list[np.ndarray]:
+    """Boxes (96, 5) and velocities of tracks, in an order that does not depend on their names."""
+    agents = clip.agents
+    columns = np.concatenate([agents.boxes, agents.velocities, agents.center_z[..., None]], axis=-1)
+    columns[..., 2] = np.cos(columns[..., 2])
+    key = [
+        tuple(np.round(np.nan_to_num(np.nanmean(columns[:, i, [0, 1, 3, 4]], axis=0)), 3)) for i in range(len(agents))
+    ]
+    return [columns[:, i] for i in sorted(range(len(agents)), key=key.__getitem__)]
+
+
+def _red(clip: Clip) -> dict[str, list[int]]:
+    red = clip.lights.states == LightState.RED
+    return {lane: np.flatnonzero(red[:, i]).tolist() for i, lane in enumerate(clip.lights.lane_ids) if red[:, i].any()}
