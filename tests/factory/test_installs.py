@@ -1,7 +1,6 @@
 """What each install brings: nothing undeclared, nothing unused, and without PyTorch and CUDA what needs neither."""
 
 import ast
-import json
 import os
 import re
 import shutil
@@ -184,48 +183,11 @@ def test_the_version_stands_in_one_place() -> None:
     assert shown.stdout.decode() == f"driving-data-factory {tasks.__version__}\n"
 
 
-def pip_would_install(report: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """pip's own resolution, of the checkout, without any configuration of this machine but its certificates.
-
-    Skips the test where PyPI is out of reach.
-    """
-    env = {name: value for name, value in os.environ.items() if not name.startswith("PIP_")}
-    certificates = subprocess.run(
-        [sys.executable, "-m", "pip", "config", "get", "global.cert"], capture_output=True, text=True
-    )
-    env |= {"PIP_CONFIG_FILE": os.devnull, "PIP_RETRIES": "1", "PIP_TIMEOUT": "15"}
-    if "PIP_CERT" in os.environ or certificates.returncode == 0:
-        env["PIP_CERT"] = os.environ.get("PIP_CERT", certificates.stdout.strip())
-    command = [sys.executable, "-m", "pip", "install", "--dry-run", "--ignore-installed", "--report", str(report)]
-    done = subprocess.run([*command, *arguments], cwd=REPOSITORY, env=env, capture_output=True, text=True, timeout=250)
-    if done.returncode and re.search(r"from versions: none|connection broken|Temporary failure", done.stderr):
-        pytest.skip("PyPI cannot be reached from here")
-    return done
-
-
-@pytest.mark.slow
-def test_pip_asks_for_neither_pytorch_nor_cuda_for_the_demo(tmp_path: Path) -> None:
-    requirements = [str(text) for extra in (SMALL, "run") for text in _own(extra)]
-    done = pip_would_install(tmp_path / "report.json", "-c", "constraints.txt", *requirements)
-    assert done.returncode == 0, done.stderr
-    report = json.loads((tmp_path / "report.json").read_text())
-    names = {canonicalize_name(item["metadata"]["name"]) for item in report["install"]}
-    assert {"ray", "hydra-core"} <= names and not [name for name in names if GPU.search(name)]
-
-
-@pytest.mark.slow
-def test_no_cuda_build_on_pypi_satisfies_what_the_tests_install(tmp_path: Path) -> None:
-    made = subprocess.run(
-        ["make", "-n", "-B", "install"], cwd=REPOSITORY, capture_output=True, text=True, check=True
-    ).stdout
+def test_make_installs_pytorch_for_the_cpu() -> None:
+    command = ["make", "-n", "-B", "install"]
+    made = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout
     (wanted,) = set(re.findall(r"torch==[\w.+]*\w", made))
     assert wanted.endswith("+cpu") and re.search(r"--extra-index-url https://download\.pytorch\.org/whl/cpu ", made)
-    done = pip_would_install(tmp_path / "report.json", "--no-deps", wanted)
-    assert done.returncode == 1 and f"No matching distribution found for {wanted}" in done.stderr
-
-
-def _own(extra: str) -> list[str]:
-    return list(PROJECT["optional-dependencies"][extra] if extra else PROJECT["dependencies"])
 
 
 OLD = "import sys; sys.version_info = (3, 9, 18, 'final', 0)\n"

@@ -136,6 +136,8 @@ WRONG = [
     run("vocabulary.file=shape.npy", says=["shape.npy: trajectories have shape (3, 4), expected (K >= 1, 40, 3)"]),
     run(*STREET, "render=map", "render.cameras=[nowhere]", says=["no camera nowhere; this rig has front_left, front"]),
     run("expert.recovery.table=nowhere.npz", says=["nowhere.npz: there is no such file"]),
+    run(*STREET, "reward.label_vocabulary=shape.npy", says=["shape.npy: trajectories have shape (3, 4), expected (K"]),
+    run("reward.labels=none", "reward.label_vocabulary=x.npy", says=["label_vocabulary=x.npy is for labels=vocab"]),
     Wrong(("plan", "rounsd=5"), ("did you mean rounds=?",)),
     Wrong(("rnu",), ("there is no command rnu", "did you mean run?")),
     Wrong(("train", "planner=ltf"), ("python -m planners train",)),

@@ -21,7 +21,6 @@ from factory.commands.table import COMMANDS, DOORS, PLANNERS
 from factory.exits import MEANING
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import Execution, execute
-from factory.store.funnel import funnel_of
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import COPIES
 from factory.views.show import prepared_episode
@@ -128,31 +127,6 @@ def test_settings_are_shown_as_they_are_given(command: str, shown: dict[str, obj
     found = yaml.safe_load(done.stdout)
     assert {key: found.get(key) for key in shown} == shown
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "meant"),
-    [
-        (("stauts", "out=x"), "did you mean status?"),
-        (("xyzzy",), "there is no command xyzzy; see --help"),
-        (("status", "outt=x"), "did you mean out=?"),
-        (("show", "smaple=0"), "did you mean sample=?"),
-        (("run", "rounsd=3"), "did you mean rounds=?"),
-        (("run", "render.widht=3"), "did you mean render.width=?"),
-    ],
-)
-def test_a_mistyped_word_gets_a_suggestion_and_ends_with_2(
-    arguments: tuple[str, ...], meant: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, text, error = ask(capsys, *arguments)
-    assert code == 2 and not text and meant in error
-
-
-def test_status_holds_the_funnel_and_failed_names_every_failure(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, status, _ = ask(capsys, "status", f"out={out}")
-    assert code == 0 and funnel_of(Store(out)).text().strip() in status
-    code, failed, _ = ask(capsys, "failed", f"out={out}")
-    assert code == 0 and "ZeroDivisionError" in failed and "python -m factory retry" in failed
 
 
 def test_a_plan_is_the_run_s_own_and_makes_nothing(

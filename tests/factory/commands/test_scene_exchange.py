@@ -31,7 +31,7 @@ def stored(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", ["ply", "spz", "ckpt"])
+@pytest.mark.parametrize("kind", ["spz", "ckpt"])
 def test_a_block_goes_out_and_comes_back(stored: Path, tmp_path: Path, kind: str) -> None:
     out, back = tmp_path / "out", tmp_path / "back.safetensors"
     assert main(["export", str(stored), f"to={out}", f"format={kind}"]) == 0

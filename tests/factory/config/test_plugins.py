@@ -1,21 +1,16 @@
 """A user's own reader and expert, in a folder outside the package, named by `_target_` alone."""
 
-import io
-import shlex
 import sys
 from collections.abc import Iterator
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from factory.__main__ import main as factory_main
 from factory.config.compose import ConfigError
 from factory.config.run import load_config
 from factory.graph.work import Columns, Dropped, PreparedClip, attempted
 from factory.readers.base import BadClip
-from factory.run import main as run_main
 from factory.setup.settings import Run, assemble
 from factory.store.schema import BOOKKEEPING, sample_row_to_table
 from tasks.stages import Rejected
@@ -169,25 +164,3 @@ def test_arguments_my_classes_do_not_take_are_refused_by_name(package: Path) -> 
         assembled(package, "+expert.mine.speed=3")
     with pytest.raises(ConfigError, match=r"(?s)clips: .*colour"):
         assembled(package, "+clips.colour=red")
-
-
-def test_a_run_in_which_both_fail_ends_with_what_failed_how_often_and_the_command_that_shows_all(
-    package: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    printed = io.StringIO()  # both streams, in the order of their lines
-    with redirect_stdout(printed), redirect_stderr(printed):
-        code = run_main(words(package, "+expert.mine.gain=-1.0", "+clips.n=3", "executor=local", "render=none"))
-    assert code == 3
-    good, bad, also_good = (ref.clip_id for ref in assembled(package, "+clips.n=3").index.refs)
-    said = {
-        good: f"mine on clip {good}: and I only drive ahead",
-        bad: f"clip {bad}: {package}/log: x: holds NaN",
-        also_good: f"mine on clip {also_good}: and I only drive ahead",
-    }
-    *_, what, shown = printed.getvalue().splitlines()
-    assert what == f"3 failed (bug 2, input 1), the first, {said[min(said)]}"
-    assert shown == f"all of them: python -m factory failed out={package}/out"
-    assert factory_main(shlex.split(shown.partition("-m factory ")[2])) == 0
-    told = capsys.readouterr().out
-    assert all(clip_id in told for clip_id in said)
-    assert told.count("ValueError: gain is -1.0") == 2 and told.count("holds NaN") == 1

@@ -68,7 +68,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
     return set(Store(out).samples)
 
 
-MORE_SIZES = ["16k", "128k", "192k", "256k", "384k", "512k"]
+MORE_SIZES = ["192k", "512k"]
 
 
 @pytest.mark.parametrize("size", ["64k", *(pytest.param(size, marks=pytest.mark.slow) for size in MORE_SIZES)])
@@ -102,12 +102,11 @@ def whole_town(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", ["4200k", "4700k", "5500k"])
 def test_a_whole_run_on_a_disk_that_fills_says_so_once_and_goes_on(
-    disk: Path, whole_town: Path, size: str, capsys: pytest.CaptureFixture[str]
+    disk: Path, whole_town: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = [*TOWN, f"out={disk / 'out'}"]
-    resize(disk, size)
+    resize(disk, "4700k")
     assert run_main(command) == INTERRUPTED
     told = [line for line in capsys.readouterr().err.splitlines() if "full" in line]
     assert len(told) == 1 and re.match(ONE_LINE.format(out=re.escape(str(disk / "out"))), told[0]), told
@@ -176,11 +175,11 @@ def test_a_full_disk_under_the_user_s_cache_is_told_with_its_path_and_is_no_wron
 
 
 @pytest.mark.parametrize("executor", ["local", "isolated", pytest.param("ray", marks=pytest.mark.ray)])
-@pytest.mark.parametrize("work", [ColdWork(number=errno.ENOSPC), ColdWork(number=errno.EIO)])
 def test_a_machine_that_is_ill_while_kernels_are_compiled_is_no_bug_and_no_wrong_setting(
-    tmp_path: Path, work: ToyWork, executor: str
+    tmp_path: Path, executor: str
 ) -> None:
     out, where = tmp_path / "out", "ray" if executor == "ray" else "local"
+    work = ColdWork(number=errno.ENOSPC)
     summary = execute(work, refs(1), ["human"], 1, Store(out), Execution(where, 1, isolated=executor == "isolated"))  # type: ignore[arg-type]
     assert summary.exit_code == INTERRUPTED and not [*out.rglob("*.parquet")]
     assert COLD in summary.message and "run the same command again" in summary.message

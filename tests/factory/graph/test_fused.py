@@ -1,7 +1,6 @@
 """However the stages of an attempt are cut into tasks, the rows are the same, to the byte."""
 
 import json
-import pickle
 import re
 import time
 from collections.abc import Iterator
@@ -14,7 +13,7 @@ import pytest
 from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, Execution, execute
 from factory.graph.local import Claims, attempt_tasks
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
-from factory.graph.work import Columns, Driven, Dropped, PreparedClip, Underway, attempted, go_on
+from factory.graph.work import Driven, Dropped, PreparedClip
 from factory.pipeline import FactoryWork
 from factory.store.samples import Store
 from tasks.stages import ATTEMPT, TASKS
@@ -61,27 +60,6 @@ def test_stages_as_tasks_of_their_own_make_the_same_rows_in_this_process(tmp_pat
 def town(small_town: Path, tmp_path_factory: pytest.TempPathFactory) -> FactoryWork:
     """A run that draws from a small town's block."""
     return work_on(small_town, tmp_path_factory.mktemp("drawn") / "out")
-
-
-@pytest.mark.slow
-def test_a_real_drive_travels_between_tasks_and_makes_the_same_row(town: FactoryWork) -> None:
-    prepared = town.prepare(town.reader.index().refs[0])
-    assert isinstance(prepared, PreparedClip)
-    drawn = []
-    for expert, candidates in (("human", [-1]), ("pdm_closed", [row.index for row in prepared.candidates[:4]])):
-        for candidate in candidates:
-            whole = attempted(town, prepared, candidate, expert)
-            result: object = prepared
-            for stage in ATTEMPT:
-                travelled = pickle.loads(pickle.dumps(result))
-                result = go_on(town, stage, travelled, candidate, expert)
-                if not isinstance(result, Underway):
-                    break
-            assert type(result) is type(whole)
-            if isinstance(result, Columns) and isinstance(whole, Columns):
-                drawn.append(whole.row["image_source"])
-                assert repr(result.row) == repr(whole.row)
-    assert set(drawn) == {"photo", "render"}
 
 
 @pytest.fixture
@@ -205,14 +183,6 @@ def test_the_town_s_pictures_are_drawn_on_the_gpu_node_and_its_drives_made_on_th
     assert any(min(pictures)[0] < began < max(pictures)[0] for began, _ in drives)
     execute(work, *what, Store(tmp_path / "local"), Execution("local"), say=lambda line: None)
     assert_same_tables(tmp_path / "ray", tmp_path / "local")
-
-
-@pytest.mark.ray
-@pytest.mark.slow
-def test_stages_as_tasks_of_their_own_make_the_same_rows_on_ray(tmp_path: Path, two_nodes: dict[str, str]) -> None:
-    assert run(tmp_path / "apart", ToyWork(trouble=UNFIT), workers=2, fuse="none").exit_code == COMPLETE
-    run(tmp_path / "local", ToyWork(trouble=UNFIT), executor="local")
-    assert_same_tables(tmp_path / "apart", tmp_path / "local")
 
 
 @pytest.mark.ray

@@ -96,25 +96,6 @@ def test_workers_write_the_same_episodes_as_one_process(tmp_path: Path, two_cpus
     assert local == ray_s and len(local) == len(Store(tmp_path / "ray").samples)
 
 
-def test_only_what_draws_claims_its_share_of_a_gpu(tmp_path: Path, two_cpus: None) -> None:
-    journal = str(tmp_path / "journal")
-    summary = execute(
-        ToyWork(journal=journal),
-        refs(2),
-        ["recovery"],
-        1,
-        Store(tmp_path / "out"),
-        Execution(claims=Claims(gpu_share=0.5)),
-        say=lambda line: None,
-    )
-    assert summary.exit_code == COMPLETE
-    lines = Path(journal).read_text().splitlines()
-    drawn, driven = ([line for line in lines if line.startswith(word)] for word in ("render", "attempt"))
-    assert len(driven) == summary.executed.attempts > len(drawn) == summary.counts["accepted"] > 0
-    assert all(line.endswith(" gpu 0") for line in drawn)
-    assert ran(journal, "label") == len(drawn)
-
-
 def test_a_cluster_without_a_gpu_is_waited_for_and_then_named(
     tmp_path: Path, two_cpus: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -24,7 +24,7 @@ from tests.factory.toy import refs
 if __name__ == "__main__":
     out, journal, how, executor = sys.argv[1:]
     work = WildWork(wild=(("log0:0:recovery:0", how),), journal=journal)
-    asked = Execution(executor.split("+")[0], 2, shard_seconds=0.1, isolated="isolated" in executor)
+    asked = Execution(executor, 2, shard_seconds=0.1)
     ended = execute(work, refs(2), ["recovery", "human"], 1, Store(out), asked)
     sys.exit(ended.exit_code)
 """
@@ -35,9 +35,7 @@ if __name__ == "__main__":
 @pytest.mark.parametrize(
     ("executor", "how", "number", "code"),
     [
-        ("local", "loop", signal.SIGHUP, INTERRUPTED),
         ("local", "compiled loop", signal.SIGTERM, -signal.SIGKILL),
-        ("local+isolated", "compiled loop", signal.SIGHUP, INTERRUPTED),
         pytest.param("ray", "compiled loop", signal.SIGHUP, INTERRUPTED, marks=pytest.mark.ray),
     ],
 )

@@ -1,6 +1,5 @@
 """Two runs on one store: the one that begins later wins, whenever the older commits."""
 
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from factory.exits import COMPLETE, INTERRUPTED
-from factory.graph.execute import RunSummary
+from factory.exits import COMPLETE
 from factory.store.attempts import OUTCOMES, Kind, Outcome, outcomes_table
 from factory.store.location import Location
 from factory.store.parquet_file import write_shard
@@ -64,27 +62,3 @@ def test_what_the_older_run_commits_while_the_newer_gets_ready_is_not_made_again
     newer = run(tmp_path / "out", LateWork(out=str(tmp_path / "out")))
     assert newer.exit_code == COMPLETE and newer.executed.attempts == 0
     assert_same_tables(tmp_path / "out", plain())
-
-
-@pytest.mark.slow
-def test_in_each_of_six_trials_the_newer_wins(tmp_path: Path, plain: Callable[..., Path]) -> None:
-    for trial in range(6):
-        out, begun, ended = tmp_path / f"out{trial}", threading.Event(), dict[str, RunSummary]()
-
-        @dataclass(frozen=True)
-        class Older(ToyWork):
-            def prepare(self, ref):  # type: ignore[no-untyped-def]
-                begun.set()  # noqa: B023
-                return super().prepare(ref)
-
-        def drive(name: str, work: ToyWork) -> None:
-            ended[name] = run(out, work, shard_seconds=0.0)  # noqa: B023
-
-        older = threading.Thread(target=drive, args=("older", Older(seconds=0.05)))
-        older.start()
-        assert begun.wait(20.0)
-        drive("newer", ToyWork(seconds=0.01))
-        older.join()
-        assert (ended["newer"].exit_code, ended["older"].exit_code) == (COMPLETE, INTERRUPTED)
-        assert "another run has taken over" in ended["older"].message
-        assert_same_tables(out, plain())

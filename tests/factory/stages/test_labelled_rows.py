@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from factory.commands.table import COMMANDS
-from factory.config.compose import ConfigError
 from factory.config.run import load_config
-from factory.exits import BAD_CONFIG
 from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
 from factory.pipeline import FactoryWork
 from factory.run import main as run_main
@@ -114,41 +112,6 @@ def test_another_vocabulary_can_be_labelled_wherever_its_file_lies(tmp_path: Pat
     assert here.settings_hash == there.settings_hash != default.settings_hash
     assert here.settings["reward.label_vocabulary"] == other.digest
     assert here.prepare_digest == default.prepare_digest, "perturbing knows nothing of labels"
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (None, "not readable as a numpy file"),
-        (np.zeros((5, 8, 3)), "have shape (5, 8, 3), expected (K >= 1, 40, 3)"),
-        (np.full((5, 40, 3), np.nan), "5 trajectories hold NaN"),
-        (np.zeros((5, 40, 3), int), "expected a floating point type"),
-    ],
-)
-def test_a_label_vocabulary_that_is_none_ends_the_command_before_anything_is_written(
-    content: np.ndarray | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file, out = tmp_path / "labels.npy", tmp_path / "out"
-    if content is not None:
-        np.save(file, content)
-    assert run_main([*STREET, f"reward.label_vocabulary={file}", f"out={out}"]) == BAD_CONFIG
-    error = capsys.readouterr().err
-    assert str(file) in error and message in error
-    assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (("reward.label=none",), "label"),
-        (("reward.labels=all",), "reward.labels"),
-        (("reward.traffic=log",), "reward.traffic"),
-        (("reward.labels=none", "reward.label_vocabulary=x.npy"), "label_vocabulary=x.npy is for labels=vocabulary"),
-    ],
-)
-def test_a_wish_that_makes_no_sense_is_named(overrides: tuple[str, ...], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        load_config(overrides)
 
 
 def test_a_dry_run_counts_the_labels_time_and_bytes() -> None:

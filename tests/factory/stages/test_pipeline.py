@@ -133,13 +133,6 @@ def test_the_earlier_frame_of_a_pair_shows_its_own_instants_from_where_the_ego_w
         np.testing.assert_allclose(np.reshape(image["ego_pose"], (4, 4)), log.world_from_ego[step], atol=1e-6)
 
 
-def test_a_rejected_attempt_is_no_sample(small_town: Path, tmp_path: Path) -> None:
-    work = work_on(small_town, tmp_path, "reward.progress_above=2.0", "render=none")
-    prepared = prepared_by(work)
-    results = [attempted(work, prepared, row.index, "pdm_closed") for row in prepared.candidates[:2]]
-    assert results and all(isinstance(result, Dropped) for result in results)
-
-
 def test_with_an_open_gate_the_log_s_future_is_the_label_of_every_perturbed_state(
     small_town: Path, tmp_path: Path
 ) -> None:

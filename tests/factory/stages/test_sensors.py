@@ -16,7 +16,7 @@ from factory.graph.work import Halted, Stopped
 from factory.readers.base import BadClip
 from factory.stages import assets
 from factory.stages.assets import Sensing, asset_for, block_id, sensing
-from factory.stages.scene_file import read_scene, stored_dtype
+from factory.stages.scene_file import stored_dtype
 from factory.stages.sensors import SAMPLING, block_of, chosen_cameras, decode_image, encode_jpeg, load_sensors
 from tasks.render.fit import reconstruct
 from tasks.render.scene.build import AssetSettings, psnr
@@ -203,36 +203,6 @@ def test_a_scene_says_which_stretch_of_driving_it_stands_for(clip: Clip, tmp_pat
     assert (asset.block.low.tolist(), asset.block.high.tolist()) == ([0.0, 0.0], [4.0, 0.0])
 
 
-def test_a_damaged_block_is_noticed_and_built_again(
-    clip: Clip, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    first = asset_for(clip, SETTINGS, tmp_path)
-    path = tmp_path / f"block-{block_id(clip, SETTINGS)}.safetensors"
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    again = asset_for(clip, SETTINGS, tmp_path)
-    assert first is not None and again is not None and again.digest == first.digest
-    assert f"{path}: cannot be read" in caplog.text and "built again" in caplog.text
-    assert read_scene(path).digest == first.digest
-    assert not list(tmp_path.glob(".scene-*"))
-
-
-def test_a_block_under_another_s_name_is_built_again(clip: Clip, tmp_path: Path) -> None:
-    both = [clip, replace(clip, log_id="another")]
-    paths = [tmp_path / f"block-{block_id(one, SETTINGS)}.safetensors" for one in both]
-    for one in both:
-        asset_for(one, SETTINGS, tmp_path)
-    whole = [path.read_bytes() for path in paths]
-    assert whole[0] != whole[1]
-    paths[0].write_bytes(whole[1])
-    paths[1].write_bytes(whole[0])
-    assert [asset.block.log_id for one in both if (asset := asset_for(one, SETTINGS, tmp_path)) and asset.block] == [
-        "log",
-        "another",
-    ]
-    assert [path.read_bytes() for path in paths] == whole
-
-
 def test_a_clip_without_lidar_or_without_a_rig_has_no_scene(clip: Clip, tmp_path: Path) -> None:
     assert asset_for(replace(clip, images=(), sweeps=()), SETTINGS, tmp_path) is None
     assert asset_for(replace(clip, cameras=(), images=()), SETTINGS, tmp_path) is None
@@ -340,17 +310,6 @@ def test_a_fit_that_is_asked_to_stop_keeps_every_iteration_and_goes_on_to_the_sa
     again = asset_for(clip, FITTED, tmp_path / "two", stopped=after(8))  # the last iteration is done: nothing to leave
     assert undisturbed is not None and again is not None and again.digest == undisturbed.digest
     assert not begun.exists()
-
-
-def test_a_damaged_half_fit_is_said_and_begun_again(
-    clip: Clip,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    begun = tmp_path / f"block-{block_id(clip, FITTED)}.fit.npz"
-    begun.write_bytes(b"half")
-    assert asset_for(clip, FITTED, tmp_path) is not None
-    assert f"{begun} is damaged" in caplog.text and not begun.exists()
 
 
 def test_only_the_settings_that_make_the_scene_are_in_its_name(clip: Clip) -> None:

@@ -138,13 +138,6 @@ def test_replayed_traffic_needs_no_idm(tmp_path: Path, towns: str) -> None:
     assert not any(name.startswith("tasks/rollout/traffic") for name in after)
 
 
-def test_the_public_traffic_has_no_kernels(tmp_path: Path, towns: str) -> None:
-    public = ("traffic=navsim", "reward.labels=none")
-    before, after = run_with_these(["judge", "plan"], tmp_path, *TOWN, *BLIND, *public, towns, "executor=local")
-    assert after == before
-    assert not any(name.startswith("tasks/rollout/traffic") for name in after)
-
-
 def test_labels_among_traffic_that_answers_compile_nothing(tmp_path: Path, towns: str) -> None:
     answers = ("reward.traffic=idm", "experts=[human]")
     before, after = run_with_these(
@@ -157,11 +150,4 @@ def test_labels_among_traffic_that_answers_compile_nothing(tmp_path: Path, towns
 def test_arrays_out_of_ray_s_store_need_no_forms_of_their_own(tmp_path: Path, towns: str) -> None:
     """They cannot be written, which is another type to numba."""
     before, after = run_with_these(["judge", "plan", "drive"], tmp_path, *TOWN, *BLIND, towns, "workers=1")
-    assert after == before
-
-
-def test_a_run_on_argoverse_logs_compiles_nothing(tmp_path: Path, shared_root: Path) -> None:
-    logs = ("clips=av2", f"clips.root={shared_root / 'data/av2/sensor/val'}", "limit=2", "render=none")
-    human = f"vocabulary.file={shared_root / 'data/vocabulary/human_8192x40x3.npy'}"
-    before, after = run_with_these(["judge", "plan", "drive"], tmp_path, *logs, human, "executor=local")
     assert after == before

@@ -20,12 +20,9 @@ from factory.graph.execute import Execution, execute
 from factory.store.reader import Format, SampleTable, image_of, labels_of, to_torch
 from factory.store.samples import Store
 from factory.store.schema import LABEL_COLUMNS
-from factory.store.verify import verify
 from tasks.reward.label_bytes import VocabularyLabels
 from tasks.sealed import sealed_json
 from tests.factory.toy import ToyWork, refs, row_of, stream
-
-main = COMMANDS["verify"].load()
 
 
 @pytest.fixture(scope="module")
@@ -96,14 +93,6 @@ def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
         SampleTable(tmp_path)
     with pytest.raises(FileNotFoundError):
         SampleTable(tmp_path / "nowhere")
-
-
-def test_a_table_of_another_version_is_named(tmp_path: Path) -> None:
-    store = Store(tmp_path)
-    execute(ToyWork(), refs(1), ["human"], 1, store, Execution("local"), say=lambda line: None)
-    store.samples.set_property("factory.schema_version", "1")
-    with pytest.raises(ValueError, match=f"{tmp_path}.*schema_version 1, this version reads and writes 4: make the"):
-        SampleTable(tmp_path)
 
 
 @pytest.mark.parametrize("is_sealed", [True, False], ids=["sealed", "as the first versions wrote it"])
@@ -189,27 +178,3 @@ def test_tensors_hold_the_numeric_columns(out: Path) -> None:
     assert tuple(tensors["label_10hz"].shape) == (40, 3)
     assert np.array_equal(tensors["agent_valid"].numpy(), sample["agent_valid"])
     assert "clip_id" not in tensors and "cameras" not in tensors
-
-
-def test_verify_tells_damage_from_orphans(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert verify(Store(out)).damage == () and main([str(out)]) == 0
-    shard = sorted((out / "samples").rglob("*.parquet"))[0]
-    orphan = shard.with_name("part-left-behind.parquet")
-    orphan.write_bytes(shard.read_bytes())
-    verdict = verify(Store(out))
-    assert verdict.damage == () and verdict.orphans == (f"samples/{orphan.relative_to(out / 'samples')}",)
-    orphan.unlink()
-
-    data = shard.read_bytes()
-    flipped = bytearray(data)
-    flipped[len(data) // 3] ^= 1
-    shard.write_bytes(bytes(flipped))
-    assert main([str(out)]) == 1 and shard.name in capsys.readouterr().out
-    shard.unlink()
-    assert any(shard.name in line for line in verify(Store(out)).damage)
-    shard.write_bytes(data)
-    assert verify(Store(out)).damage == ()
-
-
-def test_verify_of_nothing_says_so(tmp_path: Path) -> None:
-    assert main([str(tmp_path)]) == 2 and main([]) == 2

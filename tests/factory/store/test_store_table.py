@@ -14,7 +14,7 @@ import factory.store.table as table_module
 from factory.store.location import Location
 from factory.store.parquet_file import Shard, TableSpec, write_shard
 from factory.store.schema import SAMPLES, Stamp, sample_row_to_table
-from factory.store.table import AnotherWriter, DuplicateKey, KeyedTable
+from factory.store.table import DuplicateKey, KeyedTable
 from tests.factory.toy import row_of, stream
 
 SPEC = TableSpec(
@@ -101,29 +101,6 @@ def test_a_damaged_file_of_an_object_store_is_named(location: Location) -> None:
     Path(location.uri, path).write_bytes(b"PAR1")
     with pytest.raises(OSError, match=path):
         list(table.files())
-
-
-def test_the_newest_run_writes_and_the_older_one_fails_clearly(location: Location) -> None:
-    old = KeyedTable(location, SPEC)
-    old.claim()
-    old.commit([shard(location, "a")])
-    new = KeyedTable(location, SPEC)
-    new.claim()
-    with pytest.raises(AnotherWriter, match="another run"):
-        old.commit([shard(location, "b")])
-    new.commit([shard(location, "c")])
-    assert sorted(content(location)) == ["a", "c"]
-
-
-def test_a_flipped_byte_is_found(location: Location) -> None:
-    table = KeyedTable(location, SPEC)
-    table.commit([shard(location, "abcdefgh")])
-    (path,) = Path(location.uri).rglob("*.parquet")
-    data = bytearray(path.read_bytes())
-    data[len(data) // 8] ^= 0x10
-    path.write_bytes(bytes(data))
-    with pytest.raises(OSError, match=path.name):
-        KeyedTable(location, SPEC).read()
 
 
 @pytest.mark.slow

@@ -228,7 +228,7 @@ def _not_annotated(log: list[dict[str, Any]]) -> None:
 
 
 def _token(log: list[dict[str, Any]]) -> None:
-    log[3]["token"] += "-000" if len(log[3]["token"]) == 16 else "0"
+    log[3]["token"] += "0"
 
 
 @pytest.mark.parametrize(
@@ -241,15 +241,10 @@ def _token(log: list[dict[str, Any]]) -> None:
         (_token, "frames[3].token: is "),
     ],
 )
-@pytest.mark.parametrize(("folder", "round"), [(PDM, 0), (HUMAN, None)])
-def test_a_bad_log_is_counted_and_hurts_no_other(
-    folder: str, round: int | None, harm: Any, said: str, released: Path, tmp_path: Path
-) -> None:
-    log = simscale.frames(2, round)
+def test_a_bad_log_is_counted_and_hurts_no_other(harm: Any, said: str, released: Path, tmp_path: Path) -> None:
+    log = simscale.frames(2, 0)
     harm(log)
-    path = simscale.write_log(released, folder, 2, round, log)
-    if folder != PDM:
-        (released / "navsim_logs" / PDM / f"{simscale.names(2, 0)[0]}.pkl").unlink()
+    path = simscale.write_log(released, PDM, 2, 0, log)
     assert imported(released, tmp_path / "out") == COMPLETE_WITH_FAILURES
     (failed,) = Store(tmp_path / "out").outcomes.read().to_pylist()
     assert failed["error"].startswith(f"{path}: {said}") and failed["error_kind"] == "input"
@@ -331,18 +326,6 @@ def test_files_are_cut_by_the_bytes_of_the_rows_since_the_last(tmp_path: Path, m
     monkeypatch.setattr(table, "SHARD_BYTES", int(1.5 * whole.read().nbytes / 5))
     assert imported(root, out) == COMPLETE
     assert sorted(len(rows) for _, rows in Store(out).samples.files(["attempt_id"])) == [1, 2, 2]
-
-
-def test_a_pickle_with_code_runs_none_of_it(released: Path, tmp_path: Path) -> None:
-    class Harm:
-        def __reduce__(self) -> tuple[Any, tuple[str]]:
-            return eval, ("1 / 0",)  # no print: Ray puts one of its own into a process that it runs in
-
-    path = released / "navsim_logs" / PDM / f"{simscale.names(1, 0)[0]}.pkl"
-    path.write_bytes(pickle.dumps([{"token": Harm()}]))
-    assert imported(released, tmp_path / "out") == COMPLETE_WITH_FAILURES
-    (failed,) = Store(tmp_path / "out").outcomes.read().to_pylist()
-    assert "refused global builtins.eval" in failed["error"]
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,10 @@ import shapely
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.py123d.arrow import KINDS_OF_LABELS
 from factory.datasets.py123d.reader import Py123dReader
-from tasks.trajectories import score_trajectories
 from tasks.world.agents import AgentKind
 from tasks.world.clip import NOW, Clip
 from tasks.world.lanes import LightState, MapLayer
 from tasks.world.polygons import polygons_near
-from tasks.world.vocabulary import kinematic_trajectories
 from tests.factory.datasets.av2.test_av2 import SPEED, START_NS, road, write_log, write_table
 from tests.factory.datasets.py123d.py123d_logs import (
     CARPARK,
@@ -118,13 +116,6 @@ def test_a_converted_map_lacks_nothing_but_lanes_beyond_it(pair: tuple[Clip, Cli
         assert (mine.token, mine.layer) == (other.token, other.layer)
         assert np.array_equal(mine.ring, other.ring)
     assert all(np.array_equal(a, b) for a, b in zip(native.crossings, through.crossings, strict=True))
-
-
-def test_plans_score_the_same_through_123d(pair: tuple[Clip, Clip]) -> None:
-    plans = kinematic_trajectories(64, 0)
-    native, through = (score_trajectories(clip, plans) for clip in pair)
-    for name in ("nc", "dac", "ddc", "tlc", "ttc", "lk", "hc", "ep", "pdm_score"):
-        assert np.array_equal(getattr(native, name), getattr(through, name)), name
 
 
 def test_keyframes_of_2_hz_become_10_hz(street: Path, tmp_path: Path) -> None:

@@ -207,11 +207,6 @@ def test_a_log_that_lacks_something_is_skipped_and_says_what(
     assert index.skipped_logs == {"log-a": reason}
 
 
-def test_a_short_log_is_skipped(tmp_path: Path) -> None:
-    convert(write_log(tmp_path / "source" / "short", seconds=9.0), tmp_path / "out")
-    assert "a clip needs 9.6 s" in Py123dReader(tmp_path / "out").index().skipped_logs["short"]
-
-
 def test_frames_too_far_apart_for_10_hz_are_refused(source: Path, tmp_path: Path) -> None:
     convert(source, tmp_path, Made(every=10))
     (broken,) = Py123dReader(tmp_path).index().broken.values()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from factory.datasets.scenarionet.reader import ScenarioNetReader
-from factory.readers.base import BadClip, ClipRef, Unreadable
+from factory.readers.base import BadClip, ClipRef
 from tests.factory.datasets.scenarionet import scenarionet_scenarios as town
 
 
@@ -101,33 +101,6 @@ def test_a_broken_map_or_light_is_named_when_the_clip_is_read(tmp_path, message)
         reader.read(reader.index().refs[0])
 
 
-JUNK = [None, 3, float("nan"), "x", [], {}, [{}], np.zeros((2, 2)), np.full(121, np.nan), b"x", [None] * 121]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dialect", ["nuscenes", "waymo", "nuplan"])
-def test_junk_in_any_field_is_a_bad_clip_or_harmless(tmp_path, dialect):
-    def fields(part, path=()):
-        for key, value in part.items():
-            yield (*path, key)
-            if isinstance(value, dict):
-                yield from fields(value, (*path, key))
-
-    data = pickle.dumps(getattr(town, dialect)())
-    paths = list(fields(pickle.loads(data)))
-    rng = np.random.default_rng(0)
-    for k in range(60):
-        scenario = pickle.loads(data)
-        with_value(JUNK[k % len(JUNK)], *paths[rng.integers(len(paths))])(scenario)
-        path = town.save(scenario, tmp_path)
-        reader = ScenarioNetReader(path)
-        reader.index()
-        try:
-            reader.read(ClipRef("scenarionet", path.stem, 0))
-        except BadClip as error:
-            assert error.file == str(path) and not isinstance(error, Unreadable)
-
-
 class Evil:
     def __reduce__(self):
         return os.system, ("touch ran",)
@@ -175,29 +148,3 @@ def test_a_root_without_scenarios_or_with_one_twice_is_refused(tmp_path):
     town.save(town.nuscenes(), tmp_path / "b")
     with pytest.raises(ValueError, match="stands in two folders"):
         ScenarioNetReader(tmp_path).index()
-
-
-def test_a_reader_travels_light_keeps_two_logs_and_reads_the_same_twice(tmp_path):
-    for k in range(3):
-        town.save(town.nuscenes(), tmp_path, f"sd_{k}.pkl")
-    reader = ScenarioNetReader(tmp_path, stride_s=2.0)
-    index = reader.index()
-    assert index == reader.index() and [ref.start_ms for ref in index.refs] == [0, 2000] * 3
-    clips = [reader.read(ref) for ref in index.refs]
-    assert len(reader._logs) == 2
-    traveller = pickle.loads(pickle.dumps(reader))
-    assert not traveller._logs
-    again = traveller.read(index.refs[0])
-    np.testing.assert_array_equal(again.ego_states, clips[0].ego_states)
-    np.testing.assert_array_equal(again.agents.velocities, clips[0].agents.velocities)
-    assert again.clip_id == index.refs[0].clip_id and again.route == clips[0].route
-
-
-def test_a_window_that_is_not_there_is_a_bad_clip(tmp_path):
-    path = town.save(town.nuscenes(), tmp_path)
-    reader = ScenarioNetReader(path)
-    for ref in (ClipRef("scenarionet", path.stem, 9000), ClipRef("scenarionet", path.stem, 55)):
-        with pytest.raises(BadClip, match="start_ms"):
-            reader.read(ref)
-    with pytest.raises(BadClip, match="no log sd_other"):
-        reader.read(ClipRef("scenarionet", "sd_other", 0))

@@ -73,16 +73,6 @@ def test_the_nearer_of_two_things_hides_the_other() -> None:
         assert centre[1] > centre[0]
 
 
-def test_twice_as_far_is_half_as_large() -> None:
-    widths = []
-    for distance in (10.0, 20.0):
-        builder = Builder()
-        builder.face([(distance, 2, 0), (distance, -2, 0), (distance, -2, 3), (distance, 2, 3)], tx.GLOW, RED)
-        picture = paint(staged(builder), FRONT, world_from_ego(np.array([-1.62, 0.0, 0.0]))).astype(int)
-        widths.append(int(((picture[90, :, 0] > 150) & (picture[90, :, 1] < 120)).sum()))
-    assert widths[0] == pytest.approx(2 * widths[1], abs=2)
-
-
 def test_a_surface_that_passes_beside_and_behind_the_camera_is_drawn_to_the_picture_edge() -> None:
     builder = Builder()
     lawn(builder)

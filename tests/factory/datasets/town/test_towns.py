@@ -6,8 +6,7 @@ import pytest
 
 import factory.datasets.town.town as painters_module
 from factory.datasets.town.drive import SCENARIOS
-from factory.datasets.town.reader import SyntheticReader, SyntheticTownsReader
-from factory.datasets.town.town import write_logs, write_town
+from factory.datasets.town.reader import SyntheticTownsReader
 from factory.readers.base import BadClip, ClipRef
 from factory.readers.settings import LOGS_PER_TOWN, TownSettings
 
@@ -65,16 +64,6 @@ def test_others_of_the_same_towns_are_those_behind_the_first(folder: Path) -> No
 
 
 @pytest.mark.slow
-def test_a_log_has_the_same_bytes_whatever_logs_are_written_beside_it(tmp_path: Path) -> None:
-    write_town(tmp_path / "all", 4, 3, BLIND)
-    alone = write_logs(tmp_path / "one", [1], 3, BLIND)[0]
-    files = [path for path in sorted(alone.rglob("*")) if path.is_file()]
-    assert files
-    for path in files:
-        assert path.read_bytes() == (tmp_path / "all" / path.relative_to(tmp_path / "one")).read_bytes()
-
-
-@pytest.mark.slow
 def test_a_town_is_written_once_and_only_where_it_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -104,15 +93,6 @@ def test_first_window_skips_the_start_of_every_log(reader: SyntheticTownsReader,
     none_left = reader_of(folder, [18], first_window=3).index()
     assert not none_left.refs
     assert "a clip needs 12.6 s" in next(iter(none_left.skipped_logs.values()))
-
-
-@pytest.mark.slow
-def test_a_town_alone_reads_the_same_clip(reader: SyntheticTownsReader, tmp_path: Path) -> None:
-    ref = reader.index().refs[0]
-    assert reader.towns[0].indices == (0,)
-    single = SyntheticReader(tmp_path, 1, 18, BLIND)
-    assert single.index().refs == (ref,)
-    assert (single.read(ref).ego_states == reader.read(ref).ego_states).all()
 
 
 def test_wrong_wishes_are_refused_by_name(reader: SyntheticTownsReader) -> None:

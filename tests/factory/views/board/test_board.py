@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
-from factory.commands.dashboard import Request, awaited
+from factory.commands.dashboard import awaited
 from factory.commands.table import COMMANDS
-from factory.config.arguments import Refused, parse
+from factory.config.arguments import Refused
 from factory.config.run import load_config
 from factory.graph.execute import Execution, execute
 from factory.setup.settings import assemble
@@ -264,12 +264,6 @@ def test_what_is_not_there_is_refused_with_a_reason(board: Board, target: str, s
     assert get(board, target, status)["error"]
 
 
-def test_an_attempt_that_is_no_sample_says_what_became_of_it(out: Path, board: Board) -> None:
-    rejected = next(o for o in Store(out).outcomes.read().to_pylist() if o["kind"] == "rejected" and o["expert"])
-    error = get(board, f"/api/samples/{rejected['attempt_id']}", 404)["error"]
-    assert "rejected" in error and rejected["reason"] in error
-
-
 def test_the_page_fetches_nothing_from_elsewhere() -> None:
     assert {"index.html", "board.css", "app.js"} <= set(SERVED)
     for path in STATIC.iterdir():
@@ -325,17 +319,6 @@ def test_what_is_kept_is_bounded_and_the_latest_used_stay() -> None:
     make("large", 11)
     make("large", 11)
     assert made[-2:] == ["large", "large"]
-
-
-def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments in ([], ["out="], ["out=x", "port=no"], ["out=x", "port=70000"], ["colour=red"], ["out=x", "out=y"]):
-        assert main(arguments) == 2
-        assert "error:" in capsys.readouterr().err
-    assert main([f"out={tmp_path / 'nothing'}"]) == 2
-    assert "no store at" in capsys.readouterr().err
-    with pytest.raises(Refused, match="port"):
-        parse(Request, ["out=x", "port=99999"])
-    assert (parse(Request, ["out=x"]).host, parse(Request, ["out=x", "port=0"]).port) == ("127.0.0.1", 0)
 
 
 def test_a_taken_port_is_said(out: Path, served: tuple[str, int], capsys: pytest.CaptureFixture[str]) -> None:
