@@ -14,11 +14,10 @@ import yaml
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from factory.graph.execute import Execution, execute
 from factory.store.samples import Store
 from tests.factory.filmed import FilmedWork
 from tests.factory.installs import PROJECT, REPOSITORY, SMALL, as_if_installed, closure, declared
-from tests.factory.toy import refs
+from tests.factory.toy import executed, refs
 
 OURS = {"tasks", "factory", "planners"}
 DISTRIBUTIONS = {  # of modules whose distribution has another name
@@ -143,15 +142,7 @@ def test_a_command_that_needs_an_extra_names_the_line_that_installs_it(
 
 @pytest.mark.slow
 def test_the_small_install_looks_at_a_finished_run(tmp_path: Path) -> None:
-    execute(
-        FilmedWork(),
-        refs(2),
-        ["recovery", "human"],
-        1,
-        Store(tmp_path / "out"),
-        Execution("local"),
-        say=lambda line: None,
-    )
+    executed(FilmedWork(), refs(2), ["recovery", "human"], 1, Store(tmp_path / "out"))
     code = (
         "from factory.__main__ import main\n"
         "for words in ('status', 'failed', 'lineage sample=0', 'show sample=0 to=.', 'report', 'verify'):\n"

@@ -10,13 +10,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from factory.graph.execute import Execution, RunSummary, execute
 from factory.graph.work import Built, Columns, Driven, Dropped, PreparedClip, Stopped, never
 from factory.readers.base import BadClip, ClipRef
 from factory.stages.rows import label_columns
 from factory.store.attempts import CandidateRow
+from factory.store.samples import Store
 from factory.store.schema import BOOKKEEPING, FIELDS, UNLISTED, Column, RunIdentity
 from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
 from tasks.stages import Rejected
@@ -24,6 +27,13 @@ from tasks.stages import Rejected
 VERSIONS = {"clip": 1, "perturb": 1, "rollout": 1, "expert": 1, "reward": 1, "render": 1, "write": 1}
 PICTURES = ("cameras", "images", "image_source")
 RAGGED = {"B": 2, "N": 3, "L": 4, "P": 5, "D": 2, "X": 1, "S": 1, "R": 2, "C": 1, "I": 2, "T": 1}
+
+
+def executed(
+    work: Any, clips: Sequence[ClipRef], experts: Sequence[str], rounds: int, store: Store, how: Execution | None = None
+) -> RunSummary:
+    """A run that prints nothing; how: in this process, where none is given."""
+    return execute(work, clips, experts, rounds, store, how or Execution("local"), say=lambda line: None)
 
 
 def refs(n: int) -> list[ClipRef]:

@@ -20,14 +20,14 @@ from factory.commands.completion import candidates, settings_of
 from factory.commands.table import COMMANDS, DOORS, PLANNERS
 from factory.exits import MEANING
 from factory.graph.episodes import EpisodesWanted
-from factory.graph.execute import Execution, execute
+from factory.graph.execute import Execution
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import COPIES
 from factory.views.show import prepared_episode
 from factory.views.status import failed_line
 from planners.__main__ import main as planners_main
 from tests.factory.filmed import FilmedWork
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 HEAVY = ("numpy", "ray", "torch", "hydra", "omegaconf", "pyarrow", "deltalake", "numba", "cv2", "rich")
@@ -40,14 +40,13 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     work = FilmedWork(trouble={"log0:2000:recovery:1": "bug"})
     given = ["executor=local", "episodes=all", f"out={folder}", "rounds=2"]
     store = Store(folder)
-    execute(
+    executed(
         work,
         refs(4),
         ["recovery", "human"],
         2,
         store,
         Execution("local", episodes=EpisodesWanted(1, prepared_episode), command=given),
-        say=lambda line: None,
     )
     return folder
 
@@ -298,10 +297,10 @@ def test_retry_calls_no_code_that_a_table_alone_names(
 def test_retry_of_a_run_without_failures_or_without_a_record_does_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    execute(ToyWork(), refs(1), ["human"], 1, Store(tmp_path / "fine"), Execution("local"), say=lambda line: None)
+    executed(ToyWork(), refs(1), ["human"], 1, Store(tmp_path / "fine"))
     assert ask(capsys, "retry", f"out={tmp_path / 'fine'}")[:2] == (0, "0 failed\n")
     work = ToyWork(trouble={"log0:0:human:-1": "bug"})
-    execute(work, refs(1), ["human"], 1, Store(tmp_path / "old"), Execution("local"), say=lambda line: None)
+    executed(work, refs(1), ["human"], 1, Store(tmp_path / "old"))
     code, _, error = ask(capsys, "retry", f"out={tmp_path / 'old'}")
     assert code == 2 and "records no settings" in error
 

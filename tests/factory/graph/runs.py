@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from factory.graph.execute import Execution, RunSummary, execute
+from factory.graph.execute import Execution, RunSummary
 from factory.store.samples import Store
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 EXPERTS = ["recovery", "pdm_closed", "human"]
 
@@ -20,4 +20,4 @@ def run(
 ) -> RunSummary:
     """options: of Execution."""
     how = Execution("local", **options)  # type: ignore[arg-type]
-    return execute(work or ToyWork(), refs(n), experts, rounds, Store(out), how, say=lambda line: None)
+    return executed(work or ToyWork(), refs(n), experts, rounds, Store(out), how)

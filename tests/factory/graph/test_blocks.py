@@ -7,12 +7,11 @@ import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.driver import BlockQueue, Build
-from factory.graph.execute import Execution, execute
 from factory.graph.plan import ClipPlan
 from factory.readers.base import ClipRef
 from factory.store.samples import Store
 from tests.factory.tables import assert_same_tables
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 
 def plans(logs: str) -> list[ClipPlan]:
@@ -51,29 +50,29 @@ def test_as_many_are_built_at_once_as_there_are_blocks_and_workers(logs: str, wo
     assert BlockQueue(plans(logs), lambda ref: ref.log_id, workers).at_once == at_once
 
 
-def executed(out: Path, work: ToyWork, rounds: int = 2, n: int = 4) -> int:
+def done(out: Path, work: ToyWork, rounds: int = 2, n: int = 4) -> int:
     experts: Sequence[str] = ["recovery", "human"]
-    return execute(work, refs(n), experts, rounds, Store(out), Execution("local"), say=lambda line: None).exit_code
+    return executed(work, refs(n), experts, rounds, Store(out)).exit_code
 
 
 def test_a_run_builds_every_block_once_and_first(tmp_path: Path) -> None:
     journal = tmp_path / "journal"
-    assert executed(tmp_path / "blocks", ToyWork(blocks=True, journal=str(journal))) == COMPLETE
+    assert done(tmp_path / "blocks", ToyWork(blocks=True, journal=str(journal))) == COMPLETE
     lines = journal.read_text().splitlines()
     for log in ("log0", "log1"):
         assert lines.count(f"reconstruct {log}") == 1
         first = min(i for i, line in enumerate(lines) if line.startswith(f"prepare {log}"))
         assert lines.index(f"reconstruct {log}") < first
-    assert executed(tmp_path / "none", ToyWork()) == COMPLETE
+    assert done(tmp_path / "none", ToyWork()) == COMPLETE
     assert_same_tables(tmp_path / "blocks", tmp_path / "none")
 
-    assert executed(tmp_path / "blocks", ToyWork(blocks=True, journal=str(journal))) == COMPLETE
+    assert done(tmp_path / "blocks", ToyWork(blocks=True, journal=str(journal))) == COMPLETE
     assert journal.read_text().splitlines()[len(lines) :] in ([], ["warm"]), "nothing to prepare, nothing to build"
 
 
 def test_a_block_that_fails_keeps_no_clip_of_another_from_its_samples(tmp_path: Path) -> None:
     work = ToyWork(blocks=True, trouble={"log0": "bad", "log0:0": "bad", "log0:2000": "bad"})
-    assert executed(tmp_path / "out", work) == COMPLETE_WITH_FAILURES
+    assert done(tmp_path / "out", work) == COMPLETE_WITH_FAILURES
     sound = ToyWork(trouble={"log0:0": "bad", "log0:2000": "bad"})
-    assert executed(tmp_path / "none", sound) == COMPLETE_WITH_FAILURES
+    assert done(tmp_path / "none", sound) == COMPLETE_WITH_FAILURES
     assert_same_tables(tmp_path / "out", tmp_path / "none")

@@ -11,14 +11,14 @@ from factory.config.run import load_config
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph import episodes
 from factory.graph.episodes import EpisodesWanted
-from factory.graph.execute import Execution, RunSummary, execute
+from factory.graph.execute import Execution, RunSummary
 from factory.store.location import Location
 from factory.store.mcap_files import FOLDER, episode_name, is_chosen
 from factory.store.samples import Store
 from factory.store.verify import verify
 from factory.views.show import prepared_episode
 from tests.factory.filmed import FilmedWork
-from tests.factory.toy import refs
+from tests.factory.toy import executed, refs
 
 EXPERTS = ["recovery", "human"]
 
@@ -27,7 +27,7 @@ def run(out: Path | Store, every: int = 1, rounds: int = 2, n: int = 3, **option
     store = out if isinstance(out, Store) else Store(out)
     work = options.pop("work", FilmedWork())
     how = Execution("local", episodes=EpisodesWanted(every, prepared_episode), **options)
-    return execute(work, refs(n), EXPERTS, rounds, store, how, say=lambda line: None)
+    return executed(work, refs(n), EXPERTS, rounds, store, how)
 
 
 def there(out: Path) -> dict[str, bytes]:

@@ -6,10 +6,9 @@ from pathlib import Path
 import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
-from factory.graph.execute import Execution, execute
 from factory.graph.progress import RunForecast, Workload
 from factory.store.samples import Store
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 EXPERTS = ["recovery", "human"]
 
@@ -34,9 +33,7 @@ def test_a_kind_of_work_that_nothing_is_known_of_leaves_the_time_open() -> None:
 def last_line(out: Path, work: ToyWork, rounds: int, capsys: pytest.CaptureFixture[str], code: int = COMPLETE) -> str:
     experts: Sequence[str] = EXPERTS
     capsys.readouterr()
-    assert (
-        execute(work, refs(4), experts, rounds, Store(out), Execution("local"), say=lambda line: None).exit_code == code
-    )
+    assert executed(work, refs(4), experts, rounds, Store(out)).exit_code == code
     return [line for line in capsys.readouterr().err.splitlines() if line.startswith("clips ")][-1]
 
 

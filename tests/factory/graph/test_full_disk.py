@@ -19,7 +19,7 @@ from factory.store.verify import verify
 from tasks.caches import user_cache
 from tests.chaos.full_disks import PAGE, at_level, needed
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
-from tests.factory.toy import COLD, ColdWork, DyingWork, ToyWork, refs
+from tests.factory.toy import COLD, ColdWork, DyingWork, ToyWork, executed, refs
 
 LARGE = "64m"
 TOWN = ["clips.n_clips=3", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none"]
@@ -50,15 +50,7 @@ def resize(folder: Path, size: str) -> None:
 
 def run(out: Path) -> RunSummary:
     work = ToyWork(threshold=0.4)
-    return execute(
-        work,
-        refs(8),
-        ["recovery", "human"],
-        2,
-        Store(out),
-        Execution("local", shard_seconds=0.0),
-        say=lambda line: None,
-    )
+    return executed(work, refs(8), ["recovery", "human"], 2, Store(out), Execution("local", shard_seconds=0.0))
 
 
 @pytest.fixture(scope="module")

@@ -20,14 +20,14 @@ from tasks.stages import ATTEMPT, TASKS
 from tests.factory.noted import NotedWork
 from tests.factory.stages.test_pipeline import work_on
 from tests.factory.tables import assert_same_tables, tables_of
-from tests.factory.toy import TakesItsNodeAway, ToyWork, ran, refs
+from tests.factory.toy import TakesItsNodeAway, ToyWork, executed, ran, refs
 
 EXPERTS = ["recovery", "pdm_closed", "human"]
 UNFIT = {f"log0:{start}:pdm_closed:{i}:render": "unfit" for start in (0, 2000) for i in range(3)}
 
 
 def run(out: Path, work: ToyWork, **options: object):  # type: ignore[no-untyped-def]
-    return execute(work, refs(4), EXPERTS, 2, Store(out), Execution(**options), say=lambda line: None)  # type: ignore[arg-type]
+    return executed(work, refs(4), EXPERTS, 2, Store(out), Execution(**options))  # type: ignore[arg-type]
 
 
 def test_the_tasks_of_an_attempt() -> None:
@@ -100,21 +100,6 @@ def test_memory_bounds_what_a_node_does_at_once(
     spans = [[float(t) for t in line.split()[1:]] for line in journal.read_text().splitlines() if line[:3] == "at "]
     together = [sum(began <= start < ended for began, ended in spans) for start, _ in spans]
     assert max(together) == at_once
-
-
-@pytest.mark.ray
-@pytest.mark.slow
-def test_a_real_run_makes_the_same_rows_in_one_task_here_and_in_three_on_ray(town: FactoryWork, tmp_path: Path) -> None:
-    stores = {}
-    for executor, fuse in (("local", "all"), ("ray", "none")):
-        stores[executor] = Store(tmp_path / executor)
-        made = execute(
-            *(town, town.reader.index().refs[:1], ["pdm_closed", "human"], 1, stores[executor]),
-            Execution(executor, 2, fuse=fuse),  # type: ignore[arg-type]
-            say=lambda line: None,
-        )
-        assert made.exit_code == COMPLETE and made.counts["accepted"] == 2
-    assert_same_tables(tmp_path / "local", tmp_path / "ray")
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 import os
 import re
 import signal
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +22,7 @@ from factory.store.schema import UNLISTED
 from factory.store.verify import verify
 from tests.factory.graph.runs import EXPERTS, run
 from tests.factory.tables import assert_same_tables, tables_of
-from tests.factory.toy import ToyWork, ran, refs
+from tests.factory.toy import ToyWork, executed, ran, refs
 
 
 def test_when_minutes_are_up_nothing_new_begins_and_the_same_command_goes_on(
@@ -79,18 +78,6 @@ def test_five_rounds_after_two_are_five_rounds_and_perturb_nothing_again(tmp_pat
     direct = run(tmp_path / "direct", rounds=5)
     assert later.executed.attempts + later.executed.found_done == direct.executed.attempts
     assert_same_tables(tmp_path / "nested", tmp_path / "direct")
-
-
-def test_a_lost_cache_is_prepared_again_and_said(
-    tmp_path: Path, begun: Callable[..., Path], plain: Callable[..., Path]
-) -> None:
-    begun(rounds=1)
-    for path in (tmp_path / "out/cache/prepared").iterdir():
-        path.write_bytes(path.read_bytes()[:50])
-    later = run(tmp_path / "out", rounds=3)
-    assert later.executed.prepared > 0
-    assert any("prepared again" in note for note in later.notes)
-    assert_same_tables(tmp_path / "out", plain(rounds=3))
 
 
 def test_every_attempt_has_one_row_in_one_table(tmp_path: Path) -> None:
@@ -163,16 +150,6 @@ def test_zero_inputs_and_double_ones_write_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_stopped_run_goes_on_where_it_was(tmp_path: Path, plain: Callable[..., Path]) -> None:
-    timer = threading.Timer(0.6, os.kill, (os.getpid(), signal.SIGTERM))
-    timer.start()
-    summary = run(tmp_path / "out", ToyWork(seconds=0.05))
-    timer.join()
-    assert summary.exit_code == INTERRUPTED
-    assert run(tmp_path / "out").exit_code == COMPLETE
-    assert_same_tables(tmp_path / "out", plain())
-
-
 def test_nothing_new_begins_once_a_run_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a cluster, where tasks that were handed over end; in this process those that wait are left undone too."""
     local = execution.LocalGraph
@@ -224,15 +201,7 @@ def test_a_run_that_is_overtaken_stops_and_loses_nothing(tmp_path: Path, plain: 
                 run(tmp_path / "out")  # the same command, started a second time meanwhile
             return super().drive(prepared, candidate, expert)
 
-    summary = execute(
-        Overtaking(),
-        refs(4),
-        EXPERTS,
-        2,
-        overtaken,
-        Execution("local", shard_seconds=0.0),
-        say=lambda line: None,
-    )
+    summary = executed(Overtaking(), refs(4), EXPERTS, 2, overtaken, Execution("local", shard_seconds=0.0))
     assert summary.exit_code == INTERRUPTED and "another run has taken over" in summary.message
     assert_same_tables(tmp_path / "out", plain())
 

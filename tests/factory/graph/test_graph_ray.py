@@ -11,7 +11,7 @@ import pytest
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.episodes import EpisodesWanted
-from factory.graph.execute import Execution, execute
+from factory.graph.execute import Execution
 from factory.graph.limits import Limits
 from factory.graph.local import Claims
 from factory.graph.on_ray import graph
@@ -22,14 +22,14 @@ from factory.views.show import prepared_episode
 from tests.factory.filmed import FilmedWork
 from tests.factory.graph.wild import WildWork
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
-from tests.factory.toy import ToyWork, ran, refs
+from tests.factory.toy import ToyWork, executed, ran, refs
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 EXPERTS = ["recovery", "pdm_closed", "human"]
 
 
 def run(out: Path, executor: str, work: ToyWork, rounds: int, workers: int, n: int = 5):  # type: ignore[no-untyped-def]
-    return execute(work, refs(n), EXPERTS, rounds, Store(out), Execution(executor, workers), say=lambda line: None)  # type: ignore[arg-type]
+    return executed(work, refs(n), EXPERTS, rounds, Store(out), Execution(executor, workers))  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -80,14 +80,13 @@ def test_local_and_ray_with_one_and_two_workers_make_identical_rows(tmp_path: Pa
 def test_workers_write_the_same_episodes_as_one_process(tmp_path: Path, two_cpus: None) -> None:
     for executor in ("local", "ray"):
         store = Store(tmp_path / executor)
-        execute(
+        executed(
             FilmedWork(),
             refs(3),
             EXPERTS,
             2,
             store,
             Execution(executor, 2, episodes=EpisodesWanted(1, prepared_episode)),
-            say=lambda line: None,
         )  # type: ignore[arg-type]
     local, ray_s = (
         {path.name: path.read_bytes() for path in (tmp_path / executor / "episodes").iterdir()}
@@ -103,15 +102,7 @@ def test_a_cluster_without_a_gpu_is_waited_for_and_then_named(
     monkeypatch.setattr(graph, "nodes_of_cluster", lambda having="": [] if having == "GPU" else nodes(having))
     monkeypatch.setattr(graph, "GPU_WAIT_S", 0.1)
     store = Store(tmp_path / "out")
-    summary = execute(
-        ToyWork(),
-        refs(1),
-        ["human"],
-        1,
-        store,
-        Execution(claims=Claims(gpu_share=0.5)),
-        say=lambda line: None,
-    )
+    summary = executed(ToyWork(), refs(1), ["human"], 1, store, Execution(claims=Claims(gpu_share=0.5)))
     assert summary.exit_code == BAD_CONFIG and "render.backend=cpu" in summary.message
     assert not (tmp_path / "out").exists()
 
@@ -125,15 +116,7 @@ def test_a_clip_that_kills_its_workers_hurts_nobody_else(tmp_path: Path, two_cpu
     failed = {o["error_kind"] for o in tables_of(tmp_path / "out")[1] if o["kind"] == "failed"}  # type: ignore[index]
     assert failed == {"system", "input"}
     assert (
-        execute(
-            ToyWork(),
-            refs(5),
-            EXPERTS,
-            2,
-            Store(tmp_path / "out"),
-            Execution("local", retry=True),
-            say=lambda line: None,
-        ).exit_code
+        executed(ToyWork(), refs(5), EXPERTS, 2, Store(tmp_path / "out"), Execution("local", retry=True)).exit_code
         == COMPLETE
     )
     run(tmp_path / "never", "local", ToyWork(), 2, 1)
@@ -145,15 +128,7 @@ def test_a_loop_is_ended_on_a_worker_too_and_tried_once_a_run(tmp_path: Path, tw
     journal = str(tmp_path / "journal")
     work = WildWork(wild=(("log0:0:recovery:0", "loop"),), journal=journal)
     limits = Limits(seconds={"drive": 1.0, "render": 0.0, "label": 0.0})
-    summary = execute(
-        work,
-        refs(3),
-        EXPERTS,
-        1,
-        Store(tmp_path / "out"),
-        Execution("ray", 2, limits=limits),
-        say=lambda line: None,
-    )
+    summary = executed(work, refs(3), EXPERTS, 1, Store(tmp_path / "out"), Execution("ray", 2, limits=limits))
     assert summary.exit_code == COMPLETE_WITH_FAILURES
     (failed,) = [o for o in tables_of(tmp_path / "out")[1] if o["kind"] == "failed"]  # type: ignore[index]
     assert failed["error_kind"] == "limit" and "wild.py" in failed["error"]

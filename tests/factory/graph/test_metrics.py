@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from factory.graph import execute as execution
-from factory.graph.execute import Execution, execute
 from factory.graph.local import LocalGraph
 from factory.graph.metrics import (
     BYTES,
@@ -29,7 +28,7 @@ from factory.graph.metrics import (
 from factory.store.location import Location
 from factory.store.parquet_file import Shard
 from factory.store.samples import Store
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "metrics.md"
 EXPERTS = ["recovery", "pdm_closed", "human"]
@@ -65,7 +64,7 @@ def recorded_run(out: Path, monkeypatch: pytest.MonkeyPatch, rounds: int = 2, bl
 
     monkeypatch.setattr(execution, "LocalGraph", Watched)
     work = ToyWork(trouble=TROUBLE, blocks=blocks)
-    execute(work, refs(5), EXPERTS, rounds, Store(out), Execution("local"), say=lambda line: None)
+    executed(work, refs(5), EXPERTS, rounds, Store(out))
     return recorded
 
 

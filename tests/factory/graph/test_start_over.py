@@ -3,17 +3,17 @@
 from pathlib import Path
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
-from factory.graph.execute import Execution, RunSummary, execute
+from factory.graph.execute import RunSummary
 from factory.store.samples import Store
 from factory.store.verify import verify
 from tests.factory.tables import assert_same_tables
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 BROKEN = {f"{ref.log_id}:{ref.start_ms}": "bug" for ref in refs(4)}
 
 
 def run(work: ToyWork, out: Path, n_clips: int = 4) -> RunSummary:
-    return execute(work, refs(n_clips), ["recovery"], 1, Store(out), Execution("local"), say=lambda line: None)
+    return executed(work, refs(n_clips), ["recovery"], 1, Store(out))
 
 
 def test_a_run_without_a_sample_takes_corrected_settings_as_a_fresh_one_does(tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ from factory.graph import limits
 from factory.graph.on_ray import graph
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
 from factory.store.samples import Store
-from tests.factory.graph.runs import EXPERTS, Execution, execute, refs, run
+from tests.factory.graph.runs import EXPERTS, Execution, refs, run
 from tests.factory.tables import assert_same_rows, assert_same_tables
-from tests.factory.toy import ToyWork, ran
+from tests.factory.toy import ToyWork, executed, ran
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 ROUNDS, CLIPS = 4, 4
@@ -44,7 +44,7 @@ def long(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def on_ray(out: Path, work: ToyWork, rounds: int = ROUNDS):  # type: ignore[no-untyped-def]
-    return execute(work, refs(CLIPS), EXPERTS, rounds, Store(out), Execution("ray", 2), say=lambda line: None)
+    return executed(work, refs(CLIPS), EXPERTS, rounds, Store(out), Execution("ray", 2))
 
 
 def test_stretches_make_the_rows_of_attempts_one_by_one(tmp_path: Path, two_cpus: None, long: list[int]) -> None:

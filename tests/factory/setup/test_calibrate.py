@@ -5,16 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from factory.graph.execute import Execution, execute
 from factory.setup.calibrate import by_the_tables
 from factory.store.samples import Store
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     found = Store(tmp_path_factory.mktemp("out"))
-    execute(ToyWork(), refs(6), ["recovery", "human"], 2, found, Execution("local"), say=lambda line: None)
+    executed(ToyWork(), refs(6), ["recovery", "human"], 2, found)
     return found
 
 

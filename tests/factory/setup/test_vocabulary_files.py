@@ -156,12 +156,6 @@ def test_the_command_line_separates_clips_from_its_own_settings() -> None:
             parse(Request, wrong)
 
 
-def test_a_bad_command_ends_with_two(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["k=3"]) == 2
-    assert "nothing to build" in capsys.readouterr().err
-    assert main(["--help"]) == 0
-
-
 def test_the_kinematic_vocabulary_is_written_as_a_run_has_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

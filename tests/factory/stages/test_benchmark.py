@@ -12,7 +12,6 @@ import pytest
 
 from factory.config.run import BenchmarkSettings, load_config
 from factory.exits import COMPLETE
-from factory.graph.execute import Execution, execute
 from factory.graph.work import Columns, Dropped, PreparedClip, attempted
 from factory.pipeline import BenchmarkWork, FactoryWork
 from factory.readers.base import ClipRef
@@ -25,6 +24,7 @@ from factory.store.samples import Store
 from tasks.stages import Rejected
 from tasks.world.clip import HORIZON_STEPS, NOW
 from tests.factory.stages.test_pipeline import VOCABULARY
+from tests.factory.toy import executed
 
 SMALL = TownSettings(cameras=("ring_front_center",), lidar_beams=32)
 EXPERTS = ("human", "human_before", "follow_up", "follow_up_before")
@@ -69,7 +69,7 @@ def refs(work: FactoryWork) -> Sequence[ClipRef]:
 
 def made(work: FactoryWork, refs: Sequence[ClipRef], out: Path, rounds: int) -> Store:
     store = Store(str(out))
-    assert execute(work, refs, EXPERTS, rounds, store, Execution("local"), say=lambda line: None).exit_code == COMPLETE
+    assert executed(work, refs, EXPERTS, rounds, store).exit_code == COMPLETE
     return Store(str(out))
 
 
@@ -172,7 +172,7 @@ def test_scenes_are_there_before_any_row_is(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(BenchmarkWork, "drive", killed)
-    execute(work, refs[1:2], EXPERTS, 1, Store(str(tmp_path)), Execution("local"), say=lambda line: None)
+    executed(work, refs[1:2], EXPERTS, 1, Store(str(tmp_path)))
     assert SceneFiles(Location(str(tmp_path / "scenes"))).clip_ids() == [refs[1].clip_id]
     assert not len(Store(str(tmp_path)).samples)
 

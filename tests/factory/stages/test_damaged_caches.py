@@ -75,15 +75,6 @@ def test_a_clip_s_scenes_are_named(tmp_path: Path) -> None:
             files.load("warm")
 
 
-def test_a_scene_file(tmp_path: Path) -> None:
-    path = tmp_path / "block-1.safetensors"
-    write_scene(path, scene())
-    for content in damaged(path.read_bytes()):
-        path.write_bytes(content)
-        with pytest.raises(BadScene, match=f"{path}: "):
-            read_scene(path)
-
-
 def test_a_city_s_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: Lines) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     write_root(tmp_path, "us-ma-boston", stub_rows())

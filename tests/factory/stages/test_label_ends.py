@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from factory.config.run import load_config
-from factory.graph.execute import Execution, execute
 from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
 from factory.pipeline import FactoryWork
 from factory.setup.settings import assemble
@@ -13,6 +12,7 @@ from factory.store.funnel import Funnel, funnel_of
 from factory.store.samples import Store
 from factory.views.card import card
 from tasks.experts.protocol import Expert
+from tests.factory.toy import executed
 from tests.tasks.bad_ends import Aside, Close
 
 UNSCORED = ["reward.full=[]", "reward.progress_above=-1", "reward.labels=none", "traffic=replay", "render=none"]
@@ -28,15 +28,7 @@ def work_of(experts: Mapping[str, Expert], out: Path, *words: str) -> FactoryWor
 
 def ran(work: FactoryWork, out: Path) -> tuple[Store, Funnel]:
     store = Store(out)
-    execute(
-        work,
-        work.reader.index().refs[:1],
-        [*work.experts],
-        2,
-        store,
-        Execution("local"),
-        say=lambda line: None,
-    )
+    executed(work, work.reader.index().refs[:1], [*work.experts], 2, store)
     return store, funnel_of(store)
 
 

@@ -22,7 +22,7 @@ from factory.store.verify import damaged_logs, restore_logs, verify
 from tests.factory.damage import damaged
 from tests.factory.data_folders import add_companions
 from tests.factory.tables import assert_same_tables
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 check = COMMANDS["verify"].load()
 
@@ -90,9 +90,7 @@ def test_the_command_says_so_and_repairs_a_log(out: Path, golden: Path, capsys: 
 def test_a_lost_last_commit_is_noticed_by_the_run_too(out: Path, golden: Path) -> None:
     files(out, "samples/_delta_log/*.json")[-1].unlink()
     assert len(Store(out).samples) < len(Store(golden).samples)
-    summary = execute(
-        ToyWork(), refs(3), ["recovery", "human"], 2, Store(out), Execution("local"), say=lambda line: None
-    )
+    summary = executed(ToyWork(), refs(3), ["recovery", "human"], 2, Store(out))
     assert summary.exit_code == BAD_CONFIG
     assert "commit 3 is gone from the table's log; python -m factory verify out=" in summary.message
     assert check([str(out), "repair=true"]) == COMPLETE

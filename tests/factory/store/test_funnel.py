@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
-from factory.graph.execute import Execution, execute
+from factory.graph.execute import Execution
 from factory.store.attempts import OUTCOMES, ClipCandidates
 from factory.store.funnel import (
     OUTCOME_COLUMNS,
@@ -23,7 +23,7 @@ from factory.store.funnel import (
 )
 from factory.store.samples import Store
 from factory.store.schema import SAMPLES
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 Walks = dict[str, dict[str, list[tuple[int, str]]]]  # expert -> clip -> candidate and why it fell, "": accepted
 RUN = {"settings_hash": "s", "stage_versions": {}, "expert_digests": {}}
@@ -112,7 +112,7 @@ def test_the_funnel_is_that_of_a_count_attempt_by_attempt(whys: dict[str, dict[s
 def test_the_funnel_adds_up_to_the_tables(tmp_path: Path) -> None:
     work = ToyWork(trouble={"log0:0": "standing", "log1:1000": "no_candidates", "log0:2000:recovery:1": "bug"})
     store = Store(tmp_path)
-    summary = execute(work, refs(6), ["recovery", "human"], 3, store, Execution("local"), say=lambda line: None)
+    summary = executed(work, refs(6), ["recovery", "human"], 3, store)
     funnel = funnel_of(store)
     assert funnel == summary.funnel
     assert sum(row.accepted for row in funnel.rows) == summary.counts["accepted"] == len(store.samples)
@@ -130,7 +130,7 @@ def test_the_funnel_adds_up_to_the_tables(tmp_path: Path) -> None:
 
 def test_image_sources_are_counted_over_the_clips_asked_for(tmp_path: Path) -> None:
     store, clips = Store(tmp_path), refs(4)
-    execute(ToyWork(), clips, ["human"], 1, store, Execution("local"), say=lambda line: None)
+    executed(ToyWork(), clips, ["human"], 1, store)
     counted = [
         sum(int(part.rsplit(" ", 1)[1]) for part in image_sources_text(store, ids).removeprefix("images: ").split(", "))
         for ids in ([ref.clip_id for ref in clips], [clips[0].clip_id])
@@ -142,17 +142,9 @@ def test_image_sources_are_counted_over_the_clips_asked_for(tmp_path: Path) -> N
 def test_a_candidate_counts_once_though_its_failure_was_mended_with_other_inputs(tmp_path: Path) -> None:
     broken = ToyWork(trouble={"log0:0:pdm_closed:0": "bug"})
     fixed = ToyWork(digests={"pdm_closed": "pdm_closed-2"})
-    execute(broken, refs(1), ["pdm_closed"], 2, Store(tmp_path), Execution("local"), say=lambda line: None)
+    executed(broken, refs(1), ["pdm_closed"], 2, Store(tmp_path))
     store = Store(tmp_path)
-    execute(
-        fixed,
-        refs(1),
-        ["pdm_closed"],
-        9,
-        store,
-        Execution("local", on_change="keep", retry=True),
-        say=lambda line: None,
-    )
+    executed(fixed, refs(1), ["pdm_closed"], 9, store, Execution("local", on_change="keep", retry=True))
     tried = sum(row.accepted + row.rejected + row.failed for row in funnel_of(store).rows)
     assert tried == fixed.n_candidates
     assert "failed" not in store.outcomes.read(["kind"])["kind"].to_pylist()
@@ -161,7 +153,7 @@ def test_a_candidate_counts_once_though_its_failure_was_mended_with_other_inputs
 def test_a_redo_that_failed_is_seen_and_not_mended_by_the_next_run(tmp_path: Path) -> None:
     def run(work: ToyWork, **options: object) -> int:
         how = Execution("local", **options)  # type: ignore[arg-type]
-        summary = execute(work, refs(1), ["recovery"], 2, Store(tmp_path), how, say=lambda line: None)
+        summary = executed(work, refs(1), ["recovery"], 2, Store(tmp_path), how)
         return summary.exit_code
 
     run(ToyWork(threshold=0.3))

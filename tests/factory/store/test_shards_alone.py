@@ -12,11 +12,10 @@ import pyarrow.parquet as pq
 import pytest
 from deltalake import DeltaTable
 
-from factory.graph.execute import Execution, execute
 from factory.store.parquet_file import Shard
 from factory.store.samples import Store
 from factory.store.verify import verify
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 PLACE = ["attempt_id", "expert", "round"]
 
@@ -24,7 +23,7 @@ PLACE = ["attempt_id", "expert", "round"]
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
-    execute(ToyWork(), refs(3), ["recovery", "human"], 2, Store(folder), Execution("local"), say=lambda line: None)
+    executed(ToyWork(), refs(3), ["recovery", "human"], 2, Store(folder))
     return folder
 
 

@@ -5,15 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from factory.graph.execute import Execution, execute
 from factory.store.attempts import Kind, Listed, Outcome
 from factory.store.samples import OnChange, Store
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 
 def test_of_candidate_lists_only_their_length_is_kept(tmp_path: Path) -> None:
     work = ToyWork(n_candidates=200, threshold=0.0)
-    execute(work, refs(20), ["recovery"], 1, Store(tmp_path), Execution("local"), say=lambda line: None)
+    executed(work, refs(20), ["recovery"], 1, Store(tmp_path))
     listed = Store(tmp_path).history(work.identity, {}).candidates
     assert listed == {ref.clip_id: Listed("perturb-1", "content", 200) for ref in refs(20)}
     assert len(pickle.dumps(listed)) < 200 * len(listed)  # bytes; a list of 200 candidates takes 20 kB
@@ -24,7 +23,7 @@ def test_a_failure_beside_its_sample_goes_unless_it_is_newer(
     tmp_path: Path, threshold: float, on_change: OnChange, stays: int
 ) -> None:
     first, later = ToyWork(threshold=0.0), ToyWork(threshold=threshold)
-    execute(first, refs(1), ["recovery"], 1, Store(tmp_path), Execution("local"), say=lambda line: None)
+    executed(first, refs(1), ["recovery"], 1, Store(tmp_path))
     store = Store(tmp_path)
     store.begin(store.agree(later.identity, {"recovery": "recovery-1"}, on_change))
     (sample,) = store.samples.read(["attempt_id", "clip_id"]).to_pylist()

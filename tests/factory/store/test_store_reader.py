@@ -22,13 +22,13 @@ from factory.store.samples import Store
 from factory.store.schema import LABEL_COLUMNS
 from tasks.reward.label_bytes import VocabularyLabels
 from tasks.sealed import sealed_json
-from tests.factory.toy import ToyWork, refs, row_of, stream
+from tests.factory.toy import ToyWork, executed, refs, row_of, stream
 
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     path = tmp_path_factory.mktemp("reader") / "out"
-    execute(ToyWork(), refs(3), ["recovery", "human"], 2, Store(path), Execution("local"), say=lambda line: None)
+    executed(ToyWork(), refs(3), ["recovery", "human"], 2, Store(path))
     yield path
 
 
@@ -81,9 +81,7 @@ def test_the_tables_metadata_names_version_and_licences(out: Path) -> None:
 
 def test_licences_of_later_commits_are_added_to_those_that_are_named(tmp_path: Path) -> None:
     for n in (1, 3):
-        execute(
-            ToyWork(), refs(n), ["recovery", "human"], 2, Store(tmp_path), Execution("local"), say=lambda line: None
-        )
+        executed(ToyWork(), refs(n), ["recovery", "human"], 2, Store(tmp_path))
     named = set(Store(tmp_path).samples.properties["factory.licences"].split("; "))
     assert named == set(SampleTable(tmp_path).table(["licence"])["licence"].to_pylist())
 
@@ -99,7 +97,7 @@ def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
 def test_tables_of_another_version_are_refused_in_one_line_and_left_as_they_are(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], is_sealed: bool
 ) -> None:
-    execute(ToyWork(), refs(1), ["human"], 1, Store(tmp_path), "local", say=lambda line: None)
+    executed(ToyWork(), refs(1), ["human"], 1, Store(tmp_path), "local")
     record = {"schema_version": 3, "runs": json.loads((tmp_path / "run.json").read_text())["runs"]}
     (tmp_path / "run.json").write_text(sealed_json(record) if is_sealed else json.dumps(record))
     shutil.rmtree(tmp_path / "samples" / "_commits")  # a repair would make them again

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from factory.graph.episodes import EpisodesWanted
-from factory.graph.execute import Execution, execute
+from factory.graph.execute import Execution
 from factory.store.location import BadLocation, Location
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
@@ -17,7 +17,7 @@ from factory.views.show import prepared_episode
 from tests.chaos.buckets.bad_store import BUCKET, credentials, moto_server
 from tests.factory.filmed import FilmedWork
 from tests.factory.tables import assert_same_tables
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +33,7 @@ def test_a_bucket_holds_the_same_rows_as_a_folder(s3: dict[str, str], tmp_path: 
     url = f"s3://{BUCKET}/runs/one"
     for rounds in (1, 3):
         for out in (Store(url, s3), Store(tmp_path)):
-            summary = execute(
-                ToyWork(), refs(3), ["recovery", "human"], rounds, out, Execution("local"), say=lambda line: None
-            )
+            summary = executed(ToyWork(), refs(3), ["recovery", "human"], rounds, out)
             assert summary.exit_code == 0
     assert summary.executed.prepared == 0
     assert_same_tables(Location.parse(url, s3), tmp_path)
@@ -50,28 +48,26 @@ def test_a_bucket_holds_the_same_episodes_as_a_folder_and_makes_up_for_lost_ones
 ) -> None:
     url = f"s3://{BUCKET}/runs/filmed"
     for out in (Store(url, s3), Store(tmp_path)):
-        execute(
+        executed(
             FilmedWork(),
             refs(2),
             ["recovery"],
             1,
             out,
             Execution("local", episodes=EpisodesWanted(1, prepared_episode)),
-            say=lambda line: None,
         )
     there, here = Location.parse(url, s3).child("episodes"), Location.parse(tmp_path).child("episodes")
     names = here.names()
     assert names and there.names() == names
     assert [there.read(name) for name in names] == [here.read(name) for name in names]
     there.remove(names[0])
-    again = execute(
+    again = executed(
         FilmedWork(),
         refs(2),
         ["recovery"],
         1,
         Store(url, s3),
         Execution("local", episodes=EpisodesWanted(1, prepared_episode)),
-        say=lambda line: None,
     )
     assert again.executed.episodes == 1 and there.read(names[0]) == here.read(names[0])
 
@@ -82,10 +78,7 @@ def test_the_dashboard_follows_a_run_in_a_bucket(s3: dict[str, str]) -> None:
     board = None
     for rounds in (1, 2):
         out = Store(url, s3)
-        assert (
-            execute(ToyWork(), refs(2), ["recovery"], rounds, out, Execution("local"), say=lambda line: None).exit_code
-            == 0
-        )
+        assert executed(ToyWork(), refs(2), ["recovery"], rounds, out).exit_code == 0
         board = board or Board(Store(url, s3), look_every_s=0.0)
         assert json.loads(board.answer("/api/overview").body)["counts"]["samples"] == len(out.samples)
     (item,) = json.loads(board.answer("/api/samples?size=1").body)["items"]

@@ -9,11 +9,11 @@ import yaml
 
 from factory.commands.table import COMMANDS
 from factory.exits import COMPLETE, INTERRUPTED
-from factory.graph.execute import Execution, execute
+from factory.graph.execute import Execution
 from factory.store.funnel import funnel_of
 from factory.store.samples import Store
 from factory.views.card import FILE, card, write_card
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 report_main = COMMANDS["report"].load()
 
@@ -36,15 +36,7 @@ def table_rows(text: str, heading: str) -> list[list[str]]:
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     work = ToyWork()
-    execute(
-        work,
-        refs(4),
-        ["recovery", "human"],
-        2,
-        Store(folder),
-        Execution("local", command=["rounds=2"]),
-        say=lambda line: None,
-    )
+    executed(work, refs(4), ["recovery", "human"], 2, Store(folder), Execution("local", command=["rounds=2"]))
     return folder
 
 
@@ -76,14 +68,11 @@ def test_the_tables_of_the_card_are_those_of_the_run(out: Path) -> None:
 
 def test_a_card_says_that_a_run_was_interrupted_and_the_next_that_it_is_complete(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    stopped = execute(ToyWork(), refs(3), ["human"], 1, store, Execution("local", minutes=0.0), say=lambda line: None)
+    stopped = executed(ToyWork(), refs(3), ["human"], 1, store, Execution("local", minutes=0.0))
     assert stopped.exit_code == INTERRUPTED
     write_card(store)
     assert "The run is interrupted" in (text := (tmp_path / FILE).read_text()) and front_matter(text)
-    assert (
-        execute(ToyWork(), refs(3), ["human"], 1, store, Execution("local"), say=lambda line: None).exit_code
-        == COMPLETE
-    )
+    assert executed(ToyWork(), refs(3), ["human"], 1, store).exit_code == COMPLETE
     write_card(store)
     assert "The run is complete." in (tmp_path / FILE).read_text()
     (tmp_path / "last_run.json").unlink()  # as after a kill
@@ -92,7 +81,7 @@ def test_a_card_says_that_a_run_was_interrupted_and_the_next_that_it_is_complete
 
 def test_files_that_no_commit_names_are_not_offered(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    execute(ToyWork(), refs(1), ["human"], 1, store, Execution("local"), say=lambda line: None)
+    executed(ToyWork(), refs(1), ["human"], 1, store)
     assert "configs" in front_matter(card(store))
     (path,) = store.samples.live_files()
     (tmp_path / "samples" / path).with_name("part-0.parquet").write_bytes((tmp_path / "samples" / path).read_bytes())
@@ -102,7 +91,7 @@ def test_files_that_no_commit_names_are_not_offered(tmp_path: Path) -> None:
 
 def test_a_readme_of_the_user_s_own_stays(out: Path, tmp_path: Path) -> None:
     store = Store(tmp_path)
-    execute(ToyWork(), refs(1), ["human"], 1, store, Execution("local"), say=lambda line: None)
+    executed(ToyWork(), refs(1), ["human"], 1, store)
     (tmp_path / FILE).write_text("# Mine\n")
     assert "stays as it is" in write_card(store)
     assert (tmp_path / FILE).read_text() == "# Mine\n"

@@ -10,7 +10,6 @@ import pyarrow as pa
 import pytest
 
 from factory.config.run import load_config
-from factory.graph.execute import Execution, execute
 from factory.setup.settings import Run, assemble
 from factory.store.reader import SampleTable, decoded
 from factory.store.samples import Store
@@ -27,13 +26,13 @@ from factory.views.examples import (
     strips_of,
 )
 from factory.views.sample_picture import encoded, fitted, sample_sheet
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     found = Store(tmp_path_factory.mktemp("out"))
-    execute(ToyWork(), refs(3), ["recovery", "human"], 2, found, Execution("local"), say=lambda line: None)
+    executed(ToyWork(), refs(3), ["recovery", "human"], 2, found)
     return found
 
 
@@ -116,7 +115,7 @@ def test_rejected_examples_are_the_same_with_and_without_the_cache(tmp_path: Pat
         )
     )
     store = Store(tmp_path)
-    execute(run.work, run.index.refs[:1], run.config.experts, 9, store, Execution("local"), say=lambda line: None)
+    executed(run.work, run.index.refs[:1], run.config.experts, 9, store)
     rows = [row for row in store.outcomes.read().to_pylist() if row["kind"] == "rejected"]
     first = drawn(store, run, rows)
     assert first and not any("not reproducible" in picture.detail for picture in first)

@@ -11,7 +11,6 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.config.run import load_config
-from factory.graph.execute import Execution, execute
 from factory.setup.settings import assemble
 from factory.store.reader import SampleTable, decoded
 from factory.store.samples import Store
@@ -34,6 +33,7 @@ from factory.views.seen_again import (
 from factory.views.status import REASON_WORDS
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.stages import STAGES
+from tests.factory.toy import executed
 
 main = COMMANDS["show"].load()
 
@@ -47,7 +47,7 @@ def store(small_town: Path, tmp_path_factory: pytest.TempPathFactory) -> Store:
     folder = tmp_path_factory.mktemp("seen")
     run = assemble(load_config(["clips=av2", f"clips.root={small_town}", f"out={folder / 'out'}", *SIZE]))
     store = Store(folder / "out")
-    execute(run.work, run.index.refs[:1], run.config.experts, 1, store, Execution("local"), say=lambda line: None)
+    executed(run.work, run.index.refs[:1], run.config.experts, 1, store)
     return store
 
 

@@ -8,10 +8,9 @@ import cv2
 import pytest
 
 from factory.commands.table import COMMANDS
-from factory.graph.execute import Execution, execute
 from factory.readers.base import ClipRef
 from factory.store.samples import Store
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import ToyWork, executed, refs
 
 main = COMMANDS["show"].load()
 status, failed = COMMANDS["status"].load(), COMMANDS["failed"].load()
@@ -22,7 +21,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store with samples, rejections, a broken clip and an attempt that raised."""
     folder = tmp_path_factory.mktemp("out")
     work = ToyWork(trouble={"log1:1000": "bad", "log0:2000:recovery:1": "bug"})
-    execute(work, refs(5), ["recovery", "human"], 2, Store(folder), Execution("local"), say=lambda line: None)
+    executed(work, refs(5), ["recovery", "human"], 2, Store(folder))
     return folder
 
 
@@ -106,7 +105,7 @@ def test_an_attempt_that_is_no_sample_says_what_became_of_it(out: Path, capsys: 
 
 def test_a_store_without_samples_shows_its_status_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     work = ToyWork(trouble={"log0:0": "standing"})
-    execute(work, [ClipRef("toy", "log0", 0)], ["human"], 1, Store(tmp_path), Execution("local"), say=lambda line: None)
+    executed(work, [ClipRef("toy", "log0", 0)], ["human"], 1, Store(tmp_path))
     assert status([f"out={tmp_path}"]) == 0 and capsys.readouterr().out
     for request in ("sample=0", "list=true"):
         code, _, error = ask(capsys, f"out={tmp_path}", request)
@@ -114,7 +113,7 @@ def test_a_store_without_samples_shows_its_status_only(tmp_path: Path, capsys: p
 
 
 def test_a_run_that_died_is_told_from_one_that_ended(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    execute(ToyWork(), refs(1), ["human"], 1, Store(tmp_path), Execution("local"), say=lambda line: None)
+    executed(ToyWork(), refs(1), ["human"], 1, Store(tmp_path))
     (tmp_path / "last_run.json").unlink()
     assert status([f"out={tmp_path}"]) == 0 and "did not finish" in capsys.readouterr().out
 

@@ -12,7 +12,7 @@ from factory.datasets.navsim.log import CAMERA_NAMES
 from factory.datasets.navsim.reader import NavsimReader
 from factory.readers.base import BadClip
 from factory.readers.pictures import BadPicture, jpeg_size
-from factory.stages.sensors import block_of, load_photos, load_sweeps
+from factory.stages.sensors import block_of, load_sweeps
 from tasks.world.clip import Clip
 from tests.factory.datasets.navsim.logs import NAME
 from tests.factory.datasets.navsim.small import (
@@ -178,34 +178,6 @@ def test_a_first_photo_whose_size_cannot_be_told_is_named(root: Path, content: b
     with pytest.raises(BadClip, match=r"image: (the file is empty|a (JPEG|PNG) that is cut off)") as refused:
         read(reader_of(root))
     assert refused.value.file == str(bad)
-
-
-@pytest.mark.parametrize(
-    ("content", "field"), [(picture(WIDTH, HEIGHT)[:-40], "image"), (picture(WIDTH, HEIGHT - 2), "size")]
-)
-def test_a_photo_that_is_half_there_or_of_another_size_is_named_where_it_is_opened(
-    root: Path, content: bytes, field: str
-) -> None:
-    bad = blob(root, road_frames()[9]["cams"]["CAM_R1"]["data_path"])
-    bad.write_bytes(content)
-    clip = read(reader_of(root))
-    with pytest.raises(BadClip) as refused:
-        load_photos(clip.images, clip.cameras, WIDTH, HEIGHT)
-    assert (refused.value.file, refused.value.field) == (str(bad), field)
-    others = [image for image in clip.images if image.sensor != "CAM_R1"]
-    assert len(load_photos(others, clip.cameras, WIDTH, HEIGHT)) == FRAMES * 7
-
-
-@pytest.mark.parametrize(("old", "new", "field"), [(b"", b"", "DATA"), (b"DATA binary", b"DATA ascii", "DATA")])
-def test_a_sweep_that_is_cut_off_or_text_is_named_where_it_is_opened(
-    root: Path, old: bytes, new: bytes, field: str
-) -> None:
-    bad = blob(root, road_frames()[9]["lidar_path"])
-    bad.write_bytes(bad.read_bytes().replace(old, new, 1) if old else bad.read_bytes()[:-60])
-    clip = read(reader_of(root))
-    with pytest.raises(BadClip) as refused:
-        load_sweeps(clip.sweeps)
-    assert (refused.value.file, refused.value.field) == (str(bad), field)
 
 
 @pytest.mark.parametrize("progressive", [0, 1])

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from factory.graph.execute import Execution, RunSummary, execute
+from factory.graph.execute import Execution, RunSummary
 from factory.graph.work import Columns, Driven, Dropped, PreparedClip
 from factory.readers.base import ClipRef
 from factory.store.funnel import funnel_of
 from factory.store.samples import Store
-from tests.factory.toy import ToyWork
+from tests.factory.toy import ToyWork, executed
 from tests.planners.samples import FRONT_YAWS, jpeg, pictures, plain
 
 EXPERTS = ["recovery", "pdm_closed", "human"]
@@ -43,9 +43,7 @@ class PicturedWork(ToyWork):
 def run(out: Path, rounds: int = 2, watching: Callable[[], None] = lambda: None, n: int = len(REFS)) -> RunSummary:
     """Of the first n clips."""
     work = PicturedWork(trouble=TROUBLE, watching=watching)
-    return execute(
-        work, REFS[:n], EXPERTS, rounds, Store(out), Execution("local", shard_seconds=0.0), say=lambda line: None
-    )
+    return executed(work, REFS[:n], EXPERTS, rounds, Store(out), Execution("local", shard_seconds=0.0))
 
 
 def counted(out: Path) -> dict[str, Any]:

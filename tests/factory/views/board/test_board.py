@@ -16,7 +16,6 @@ from factory.commands.dashboard import awaited
 from factory.commands.table import COMMANDS
 from factory.config.arguments import Refused
 from factory.config.run import load_config
-from factory.graph.execute import Execution, execute
 from factory.setup.settings import assemble
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
@@ -26,6 +25,7 @@ from factory.views.board.server import SERVED, STATIC, Board, Server
 from factory.views.board.watch import Watch
 from factory.views.sample_picture import encoded, nearer, sample_bev
 from factory.views.show import logged_drive
+from tests.factory.toy import executed
 from tests.factory.views.board.runs import EVIL, REFS, VIEW, counted, run, told
 
 main = COMMANDS["dashboard"].load()
@@ -217,7 +217,7 @@ def test_the_whole_logged_drive_is_in_the_picture_and_the_episode_where_the_prep
     made += ["clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none", "vocabulary.k=2000"]
     work = assemble(load_config([*made, "experts=[pdm_closed]", f"out={tmp_path / 'out'}"])).work
     store = Store(tmp_path / "out")
-    execute(work, work.reader.index().refs[:1], ["pdm_closed"], 1, store, Execution("local"), say=lambda line: None)
+    executed(work, work.reader.index().refs[:1], ["pdm_closed"], 1, store)
     table = SampleTable(tmp_path / "out")
     row = table[table.attempt_ids[0]]
     drive = logged_drive(store, row)
