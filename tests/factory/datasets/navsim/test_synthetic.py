@@ -107,10 +107,3 @@ def test_records_are_paid_for(tmp_path: Path) -> None:
     assert load_records(few, "file", ["m C"]) is None
     with pytest.raises(BadClip, match="outgrow"):
         load_records(many, "file", ["m C"])
-
-
-def test_a_scene_that_is_cut_off_is_told(tmp_path: Path) -> None:
-    path = scene_pickles.write_scene(tmp_path, scene_pickles.scene())
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(BadClip, match="truncated"):
-        read_scene_pickle(path)
