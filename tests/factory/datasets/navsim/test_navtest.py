@@ -92,10 +92,9 @@ def test_a_frame_scores_as_in_one_stage_of_a_pair(
 def test_a_split_without_a_second_stage_is_no_navhard(
     installed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "split.yaml").write_text(
-        yaml.safe_dump({"defaults": [{"scene_filter": "small"}], "data_split": "test"})
-    )
+    split = installed / "one_stage.yaml"
+    split.write_text(yaml.safe_dump({"defaults": [{"scene_filter": "small"}], "data_split": "test"}))
     logs = f"logs={installed / 'navsim_logs' / 'test'}"
     words = [f"root={installed / 'navhard_two_stage'}", logs, f"maps={installed / 'maps'}", "pictures=false"]
-    assert factory(["import", "navhard", *words, f"split={tmp_path / 'split.yaml'}", f"out={tmp_path / 'out'}"]) == 2
+    assert factory(["import", "navhard", *words, f"split={split}", f"out={tmp_path / 'out'}"]) == 2
     assert "names no scenes of a second stage" in capsys.readouterr().err
