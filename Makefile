@@ -78,12 +78,12 @@ format: install
 # N=<mutants of each kind>, KINDS="ply spz".
 chaos: install
 	$(PY) -m tests.chaos.damaged_files.fuzz $(or $(N),5000) $(KINDS)
-	$(PY) -m tests.chaos.damaged_files.flips
-	$(PY) -m tests.chaos.kills
+	$(PY) -m experiments.chaos.flips
+	$(PY) -m experiments.chaos.kills
 	$(PY) -m tests.chaos.commit_steps
 	$(PY) -m tests.chaos.full_disks
 	$(PY) -m tests.chaos.poison
-	$(PY) -m tests.chaos.long_run hours=$(or $(HOURS),2)
+	$(PY) -m experiments.chaos.long_run hours=$(or $(HOURS),2)
 
 # The site of the pages, into build/site; whatever MkDocs would warn of ends it. The variable leaves out a notice of the
 # theme's makers about what comes after it.

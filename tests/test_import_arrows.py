@@ -191,7 +191,7 @@ def test_every_program_of_the_tests_imports() -> None:
     """Benchmarks and trials that no test runs break unseen otherwise."""
     files = sorted(path.relative_to(ROOT) for path in (ROOT / "tests").rglob("*.py"))
     names = [".".join(path.with_suffix("").parts) for path in files if not path.name.startswith(("test_", "conftest"))]
-    assert {"tests.bench.__main__", "tests.bench.bench_reward", "tests.chaos.kills"} <= set(names)
+    assert {"tests.bench.__main__", "tests.bench.bench_reward", "tests.chaos.commit_steps"} <= set(names)
     words = [sys.executable, "-c", IMPORTING, *names]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stderr

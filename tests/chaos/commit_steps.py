@@ -34,8 +34,7 @@ from factory.store.samples import OnChange, Store
 from factory.store.table import KeyedTable
 from factory.store.verify import verify
 from tests.chaos.file_steps import FAULTS, Step, Stepped, Trial, stepping, steps_of
-from tests.chaos.kills import Told, compare
-from tests.chaos.trials import Findings
+from tests.chaos.trials import Findings, assert_same_stores
 from tests.factory.toy import ToyWork, refs
 
 EXPERTS = ["recovery", "human"]
@@ -184,7 +183,7 @@ def disturbed(golden: Undisturbed, number: int, fault: str, folder: Path, steppe
         if len(Store(out).samples):
             assert len(list(SampleTable(out))) == len(Store(out).samples)
         assert stepped.exit_code(Trial(function, str(out), str(folder / "log"), str(words))) == COMPLETE
-        compare(out, golden.out, Told("steps"))
+        assert_same_stores(out, golden.out)
     except Exception as error:
         return f"{type(error).__name__} {error}; it said: {words.read_text().strip()}"
     return told

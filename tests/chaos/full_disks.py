@@ -42,9 +42,8 @@ from factory.store.samples import Store
 from factory.store.verify import verify
 from tasks.caches import user_cache
 from tasks.stages import Rejected
-from tests.chaos.kills import untold
 from tests.chaos.processes import below, kill, put_away
-from tests.chaos.trials import Findings, leave_by
+from tests.chaos.trials import Findings, leave_by, untold
 from tests.factory.tables import assert_same_rows, tables_of
 from tests.factory.toy import ToyWork, ran, refs
 

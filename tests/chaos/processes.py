@@ -5,6 +5,8 @@ import signal
 import time
 from pathlib import Path
 
+PROGRAMS = {"raylet": "/raylet/raylet ", "gcs": "/gcs_server", "agent": "ray::DashboardAgent"}
+
 
 def below(pid: int) -> dict[int, str]:
     """Pid -> command line of every process that descends from one, itself left out."""

@@ -60,8 +60,7 @@ import threading
 import time
 from factory.graph.local import ClusterDied
 from factory.graph.on_ray.graph import connect
-from tests.chaos.kills import PROGRAMS
-from tests.chaos.processes import below, kill
+from tests.chaos.processes import PROGRAMS, below, kill
 
 def killing():
     while not (found := [pid for pid, line in below(os.getpid()).items() if PROGRAMS["raylet"] in line]):

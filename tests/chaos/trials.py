@@ -7,7 +7,13 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
+
+from factory.store.location import Location
+from factory.store.mcap_files import McapTable
+from factory.store.samples import Store
+from factory.store.verify import verify
+from tests.factory.tables import assert_same_rows, tables_of
 
 
 def leave_by(trial: Callable[[], int], words: Path) -> NoReturn:
@@ -49,3 +55,21 @@ class Findings:
     def cells(self) -> str:
         """Of a table's row: a count for each fine way, and of all others."""
         return " | ".join(str(self.told[kind]) for kind in (*self.fine, "else"))
+
+
+def untold(row: Any) -> dict[str, Any]:
+    """A row less the number of runs that tried it: a run that was killed at it counts."""
+    return {name: value for name, value in row.items() if name != "tries"}
+
+
+def assert_same_stores(out: Path, golden: Path) -> None:
+    """All tables, their MCAP shards, and verify."""
+    made, undisturbed = tables_of(out), tables_of(golden)
+    assert_same_rows(made[0], undisturbed[0])
+    for rows, others in zip(made[1:], undisturbed[1:]):
+        assert [untold(row) for row in rows] == [untold(row) for row in others]
+    mcap = McapTable(Location.parse(out))
+    assert_same_rows(mcap.read().sort_by("attempt_id"), Store(golden).samples.read().sort_by("attempt_id"))
+    assert not mcap.behind(Store(out).samples) and not mcap.outdated(Store(out).samples)
+    found = verify(Store(out)).damage
+    assert found == (), found

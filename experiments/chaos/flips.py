@@ -1,4 +1,4 @@
-"""One flipped bit at a time in files that a run keeps: `python -m tests.chaos.damaged_files.flips [FLIPS] [WORD]`.
+"""One flipped bit at a time in files that a run keeps: `python -m experiments.chaos.flips [FLIPS] [WORD]`.
 
 Of each file, or of those whose kind has the word in it: how often the damage was found, how often what came out was the
 same all the same (a byte that nothing says anything with), and how often something else came out or raised, which must

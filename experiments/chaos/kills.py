@@ -1,4 +1,4 @@
-"""SIGKILL at moments drawn by chance: `python -m tests.chaos.kills [seed=0] [minutes=60] [local=50] [workers=100]...`
+"""SIGKILL at moments drawn by chance: `python -m experiments.chaos.kills [seed=0] [local=50] [workers=100]...`
 
 A run of toy samples is killed, the same command given and killed again, and at last given until it says that it is
 complete; then samples, outcomes, candidates and MCAP shards must be those of an undisturbed run, nothing missing and
@@ -27,16 +27,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
+from experiments.chaos.killed_run import CLIPS, drive, leave
 from factory.exits import COMPLETE
-from factory.store.location import Location
-from factory.store.mcap_files import McapTable
 from factory.store.samples import Store
-from factory.store.verify import verify
-from tests.chaos.killed_run import CLIPS, drive, leave
-from tests.chaos.processes import below, kill, put_away, workers_below
-from tests.factory.tables import assert_same_rows, tables_of
+from tests.chaos.processes import PROGRAMS, below, kill, put_away, workers_below
+from tests.chaos.trials import assert_same_stores
 from tests.pages import REPOSITORY
 
 AGAIN = 5  # commands until one says that it is complete
@@ -44,14 +40,13 @@ OVER_S = 90.0  # after which a run whose cluster was killed is ended
 KILLS_A_RUN = 5  # of drivers, until the command is left alone
 TIMED = 5  # runs from one timed to the next
 MANY = 24  # clips of a run whose workers are killed
-PROGRAMS = {"raylet": "/raylet/raylet ", "gcs": "/gcs_server", "agent": "ray::DashboardAgent"}
 KINDS = {"local": 50, "ray": 10, "cluster": 40, "workers": 100, "raylet": 3, "gcs": 3, "agent": 2, "node": 3}
 
 
 def _started(*given: object) -> multiprocessing.process.BaseProcess:
     """The command in a new process that has its modules already: of a driver that is to be killed soon."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tests.chaos.killed_run"])
+    context.set_forkserver_preload(["experiments.chaos.killed_run"])
     process = context.Process(target=leave, args=given)
     process.start()
     return process
@@ -125,18 +120,15 @@ class Trial:
 
     def _timed(self, executor: str, journal: Path) -> int:
         began = time.monotonic()
-        given = [sys.executable, "-m", "tests.chaos.killed_run", str(self.out), executor, str(journal)]
-        process = subprocess.Popen(given, cwd=REPOSITORY, env=os.environ | {"PYTHONPATH": str(REPOSITORY)})
+        given = [sys.executable, "-m", "experiments.chaos.killed_run", str(self.out), executor, str(journal)]
+        process = subprocess.Popen(  # noqa: S603 - our own
+            given, cwd=REPOSITORY, env=os.environ | {"PYTHONPATH": str(REPOSITORY)}
+        )
         while process.poll() is None and not attempts(journal):
             time.sleep(0.02)
         if attempts(journal):
             self.told.first_s.append(time.monotonic() - began)
         return process.wait()
-
-
-def untold(row: Any) -> dict[str, Any]:
-    """A row less the number of runs that tried it: a run that was killed at it counts."""
-    return {name: value for name, value in row.items() if name != "tries"}
 
 
 def compare(out: Path, golden: Path, told: Told) -> None:
@@ -145,15 +137,7 @@ def compare(out: Path, golden: Path, told: Told) -> None:
     keys = Store(out).samples.read(["attempt_id"])["attempt_id"].to_pylist()
     told.missing += len(set(wanted) - set(keys))
     told.twice += len(keys) - len(set(keys))
-    made, undisturbed = tables_of(out), tables_of(golden)
-    assert_same_rows(made[0], undisturbed[0])
-    for rows, others in zip(made[1:], undisturbed[1:]):
-        assert [untold(row) for row in rows] == [untold(row) for row in others]
-    mcap = McapTable(Location.parse(out))
-    assert_same_rows(mcap.read().sort_by("attempt_id"), Store(golden).samples.read().sort_by("attempt_id"))
-    assert not mcap.behind(Store(out).samples) and not mcap.outdated(Store(out).samples)
-    found = verify(Store(out)).damage
-    assert found == (), found
+    assert_same_stores(out, golden)
 
 
 def drivers(kind: str, n: int, folder: Path, golden: Path, rng: random.Random, end: float = math.inf) -> Told:
@@ -262,7 +246,8 @@ def parts(kind: str, n: int, folder: Path, golden: Path, rng: random.Random, end
 
 def main(**asked: int) -> None:
     """Prints one table; with any kind named, those alone."""
-    rng, end = random.Random(asked.pop("seed", 0)), time.monotonic() + 60.0 * asked.pop("minutes", 60)
+    rng = random.Random(asked.pop("seed", 0))  # noqa: S311 - no secret
+    end = time.monotonic() + 60.0 * asked.pop("minutes", 60)
     assert set(asked) <= set(KINDS), f"there are {list(KINDS)}"
     with tempfile.TemporaryDirectory() as name:
         folder, golden, many = Path(name), Path(name) / "golden", Path(name) / "many"

@@ -1,4 +1,4 @@
-"""Hours of a run under kills: `python -m tests.chaos.long_run [hours=2] [every_s=180] [executor=ray] [seed=0] ...`
+"""Hours of a run under kills: `python -m experiments.chaos.long_run [hours=2] [every_s=180] [executor=ray] ...`
 
 The real command on clips of the synthetic town, without pictures. Some `every_s` after the run goes on, drawn by
 chance, a worker, the driver or one of Ray's two processes is killed; where the run ends before it is complete, the same
@@ -22,10 +22,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
+from experiments.chaos.kills import Told, compare
+from experiments.chaos.memory import Flatness, Held, draw, flatness, read, rss_mb, write
 from factory.exits import COMPLETE
-from tests.chaos.kills import PROGRAMS, Told, compare
-from tests.chaos.memory import Flatness, Held, draw, flatness, read, rss_mb, write
-from tests.chaos.processes import below, kill, put_away, workers_below
+from tests.chaos.processes import PROGRAMS, below, kill, put_away, workers_below
 from tests.pages import REPOSITORY
 
 WORDS = (
@@ -61,7 +61,7 @@ def command(out: Path, executor: str, size: Size, wait_s: float, journal: Path) 
     words = [f"out={out}", f"executor={executor}", f"workers={WORKERS[executor]}", f"limit={size.clips}"]
     words.append(f"experts=[{','.join(names)}]")
     for number, name in enumerate(names):
-        given = {"_target_": "tests.chaos.slow_expert.SlowKeepLane", "settle_m": 5.0 + 5.0 * number}
+        given = {"_target_": "experiments.chaos.slow_expert.SlowKeepLane", "settle_m": 5.0 + 5.0 * number}
         given |= {"name": name, "wait_s": wait_s, "journal": journal}
         words += [f"+expert.{name}.{key}={value}" for key, value in given.items()]
     return [sys.executable, "-m", "factory.run", *words, *WORDS]
@@ -69,7 +69,9 @@ def command(out: Path, executor: str, size: Size, wait_s: float, journal: Path) 
 
 def start(words: list[str], log: IO[bytes]) -> subprocess.Popen[bytes]:
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
-    return subprocess.Popen(words, cwd=REPOSITORY, env=environment, stdout=log, stderr=subprocess.STDOUT)
+    return subprocess.Popen(  # noqa: S603 - our own
+        words, cwd=REPOSITORY, env=environment, stdout=log, stderr=subprocess.STDOUT
+    )
 
 
 def workers_of(driver: int, executor: str) -> list[int]:
@@ -160,7 +162,8 @@ def trial(folder: Path, hours: float, every_s: float, executor: str, seed: int, 
     assert code == COMPLETE, (folder / "golden.txt").read_text()
     wait_s = 3600.0 * hours * WORKERS[executor] / planned(first)
     print(f"{planned(first)} plans without kills; each waits {wait_s:.2f} s from now on", flush=True)
-    met = endure(command(out, executor, size, wait_s, second), executor, every_s, random.Random(seed), second, folder)
+    rng = random.Random(seed)  # noqa: S311 - no secret
+    met = endure(command(out, executor, size, wait_s, second), executor, every_s, rng, second, folder)
     told = Told("all of it")
     compare(out, golden, told)
     told.made_twice = planned(second) - planned(first)

@@ -1,4 +1,4 @@
-"""The run that tests.chaos.kills kills: `python -m tests.chaos.killed_run OUT EXECUTOR JOURNAL`."""
+"""The run that experiments.chaos.kills kills: `python -m experiments.chaos.killed_run OUT EXECUTOR JOURNAL`."""
 
 import sys
 from pathlib import Path
