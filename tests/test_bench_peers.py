@@ -6,19 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.bench.bench_reward import town_row
 from tests.bench.peer import Beside, peer_python
 from tests.bench.peer_splat import peer_checkout
-
-
-@pytest.mark.slow
-def test_without_a_peer_nothing_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("PEER", raising=False)
-    assert peer_python() is None
-    assert peer_checkout() is None
-    row = town_row(2, None)
-    assert row.beside is None
-    assert 0.0 < row.score_ms[0] <= row.score_ms[1]
 
 
 @pytest.mark.parametrize("python", ["/nowhere/python", sys.executable])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.bench import bench_decoding, bench_planner_steps
-from tests.bench.bench_planner_steps import counted_alone, hours, measured
+from tests.bench.bench_planner_steps import counted_alone, measured
 
 SMALL = "gtrs_dense_small"
 FIT_S_OWN = ("picture_of", "on_cpu import compose", "on_cpu import look")  # what the fit draws with, no sample
@@ -30,32 +30,6 @@ def test_counts_from_shapes_are_those_of_a_computed_step() -> None:
     assert counted.state_gb == pytest.approx(computed.state_gb, rel=1e-6)
     assert computed.state_gb >= 4 * 4 * computed.parameters / 1e9, "weights, gradients and two moments in float32"
     assert computed.step_s[0] > 0.0 and math.isnan(counted.step_s[0])
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("small")
-def test_hours_are_samples_times_epochs_at_the_rate_of_all_gpus(capsys: pytest.CaptureFixture[str]) -> None:
-    one = counted_alone(SMALL, batch=1)
-    hours([one], {"a GPU": [100.0]}, gpus=4)
-    epochs = one.training.epochs
-    expected = [f"{n * epochs / 400.0 / 3600.0:.1f}" for n in bench_planner_steps.SEEN.values()]
-    cells = capsys.readouterr().out.splitlines()[-1].split(" | ")
-    assert cells[-2:] == [expected[0], expected[1] + " |"]
-
-
-@pytest.mark.slow
-def test_decoding_s_tables_have_a_line_for_each_number_of_workers(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By CPU time a kept picture takes less than half of decoding it."""
-    monkeypatch.setattr(bench_decoding, "PASSES", 1)
-    bench_decoding.main(samples=8, cores=2)
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split(" | ")[0] for line in lines if line[:3] in ("| 1", "| 2")] == ["| 1", "| 2"]
-    per_core = {
-        line.split(" | ")[0][2:]: float(line.split(" | ")[-1][:-2]) for line in lines if line[:3] in ("| f", "| k")
-    }
-    assert per_core["kept"] > 2.0 * per_core["full"]
 
 
 def test_benches_draw_as_samples_are_drawn() -> None:

@@ -14,7 +14,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(compiler() is None, reason="steps are counted on Linux, with a C compiler"),
 ]
-EACH = 4  # faults of a kind
+EACH = 2  # faults of a kind
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,6 @@ import sys
 from factory.graph import driver
 from factory.graph.execute import Execution, execute, on_new_clusters
 from factory.graph.on_ray.graph import ray
-from factory.graph.on_ray.graph import RayGraph
 from factory.store.samples import Store
 from tests.chaos.killed_driver import EXPERTS
 from tests.factory.toy import ToyWork, refs
@@ -49,7 +48,7 @@ def killing(kind, name, at):
 
     setattr(kind, name, method)
 
-killing(*{"warming": (RayGraph, "_warm_every_node", 1), "working": (driver.Driver, "_take_attempt", 6)}[sys.argv[2]])
+killing(driver.Driver, "_take_attempt", 6)
 store = Store(sys.argv[1])
 ended = on_new_clusters(lambda: execute(ToyWork(), refs(5), EXPERTS, 2, store, Execution("ray", 1, shard_seconds=0.05)))
 sys.exit(ended.exit_code)
@@ -233,9 +232,8 @@ def test_a_cluster_that_dies_while_it_is_started_is_one_that_died() -> None:
 
 @pytest.mark.ray
 @pytest.mark.slow
-@pytest.mark.parametrize("while_", ["warming", "working"])
-def test_a_run_goes_on_where_its_own_raylet_dies(tmp_path: Path, while_: str) -> None:
-    words = [sys.executable, "-c", RUN, str(tmp_path / "out"), while_]
+def test_a_run_goes_on_where_its_own_raylet_dies(tmp_path: Path) -> None:
+    words = [sys.executable, "-c", RUN, str(tmp_path / "out")]
     done = subprocess.run(words, cwd=REPOSITORY, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     assert done.stdout.count("a new cluster is started") == 1 and "Ray's raylet died" in done.stdout

@@ -41,7 +41,7 @@ def golden() -> Iterator[Path]:
         yield made
 
 
-@pytest.mark.parametrize("name", ["503 from then on", "no right to write any more", "SIGKILL in a commit"])
+@pytest.mark.parametrize("name", ["503 from then on", "SIGKILL in a commit"])
 def test_the_same_command_makes_the_same_rows(store: BadStore, golden: Path, name: str) -> None:
     number = list(TROUBLES).index(name)
     check(store, golden, f"s3://{BUCKET}/run-{number}", TROUBLES[name]())
@@ -63,7 +63,7 @@ def test_a_commit_whose_answer_is_lost_is_known_as_ones_own(store: BadStore, num
     assert committed(store, f"lost-{number}", "b", None) == "a b"
 
 
-@pytest.mark.parametrize("first", range(1, 14, 3))
+@pytest.mark.parametrize("first", [1, 7, 13])
 def test_listings_that_break_off_are_asked_for_again(store: BadStore, first: int) -> None:
     """Those of the table's opening, of its making, of its claim, and of commits, before they are made and after it."""
     torn = Fault(What.TORN, "GET", "list-type=2&prefix|start-after", first=first, times=3)
@@ -71,10 +71,9 @@ def test_listings_that_break_off_are_asked_for_again(store: BadStore, first: int
     assert committed(store, f"torn-{first}", "b", None) == "a b"
 
 
-@pytest.mark.parametrize("first", [1, 3, 5])
-def test_half_a_word_that_there_is_no_checkpoint_is_asked_for_again(store: BadStore, first: int) -> None:
-    torn = Fault(What.TORN, "GET", "_last_checkpoint", first=first, times=3)
-    assert committed(store, f"unsaid-{first}", "a", torn) == "a" and torn.met == 3
+def test_half_a_word_that_there_is_no_checkpoint_is_asked_for_again(store: BadStore) -> None:
+    torn = Fault(What.TORN, "GET", "_last_checkpoint", first=3, times=3)
+    assert committed(store, "unsaid", "a", torn) == "a" and torn.met == 3
 
 
 def test_listings_that_are_behind_are_waited_for(store: BadStore) -> None:

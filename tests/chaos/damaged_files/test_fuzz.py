@@ -13,7 +13,7 @@ from tests.chaos.damaged_files.mutants_of_files import rng_of
 
 pytestmark = pytest.mark.slow  # a town is painted, and each kind's reader is warmed in the other process
 
-SHORT = 20
+SHORT = 10
 
 
 @pytest.fixture(scope="module")

@@ -304,19 +304,6 @@ def test_damaged_labels_are_named(tmp_path: Path) -> None:
         list(Loader(data, Needs(labels="vocabulary-1"), MixSettings(), 2).epoch(0))
 
 
-def test_a_damaged_file_is_named(tmp_path: Path) -> None:
-    write_table(tmp_path, rows(8, 0))
-    data = open_data(DataSettings(real=str(tmp_path)))
-    path = Path(data.files[0].path)
-    content = bytearray(path.read_bytes())
-    metadata = pq.ParquetFile(path).metadata.row_group(0)
-    chunk = next(c for c in map(metadata.column, range(metadata.num_columns)) if c.path_in_schema.endswith("jpeg"))
-    content[chunk.data_page_offset + chunk.total_compressed_size // 2] ^= 1
-    path.write_bytes(bytes(content))
-    with pytest.raises(OSError, match=f"{tmp_path}.*part-.*(CRC|checksum)"):
-        list(Loader(data, NEEDS, MixSettings(), BATCH).epoch(0))
-
-
 def test_labels_are_decoded_anew_and_never_kept(tmp_path: Path) -> None:
     """200 samples of K = 4,096: decoded they would be 52 MB."""
     n, k = 200, 4096

@@ -1,6 +1,5 @@
 """A copy changes nothing but where is read from, is made once, and again when it is damaged."""
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from planners.data.index import DataSettings, make_feed, open_data
 from planners.data.loader import Loader, copies_of
 from planners.data.mix import MixSettings
 from tasks.world.agents import AgentKind
-from tests.factory.store.test_store_s3 import BUCKET, s3
+from tests.factory.store.test_store_s3 import s3
 from tests.planners.data.test_loader import BATCH, NEEDS, assert_same, counted_reads, n_groups, out, rows, windows
 from tests.planners.samples import FRONT_YAWS, jpeg, labels, pictures, plain, sample, write_table
 
@@ -175,25 +174,6 @@ def test_a_damaged_copy_is_made_again_wherever_it_is_damaged(
         assert line.startswith(f"{copy.path}: ") and line.endswith("it is made again")
 
 
-@pytest.mark.parametrize("kind", ["a flipped bit", "cut", "empty"])
-def test_a_training_goes_on_over_a_damaged_copy(tmp_path: Path, folder: Path, kind: str) -> None:
-    write_table(tmp_path / "out", rows(BATCH, 0))
-
-    def batches() -> list[Any]:
-        data = open_data(DataSettings(real=str(tmp_path / "out"), copy=str(folder)))
-        return list(Loader(data, NEEDS, MixSettings(), BATCH).epoch(0))
-
-    (expected,) = batches()
-    (path,) = folder.iterdir()
-    whole = path.read_bytes()
-    content = bytearray(whole)
-    content[len(content) // 2] ^= 1
-    path.unlink()
-    path.write_bytes({"a flipped bit": bytes(content), "cut": bytes(content[:-100]), "empty": b""}[kind])
-    assert_same(batches()[0], expected)
-    assert path.read_bytes() == whole
-
-
 def test_a_folder_that_cannot_be_written_is_named(out: str, folder: Path) -> None:
     folder.write_text("a file")
     with pytest.raises(OSError, match=rf"{out}.*while it was copied to {folder}"):
@@ -209,19 +189,3 @@ def test_what_is_copied_is_said(out: str, folder: Path) -> None:
     list(one.epoch(0))
     assert f"{n} of {n} files are copied to {folder}" in one.text()
     assert "copied" not in loader(out, None).text()
-
-
-@pytest.mark.slow
-def test_a_bucket_is_read_once_for_all_trainings(
-    s3: Iterator[dict[str, str]], folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from factory.store.location import Location
-
-    options: Any = s3
-    url = f"s3://{BUCKET}/copied/out"
-    write_table(Location.parse(url, options), rows(6, 10), shard_rows=4, group_rows=2)
-    reads = counted_reads(monkeypatch)
-    for _ in range(2):
-        one = loader(url, folder, storage_options=options)
-        assert sum(1 for epoch in range(2) for _ in one.epoch(epoch)) == 4
-        assert len(reads) == n_groups(one.dataset)

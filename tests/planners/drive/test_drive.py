@@ -58,11 +58,6 @@ def test_what_cannot_be_meant_is_refused_and_nothing_is_written(
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unknown_planner_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([f"out={tmp_path / 'out'}", "planner=nobody"]) == BAD_CONFIG
-    assert "planner=nobody" in capsys.readouterr().err
-
-
 def test_what_is_driven_is_not_driven_again(
     towns: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -147,11 +142,3 @@ def test_processes_make_the_rows_that_one_makes(towns: Path, tmp_path: Path) -> 
     assert main(words(towns, tmp_path / "two", "perturbed=1", "workers=2")) == COMPLETE
     assert str(rows(tmp_path / "one")) == str(rows(tmp_path / "two"))
     assert {row["start"] for row in rows(tmp_path / "one")} == {-1, 0}
-
-
-@pytest.mark.ray
-@pytest.mark.slow
-def test_ray_makes_the_rows_that_one_makes(towns: Path, tmp_path: Path) -> None:
-    assert main(words(towns, tmp_path / "one")) == COMPLETE
-    assert main(words(towns, tmp_path / "ray", "executor=ray", "workers=2")) == COMPLETE
-    assert str(rows(tmp_path / "one")) == str(rows(tmp_path / "ray"))

@@ -2,21 +2,17 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from factory.exits import COMPLETE
 from factory.stages.sensors import encode_jpeg
-from planners.drive.drive import main
 from planners.drive.films import BEV_PX, CAMERA_PX, HOLD, pictures_of
 from planners.drive.loop import LoopSettings, drive
 from tasks.render.settings import ImageSource
 from tasks.world.clip import Scene
 from tests.planners.drive.streets import Steady, car, start_on, street_with
-from tests.planners.drive.test_drive import rows, words
 from tests.planners.drive.test_drive import towns as towns  # the fixture
 
 SETTINGS = LoopSettings(seconds=1.2, bound_m=1000.0)
@@ -44,12 +40,3 @@ def test_a_film_has_a_picture_for_every_tenth_of_a_second(eyes: RedEyes | None) 
     middle = pictures[0][CAMERA_PX[1] // 2, BEV_PX[0] + CAMERA_PX[0] // 2].astype(int)
     assert (middle[0] - middle[1] > 200) == (eyes is not None)
     assert (pictures[0] != pictures[5]).any()
-
-
-def test_the_table_names_the_films(towns: Path, tmp_path: Path) -> None:
-    assert main(words(towns, tmp_path, "films=all", "seconds=0.5")) == COMPLETE
-    found = rows(tmp_path)
-    assert len(found) == 2
-    assert all((tmp_path / str(row["film"])).stat().st_size > 1000 for row in found)
-    assert main(words(towns, tmp_path, "films=none", "seconds=0.6")) == COMPLETE
-    assert sum(row["film"] == "" for row in rows(tmp_path)) == 2

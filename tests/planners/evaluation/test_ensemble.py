@@ -17,12 +17,6 @@ from tests.planners.models.test_gtrs_dense import TINY, labelled, planner
 from tests.planners.toy import Toy, ToySettings
 
 
-def test_an_ensemble_of_one_is_that_model() -> None:
-    batch, _ = labelled(4)
-    model = planner().eval()
-    assert torch.equal(Ensemble([("one", model)]).plan(batch), model.plan(batch))
-
-
 def test_scores_are_averaged_as_probabilities_before_they_are_weighted() -> None:
     batch, _ = labelled(4)
     models = [planner(seed=seed).eval() for seed in range(3)]
@@ -34,11 +28,6 @@ def test_scores_are_averaged_as_probabilities_before_they_are_weighted() -> None
     assert torch.equal(together.plan(batch), models[0].choices[models[0].choose(mean_scores(each))])
 
 
-def test_the_sure_one_outvotes_two_that_doubt() -> None:
-    one, two = ({"ep": torch.tensor([[0.9, 0.2]])}, {"ep": torch.tensor([[0.4, 0.6]])})
-    torch.testing.assert_close(mean_scores([one, two, two])["ep"], torch.tensor([[1.7 / 3, 1.4 / 3]]))
-
-
 def test_members_that_have_nothing_to_average_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match="one model at least"):
         Ensemble([])
@@ -46,11 +35,6 @@ def test_members_that_have_nothing_to_average_are_refused_by_name() -> None:
         Ensemble([("a.pt", planner()), ("b.pt", planner(k=12))])
     with pytest.raises(ValueError, match=r"b\.pt sees .*width=96.* and a\.pt sees .*width=64"):
         Ensemble([("a.pt", planner()), ("b.pt", planner(replace(TINY, image=ImageLayout(width=96, height=32))))])
-
-
-def test_it_asks_for_the_picture_and_no_labels() -> None:
-    needs = Ensemble([("one", planner())]).needs
-    assert needs.image == TINY.image and needs.labels is None
 
 
 def saved(out: Path, seed: int) -> str:

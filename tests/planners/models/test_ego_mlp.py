@@ -92,19 +92,6 @@ def test_from_constant_velocity_layers_that_say_nothing_keep_the_speed(model: Eg
     assert straight.plan(batch).any() and not model.plan(batch).any()
 
 
-def test_one_is_blind_and_the_other_is_not_called_so() -> None:
-    assert (blind().name, shown().name) == ("ego_mlp", "ego_mlp_bev")
-    assert blind().needs == Needs() and shown().needs == Needs(bev=TINY_BEV.bev)
-
-
-def test_the_status_tells_32_plans_only_where_it_differs() -> None:
-    """Without eyes no more than the mean can be learnt where the status is always the same."""
-    batch = made_batch(Needs(), 32)
-    assert errors_after(blind(), batch, 200, 3e-3) > 2.0
-    telling = torch.randn(32, 8, generator=torch.Generator().manual_seed(1))
-    assert errors_after(blind(), replace(batch, status=telling), 600, 1e-2) < 0.1
-
-
 @pytest.mark.slow
 def test_it_learns_32_rasters_by_heart() -> None:
     model = shown()

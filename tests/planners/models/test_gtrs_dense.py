@@ -5,14 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 
-from factory.config.compose import conf_dir, fill
 from planners.data.batch import Batch, ImageLayout
 from planners.models.backbones import BackboneSettings
 from planners.models.gtrs_dense import GtrsDense, GtrsDenseSettings, imitated, shifted
 from planners.models.planner import TrainingData
-from planners.training.optim import TrainingSettings
 from tasks.subscores import LABELLED
 from tasks.world.vocabulary import Vocabulary
 from tests.planners import scenes
@@ -40,28 +37,6 @@ def labelled(n: int, k: int = K) -> tuple[Batch, torch.Tensor]:
     trajectories = scenes.vocabulary(k)
     labels, final = scenes.labels(n, trajectories)
     return scenes.batch(n, trajectories[final.argmax(1)], labels=labels), final
-
-
-@pytest.mark.slow
-def test_it_learns_to_rank_the_best_trajectory_of_32_scenes_first() -> None:
-    batch, final = labelled(32)
-    model = planner(EXACT)
-    optimiser = torch.optim.Adam(model.parameters())
-    best = final.max(dim=1).values - 1e-6
-    right = 0.0
-    for step in range(300):
-        optimiser.param_groups[0]["lr"] = 5e-3 * (1 - step / 300)
-        optimiser.zero_grad()
-        torch.stack(list(model(batch).values())).sum().backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-        optimiser.step()
-        if step >= 100 and step % 20 == 0:
-            chosen = model.eval().choose(model.scores(batch))
-            right = (final.gather(1, chosen[:, None])[:, 0] >= best).float().mean().item()
-            model.train()
-            if right >= 0.9:
-                break
-    assert right >= 0.9
 
 
 @pytest.mark.slow
@@ -200,17 +175,6 @@ def test_it_chooses_from_fewer_or_other_trajectories_than_it_was_trained_on() ->
         planner(replace(TINY, inference_entries=K + 1))
 
 
-def test_bf16_learns_and_plans() -> None:
-    batch, _ = labelled(2)
-    model = planner()
-    with torch.autocast("cpu", torch.bfloat16):
-        terms = model(batch)
-        torch.stack(list(terms.values())).sum().backward()
-        plan = model.eval().plan(batch)
-    assert all(term.isfinite() and term.dtype == torch.float32 for term in terms.values())
-    assert plan.dtype == torch.float32
-
-
 def test_a_wrong_or_missing_vocabulary_is_refused_with_the_setting(tmp_path) -> None:  # type: ignore[no-untyped-def]
     file = tmp_path / "vocabulary.npy"
     np.save(file, scenes.vocabulary(K))
@@ -238,32 +202,3 @@ def test_settings_that_contradict_themselves_are_refused() -> None:
         replace(TINY, kept=0.0)
     with pytest.raises(ValueError, match="divisible by 32"):
         planner(replace(TINY, image=ImageLayout(width=100, height=32)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("encoder", "millions"), [("fused", 67), ("picture", 83)])
-def test_the_papers_sizes_are_67_million_parameters_with_resnet_34_and_83_with_v2_99(
-    encoder: str, millions: int
-) -> None:
-    with torch.device("meta"):
-        model = GtrsDense(GtrsDenseSettings(encoder=encoder), {"vocabulary": scenes.vocabulary(2)})
-    assert sum(p.numel() for p in model.parameters()) == pytest.approx(millions * 1e6, rel=0.1)
-
-
-def test_the_fused_encoder_learns_too() -> None:
-    batch, _ = labelled(2)
-    model = planner(replace(TINY, encoder="fused", fusion=scenes.FUSION))
-    torch.stack(list(model(batch).values())).sum().backward()
-    assert all(parameter.grad is not None for parameter in model.parameters())
-    assert model.tokens(batch.image).shape == (2, 64, 32)
-
-
-@pytest.mark.parametrize("name", ["gtrs_dense", "gtrs_dense_v2_99", "gtrs_dense_small"])
-def test_its_configuration_fills_its_settings(name: str) -> None:
-    values = OmegaConf.to_container(OmegaConf.load(conf_dir() / "planner" / f"{name}.yaml"))
-    settings = fill(GtrsDenseSettings, values.get("settings", {}), "settings")
-    fill(TrainingSettings, values["training"], "training")
-    with torch.device("meta"):
-        GtrsDense(settings, {"vocabulary": scenes.vocabulary(2)})
-    if not name.endswith("small"):
-        assert replace(settings, backbone=GtrsDenseSettings().backbone, encoder="fused") == GtrsDenseSettings()

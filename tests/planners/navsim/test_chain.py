@@ -2,7 +2,7 @@
 
 A town's log as OpenScene with a GeoPackage, sweeps and the JPEGs of bent lenses -> a run that reconstructs the street
 and renders where the simulated ego was -> its export, read by the independent reader -> a training step -> the agent
-before the exported logs -> our scorer; and the export brought back as samples.
+before the exported logs -> our scorer. Brought back as samples: tests/factory/imports.
 """
 
 import json
@@ -18,15 +18,13 @@ import pytest
 
 from factory.__main__ import main as factory
 from factory.datasets.av2.reader import read_log
-from factory.datasets.navsim.frames import sample_names, split_names
 from factory.datasets.navsim.reader import NavsimReader
-from factory.datasets.navsim.simscale import METRICS
 from factory.datasets.town.town import write_logs
 from factory.readers.pickles import load_plain
 from factory.readers.settings import MOUNTS, TownSettings
 from factory.run import main as run
 from factory.stages.sensors import decode_image, encode_jpeg
-from factory.store.reader import SampleTable, decoded, labels_of
+from factory.store.reader import SampleTable, decoded
 from planners.evaluation.planning import plans_of
 from planners.navsim.agent import RemotePlanner, shown
 from planners.navsim.pilot import FRONT, Pilot, seen_of
@@ -35,7 +33,7 @@ from planners.training.train import main as train
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import Clip
 from tasks.world.frames import to_world
-from tasks.world.lanes import LightState
+from tests.factory.exports.openscene_reader import Scene, read_scenes, read_split
 from tests.factory.datasets.navsim.geopackage_writer import ORIGIN, town_rows, write_root
 from tests.factory.datasets.navsim.openscene_reader import Scene, read_rewards, read_scenes, read_split
 from tests.factory.datasets.navsim.openscene_writer import Place, Sensed, sensed_by_town, write_openscene
@@ -75,8 +73,8 @@ class Chain:
     def reader(self) -> NavsimReader:
         return NavsimReader(self.logs, self.root / "maps", cache_dir=self.root / "kept", stride_s=4.0)
 
-    def rows(self, out: str = "run") -> list[dict[str, Any]]:
-        return sorted(SampleTable(self.root / out), key=lambda row: (row["expert"], row["round"]))
+    def rows(self) -> list[dict[str, Any]]:
+        return sorted(SampleTable(self.run), key=lambda row: (row["expert"], row["round"]))
 
     def scenes(self) -> dict[tuple[str, int], Scene]:
         """By expert and round, found as a training finds them: by the splits' files."""
@@ -198,18 +196,6 @@ def test_the_independent_reader_finds_in_the_export_what_the_rows_say(chain: Cha
     assert lit and lit <= connectors
 
 
-@pytest.mark.slow
-def test_the_human_s_history_has_the_log_s_own_velocities_and_accelerations(chain: Chain) -> None:
-    """Samples do not hold them; the public metric's history comfort looks at them."""
-    logged = {frame["token"]: frame["ego_dynamic_state"] for frame in _logged(chain)}
-    tokens, scene = list(logged), chain.scenes()["human", 0]
-    at = tokens.index(scene.token)
-    for i, frame in enumerate(scene.frames):
-        own = logged[tokens[at - 3 + i]]
-        np.testing.assert_allclose(frame.velocity, own[:2], atol=0.1)
-        np.testing.assert_allclose(frame.acceleration, own[2:], atol=0.25)
-
-
 def _logged(chain: Chain) -> list[dict[str, Any]]:
     """The frames of NAVSIM's log, written as NumPy 1 names its parts."""
     (file,) = chain.logs.glob("*.pkl")
@@ -235,22 +221,6 @@ def _same_pictures(row: Mapping[str, Any], scene: Scene) -> None:
         pose = rig[name]["ego_from_camera"].reshape(4, 4)
         np.testing.assert_allclose(shot.rotation, pose[:3, :3], atol=1e-9)
         np.testing.assert_allclose(shot.translation, pose[:3, 3], atol=1e-9)
-
-
-@pytest.mark.slow
-def test_the_rewards_are_the_rows_labels_and_those_the_scores_of_their_trajectories(chain: Chain) -> None:
-    vocabulary = np.load(chain.to / f"devkit/traj_final/{K}.npy")
-    for row in chain.rows():
-        names, split = sample_names(row), split_names(row)
-        rewards = read_rewards(chain.to / "traj_pdm_v2" / split.rewards, [names.token], K)[names.token]
-        labels = labels_of(row)
-        for public, ours in METRICS.items():
-            np.testing.assert_array_equal(rewards[public], np.float16(getattr(labels, ours)))
-        np.testing.assert_array_equal(rewards["ego_progress"], np.float16(labels.ep("masked")))
-    scores = score_trajectories(_clip(chain), vocabulary)
-    human = labels_of(chain.rows()[0])
-    for ours in METRICS.values():
-        np.testing.assert_array_equal(getattr(scores, ours), getattr(human, ours))
 
 
 @pytest.mark.slow
@@ -295,91 +265,3 @@ def agent_input(scene: Scene) -> AgentInput:
         calibration = camera.rotation, camera.translation, camera.intrinsics, camera.distortion
         shot[name] = agent_inputs.Camera(camera.image(), *calibration)
     return AgentInput(egos, [Cameras(), Cameras(), Cameras(), Cameras(**shot)])
-
-
-@pytest.mark.slow
-def test_the_export_brought_back_is_the_run(chain: Chain) -> None:
-    """States, labels, rewards and pictures of human and simulated samples, to float32.
-
-    Not carried: what lies between two frames (label, history, tracks and lights at 10 Hz), perturbation, proposal and
-    scores, metres of progress, of simulated samples the logged drive before (parent_states), the vocabulary's digest
-    (NAVSIM's are float32).
-    """
-    words = [
-        f"maps={chain.root / 'maps'}",
-        f"rewards={chain.to / 'traj_pdm_v2'}",
-        f"vocabulary={chain.to / f'devkit/traj_final/{K}.npy'}",
-    ]
-    assert factory(["import", "simscale", f"root={chain.to}", f"out={chain.root / 'back'}", *words]) == 0
-    rows, back, scenes = chain.rows(), chain.rows("back"), chain.scenes()
-    assert [(row["expert"], row["round"]) for row in back] == [(row["expert"], row["round"]) for row in rows]
-    assert len({row["clip_id"] for row in back}) == 1, "all are of one clip, whose human sample is among them"
-    for row, again in zip(rows, back):
-        if row["expert"] == "human":
-            np.testing.assert_allclose(again["parent_states"], row["parent_states"], rtol=0, atol=1e-4)
-            assert again["candidate_index"] == row["candidate_index"] == -1
-        for name in ("ego_history_2hz", "label_2hz", "ego_status", "label_subscores", "now_pose", "world_from_ego"):
-            _equal(again[name], row[name])
-        for name in ("command", "frame_tokens", "map_location", "route_roadblock_ids", "route_lane_ids", "lane_ids"):
-            assert again[name] == row[name], name
-        np.testing.assert_allclose(again["route_centerline"], row["route_centerline"], atol=1e-4)
-        assert again["light_lane_ids"] == row["light_lane_ids"]
-        lights = [np.asarray(one["light_states"])[:, ::5] == LightState.RED for one in (row, again)]
-        np.testing.assert_array_equal(*lights)
-        np.testing.assert_array_equal(again["label_10hz"][4::5], again["label_2hz"])
-        np.testing.assert_allclose(again["label_10hz"], row["label_10hz"], atol=0.1)
-        labels, kept = labels_of(row), labels_of(again)
-        for ours in METRICS.values():
-            np.testing.assert_array_equal(getattr(kept, ours), getattr(labels, ours))
-        np.testing.assert_array_equal(np.float16(kept.ep("masked")), np.float16(labels.ep("masked")))
-        _same_agents(row, again)
-        shots = scenes[row["expert"], row["round"]].frames
-        for image in again["images"]:
-            shot = shots[round(2.0 * image["time_s"]) + 3].cameras[image["camera"].lower()]
-            assert image["jpeg"] == shot.file.read_bytes()
-
-
-def _equal(mine: Any, theirs: Any) -> None:
-    if isinstance(theirs, bytes):
-        assert mine == theirs
-    else:
-        np.testing.assert_allclose(np.asarray(mine, np.float64), theirs, rtol=0, atol=1e-5)
-
-
-def _same_agents(row: Mapping[str, Any], again: Mapping[str, Any]) -> None:
-    """At every frame everybody, where they were, as fast as they were."""
-    for step in range(0, 56, 5):
-        found = [_agents(one, step) for one in (row, again)]
-        assert found[0].keys() == found[1].keys()
-        for name, there in found[0].items():
-            np.testing.assert_allclose(found[1][name], there, atol=1e-4)
-
-
-def _agents(row: Mapping[str, Any], step: int) -> dict[str, np.ndarray]:
-    boxes, velocities, z = (np.asarray(row[f"agent_{part}"]) for part in ("boxes", "velocities", "center_z"))
-    return {
-        str(row["agent_ids"][i]): np.concatenate([boxes[i, step], velocities[i, step], [z[i, step]]])
-        for i in np.flatnonzero(np.asarray(row["agent_valid"])[:, step])
-    }
-
-
-@pytest.mark.slow
-def test_pictures_that_are_not_resized_keep_their_bytes(chain: Chain, tmp_path: Path) -> None:
-    only = ["expert=pdm_closed", "round=1"]
-    assert factory(["export", "navsim", f"out={chain.run}", f"to={tmp_path / 'to'}", *only, "workers=1"]) == 0
-    assert factory(["import", "simscale", f"root={tmp_path / 'to'}", f"out={tmp_path / 'back'}"]) == 0
-    (back,) = SampleTable(tmp_path / "back")
-    row = chain.rows()[-1]
-    stored, kept = ({(i["camera"], round(i["time_s"], 3)): i["jpeg"] for i in one["images"]} for one in (row, back))
-    assert len(stored) == 32 and kept == stored
-    by_name = {camera["name"]: camera for camera in row["cameras"]}
-    for camera in back["cameras"]:
-        for part in ("width", "height", "intrinsics", "ego_from_camera"):
-            np.testing.assert_allclose(camera[part], by_name[camera["name"]][part], atol=1e-9)
-
-
-@pytest.mark.slow
-def test_an_exported_log_ends_too_early_to_be_a_clip_and_that_is_said(chain: Chain) -> None:
-    for folder in (chain.to / "navsim_logs").iterdir():
-        plan = NavsimReader(folder, chain.root / "maps", cache_dir=chain.root / "kept").index()
-        assert not plan.refs and list(plan.skipped_logs.values()) == ["6.0 s long, a clip needs 10.0 s"]

@@ -64,12 +64,6 @@ def test_comparisons_so_far_have_the_seeds_that_both_sides_have() -> None:
     assert so_far(WANTED, second) == []
 
 
-def test_a_part_of_which_only_others_trainings_are_there_is_left_out() -> None:
-    done = [*labels("begin", 0), *labels("main", 0)]
-    assert MORE[1].label_of(0) in done, "what the other part is held against"
-    assert {one.part for one in so_far(WANTED, done)} == {"begin", "main"}
-
-
 def units(*counts: tuple[str, int, int]) -> list[Training]:
     return [Training(f"{part}-{i}-{seed}", unit=(part, seed)) for part, seed, n in counts for i in range(n)]
 

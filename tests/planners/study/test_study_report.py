@@ -79,29 +79,6 @@ def test_scores_of_the_file_are_those_of_the_folders(study: Path) -> None:
     assert float(trainings[LABELS[0]]["stage_two"]) != pytest.approx(float(trainings[LABELS[0]]["follow_ups"]), abs=0.1)
 
 
-def test_plans_ends_and_logs_come_back_to_the_last_digit(study: Path) -> None:
-    clips = read_study(study / "report" / FRAMES).clips
-    for label in LABELS:
-        groups = {clip.clip_id: clip for clip in clips[label]}
-        for kept in read_rows(study / "evaluations" / label):
-            side = int(kept.key.kind.endswith("before"))
-            group = groups[kept.key.clip_id].groups[side]
-            assert groups[kept.key.clip_id].log_id == LOGS[kept.key.clip_id]
-            if kept.stage == "stage_one":
-                assert group.endpoint_xy.tolist() == kept.end[:2].tolist()
-            if kept.stage == "stage_two":
-                assert group.starts_xy[kept.key.candidate_index].tolist() == kept.start[:2].tolist()
-
-
-def test_the_tables_are_made_again_to_the_byte_of_the_file_alone(study: Path, tmp_path: Path) -> None:
-    write_tables(study / "report" / FRAMES, study / "report", "unfiltered")
-    write_tables(study / "report" / FRAMES, tmp_path / "alone", "unfiltered")
-    made = {path.name: path.read_bytes() for path in (tmp_path / "alone").iterdir()}
-    assert set(made) == {"trainings.csv", "bounds.csv", "comparisons.csv", "tables.md"}
-    for name, content in made.items():
-        assert (study / "report" / name).read_bytes() == content, name
-
-
 def test_intervals_stand_over_clips_logs_and_towns_for_both_filters(study: Path) -> None:
     text = write_tables(study / "report" / FRAMES, study / "report", "filtered")
     assert "two-stage EPDMS, filtered" in text
@@ -169,12 +146,6 @@ def test_a_table_holds_scores_of_one_human_filter_and_says_which() -> None:
     ):
         text = markdown_of(rows, which)
         assert text.startswith(f"Scores are {which}: ") and f"| {said} |" in text
-
-
-def test_every_part_has_its_own_table() -> None:
-    found = [*lines_of(Comparison("main", REAL, None, 3), 1.0), *lines_of(Comparison("ratio", MORE, None, 2), 2.0)]
-    heads = [line for line in markdown_of(found, "unfiltered").splitlines() if line.startswith("##")]
-    assert heads == ["## main", "## ratio"]
 
 
 def test_what_is_no_study_is_said(tmp_path: Path) -> None:

@@ -74,19 +74,6 @@ class Interrupted(ToyBatches):
             yield batch
 
 
-@pytest.mark.slow
-def test_the_loss_falls_and_every_step_is_written(tmp_path: Path) -> None:
-    train(tmp_path, ToyBatches(20, 4), log_every=4)
-    curve = rows(tmp_path / LOSSES)
-    assert [int(row["step"]) for row in curve] == list(range(15))
-    total = [float(row["total"]) for row in curve]
-    assert sum(total[-5:]) < sum(total[:5])
-    assert float(curve[0]["learning_rate"]) == 0.01
-    assert float(curve[3]["total"]) == pytest.approx(float(curve[3]["imitation"]) + float(curve[3]["size"]))
-    assert len(rows(tmp_path / VALIDATION)) == 1
-    assert list((tmp_path / "tensorboard").iterdir())
-
-
 @pytest.mark.parametrize("stop_after", [1, 5, 7])  # within an epoch of five batches, at its end, in the next
 def test_an_interrupted_training_resumes_to_the_identical_curve_and_weights(tmp_path: Path, stop_after: int) -> None:
     whole = train(tmp_path / "whole", ToyBatches(20, 4), validate_every=5)
@@ -317,14 +304,6 @@ def test_folders_without_a_checkpoint_and_planners_nobody_knows_are_refused(tmp_
         build_planner(PlannerChoice("json:JSONDecoder"), {})
     with pytest.raises(ConfigError, match=r"planner\.settings\.hiden"):
         build_planner(PlannerChoice("tests.planners.toy:Toy", {"hiden": 3}), {})
-
-
-def test_damaged_weights_are_named(tmp_path: Path) -> None:
-    train(tmp_path, ToyBatches(20, 4))
-    weights = newest(tmp_path) / "weights.safetensors"
-    weights.write_bytes(weights.read_bytes()[:40])
-    with pytest.raises(ConfigError, match=r"weights\.safetensors: .*restore the checkpoint"):
-        load_planner(tmp_path)
 
 
 def test_a_flipped_bit_in_any_file_of_a_checkpoint_is_found_and_named(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from planners.training.curves import LOSSES
 from planners.training.fit import SCALER, Loop, fit
 from planners.training.optim import TrainingSettings
 from tests.planners.models import test_diffusiondrive, test_gtrs_dense, test_ltf
-from tests.planners.toy import Toy, ToyBatches, ToySettings, toy_batch
+from tests.planners.toy import Toy, ToyBatches, ToySettings
 from tests.planners.training.test_fit import (
     ALONE,
     Interrupted,
@@ -127,7 +127,6 @@ class Again(ToyBatches):
 
 
 LEARNERS: dict[str, Callable[[], tuple[Planner, Batch]]] = {
-    "toy": lambda: (without_chance(), toy_batch(np.arange(8))),
     "ltf": lambda: (test_ltf.planner(), test_ltf.batch(8)),
     "diffusiondrive": lambda: (test_diffusiondrive.planner(), test_diffusiondrive.scene_batch(8)),
     "gtrs_dense": lambda: (test_gtrs_dense.planner(), test_gtrs_dense.labelled(8)[0]),
@@ -141,8 +140,7 @@ def test_the_loss_follows_that_of_fp32(tmp_path: Path, name: str) -> None:
     curves = []
     for precision in ("fp32", "fp16"):
         planner, batch = LEARNERS[name]()
-        rate = 3e-3 if name == "toy" else 3e-4
-        training = TrainingSettings(epochs=1, batch_size=8, learning_rate=rate, optimiser="adamw", gradient_clip=1.0)
+        training = TrainingSettings(epochs=1, batch_size=8, learning_rate=3e-4, optimiser="adamw", gradient_clip=1.0)
         loop = Loop(1, 30, precision=precision)  # type: ignore[arg-type]
         fit(planner, Again(batch), training, loop, ALONE, tmp_path / precision, {})
         curves.append(np.array([float(row["total"]) for row in rows(tmp_path / precision / LOSSES)]))

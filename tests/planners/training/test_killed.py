@@ -1,4 +1,4 @@
-"""Trainings of 1, 2 and 4 processes, killed on their way: what the same and what other numbers of them go on to."""
+"""Trainings of 1 and 2 processes, killed on their way: what the same and what other numbers of them go on to."""
 
 import os
 import shutil
@@ -24,12 +24,12 @@ from planners.training.optim import RAW
 from tests.planners.samples import sample, write_table
 from tests.planners.toy import Toy, ToySettings
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # twelve processes start, four at once
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # processes start one after the other
 
 ROOT = Path(__file__).resolve().parents[3]
 SAMPLES, BATCH, STEPS = 60, 8, 40  # five epochs of 7 batches and a part of the next
 EPOCH = SAMPLES // BATCH
-NUMBERS = (1, 2, 4)
+NUMBERS = (1, 2)
 NOTES, NAP_S = "TESTS_NOTES", "TESTS_NAP_S"
 
 
@@ -150,7 +150,7 @@ def test_the_same_number_goes_on_to_the_same_weights_to_the_last_bit(trainings: 
             assert torch.equal(ours["optimiser"]["state"][index][name], value), (index, name)
 
 
-@pytest.mark.parametrize(("before", "after"), [(1, 1), (2, 2), (4, 4), (1, 2), (2, 4), (4, 1)])
+@pytest.mark.parametrize(("before", "after"), [(1, 1), (2, 2), (1, 2), (2, 1)])
 def test_any_number_goes_on_with_the_samples_that_were_left(trainings: Trainings, before: int, after: int) -> None:
     name = trainings.folder / f"{before}-to-{after}"
     resumed = name if name.exists() else trainings.goes_on(before, after)

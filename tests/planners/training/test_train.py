@@ -2,11 +2,9 @@
 
 import json
 import os
-import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +54,7 @@ def test_it_trains_and_says_what_with(table: str, tmp_path: Path, capsys: pytest
     assert record["trained"]["mix"]["imitation"] == "real"
     assert record["backbones"] == {}
     assert len((tmp_path / LOSSES).read_text().splitlines()) == 1 + 18
+    assert list((tmp_path / "tensorboard").iterdir())
     last = (tmp_path / VALIDATION).read_text().splitlines()
     assert last[0] == "step,ade_m,fde_m" and [line.split(",")[0] for line in last[1:]] == ["10", "18"]
 
@@ -94,16 +93,12 @@ def trained(home: Path, *words: str) -> tuple[list[str], dict[str, Any]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("page", "asked", "size"), [("README.md", 32, 9), ("docs/extend.md", 64, 3), ("docs/training.md", 32, 9)]
-)
-def test_the_documented_first_trainings_take_the_demo_s_table(page: str, asked: int, size: int, demo: Path) -> None:
-    """Of three human samples, and of all: the batch is as large as there are, also where one is gone on with."""
-    for steps in (2, 4):
-        notes, record = trained(demo, *documented(page), f"steps={steps}", "resume=further")
-        (note,) = notes
-        assert note.startswith(f"note: planner.training.batch_size={asked} -> {size}: "), note
-        assert (record["step"], record["trained"]["planner.training"]["batch_size"]) == (steps, size)
+@pytest.mark.parametrize("page", ["README.md", "docs/training.md"])
+def test_the_documented_first_trainings_take_the_demo_s_table(page: str, demo: Path) -> None:
+    """Of nine samples: the batch is as large as there are. Of three: below, by two processes."""
+    (note,), record = trained(demo, *documented(page), "steps=2")
+    assert note.startswith("note: planner.training.batch_size=32 -> 9: "), note
+    assert (record["step"], record["trained"]["planner.training"]["batch_size"]) == (2, 9)
 
 
 @pytest.mark.slow
@@ -158,34 +153,6 @@ def test_a_training_that_goes_on_keeps_the_batch_that_it_began_with(
     assert main([*asked, "steps=1", "accumulate=7"]) == 0
     assert main([*asked, "steps=2", "accumulate=3"]) == 0, capsys.readouterr().err
     assert read_record(tmp_path)["trained"]["planner.training"]["batch_size"] == 21
-
-
-def test_the_same_command_again_has_nothing_left_to_do(table: str, tmp_path: Path) -> None:
-    for _ in range(2):
-        assert main(command(table, tmp_path)) == 0
-    assert len((tmp_path / LOSSES).read_text().splitlines()) == 1 + 18
-
-
-def test_real_samples_alone_are_enough(table: str, tmp_path: Path) -> None:
-    assert main(command(table, tmp_path, sim=False)) == 0
-    assert read_record(tmp_path)["step"] == 6
-
-
-@pytest.mark.slow
-def test_a_killed_training_goes_on_to_the_identical_curve(table: str, tmp_path: Path) -> None:
-    whole, cut = tmp_path / "whole", tmp_path / "cut"
-    steps = ("steps=600", "checkpoint_every=10", "log_every=10")
-    assert main(command(table, whole, *steps)) == 0
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    arguments = [sys.executable, "-m", "planners", "train", *command(table, cut, *steps)]
-    killed = subprocess.Popen(arguments, cwd=ROOT, env=environment, stderr=subprocess.DEVNULL)
-    while not list((cut / "checkpoints").glob("[0-9]*/training.pt")) and killed.poll() is None:
-        time.sleep(0.02)
-    killed.send_signal(signal.SIGKILL)
-    killed.wait()
-    assert 0 < int(newest(cut).name) < 600, "it was to be killed on its way"
-    assert main(command(table, cut, *steps)) == 0
-    assert (cut / LOSSES).read_text() == (whole / LOSSES).read_text()
 
 
 def test_a_planner_is_trained_further_from_the_weights_of_another_training(
