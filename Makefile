@@ -81,7 +81,7 @@ chaos: install
 	$(PY) -m experiments.chaos.flips
 	$(PY) -m experiments.chaos.kills
 	$(PY) -m tests.chaos.commit_steps
-	$(PY) -m tests.chaos.full_disks
+	$(PY) -m experiments.chaos.full_disks
 	$(PY) -m tests.chaos.poison
 	$(PY) -m experiments.chaos.long_run hours=$(or $(HOURS),2)
 

@@ -53,7 +53,7 @@ RUN_ELSEWHERE = {
 }
 LEFT_OUT = {  # program, and why its commands are not read here; the files that they name have to be there
     "kubectl": "needs a cluster; tests/deploy holds its files against their schemas",
-    "prometheus": "needs its server; tests/deploy runs it where it is installed",
+    "prometheus": "needs its server; experiments/dashboards runs it",
     "rsync": "copies a folder",
     "export": "sets the shell's variables",
     "echo": "writes to a file of the kernel",

@@ -121,9 +121,7 @@ class Trial:
     def _timed(self, executor: str, journal: Path) -> int:
         began = time.monotonic()
         given = [sys.executable, "-m", "experiments.chaos.killed_run", str(self.out), executor, str(journal)]
-        process = subprocess.Popen(  # noqa: S603 - our own
-            given, cwd=REPOSITORY, env=os.environ | {"PYTHONPATH": str(REPOSITORY)}
-        )
+        process = subprocess.Popen(given, cwd=REPOSITORY, env=os.environ | {"PYTHONPATH": str(REPOSITORY)})
         while process.poll() is None and not attempts(journal):
             time.sleep(0.02)
         if attempts(journal):
@@ -246,7 +244,7 @@ def parts(kind: str, n: int, folder: Path, golden: Path, rng: random.Random, end
 
 def main(**asked: int) -> None:
     """Prints one table; with any kind named, those alone."""
-    rng = random.Random(asked.pop("seed", 0))  # noqa: S311 - no secret
+    rng = random.Random(asked.pop("seed", 0))
     end = time.monotonic() + 60.0 * asked.pop("minutes", 60)
     assert set(asked) <= set(KINDS), f"there are {list(KINDS)}"
     with tempfile.TemporaryDirectory() as name:

@@ -69,9 +69,7 @@ def command(out: Path, executor: str, size: Size, wait_s: float, journal: Path) 
 
 def start(words: list[str], log: IO[bytes]) -> subprocess.Popen[bytes]:
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
-    return subprocess.Popen(  # noqa: S603 - our own
-        words, cwd=REPOSITORY, env=environment, stdout=log, stderr=subprocess.STDOUT
-    )
+    return subprocess.Popen(words, cwd=REPOSITORY, env=environment, stdout=log, stderr=subprocess.STDOUT)
 
 
 def workers_of(driver: int, executor: str) -> list[int]:
@@ -162,7 +160,7 @@ def trial(folder: Path, hours: float, every_s: float, executor: str, seed: int, 
     assert code == COMPLETE, (folder / "golden.txt").read_text()
     wait_s = 3600.0 * hours * WORKERS[executor] / planned(first)
     print(f"{planned(first)} plans without kills; each waits {wait_s:.2f} s from now on", flush=True)
-    rng = random.Random(seed)  # noqa: S311 - no secret
+    rng = random.Random(seed)
     met = endure(command(out, executor, size, wait_s, second), executor, every_s, rng, second, folder)
     told = Told("all of it")
     compare(out, golden, told)

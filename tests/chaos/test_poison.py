@@ -7,9 +7,10 @@ import pytest
 from tests.chaos.poison import HOW, trial, write_files
 
 
+@pytest.mark.ray
 @pytest.mark.slow
-@pytest.mark.parametrize("executor", ["local", pytest.param("ray", marks=pytest.mark.ray)])
-def test_clips_that_do_harm_are_told_of_and_touch_no_other(tmp_path: Path, executor: str) -> None:
+def test_clips_that_do_harm_are_told_of_and_touch_no_other(tmp_path: Path) -> None:
+    """In processes of this machine alone: tests/factory/graph/test_isolated.py."""
     write_files(tmp_path)
-    told = trial(tmp_path, executor, 20, 2)
+    told = trial(tmp_path, "ray", 20, 2)
     assert len(told) == len(HOW) + 1

@@ -17,7 +17,6 @@ from factory.store.disk import DiskFull, needs_disk, why_disk_full, why_unusable
 from factory.store.samples import Store
 from factory.store.verify import verify
 from tasks.caches import user_cache
-from tests.chaos.full_disks import PAGE, at_level, needed
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
 from tests.factory.toy import COLD, ColdWork, DyingWork, ToyWork, executed, refs
 
@@ -140,16 +139,6 @@ def test_what_a_full_disk_said_is_found_behind_other_errors_and_in_delta_s_words
     except RuntimeError as error:
         assert failure_of(error).disk_full == why_disk_full(error) == "/a/file: the disk is full"
     assert failure_of(ValueError("else")).disk_full == ""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("place", ["graph", "cache"])
-def test_little_space_in_a_place_ends_the_run_and_the_same_command_goes_on(
-    disk: Path, tmp_path: Path, place: str
-) -> None:
-    need, golden = needed(place, tmp_path / "golden")
-    n_bytes = need // 3 // PAGE * PAGE
-    assert at_level(place, n_bytes, golden, tmp_path / "trial") == "exit code 4"
 
 
 def test_a_full_disk_under_the_user_s_cache_is_told_with_its_path_and_is_no_wrong_setting(

@@ -27,7 +27,6 @@ def test_compiled_and_eager_trainings_have_one_curve_and_each_goes_on_as_the_oth
     """With dropout: it is drawn as without compilation."""
     for name, first, then in (
         ("eager", "false", "false"),
-        ("compiled", "true", "true"),
         ("begun compiled", "true", "false"),
         ("ended compiled", "false", "true"),
     ):

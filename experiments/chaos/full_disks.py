@@ -1,4 +1,4 @@
-"""Little space at 20 levels in each place that a run writes to: `python -m tests.chaos.full_disks [LEVELS] [PLACES]`.
+"""Little space at 20 levels in each place that a run writes to: `python -m experiments.chaos.full_disks ...`.
 
 The place is a file system of its own (tmpfs; only root may mount one), with from nothing to nearly all of what an
 undisturbed run takes there, in even steps. A run there is to end as complete, or with exit code 4 and one line, or to
@@ -301,6 +301,6 @@ def main(levels: int = LEVELS, names: Sequence[str] = tuple(PLACES)) -> int:
 
 
 if __name__ == "__main__":
-    from tests.chaos.full_disks import main  # so that another process can import what it runs
+    from experiments.chaos.full_disks import main  # so that another process can import what it runs
 
     sys.exit(bool(main(*map(int, sys.argv[1:2]), names=tuple(sys.argv[2:]) or tuple(PLACES))))
