@@ -82,7 +82,7 @@ chaos: install
 	$(PY) -m experiments.chaos.kills
 	$(PY) -m tests.chaos.commit_steps
 	$(PY) -m experiments.chaos.full_disks
-	$(PY) -m tests.chaos.poison
+	$(PY) -m experiments.chaos.poison
 	$(PY) -m experiments.chaos.long_run hours=$(or $(HOURS),2)
 
 # The site of the pages, into build/site; whatever MkDocs would warn of ends it. The variable leaves out a notice of the

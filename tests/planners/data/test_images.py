@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from factory.readers.pictures import jpeg_size
 from planners.data.batch import ImageLayout
 from planners.data.images import chosen_cameras, stitch, stitched
 from tests.planners.samples import FRONT_YAWS, Pixels, grey_pictures, jpeg, pictures, plain
@@ -100,19 +99,6 @@ def test_cameras_of_other_sizes_are_brought_to_one_height() -> None:
     assert [int((picture[60].argmax(axis=1) == i).sum()) for i in range(3)] == [160, 90, 160]
 
 
-def test_decoding_at_a_fraction_is_near_to_decoding_in_full() -> None:
-    ramp = np.linspace(0, 3, 960 * 540 * 3).reshape(540, 960, 3)
-    view = (127 + 90 * np.sin(40 * ramp + np.arange(3)) * np.cos(np.arange(960) / 17.0)[:, None]).astype(np.uint8)
-    data = np.frombuffer(jpeg(view), np.uint8)
-    full = cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-    for factor in (2, 4):
-        layout = ImageLayout(width=960 // factor, height=540 // factor, rows_cut=0.0)
-        picture = np.empty((layout.height, layout.width, 3), np.uint8)
-        stitch([data], layout, picture)
-        mean = cv2.resize(full, (layout.width, layout.height), interpolation=cv2.INTER_AREA)
-        assert np.abs(picture.astype(int) - mean).mean() < 1.0
-
-
 def seen(seed: int, width: int = 1920, height: int = 1080) -> Pixels:
     """Shapes and edges at all scales, none of which repeats."""
     rng = np.random.default_rng(seed)
@@ -168,9 +154,3 @@ def test_what_cannot_be_stitched_says_why() -> None:
         stitched(pictures(dict.fromkeys(FRONT_YAWS, whole[: len(whole) // 2])), PUBLIC)
     with pytest.raises(ValueError, match="leave nothing of an image of 32 x 18"):
         stitched(sample, ImageLayout(sides_cut=0.5))
-
-
-def test_the_size_is_read_from_the_header() -> None:
-    for quality, flags in ((90, []), (50, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]), (90, [cv2.IMWRITE_JPEG_RST_INTERVAL, 1])):
-        data = cv2.imencode(".jpg", plain((1, 2, 3), 45, 31), [cv2.IMWRITE_JPEG_QUALITY, quality, *flags])[1]
-        assert jpeg_size(data.ravel()) == (45, 31)

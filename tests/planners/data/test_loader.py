@@ -155,17 +155,6 @@ def test_a_resumed_loader_goes_on_to_the_byte(data: Dataset) -> None:
         assert second.state()["epoch"] == 2
 
 
-def test_ranks_may_be_others_after_a_resume(data: Dataset) -> None:
-    alone = Loader(data, Needs(), MixSettings(), BATCH)
-    running = alone.epoch(0)
-    next(running), next(running)
-    pair = [Loader(data, Needs(), MixSettings(), BATCH, rank, 2) for rank in (0, 1)]
-    for one in pair:
-        one.resume(alone.state())
-    for whole, *parts in zip(running, *(one.epoch(0) for one in pair), strict=True):
-        assert_same(whole, joined(parts))
-
-
 def test_a_resume_with_other_data_or_settings_is_refused_by_name(data: Dataset, out: str) -> None:
     state = Loader(data, Needs(), MixSettings(), BATCH).state()
     for other, message in (

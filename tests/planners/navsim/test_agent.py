@@ -3,7 +3,6 @@
 import ast
 import io
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -106,46 +105,3 @@ def test_without_navsim_only_the_agent_itself_is_missing() -> None:
     if "NAVSIM_PYTHON" not in os.environ:
         with pytest.raises(ModuleNotFoundError, match="navsim"):
             agent.FactoryAgent  # noqa: B018
-
-
-IN_NAVSIM = """
-import pickle, sys
-import numpy as np
-from hydra.utils import instantiate
-from navsim.agents.abstract_agent import AbstractAgent
-from navsim.common.dataclasses import AgentInput, Camera, Cameras, EgoStatus, Trajectory
-stored = np.load(sys.argv[1])
-checkpoint, python = sys.argv[2:]
-config = {"_target_": "planners.navsim.agent.FactoryAgent", "_convert_": "all", "checkpoint": checkpoint}
-agent = instantiate({**config, "python": python})
-assert isinstance(agent, AbstractAgent) and not agent.requires_scene
-sensors = agent.get_sensor_config()
-assert sensors.get_sensors_at_iteration(3) == ["cam_f0", "cam_l0", "cam_r0"]
-assert not any(sensors.get_sensors_at_iteration(i) for i in (0, 1, 2, 4, 11))
-agent.initialize()
-names = ["cam_f0", "cam_l0", "cam_l1", "cam_l2", "cam_r0", "cam_r1", "cam_r2", "cam_b0"]
-keys = ["image", "rotation", "translation", "intrinsics", "distortion"]
-cameras = {n: Camera(*(stored[f"{n}.{k}"] for k in keys)) if f"{n}.image" in stored else Camera() for n in names}
-status = stored["status"]
-egos = [EgoStatus(pose, status[4:6], status[6:], status[:4].astype(int)) for pose in stored["history"]]
-plan = agent.compute_trajectory(AgentInput(egos, [Cameras(**cameras)] * 4, []))
-assert isinstance(plan, Trajectory) and plan.trajectory_sampling.num_poses == 8
-again = pickle.loads(pickle.dumps({"first_stage_predictions": [{"token": plan}]}))
-np.save(sys.stdout.buffer, again["first_stage_predictions"][0]["token"].poses)
-"""
-
-
-@pytest.mark.slow
-def test_navsim_s_own_code_takes_the_agent(tmp_path: Path) -> None:
-    """NAVSIM_PYTHON=<python of an environment with NAVSIM> pytest ...; skipped where there is none."""
-    if "NAVSIM_PYTHON" not in os.environ:
-        pytest.skip("NAVSIM_PYTHON names no interpreter that has NAVSIM")
-    folder, given = saved(made("ltf_small"), tmp_path / "training"), agent_input(FRONT)
-    arrays = shown(given, FRONT)
-    np.savez(tmp_path / "seen.npz", **arrays)
-    path = os.pathsep.join([str(REPOSITORY), *filter(None, [os.environ.get("NAVSIM_PATH")])])
-    command = [os.environ["NAVSIM_PYTHON"], "-c", IN_NAVSIM, str(tmp_path / "seen.npz"), folder, sys.executable]
-    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, timeout=200)
-    assert done.returncode == 0, done.stderr.decode()
-    expected = Pilot(folder).plan(seen_of(arrays, FRONT), 8)
-    np.testing.assert_allclose(np.load(io.BytesIO(done.stdout)), expected, atol=1e-5)

@@ -1,8 +1,6 @@
 """The submission's file: what the public script puts there, read by names alone, and every plan the agent's own."""
 
-import os
 import pickletools
-import subprocess
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -278,29 +276,3 @@ def test_pictures_that_a_planner_lacks_are_named(files: Path, capsys: pytest.Cap
 def test_who_knows_the_world_submits_nothing(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert submit(files, "human") == BAD_CONFIG
     assert "plans from the log itself" in capsys.readouterr().err
-
-
-IN_NAVSIM = """
-import pickle, sys
-from navsim.common.dataclasses import Trajectory
-from nuplan.planning.simulation.trajectory.trajectory_sampling import TrajectorySampling as Sampling
-content = pickle.load(open(sys.argv[1], "rb"))
-plans = [*content["first_stage_predictions"][0].values(), *content["second_stage_predictions"][0].values()]
-for plan in plans:
-    plan.__post_init__()
-    plan.trajectory_sampling.__post_init__()
-    assert type(plan) is Trajectory and plan.trajectory_sampling == Sampling(time_horizon=4, interval_length=0.5)
-print(len(plans))
-"""
-
-
-@pytest.mark.slow
-def test_navsim_s_own_code_takes_the_file(files: Path) -> None:
-    """NAVSIM_PYTHON=<python of an environment with NAVSIM> pytest ...; skipped where there is none."""
-    if "NAVSIM_PYTHON" not in os.environ:
-        pytest.skip("NAVSIM_PYTHON names no interpreter that has NAVSIM")
-    assert submit(files, "constant_velocity") == COMPLETE
-    command = [os.environ["NAVSIM_PYTHON"], "-c", IN_NAVSIM, str(files / "submission.pkl")]
-    env = os.environ | {"PYTHONPATH": os.environ.get("NAVSIM_PATH", "")}
-    done = subprocess.run(command, env=env, capture_output=True, timeout=200)
-    assert done.returncode == 0 and done.stdout == b"5\n", done.stderr.decode()

@@ -1,4 +1,4 @@
-"""Clips that do harm, one in a hundred of each kind: `python -m tests.chaos.poison [clips=100] [local=1] [ray=1]`.
+"""Clips that do harm, one in a hundred of each kind: `python -m experiments.chaos.poison [clips=100] ...`.
 
 A run of toy samples, `human` alone, in a process of its own (executor=local) or on Ray. Which clips do harm is drawn by
 chance. Every other clip's rows must be those of a run without them, the run must end with exit code 3, and each clip
