@@ -1,4 +1,4 @@
-"""The benchmarks behind docs/reproduce.md: counts are those of computing, hours their arithmetic, kept is less."""
+"""The benchmarks behind docs/reproduce.md: counts from shapes are those of a computed step."""
 
 import math
 from pathlib import Path

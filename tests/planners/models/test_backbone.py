@@ -1,4 +1,4 @@
-"""Published names and numbers of the backbones, and weights from files."""
+"""Backbones by the names of their weights, and weights from files."""
 
 from dataclasses import replace
 from pathlib import Path

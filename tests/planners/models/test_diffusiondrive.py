@@ -1,4 +1,4 @@
-"""DiffusionDrive: its size, whom it imitates, and that it learns 32 pictures by heart."""
+"""DiffusionDrive: whom it imitates, and how it plans from noise."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Latent TransFuser: its size, what it minimises, and that it learns 32 pictures by heart."""
+"""Latent TransFuser: what it minimises and what it sees."""
 
 from dataclasses import replace
 from functools import cache

@@ -1,4 +1,4 @@
-"""The files of conf/planner that come with the regressing planners say what the code and the paper say."""
+"""The files of conf/planner that come with the planners say what the code and the paper say."""
 
 from dataclasses import replace
 from typing import Any
@@ -9,11 +9,14 @@ import yaml
 from factory.config.compose import conf_dir, fill
 from planners.models.backbones import BackboneSettings
 from planners.models.baselines import EgoMlpBevSettings, EgoMlpSettings
+from planners.models.diffusiondrive import DiffusionDriveSettings
+from planners.models.gtrs_dense import GtrsDenseSettings
 from planners.models.ltf import LtfSettings
 from planners.models.planner import PlannerChoice, settings_of
 from planners.training.optim import TrainingSettings
 
 NAMES = ("constant_velocity", "ego_mlp", "ego_mlp_small", "ego_mlp_bev", "ego_mlp_bev_small", "ltf", "ltf_small")
+NAMES += ("diffusiondrive", "diffusiondrive_small", "gtrs_dense", "gtrs_dense_v2_99", "gtrs_dense_small")
 
 
 def read(name: str) -> dict[str, Any]:
@@ -38,6 +41,10 @@ def test_the_unmarked_files_are_the_defaults() -> None:
     defaults = {"ltf": LtfSettings(), "ego_mlp": EgoMlpSettings(), "ego_mlp_bev": EgoMlpBevSettings()}
     for name, expected in defaults.items():
         assert settings_of(choice(name)) == expected and "settings" not in read(name)
+    assert settings_of(choice("diffusiondrive")) == DiffusionDriveSettings()
+    for name in ("gtrs_dense", "gtrs_dense_v2_99"):
+        same = replace(settings_of(choice(name)), backbone=GtrsDenseSettings().backbone, encoder="fused")
+        assert same == GtrsDenseSettings()
 
 
 @pytest.mark.parametrize("name", ["ltf", "diffusiondrive", "gtrs_dense", "gtrs_dense_v2_99"])
