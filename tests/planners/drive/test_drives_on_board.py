@@ -21,6 +21,7 @@ def test_the_board_reads_columns_that_the_table_has() -> None:
         assert table.SCHEMA.field(field.name).type == field.type
 
 
+@pytest.mark.slow
 def test_the_board_shows_drives_as_they_are_committed_and_their_films(towns: Path, tmp_path: Path) -> None:
     board = Board(Store(Location.parse(tmp_path)))
     assert json.loads(board.answer("/api/drives").body) == {"total": 0, "lines": [], "drives": []}

@@ -110,6 +110,7 @@ def test_what_was_seen_is_what_a_sample_s_earlier_pictures_are() -> None:
 LOOKING = ["planner=tests.planners.drive.looking:Bright", "render.width=64", "render.height=36"]
 
 
+@pytest.mark.slow
 def test_a_planner_that_looks_drives_by_the_painter_s_pictures(towns: Path, tmp_path: Path) -> None:
     assert main([*words(towns, tmp_path, "limit=1", *LOOKING), "seconds=1.5"]) == COMPLETE
     (row,) = rows(tmp_path)

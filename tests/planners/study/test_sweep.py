@@ -60,6 +60,7 @@ def test_what_is_evaluated_is_reported_and_what_changed_since_is_not(tmp_path: P
     assert evaluated(planned, tmp_path) == {"c"}, "the other was evaluated by other rules"
 
 
+@pytest.mark.slow
 def test_a_sweep_stops_where_something_is_missing_and_is_reported_when_all_is_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
