@@ -200,5 +200,5 @@ def test_every_program_of_the_tests_imports() -> None:
 
 
 def test_every_program_that_the_makefile_runs_is_there() -> None:
-    named = re.findall(r"-m ((?:tests|factory|planners)[\w.]*)", (ROOT / "Makefile").read_text())
+    named = re.findall(r"-m ((?:tests|factory|planners|experiments)[\w.]*)", (ROOT / "Makefile").read_text())
     assert len(named) >= 10 and all(map(find_spec, named))

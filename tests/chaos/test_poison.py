@@ -13,12 +13,9 @@ from factory.store.verify import verify
 from tests.factory.graph.wild import WildWork
 from tests.factory.toy import refs
 
-LIMITS = Limits(
-    seconds={"drive": 30.0, "render": 0.0, "label": 0.0}, gb={"drive": 1.2, "render": 1.2, "label": 1.2}
-)  # memory: what stands for 8 GB here
+LIMITS = Limits(seconds={"drive": 30.0, "render": 0.0, "label": 0.0})
 HOW = {  # kind -> what is told of it, and a pattern in the message
     "compiled loop": ("limit", "at work for more than"),
-    "memory": ("limit", "GB"),
     "segfault": ("system", r"at drive\+render\+label|worker died"),
     "sys.exit": ("bug", "SystemExit"),
     "mutate": ("bug", "read-only"),
@@ -42,7 +39,7 @@ def test_experts_that_do_harm_are_told_of_and_touch_no_other(tmp_path: Path) -> 
         {row["clip_id"]: repr(row) for row in Store(tmp_path / name).samples.read().to_pylist()}
         for name in ("out", "clean")
     )
-    assert found == {clip: row for clip, row in clean.items() if clip not in harmed} and len(found) == 3
+    assert found == {clip: row for clip, row in clean.items() if clip not in harmed} and len(found) == 4
     failed = {
         row["clip_id"]: row for row in Store(tmp_path / "out").outcomes.read().to_pylist() if row["kind"] == "failed"
     }
