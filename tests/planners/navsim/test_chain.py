@@ -33,9 +33,8 @@ from planners.training.train import main as train
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import Clip
 from tasks.world.frames import to_world
-from tests.factory.exports.openscene_reader import Scene, read_scenes, read_split
 from tests.factory.datasets.navsim.geopackage_writer import ORIGIN, town_rows, write_root
-from tests.factory.datasets.navsim.openscene_reader import Scene, read_rewards, read_scenes, read_split
+from tests.factory.datasets.navsim.openscene_reader import Scene, read_scenes, read_split
 from tests.factory.datasets.navsim.openscene_writer import Place, Sensed, sensed_by_town, write_openscene
 from tests.planners.navsim import agent_inputs
 from tests.planners.navsim.agent_inputs import DISTORTION, AgentInput, Cameras, EgoStatus
