@@ -27,6 +27,14 @@ STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 OF_TERMINALS = (signal.SIGINT, signal.SIGHUP)  # Ctrl-C and a closed terminal reach every process that runs in it
 
 
+class Failed(Exception):
+    """A part ended with an error; what else was to be done is done."""
+
+
+class Stopped(Exception):
+    """Interrupted or out of minutes; what is done is kept, and the same command goes on."""
+
+
 def end_at_interrupt() -> None:
     """Until `as_program`, while modules are imported and nothing is begun: SIGINT is one line and INTERRUPTED."""
 

@@ -14,54 +14,28 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
 from typing import TYPE_CHECKING
 
+from factory.config.arguments import command
 from factory.config.classes import class_of
-from factory.config.compose import ConfigError, conf_dir
-from factory.config.plugins import choices
+from factory.config.compose import ConfigError
 from factory.config.run import RunConfig, load_config, photos_alone
-from factory.config.shapes import defaults_of, described
-from factory.config.words import Asked, SettingsShown, asked_of
-from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, as_program
-from factory.files import folders_in
+from factory.config.words import Asked, asked_of
+from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, as_program
 from factory.setup.early import refuse_what_is_not_there
-from factory.store.disk import DiskFull, why_unusable
+from factory.store.disk import why_unusable
 
 if TYPE_CHECKING:
     from factory.readers.base import ClipRef
 
 
-def main(argv: Sequence[str], only_plan: bool = False) -> int:
-    """The command, or what it would take; returns the exit code."""
-    return _told(argv, lambda asked: run(asked, only_plan))
-
-
-def _told(argv: Sequence[str], do: Callable[[Asked], int]) -> int:
-    """Exit code of what a command line asks for; what it cannot have in a line."""
-    if {"-h", "--help"} & set(argv):
-        print(help_text())
-        return 0
-    try:
-        return do(asked_of(argv))
-    except SettingsShown as settings:
-        print(settings)
-        return COMPLETE
-    except (ConfigError, MemoryError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_CONFIG
-    except DiskFull as error:
-        print(f"error: {error}; free disk space and run the same command again", file=sys.stderr)
-        return INTERRUPTED
-    except Exception as error:
-        from factory.store.disk import why_ill
-        from factory.wording import one_line
-
-        if not why_ill(error):
-            raise
-        print(f"error: {one_line(error)}; run the same command again to go on", file=sys.stderr)
-        return INTERRUPTED
+@command("run", RunConfig, refused=(), resumes=True)
+def main(argv: Sequence[str]) -> int:
+    """The command; returns the exit code."""
+    return run(asked_of(argv), only_plan=False)
 
 
 def dealt(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
@@ -76,19 +50,6 @@ def dealt(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
     queues = list(logs.values())
     groups = [queues[i : i + hands] for i in range(0, len(queues), hands)]
     return [ref for group in groups for turn in zip_longest(*group) for ref in turn if ref is not None]
-
-
-def help_text() -> str:
-    """Usage, the run's keys with their defaults and meanings, and the choices of every group, plug-ins among them.
-
-    Imports nothing heavy.
-    """
-    folder = conf_dir()
-    groups = [path.name for path in folders_in(folder)]
-    listed = "\n".join(f"  {group}: {', '.join(choices(group, [folder]))}" for group in groups)
-    keys = {key: value for key, value in defaults_of(RunConfig).items() if key not in groups}
-    told = "\n".join(described(keys, RunConfig, {}))
-    return f"{__doc__}\nchoices\n{listed}\n\nkeys and defaults\n{told}"
 
 
 def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:
@@ -155,7 +116,12 @@ def _run_again(words: Sequence[str], first_began: float, begun: int, tell: Calla
         tell(line)
 
     began = first_began if begun else None
-    return _told(words, lambda asked: _run(_checked(asked), asked, False, began, begun, say))
+
+    def work(argv: Sequence[str]) -> int:
+        asked = asked_of(argv)
+        return _run(_checked(asked), asked, False, began, begun, say)
+
+    return replace(main, does=work)(words)
 
 
 def _run(

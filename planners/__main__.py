@@ -19,5 +19,10 @@ def main(argv: Sequence[str]) -> int:
     return dispatch(argv, PLANNERS, f"{__doc__}\ncommands\n{listed(PLANNERS)}\n\nMore: docs/training.md.")
 
 
-if __name__ == "__main__":
+def program() -> None:
+    """The installed program `planners`."""
     as_program(main)
+
+
+if __name__ == "__main__":
+    program()

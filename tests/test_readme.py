@@ -174,8 +174,8 @@ def test_every_command_is_one_its_program_takes(
             fill(TrainConfig, compose("train", given(arguments)), "train")
         case ["python", "-m", "planners", "import", *arguments]:
             settings_of(import_config(given(arguments)).planner)
-        case ["python", "-m", "planners", "evaluate" | "ensemble", *arguments]:
-            evaluate_settings([argument for argument in arguments if not argument.startswith("models=")])
+        case ["python", "-m", "planners", "evaluate", *arguments]:
+            evaluate_settings(arguments)
         case ["python", "-m", "planners", "compare", *arguments]:
             fill(CompareSettings, compose("compare", arguments), "compare")
         case ["python", "-m", "planners", "replay", *arguments]:

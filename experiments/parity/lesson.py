@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from factory.config.compose import ConfigError
-from planners.command import Stopped
+from factory.exits import Stopped
 from planners.data.batch import Batch
 from planners.published.import_planner import imported
 from planners.training.curves import LOSSES

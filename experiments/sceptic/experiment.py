@@ -14,7 +14,7 @@ from typing import ClassVar, Literal
 
 from experiments.study.data import Recipe, make
 from experiments.study.settings import settings_of
-from planners.command import Stopped
+from factory.exits import Stopped
 from planners.data.index import DataSettings, open_dataset
 from planners.study.arms import HeldAgainst, against_bounds, arms_of, differences_of, drive_arms, text_of, write_arms
 from planners.study.setups import Comparison, Setup

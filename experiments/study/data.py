@@ -14,8 +14,8 @@ from pathlib import Path
 from threading import Event
 
 from experiments.study.settings import settings_of
-from factory.exits import INTERRUPTED, asked_to_stop
-from planners.command import Failed, Stopped, command
+from factory.config.arguments import NOT_FITTING, answered
+from factory.exits import INTERRUPTED, Failed, Stopped, asked_to_stop
 from planners.training.many import Means, exit_code
 
 
@@ -67,4 +67,4 @@ def data(argv: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(command(data)(sys.argv[1:]))
+    sys.exit(answered(sys.argv[1:], data, lambda: __doc__, NOT_FITTING))

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments.study.settings import settings_of
+from factory.config.arguments import NOT_FITTING, answered
 from factory.config.compose import ConfigError
-from planners.command import command
 from planners.data.index import DataSettings, open_dataset
 from planners.study.setups import Budget, Comparison, Setup
 from planners.study.sweep import SweepSettings, run
@@ -226,4 +226,4 @@ def study(argv: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(command(study)(sys.argv[1:]))
+    sys.exit(answered(sys.argv[1:], study, lambda: __doc__, NOT_FITTING))

@@ -3,7 +3,8 @@
     source <(python -m factory completion bash)             for this shell; into ~/.bashrc for all
     source <(python -m factory completion zsh)              after compinit
 
-Completes `factory ...` and `python -m factory ...`.
+Completes `factory ...` and `planners ...`, `python -m` of both, and of factory.run and planners.drive. Keys of
+planners' commands take the time that PyTorch takes to be imported.
 """
 
 import re
@@ -12,14 +13,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from factory.commands.table import COMMANDS
-from factory.config.arguments import RUN, WORD, given_as, keys_of
+from factory.commands.table import COMMANDS, DOORS
+from factory.config.arguments import RUN, WORD, ComposedCommand, given_as, groups_of, keys_of
 from factory.config.compose import conf_dir
 from factory.config.plugins import choices
-from factory.config.run import EXPERTS, RunConfig, built_in_classes, reader_of
+from factory.config.run import EXPERTS, built_in_classes, reader_of
 from factory.config.shapes import choices_of, dataclass_in
 from factory.config.shapes import keys_of as settings_in
+from factory.run import main as run
 
+MODULES = ("factory", "factory.run", "planners", "planners.drive")  # what `python -m` starts
 BASH = r"""_factory_complete() {
   local line="${COMP_LINE:0:COMP_POINT}" word found
   word="${line##*[[:space:]]}"
@@ -29,9 +32,9 @@ BASH = r"""_factory_complete() {
   [[ ${#found[@]} -gt 0 && ${found[0]} == *= ]] && compopt -o nospace
 }
 _factory_python() {
-  [[ "$COMP_LINE" =~ ^[^[:space:]]+[[:space:]]+-m[[:space:]]+factory[[:space:]] ]] && _factory_complete
+  [[ "$COMP_LINE" =~ ^[^[:space:]]+[[:space:]]+-m[[:space:]]+(MODULES)[[:space:]] ]] && _factory_complete
 }
-complete -o default -F _factory_complete factory
+complete -o default -F _factory_complete factory planners
 for _name in python python3; do
   complete -p "$_name" >/dev/null 2>&1 || complete -o default -F _factory_python "$_name"
 done
@@ -49,7 +52,7 @@ ZSH = r"""_factory_complete() {
   fi
 }
 _factory_python() {
-  if [[ $words[2] == -m && $words[3] == factory ]]; then
+  if [[ $words[2] == -m && $words[3] == (MODULES) ]]; then
     _factory_complete
   elif (( $+functions[_python] )); then
     _python
@@ -57,7 +60,7 @@ _factory_python() {
     _default
   fi
 }
-compdef _factory_complete factory
+compdef _factory_complete factory planners
 compdef _factory_python python python3
 """
 
@@ -71,30 +74,37 @@ class Request:
 
 def main(request: Request) -> None:
     """Print the script of a shell."""
-    print({"bash": BASH, "zsh": ZSH}[request.shell].replace("PYTHON", sys.executable), end="")
+    script = {"bash": BASH, "zsh": ZSH}[request.shell]
+    print(script.replace("PYTHON", sys.executable).replace("MODULES", "|".join(MODULES)), end="")
 
 
 def complete(argv: Sequence[str]) -> int:
     """What may stand at the end of a command line, one a line."""
     line = argv[0] if argv else ""
-    words = re.sub(r"^\s*\S*python\S*\s+-m\s+factory\b|^\s*\S+", "", line, count=1).split()
+    program, *words = re.sub(r"^\s*\S*python\S*\s+-m\s+|^\s*(\S*/)?", "", line, count=1).split() or [""]
     last = words.pop() if words and not line[-1:].isspace() else ""
-    print("\n".join(sorted(found for found in candidates(words, last) if found.startswith(last))))
+    door, *first = program.split(".")
+    if first:  # python -m factory.run
+        words = ["run" if door == "factory" else "drive", *words]
+    print("\n".join(sorted(found for found in candidates(words, last, door) if found.startswith(last))))
     return 0
 
 
-def candidates(words: Sequence[str], last: str) -> Iterable[str]:
+def candidates(words: Sequence[str], last: str, door: str = "factory") -> Iterable[str]:
     """Whole words that may follow `words`, the last of them begun as `last`."""
+    commands = DOORS.get(door, COMMANDS)
     if not words:
-        return COMMANDS
+        return commands
     name, *given = words
-    if name not in COMMANDS:
+    if name not in commands:
         return ()
-    shape = getattr(COMMANDS[name].imported(), "Request", None)  # run and plan have none: settings alone
+    module = commands[name].imported()
+    shape = getattr(module, "Request", None)
     known: dict[str, list[str]] = {}
-    if shape is None or given_as(shape, RUN):
-        known |= settings_of(given)
-    if shape is not None:
+    if shape is None:
+        known = settings_of(given, module.main)
+    else:
+        known |= settings_of(given) if given_as(shape, RUN) else {}
         known |= {key: choices_of(kind) for key, kind in keys_of(shape).items()}
         if (words := given_as(shape, WORD)) and not given and known[words[0]]:
             return known[words[0]]
@@ -105,15 +115,15 @@ def candidates(words: Sequence[str], last: str) -> Iterable[str]:
     return [f"{key}=" for key in known if key not in taken]
 
 
-def settings_of(given: Sequence[str]) -> dict[str, list[str]]:
-    """Setting -> its choices where they are few: groups, the run's keys, the chosen reader's, the experts'."""
-    folder = conf_dir()
-    chosen = dict(re.findall(r"^  - (\w+): (\w+)$", (folder / "run.yaml").read_text(encoding="utf-8"), re.M))
-    chosen.update({key: value for key, _, value in (word.partition("=") for word in given) if key in chosen})
-    typed = dict(settings_in(RunConfig))
-    for name, target in built_in_classes("expert").items():
+def settings_of(given: Sequence[str], command: ComposedCommand = run) -> dict[str, list[str]]:
+    """Setting -> its choices where they are few: groups, the command's keys, the chosen reader's, the experts'."""
+    folder, groups = conf_dir(), groups_of(command.conf)
+    chosen = groups | {key: value for key, _, value in (word.partition("=") for word in given) if key in groups}
+    typed = dict(settings_in(command.shape))
+    for name, target in built_in_classes("expert").items() if "expert" in typed else ():
         typed |= dict(settings_in(EXPERTS[target], f"expert.{name}.")) if target in EXPERTS else {}
-    reader = reader_of(chosen["clips"])
+    reader = reader_of(chosen.get("clips", ""))
     typed |= {} if reader is None else dict(settings_in(reader, "clips."))
     found = {key: choices_of(hint) for key, hint in typed.items() if key != "expert" and dataclass_in(hint) is None}
-    return found | {group: choices(group, [folder]) for group in chosen} | {"experts": choices("expert", [folder])}
+    found |= {word: choices(word.partition("@")[0], [folder]) for word in groups}
+    return found | ({"experts": choices("expert", [folder])} if "experts" in typed else {})

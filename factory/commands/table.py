@@ -8,7 +8,7 @@ from importlib import import_module
 from types import ModuleType
 
 from factory import __version__
-from factory.config.arguments import answer, keys_of
+from factory.config.arguments import ComposedCommand, answer
 from factory.config.words import nearest
 from factory.exits import BAD_CONFIG
 
@@ -18,8 +18,7 @@ class Command:
     """One word behind `python -m factory` or `python -m planners`."""
 
     about: str
-    module: str  # a Request and what answers it, or `main` for a command that reads its arguments itself, as a run does
-    function: str = "main"  # the latter's name
+    module: str  # as factory.config.arguments has it
 
     def imported(self) -> ModuleType:
         """The file of the command."""
@@ -28,23 +27,8 @@ class Command:
     def load(self) -> Callable[[Sequence[str]], int]:
         """What answers: arguments -> exit code."""
         module = self.imported()
-        found: Callable[[Sequence[str]], int] = getattr(module, self.function)
-        return partial(_answered, module) if hasattr(module, "Request") else found
-
-
-def _answered(module: ModuleType, argv: Sequence[str]) -> int:
-    """As `answer`; where no file may be written or the disk is full, a line that says where, and exit code 2."""
-    try:
-        return answer(module, argv)
-    except Exception as error:
-        from factory.store.disk import why_not_written
-
-        why = why_not_written(error)
-        if not why:
-            raise
-        elsewhere = ", or give to=<another place>" if "to" in keys_of(module.Request) else ""
-        print(f"error: {why}{elsewhere}", file=sys.stderr)
-        return BAD_CONFIG
+        composed: ComposedCommand = module.main
+        return partial(answer, module) if hasattr(module, "Request") else composed
 
 
 COMMANDS: Mapping[str, Command] = {
@@ -79,7 +63,6 @@ PLANNERS: Mapping[str, Command] = {
     "submit": Command("plans of a NAVSIM split as its leaderboard takes them", "planners.navsim.submit"),
     "drive": Command("planners in closed loop, until something ends the drive", "planners.drive.drive"),
     "replay": Command("a planner on one clip as a film", "planners.evaluation.replay"),
-    "ensemble": Command("several GTRS-Dense models as one", "planners.evaluation.ensemble"),
 }
 DOORS = {"factory": COMMANDS, "planners": PLANNERS}  # package -> what `python -m <package>` knows
 

@@ -1,15 +1,21 @@
-"""The arguments of a command: one parser, from `key=value` and plain words to a typed dataclass of its own."""
+"""What the commands of `factory` and `planners` do alike: arguments, help, and one line for what ends them.
+
+A command is a module: its docstring says what it does, `main` does it. Its keys are a dataclass: `Request`, read here
+from `key=value` and plain words, or the settings that Hydra composes from a file of conf/, where `main` is a `command`.
+"""
 
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING, fields
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
+from factory.config.compose import conf_dir
+from factory.config.plugins import choices
 from factory.config.shapes import choices_of, defaults_of, described, plain, to_give
-from factory.config.words import SHOW, ConfigError, SettingsShown, at_home, nearest, without_show
-from factory.exits import BAD_CONFIG
+from factory.config.words import SEVERAL, SHOW, ConfigError, SettingsShown, at_home, nearest, without_show
+from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, Failed, Stopped
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -18,28 +24,131 @@ if TYPE_CHECKING:
 WORD = {"given": "word"}
 RUN = {"given": "run"}  # it takes every argument that is no field: settings of the run
 SOME = {**RUN, "of": "some"}  # of them what is given alone: the others are recorded, or of no use here
+NOT_FITTING = (ValueError, OSError)  # what settings or files that do not fit raise, where no fault of a stage can
 Request = TypeVar("Request", bound="DataclassInstance")
+Does = Callable[[Sequence[str]], int | None]  # arguments -> exit code, none for 0
 
 
 class Refused(ValueError):
     """The request cannot be answered; the message says why."""
 
 
-def answer(command: ModuleType, argv: Sequence[str]) -> int:
-    """A whole command: its help, or `main` of its Request; the exit code, 0 where `main` returns none."""
+@dataclass(frozen=True)
+class ComposedCommand:
+    """A command whose settings Hydra composes: arguments -> exit code."""
+
+    does: Does
+    conf: str  # the name of its file in conf/
+    shape: type[Any]  # of its settings
+    refused: tuple[type[Exception], ...] = NOT_FITTING
+    resumes: bool = False  # what the machine ends, the same command goes on with
+
+    def __call__(self, argv: Sequence[str]) -> int:
+        """As `answered`."""
+        return answered(argv, self.does, self.help_text, refused=self.refused, resumes=self.resumes)
+
+    def help_text(self) -> str:
+        """What its module says, the choices of its groups, plug-ins among them, its keys with their defaults."""
+        text = (conf_dir() / f"{self.conf}.yaml").read_text(encoding="utf-8")
+        groups = [*groups_of(self.conf), *(["expert"] if "expert@" in text else [])]
+        listed = "\n".join(f"  {word}: {', '.join(choices(word.partition('@')[0], [conf_dir()]))}" for word in groups)
+        told = f"\nchoices; the keys of each: --cfg\n{listed}\n" if groups else ""
+        chosen = {word.rpartition("@")[2] for word in groups}
+        values = {**_values(self.shape), **dict(re.findall(r"^(\w+): (\S+)", text, re.M))}
+        keys = {key: value for key, value in values.items() if key not in chosen}
+        return help_of(f"{sys.modules[self.does.__module__].__doc__}{told}", keys, self.shape)
+
+
+def command(
+    conf: str, shape: type[Any], refused: tuple[type[Exception], ...] = NOT_FITTING, resumes: bool = False
+) -> Callable[[Does], ComposedCommand]:
+    """A function of a command line as a command; the arguments as of ComposedCommand."""
+    return lambda does: ComposedCommand(does, conf, shape, refused, resumes)
+
+
+def answer(module: ModuleType, argv: Sequence[str]) -> int:
+    """A command with a Request: its exit code."""
+    shape = module.Request
+    keys = {name: value for name, value in _values(shape).items() if name in keys_of(shape)}
+    return answered(
+        argv,
+        lambda words: module.main(parse(shape, words)),
+        lambda: help_of(module.__doc__ or "", keys, shape),
+        elsewhere=", or give to=<another place>" if "to" in keys else "",
+    )
+
+
+def answered(
+    argv: Sequence[str],
+    does: Does,
+    about: Callable[[], str],
+    refused: tuple[type[Exception], ...] = (),
+    resumes: bool = False,
+    elsewhere: str = "",
+) -> int:
+    """The exit code of what a command line asks for; its help; one line for what it cannot have.
+
+    refused: what else is the user's to mend; resumes: as of ComposedCommand; elsewhere: what helps where nothing can be
+    written. A fault of the program is raised.
+    """
     if {"-h", "--help"} & set(argv):
-        print(
-            f"{command.__doc__}\nExit codes: 0 done, 2 refused in one line that says why; all: docs/configuration.md."
-        )
-        return 0
+        print(about())
+        return COMPLETE
     try:
-        return command.main(parse(command.Request, argv)) or 0
+        if several := [word for word in argv if word.partition("=")[0] in SEVERAL]:
+            raise ConfigError(
+                f"{several[0].partition('=')[0]}: a run fills one folder, so several runs are several commands: "
+                "for n in 1 2; do python -m factory.run rounds=$n out=runs/rounds$n; done"
+            )
+        return does(argv) or COMPLETE
     except SettingsShown as settings:
         print(settings)
-        return 0
-    except (Refused, ConfigError, MemoryError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_CONFIG
+        return COMPLETE
+    except Exception as error:
+        code, line = _end_of(error, refused, resumes, elsewhere)
+        if code == COMPLETE:
+            raise
+        print(line, file=sys.stderr)
+        return code
+
+
+def _end_of(error: Exception, refused: tuple[type[Exception], ...], resumes: bool, elsewhere: str) -> tuple[int, str]:
+    """The exit code and the line that an exception ends a command with; COMPLETE for a fault of the program."""
+    from factory.store.disk import DiskFull, why_ill, why_not_written
+    from factory.wording import one_line
+
+    if isinstance(error, Stopped):
+        return INTERRUPTED, str(error)
+    if isinstance(error, Failed):
+        return COMPLETE_WITH_FAILURES, f"error: {error}"
+    if isinstance(error, (Refused, ConfigError, MemoryError, *refused)):
+        return BAD_CONFIG, f"error: {error}"
+    if resumes and isinstance(error, DiskFull):
+        return INTERRUPTED, f"error: {error}; free disk space and run the same command again"
+    if resumes and why_ill(error):
+        return INTERRUPTED, f"error: {one_line(error)}; run the same command again to go on"
+    if not resumes and (why := why_not_written(error)):
+        return BAD_CONFIG, f"error: {why}{elsewhere}"
+    return COMPLETE, ""
+
+
+def help_of(about: str, keys: Mapping[str, Any], shape: type[Any]) -> str:
+    """What a command does, its keys with their defaults and meanings, and its exit codes."""
+    ends = "Exit codes: 0 done, 2 refused in one line that says why; all: docs/configuration.md."
+    told = [] if "exit codes" in about.lower() else [f"\n{ends}"]
+    return "\n".join([about, "keys and defaults", *described(keys, shape, {}), *told])
+
+
+def groups_of(conf: str) -> dict[str, str]:
+    """Group of choices in conf/<conf>.yaml, as a command line names it -> what is chosen there."""
+    text = (conf_dir() / f"{conf}.yaml").read_text(encoding="utf-8")
+    return dict(re.findall(r"^  - (\w+(?:@\w+)?): (\w+)$", text, re.M))
+
+
+def _values(shape: type[Any]) -> dict[str, Any]:
+    """Every key with its default, ??? where it has none, in their order."""
+    known = {**to_give(shape), **defaults_of(shape)}
+    return {field.name: known[field.name] for field in fields(shape)}
 
 
 def parse(shape: type[Request], argv: Sequence[str]) -> Request:
@@ -98,7 +207,7 @@ def given_as(shape: type["DataclassInstance"], how: Mapping[str, str]) -> list[s
 def _shown(shape: type["DataclassInstance"], given: Mapping[str, Any]) -> Iterator[str]:
     """The keys of a request as YAML, and behind them the settings of the run that it takes."""
     own = keys_of(shape)
-    values = {**to_give(shape), **defaults_of(shape), **{name: plain(value) for name, value in given.items()}}
+    values = {**_values(shape), **{name: plain(value) for name, value in given.items()}}
     yield from described({name: values[name] for name in own}, shape, {})
     for name in given_as(shape, RUN):
         groups = {re.split("[=.@]", word.lstrip("+"))[0] for word in given[name]}

@@ -78,11 +78,6 @@ def asked_of(words: Sequence[str]) -> Asked:
             if not value or not folder.is_dir():
                 raise ConfigError(f"{option} {value}: there is no such folder".replace("  ", " "))
             folders.append(folder.resolve())
-        elif option in SEVERAL:
-            raise ConfigError(
-                f"{option}: a run fills one folder, so several runs are several commands: "
-                "for n in 1 2; do python -m factory.run rounds=$n out=runs/rounds$n; done"
-            )
         elif word.startswith("-"):
             key = option.lstrip("-")
             if not equals:

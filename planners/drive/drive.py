@@ -24,7 +24,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from factory.config.arguments import command
 from factory.config.compose import ConfigError, need_run_extra
+from factory.exits import Failed, Stopped
 from factory.graph.each import WorkerDied, each
 from factory.graph.progress import Counter
 from factory.graph.work import Halted
@@ -33,7 +35,6 @@ from factory.setup.settings import choose_vocabulary, open_reader
 from factory.store.disk import why_unusable
 from factory.store.location import Location
 from factory.store.table import AnotherWriter, KeyedTable
-from planners.command import Failed, Stopped, command
 from planners.drive.drivers import driver_of
 from planners.drive.settings import DriveSettings, Pictures, settings_of
 from planners.drive.starts import LOGGED
@@ -161,7 +162,8 @@ def _drive(work: DriveWork, items: Sequence[DriveItem], table: KeyedTable) -> li
     return failed
 
 
-def drive_command(argv: Sequence[str]) -> None:
+@command("drive", DriveSettings)
+def main(argv: Sequence[str]) -> None:
     """Drive and print what a command line asks for. Raises ConfigError, Failed, Stopped."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     settings = settings_of(argv)
@@ -183,6 +185,3 @@ def local_folder(out: str) -> Path | None:
     """Where tables of numbers go; None on an object store, whose table of drives says all."""
     place = Location.parse(out)
     return Path(place.uri) if place.is_local else None
-
-
-main = command(drive_command)

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from factory.config.arguments import command
 from factory.config.compose import ConfigError, compose, fill
-from planners.command import command
 from planners.evaluation import navsim
 from planners.evaluation.aggregation import ClipResult, Measured, by_clip, check_same_clips, measured
 from planners.evaluation.bootstrap import LEVELS, Interval, clusters_of, paired_interval
@@ -170,7 +170,7 @@ def check_same_rules(folders: Sequence[str]) -> None:
                 raise ConfigError(f"{folders[0]} and {folder} differ in their {what}: evaluate both the same way")
 
 
-@command
+@command("compare", CompareSettings)
 def main(argv: Sequence[str]) -> None:
     """The command."""
     settings = fill(CompareSettings, compose("compare", argv, CompareSettings), "compare")

@@ -34,10 +34,10 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from factory.config.arguments import command
 from factory.config.compose import ConfigError, fill
 from factory.config.shapes import plain
 from factory.graph.progress import Counter
-from planners.command import command
 from planners.evaluation.aggregation import SummaryLine, lines_of, summarise
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.frames import Benchmark, FrameKey
@@ -238,7 +238,8 @@ def _folder(settings: EvaluateSettings) -> str:
     return settings.benchmark
 
 
-def evaluate_command(argv: Sequence[str]) -> None:
+@command("evaluate", EvaluateSettings)
+def main(argv: Sequence[str]) -> None:
     """The command. Raises as `evaluated`."""
     evaluated(settings_of(argv))
 
@@ -256,6 +257,3 @@ def evaluated(settings: EvaluateSettings) -> None:
     print("".join(fallback_notes(lines)), end="")
     if settings.tables:
         print(f"look at {Path(settings.out) / 'summary.png'}")
-
-
-main = command(evaluate_command)

@@ -30,13 +30,12 @@ from factory.config.compose import ConfigError
 from factory.datasets.navsim.filters import Selection, read_selection
 from factory.datasets.navsim.navhard import NavsimFolders, import_navhard
 from factory.datasets.navsim.navtest import import_navtest
-from factory.exits import INTERRUPTED
+from factory.exits import INTERRUPTED, Stopped
 from factory.files import matching
 from factory.stages.benchmark import BENCHMARK_FILE
 from factory.store.disk import why_unusable
 from factory.store.location import Location
 from factory.store.samples import Store
-from planners.command import Stopped
 from planners.evaluation.aggregation import HumanFilter, Measured, Summary, by_clip, summary_of
 from planners.evaluation.bootstrap import Interval
 from planners.evaluation.frames import FrameKey

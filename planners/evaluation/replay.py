@@ -12,11 +12,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from factory.config.arguments import command
 from factory.config.compose import ConfigError, fill
 from factory.store.reader import Sample, decoded
 from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, DrawnPath, draw_bev, map_shapes, write_mp4
 from factory.views.sample_picture import earlier_images, fitted, front_camera
-from planners.command import command
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.evaluate import check_needs
 from planners.evaluation.frames import Benchmark, FrameKey, Pair
@@ -178,7 +178,7 @@ def settings_of(argv: Sequence[str]) -> ReplaySettings:
     return fill(ReplaySettings, composed("replay", argv, ReplaySettings), "replay")
 
 
-@command
+@command("replay", ReplaySettings)
 def main(argv: Sequence[str]) -> None:
     """The command."""
     settings = settings_of(argv)

@@ -21,9 +21,9 @@ from typing import Any
 
 from torch import Tensor
 
+from factory.config.arguments import command
 from factory.config.compose import ConfigError, compose, fill
 from factory.config.words import SHOW, without_show
-from planners.command import command
 from planners.models.gtrs_dense import GtrsDenseSettings, inference_arrays
 from planners.models.planner import Planner, PlannerChoice, build_planner, settings_of
 from planners.published.weights import FAMILIES, Moves, read_public
@@ -42,7 +42,7 @@ class ImportConfig:
     out: str  # folder; it may not hold a training
 
 
-@command
+@command("import_planner", ImportConfig)
 def main(argv: Sequence[str]) -> None:
     """The command."""
     import_to(config_of(argv))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from planners.command import Failed, Stopped
+from factory.exits import Failed, Stopped
 from planners.drive.drive import drive_all, driven
 from planners.drive.settings import DriveSettings, settings_of
 from planners.drive.summary import M_PER_KM, SHARES, highest_level, start_of

@@ -13,8 +13,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from factory.exits import Failed, Stopped
 from factory.graph.progress import Counter
-from planners.command import Failed, Stopped
 from planners.evaluation.aggregation import BOUNDS, PAPER, HumanFilter
 from planners.evaluation.planner_names import planner_of
 from planners.evaluation.score_rows import RECORD

@@ -17,9 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from factory.exits import asked_to_stop
+from factory.exits import Stopped, asked_to_stop
 from factory.graph.progress import Counter
-from planners.command import Stopped
 from planners.data.batch import Batch
 from planners.models.planner import Planner
 from planners.training.checkpoint import Keep, best, load_training, load_weights, read_record, save_checkpoint

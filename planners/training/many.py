@@ -18,9 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TextIO
 
-from factory.exits import INTERRUPTED, asked_to_stop
+from factory.exits import INTERRUPTED, Failed, Stopped, asked_to_stop
 from factory.graph.progress import Counter
-from planners.command import Failed, Stopped
 
 TRAININGS, DONE, LOG = "trainings", "sweep.json", "train.log"
 LOOK_EVERY_S = 0.5

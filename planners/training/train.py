@@ -24,9 +24,9 @@ from typing import Any, Literal
 import cv2
 import torch
 
+from factory.config.arguments import command
 from factory.config.compose import ConfigError, compose, fill
 from factory.config.shapes import GIVE, merged, plain
-from planners.command import command
 from planners.data.index import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings, fitting_batch
@@ -135,7 +135,7 @@ class TrainConfig:
         return self.planner.training
 
 
-@command
+@command("train", TrainConfig)
 def main(argv: Sequence[str]) -> None:
     """The command."""
     config = fill(TrainConfig, compose("train", argv, TrainConfig, _with_planner_settings, _shapes_of), "train")

@@ -1,14 +1,14 @@
 """What all commands do alike: help, exit codes, one line for what is wrong."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from factory.commands.table import PLANNERS
+from factory.config.arguments import command
 from factory.config.compose import ConfigError, compose
-from factory.exits import BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED
-from planners.command import Failed, Stopped, command, help_of
+from factory.exits import BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED, Failed, Stopped
 from planners.drive.settings import DriveSettings
 from planners.evaluation.compare import CompareSettings
 from planners.evaluation.evaluate import EvaluateSettings
@@ -31,7 +31,7 @@ from tests.factory.text_keys import held, text_keys
 def test_what_is_raised_is_one_line_and_an_exit_code(
     raised: Exception, code: int, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    @command
+    @command("compare", CompareSettings)
     def main(argv: Sequence[str]) -> None:
         raise raised
 
@@ -75,7 +75,7 @@ def test_a_planner_of_the_home_folder_is_evaluated_alone_and_in_an_ensemble(
 
 
 def test_a_fault_of_the_program_is_not_hidden() -> None:
-    @command
+    @command("compare", CompareSettings)
     def main(argv: Sequence[str]) -> None:
         raise ZeroDivisionError
 
@@ -83,28 +83,25 @@ def test_a_fault_of_the_program_is_not_hidden() -> None:
         main([])
 
 
-def test_help_answers_without_running(capsys: pytest.CaptureFixture[str]) -> None:
-    @command
+def test_help_answers_without_running_and_tells_every_key(capsys: pytest.CaptureFixture[str]) -> None:
+    @command("compare", CompareSettings)
     def main(argv: Sequence[str]) -> None:
         raise AssertionError(argv)
 
     assert main(["--help", "x=1"]) == 0
-    assert capsys.readouterr().out.startswith("What all commands do alike")
-
-
-@dataclass(frozen=True)
-class Held(CompareSettings):
-    """What `compare` takes, and one key more."""
-
-    drawn: bool = False  # as a picture too
-
-
-def test_help_tells_every_key_with_its_value_and_its_meaning() -> None:
-    """Of the file of choices, of the dataclass, and of the dataclass that it builds on."""
-    told = help_of("planners.evaluation.compare", Held)
+    told = capsys.readouterr().out
+    assert told.startswith("What all commands do alike")
     for line in (
         "a: ???  # folder of an evaluated planner, table of NAVSIM's, or a list of them",
-        "drawn: false  # as a picture too",
+        "column: score  # or a sub-score: nc dac tlc ddc ep ttc lk hc ec",
         "out: null  # a CSV file",
     ):
-        assert f"\n{line}\n" in f"{told}\n"
+        assert f"\n{line}\n" in told
+
+
+def test_help_tells_the_choices_of_every_group_and_what_conf_gives(capsys: pytest.CaptureFixture[str]) -> None:
+    assert PLANNERS["train"].load()(["--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "  mix: half, natural, rewards_only" in lines
+    assert any(line.startswith('out: "runs/train/${planner.name}"  # ') for line in lines)
+    assert not any(line.startswith(("mix:", "planner:")) for line in lines)

@@ -321,6 +321,43 @@ def test_completion_knows_commands_keys_groups_and_choices() -> None:
     assert not list(candidates(["nothing"], ""))
 
 
+def test_completion_knows_those_of_planners_too() -> None:
+    assert set(candidates([], "", "planners")) == set(PLANNERS)
+    assert set(candidates(["train"], "mix=", "planners")) == {"mix=half", "mix=natural", "mix=rewards_only"}
+    assert {"data.real=", "planner=", "resume="} <= set(candidates(["train"], "", "planners"))
+    assert "clips.root=" in candidates(["drive", "clips=av2"], "", "planners")
+    assert "traffic@two_stage_traffic=idm" in candidates(["evaluate"], "traffic@two_stage_traffic=", "planners")
+    assert "planner=ltf" not in candidates(["evaluate"], "planner=", "planners")
+    assert {"split=", "fine="} <= set(candidates(["submit"], "", "planners"))
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        ("planners comp", ["compare"]),
+        ("/venv/bin/planners sub", ["submit"]),
+        ("python -m planners compare conf", ["confidence="]),
+        ("python3 -m planners.drive executor=", ["executor=local", "executor=ray"]),
+        ("python -m factory.run on_change=k", ["on_change=keep"]),
+    ],
+)
+def test_every_way_to_begin_a_command_is_completed(
+    line: str, found: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["complete", line]) == 0
+    assert capsys.readouterr().out.split() == found
+
+
+@pytest.mark.parametrize("package", DOORS)
+def test_no_command_does_several_runs_at_once(package: str, capsys: pytest.CaptureFixture[str]) -> None:
+    door = {"factory": main, "planners": planners_main}[package]
+    for name in DOORS[package]:
+        assert door([name, "--multirun", "x=1,2"]) == 2
+        assert capsys.readouterr().err.startswith("error: --multirun: a run fills one folder, so several runs are"), (
+            name
+        )
+
+
 def test_every_key_that_is_completed_is_one_the_run_takes() -> None:
     from factory.config.run import composed_run
 
@@ -344,10 +381,11 @@ def test_bash_completes_the_end_of_the_line(tmp_path: Path) -> None:
         'asked() { COMP_LINE=$1 COMP_POINT=${#1}; COMPREPLY=(); $2 2>/dev/null; echo "${COMPREPLY[*]}"; }\n'
         "asked 'factory sta' _factory_complete\nasked 'python -m factory run executor=l' _factory_python\n"
         "asked 'factory run clips=sc' _factory_complete\nasked 'python setup.py ' _factory_python\n"
+        "asked 'python -m factory.run preset=de' _factory_python\nasked 'planners eva' _factory_complete\n"
     )
     env = os.environ | {"PYTHONPATH": str(REPOSITORY)}
     done = subprocess.run(["bash", str(script)], env=env, capture_output=True, text=True)
-    assert done.stdout.splitlines() == ["status", "local", "scenarionet", ""], done.stderr
+    assert done.stdout.splitlines() == ["status", "local", "scenarionet", "", "demo", "evaluate"], done.stderr
 
 
 @pytest.mark.skipif(shutil.which("zsh") is None, reason="there is no zsh")

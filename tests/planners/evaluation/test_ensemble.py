@@ -5,11 +5,9 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 
 from factory.config.compose import ConfigError
 from planners.data.batch import ImageLayout
-from planners.evaluation.ensemble import main
 from planners.evaluation.planner_names import planner_of
 from planners.models.gtrs_dense import Ensemble, mean_scores
 from planners.training.checkpoint import load_planner, save_checkpoint
@@ -66,16 +64,3 @@ def test_an_ensemble_of_planners_without_scores_is_refused(tmp_path: Path) -> No
     save_checkpoint(tmp_path / "toy", 1, Toy(ToySettings(), {}), {}, {"version": 1})
     with pytest.raises(ConfigError, match=r"averages the scores of gtrs_dense models, not .*toy"):
         planner_of(f"{saved(tmp_path / 'a', 0)}+{tmp_path / 'toy'}").load()
-
-
-def test_the_command_shows_the_models_beside_the_settings_of_the_evaluation(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert main(["models=[a,b]", "--cfg", "device=cuda"]) == 0
-    shown = yaml.safe_load(capsys.readouterr().out)
-    assert (shown["models"], shown["device"], shown["benchmark"]) == (["a", "b"], "cuda", "???")
-
-
-def test_the_command_needs_two_models(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["models=[a]", "benchmark=b"]) == 2
-    assert "two at least" in capsys.readouterr().err

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from planners.command import Stopped
+from factory.exits import Stopped
 from planners.evaluation.aggregation import by_clip, scores_of_clips
 from planners.evaluation.evaluate import EvaluateSettings, evaluate
 from planners.evaluation.planner_names import planner_of

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from planners.command import Stopped
+from factory.exits import Stopped
 from planners.training.checkpoint import load_planner, load_training, newest
 from planners.training.fit import Loop, fit
 from planners.training.optim import RAW, Averaged, TrainingSettings

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from factory.config.compose import ConfigError
-from planners.command import Stopped
+from factory.exits import Stopped
 from planners.data.batch import Batch
 from planners.models.planner import PlannerChoice, build_planner
 from planners.training.checkpoint import (

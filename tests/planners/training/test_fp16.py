@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from planners.command import Stopped
+from factory.exits import Stopped
 from planners.data.batch import Batch
 from planners.models.planner import Planner
 from planners.training.checkpoint import load_training, newest

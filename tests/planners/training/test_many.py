@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.exits import INTERRUPTED
-from planners.command import Failed, Stopped
+from factory.exits import INTERRUPTED, Failed, Stopped
 from planners.training.checkpoint import read_record
 from planners.training.many import LOG, Means, Training, folder_of, is_done, train_all, train_one
 from tests.planners.training.test_train import command, table
