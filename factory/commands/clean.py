@@ -24,7 +24,7 @@ class Request:
     """The command line."""
 
     out: str
-    older_than: str = "1d"
+    older_than: str = "1d"  # days, hours or minutes, as 7d, 12h, 30min: what is younger stays
     say: bool = False  # and remove nothing
 
     def __post_init__(self) -> None:

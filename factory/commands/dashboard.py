@@ -26,8 +26,8 @@ class Request:
     """The command line."""
 
     out: str
-    port: int = PORT
-    host: str = "127.0.0.1"
+    port: int = PORT  # 0: any free one
+    host: str = "127.0.0.1"  # 0.0.0.0: for others too
     wait: bool = False  # until there is a run
 
     def __post_init__(self) -> None:

@@ -18,7 +18,7 @@ class Request:
     """The command line."""
 
     out: str
-    to: str | None = None
+    to: str | None = None  # another file; null: in the run's folder, with the card
 
 
 def main(request: Request) -> None:

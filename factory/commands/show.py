@@ -38,9 +38,9 @@ class Request:
 
     out: str
     sample: str | None = field(default=None, metadata=WORD)  # attempt_id, its beginning, or an ordinal
-    list: bool = False
-    to: str | None = None
-    film: bool = False
+    list: bool = False  # the ids, one a line, and no sample
+    to: str | None = None  # folder or .png of the picture
+    film: bool = False  # beside the picture
     vocabulary: str | None = None  # .npy that the labels are of; without it the kinematic one, where they are of that
 
     def __post_init__(self) -> None:

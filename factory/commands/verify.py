@@ -28,7 +28,7 @@ class Request:
     """The command line."""
 
     out: str = field(metadata=WORD)
-    repair: bool = False
+    repair: bool = False  # what can be
 
 
 def main(request: Request) -> int:

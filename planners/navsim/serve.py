@@ -2,11 +2,6 @@
 
 planners.navsim.agent.FactoryAgent asks on standard input and reads the plans on standard output.
 Nobody starts it by hand; what it prints goes to standard error.
-
-planner=     a training's folder, a+b, constant_velocity, or my.module:MyPlanner; it looks at pictures and status alone
-device=      cpu or cuda
-cameras=     NAVSIM's cameras in the places of those it was trained on, left to right: [cam_l0,cam_f0,cam_r0]
-undistort=   true for a planner that was trained on pinhole pictures
 """
 
 import os
@@ -25,10 +20,10 @@ from planners.navsim.pilot import Pilot, seen_of
 class Request:
     """The command line."""
 
-    planner: str
-    device: str = "cpu"
-    cameras: tuple[str, ...] = ()
-    undistort: bool = False
+    planner: str  # a training's folder, a+b, constant_velocity, or my.module:MyPlanner; it reads pictures, status alone
+    device: str = "cpu"  # or cuda
+    cameras: tuple[str, ...] = ()  # NAVSIM's in the places of those it was trained on, left to right: [cam_l0,cam_f0]
+    undistort: bool = False  # for a planner that was trained on pinhole pictures
 
 
 def main(request: Request) -> None:

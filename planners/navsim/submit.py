@@ -7,16 +7,6 @@
 Every scene of the split is planned from what NAVSIM shows an agent, and the file is what its own script
 run_create_submission_pickle.py writes with our agent. NAVSIM is not needed. A file is whole or is not there: where one
 scene cannot be planned, the error names it and nothing is written.
-
-planner=     a training's folder, a+b, constant_velocity, or my.module:MyPlanner; it looks at pictures and status alone
-split=       a split or scene filter, the path of its .yaml: one stage (navtest) or two (navhard_two_stage)
-logs=        navsim_logs/<split>
-sensors=     sensor_blobs/<split>, for a planner that looks at pictures
-root=        synthetic_scene_pickles and sensor_blobs of a second stage
-out=         the file; the leaderboard wants it to be called submission.pkl
-team_name=, authors=, email=, institution=, country=     as the leaderboard's form has them
-fine=        true: 40 poses 0.1 s apart; without it 8 poses 0.5 s apart
-device=, cameras=, undistort=     as the agent takes them (docs/training.md)
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -266,19 +256,19 @@ N_POSES, N_FINE_POSES = 8, 40
 class Request:
     """The command line."""
 
-    planner: str
-    split: str
-    logs: str
-    team_name: str
+    planner: str  # a training's folder, a+b, constant_velocity, or my.module:MyPlanner; it reads pictures, status alone
+    split: str  # a split or scene filter, the path of its .yaml: one stage (navtest) or two (navhard_two_stage)
+    logs: str  # navsim_logs/<split>
+    team_name: str  # this and the next four: as the leaderboard's form has them
     authors: str
     email: str
     institution: str
     country: str
-    sensors: str | None = None
-    root: str | None = None
-    out: str = "submission.pkl"
-    fine: bool = False
-    device: str = "cpu"
+    sensors: str | None = None  # sensor_blobs/<split>, for a planner that looks at pictures
+    root: str | None = None  # synthetic_scene_pickles and sensor_blobs of a second stage
+    out: str = "submission.pkl"  # the file; the leaderboard wants it to be called so
+    fine: bool = False  # true: 40 poses 0.1 s apart, else 8 poses 0.5 s apart
+    device: str = "cpu"  # as the agent takes it, cameras and undistort too: docs/training.md
     cameras: tuple[str, ...] = ()
     undistort: bool = False
 
