@@ -38,13 +38,13 @@ ROOMS = {
         *("render.settings", "render.splatting", "render.scene", "render.rig", "render.fit", "render"),
     ),
     "factory": (
-        *("exits", "wording", "job", "files", "locks"),
+        *("exits", "wording", "job", "files", "locks", "store.disk"),
         *("readers.settings", "readers.town.settings", "config", "readers", "store"),
         *("graph", "datasets", "stages", "pipeline", "setup", "datasets.navsim", "views", "views.board"),
         *("run", "commands", "__main__"),
     ),
     "planners": (
-        *("command", "data", "models", "training", "published"),
+        *("data", "models", "training", "published"),
         *("evaluation", "drive", "traffic", "navsim", "study", "__main__"),
     ),
 }
