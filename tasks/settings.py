@@ -1,10 +1,27 @@
 """What candidates and experts' drives must come up to. Light: importing it loads no numpy."""
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import Field, dataclass, field, fields
+from typing import Any, Literal, TypeVar
 
 from tasks.subscores import JUDGED
+
+T = TypeVar("T")
+FIXED = "fixed"  # in the metadata of a field
+
+
+def fixed(value: T) -> T:
+    """The default of a field that no configuration sets: a constant with its reason behind it, recorded with the rest.
+
+    Code that makes the settings itself, such as a test or a bench, may give another value.
+    """
+    constant: Any = field(default=value, metadata={FIXED: True})
+    return constant
+
+
+def offered(shape: type[Any]) -> list[Field[Any]]:
+    """The fields of a dataclass of settings that configuration may set."""
+    return [each for each in fields(shape) if FIXED not in each.metadata]
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,12 @@ import json
 import re
 import tokenize
 from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, Field, asdict, fields, is_dataclass
+from dataclasses import MISSING, Field, is_dataclass
 from enum import Enum
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from tasks.settings import offered
 
 SWITCH = ("false", "true")
 GIVE = "???"  # as Hydra has it: a value that must be given
@@ -27,9 +29,9 @@ def dataclass_in(hint: Any) -> type[Any] | None:
 
 
 def keys_of(shape: type[Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every key with dots, groups before what is in them, and its type."""
+    """Every key with dots that may be set, groups before what is in them, and its type."""
     hints = get_type_hints(shape)
-    for field in fields(shape):
+    for field in offered(shape):
         yield f"{prefix}{field.name}", hints[field.name]
         inner = dataclass_in(hints[field.name])
         if inner is not None:
@@ -49,12 +51,12 @@ def choices_of(hint: Any) -> list[str]:
 
 def defaults_of(shape: type[Any]) -> dict[str, Any]:
     """Key -> default of every field that has one, as YAML would hold it."""
-    return {field.name: plain(_default(field)) for field in fields(shape) if _default(field) is not MISSING}
+    return {field.name: plain(_default(field)) for field in offered(shape) if _default(field) is not MISSING}
 
 
 def to_give(shape: type[Any]) -> dict[str, Any]:
     """Key -> ??? of every field that has no default."""
-    return {field.name: GIVE for field in fields(shape) if _default(field) is MISSING}
+    return {field.name: GIVE for field in offered(shape) if _default(field) is MISSING}
 
 
 def _default(field: Field[Any]) -> Any:
@@ -62,9 +64,9 @@ def _default(field: Field[Any]) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Dataclasses as mappings, tuples as lists, enums as text."""
+    """Dataclasses as mappings of what they offer, tuples as lists, enums as text."""
     if is_dataclass(value) and not isinstance(value, type):
-        return plain(asdict(value))
+        return {field.name: plain(getattr(value, field.name)) for field in offered(type(value))}
     if isinstance(value, Mapping):
         return {key: plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):

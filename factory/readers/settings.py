@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
+from tasks.settings import fixed
+
 STEPS_PER_S = 10  # of clips
 Split = Literal["train", "val", "test"]
 
@@ -165,7 +167,7 @@ class TownSettings:
     cameras: tuple[str, ...] = ("ring_front_left", "ring_front_center", "ring_front_right")  # any of CAMERA_NAMES
     width: int = 320  # pixels
     height: int = 180  # pixels
-    jpeg_quality: int = 92  # 1 to 100
+    jpeg_quality: int = fixed(92)  # 1 to 100
     steps_per_photo: int = 5  # of 0.1 s: 5 is 2 Hz, as fast as samples want them; 1 is 10 Hz, for scenes to learn from
     photo_steps: int = LOG_STEPS  # of a log, from its first, that are photographed; the three windows' histories are 36
     lidar_beams: int = 64  # 0: no lidar

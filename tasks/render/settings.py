@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
 
+from tasks.settings import fixed
+
 # How a scene is built, and what draws it.
 
 
@@ -37,6 +39,9 @@ class AssetSettings:
     stereo_photos: int = 4  # neighbours compared where lidar does not reach
 
 
+DISCS = AssetSettings()  # every block's: a user chooses between discs and fit, not how discs are built
+
+
 # Whether a rig's calibration is corrected before its photos are used, and how far it and the poses are believed.
 
 
@@ -48,20 +53,23 @@ class Adjust(StrEnum):
 
 @dataclass(frozen=True)
 class RigSettings:
-    """Sigmas are what calibration and poses are expected to be off by; 0 holds a quantity fixed."""
+    """Sigmas are what calibration and poses are expected to be off by; 0 holds a quantity fixed.
+
+    One set for all rigs: a camera that photos say little of stays as given (docs/reconstruction.md, real rigs).
+    """
 
     adjust: Adjust = Adjust.AUTO
-    width: int = 960  # pixels of the photos that corners are looked for in, where they are larger
-    corners: int = 4000  # a photo, at most
-    partners: int = 3  # photos of each camera that a photo is matched with
-    turn_deg: float = 1.0  # of a camera on the ego
-    shift_m: float = 0.1
-    focal: float = 0.01  # share of the focal lengths
-    centre: float = 0.01  # of the principal point, as a share of the width
-    lens: float = 0.02  # of k1, k2, k3; of p1, p2 a tenth
-    stamp_s: float = 0.05  # of a camera's stamps against the ego's, where photos can tell
-    pose_turn_deg: float = 0.5  # of the ego, root mean square over the drive
-    pose_shift_m: float = 0.2
+    width: int = fixed(960)  # pixels of the photos that corners are looked for in, where they are larger
+    corners: int = fixed(4000)  # a photo, at most
+    partners: int = fixed(3)  # photos of each camera that a photo is matched with
+    turn_deg: float = fixed(1.0)  # of a camera on the ego
+    shift_m: float = fixed(0.1)
+    focal: float = fixed(0.01)  # share of the focal lengths
+    centre: float = fixed(0.01)  # of the principal point, as a share of the width
+    lens: float = fixed(0.02)  # of k1, k2, k3; of p1, p2 a tenth
+    stamp_s: float = fixed(0.05)  # of a camera's stamps against the ego's, where photos can tell
+    pose_turn_deg: float = fixed(0.5)  # of the ego, root mean square over the drive
+    pose_shift_m: float = fixed(0.2)
 
     def __post_init__(self) -> None:
         for name, least in (("width", 64), ("corners", 100), ("partners", 1)):
@@ -84,12 +92,13 @@ class RigSettings:
 class FitSettings:
     """Budgets are counts of iterations, one photo each; lengths in metres unless said otherwise.
 
-    The rates are about twice those of Kerbl et al. 2023, for budgets of some thousand iterations.
+    The rates are about twice those of Kerbl et al. 2023, for budgets of some thousand iterations. What is fixed was
+    chosen on real and synthetic streets (docs/reconstruction.md) and is the same for every block.
     """
 
     iterations: int = 8000  # in all
-    seed: int = 0  # of every draw
-    hold_out_every: int = 8  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
+    seed: int = fixed(0)  # of every draw
+    hold_out_every: int = fixed(8)  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
     # Where it starts.
     start_every: int = 1  # every n-th instant's photos say where surfaces are: less work where photos hardly differ
     start_gaussians: int = 200_000  # of the background
@@ -98,12 +107,12 @@ class FitSettings:
     most_gaussians: int = 250_000  # of a scene
     start_opacity: float = 0.5  # of every Gaussian
     stereo_photos: int = 4  # neighbours compared where lidar does not reach
-    sh_degree: int = 0  # 0 to 3
+    sh_degree: int = fixed(0)  # 0 to 3
     # Loss.
     ssim_weight: float = 0.1  # loss = (1 - w) L1 + w (1 - SSIM)
-    opaque_weight: float = 0.1  # of the mean light that passes where a photo looks at the ground
+    opaque_weight: float = fixed(0.1)  # of the mean light that passes where a photo looks at the ground
     # Step sizes of Adam; each falls exponentially to a share of itself.
-    rate_end: float = 0.3  # that share, but for mean_rate
+    rate_end: float = fixed(0.3)  # that share, but for mean_rate
     mean_rate: float = 1.6e-3  # times the nearest viewing depth
     quat_rate: float = 4e-3  # of rotations
     scale_rate: float = 2e-2  # of sizes
@@ -111,21 +120,21 @@ class FitSettings:
     colour_rate: float = 1.2e-2  # of colours
     sky_rate: float = 4e-3  # of the sky map
     exposure_rate: float = 1e-3  # 0: the cameras agree, nothing is aligned
-    turn_rate: float = 3e-4  # [rad] of the pose corrections
-    shift_rate: float = 1e-3  # [m]
+    turn_rate: float = fixed(3e-4)  # [rad] of the pose corrections
+    shift_rate: float = fixed(1e-3)  # [m]
     pose_from: int = 100  # iteration at which poses and boxes start to move
-    box_shift_rate: float = 2e-2  # [m] of where boxes are; 0: where they were logged
-    box_turn_rate: float = 2e-3  # [rad]
-    mean_rate_end: float = 0.15  # that of mean_rate
+    box_shift_rate: float = fixed(2e-2)  # [m] of where boxes are; 0: where they were logged
+    box_turn_rate: float = fixed(2e-3)  # [rad]
+    mean_rate_end: float = fixed(0.15)  # that of mean_rate
     # Shape: how often a Gaussian's longest side is its shortest, at most; 0: as often as it likes.
     stretch: float = 0.0  # of the background, but for the road
-    box_stretch: float = 2.0  # of what lies in boxes
+    box_stretch: float = fixed(2.0)  # of what lies in boxes
     # Density: relocation and growth of 3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024).
-    refine_every: int = 100  # iterations
-    refine_from: int = 300  # iteration
-    growth: float = 0.03  # share of Gaussians added each time
+    refine_every: int = fixed(100)  # iterations
+    refine_from: int = fixed(300)  # iteration
+    growth: float = fixed(0.03)  # share of Gaussians added each time
     # Road.
-    road: bool = True  # Gaussians of the road lie flat on what lidar knows of it
+    road: bool = fixed(True)  # Gaussians of the road lie flat on what lidar knows of it
 
     def __post_init__(self) -> None:
         for name in (
@@ -206,15 +215,19 @@ def _check(what: str, settings: object, bounds: Mapping[str, tuple[float, float]
 
 @dataclass(frozen=True)
 class GateSettings:
-    """What every picture must come up to. What the looks at vehicles catch and lose: docs/reconstruction.md."""
+    """What every picture must come up to. What the looks at vehicles catch and lose: docs/reconstruction.md.
+
+    The measures are fixed, since what a bound of theirs catches and loses was counted at these.
+    """
 
     enabled: bool = True  # whether pictures are looked at
-    width: int = 160  # pixels of the pictures that are looked at, where those to be stored are no smaller
-    reach_m: float = 30.0  # of the scene that is looked at
-    contrast_min: float = 0.02  # standard deviation of the grey picture in [0, 1]: five grey levels
+    width: int = fixed(160)  # pixels of the pictures that are looked at, where those to be stored are no smaller
+    reach_m: float = fixed(30.0)  # of the scene that is looked at
+    contrast_min: float = fixed(0.02)  # standard deviation of the grey picture in [0, 1]: five grey levels
     vehicle_min: float = 0.75  # likeness to its photos to be expected of a large vehicle; 0: no look at vehicles
-    beside_min: float = 0.75  # likeness that it must have beside a photo from near, place by place; 0: no such look
-    vehicle_share: float = 0.02  # of a picture, from which on a vehicle is large
+    # Likeness that it must have beside a photo from near, place by place; 0: no such look.
+    beside_min: float = fixed(0.75)
+    vehicle_share: float = fixed(0.02)  # of a picture, from which on a vehicle is large
 
     def __post_init__(self) -> None:
         shares = dict.fromkeys(("contrast_min", "vehicle_min", "beside_min", "vehicle_share"), (0.0, 1.0))
@@ -240,13 +253,14 @@ class RenderSettings:
         str, ...
     ] = ()  # files of weights: held-out photos are measured by LPIPS as well, which decides nothing
     gate: GateSettings = field(default_factory=GateSettings)  # what every rendered picture of a drive must come up to
-    lidar_only_reach_m: float = 15.0  # without photos: images only this close to where a sweep was taken; 0: none
+    # Without photos: images only this close to where a sweep was taken; 0: none.
+    lidar_only_reach_m: float = fixed(15.0)
     map_rig: Literal["front", "three_front", "ring_six"] = "three_front"  # for mode=map without a rig
     scene: SceneFrom = SceneFrom.FIT  # discs: built in one go, seconds a block; fit: then fitted to its photos, minutes
-    scene_dtype: SceneDtype = SceneDtype.FLOAT16  # of scenes' files; float16: all but the places of Gaussians
+    scene_dtype: SceneDtype = fixed(SceneDtype.FLOAT16)  # of scenes' files; float16: all but the places of Gaussians
     own_body: str = ""  # folder of masks, <camera>.png, of what the rig sees of the ego itself
     rig: RigSettings = field(default_factory=RigSettings)  # whether cameras and poses are corrected first
-    asset: AssetSettings = field(default_factory=AssetSettings)
+    asset: AssetSettings = fixed(DISCS)
     fit: FitSettings = field(default_factory=FitSettings)
 
     def __post_init__(self) -> None:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, fields
 from typing import Literal
 
+from tasks.settings import fixed
+
 MOST = 1000.0  # of any setting, and of speeds [m/s]: the length of paths grows with it
 
 
@@ -11,7 +13,8 @@ class TrafficSettings:
     """How the others move. IDM's parameters are the public benchmark's (docs/reward.md 5).
 
     `navsim` asks for the first five and the exponent; its other rules are the public code's own. `custom` asks for
-    those of the ways (target speed, comfortable deceleration), and the gap of who enters.
+    those of the ways (target speed, comfortable deceleration), and the gap of who enters. What is fixed is the shape
+    of the model, not a style of driving.
     """
 
     mode: Literal["idm", "replay", "navsim", "custom"] = "idm"  # navsim: the public code's; custom: a policy's
@@ -20,10 +23,10 @@ class TrafficSettings:
     headway_s: float = 1.5
     accel_max: float = 1.0  # m/s2
     decel_max: float = 2.0  # m/s2, comfortable
-    exponent: float = 4.0  # of the free-road term
-    emergency_decel: float = 8.0  # m/s2, what tyres can; the public traffic knows no limit
-    lookahead_m: float = 60.0
-    blend_length_m: float = 20.0  # over which a start beside the path fades onto it
+    exponent: float = fixed(4.0)  # of the free-road term
+    emergency_decel: float = fixed(8.0)  # m/s2, what tyres can; the public traffic knows no limit
+    lookahead_m: float = fixed(60.0)
+    blend_length_m: float = fixed(20.0)  # over which a start beside the path fades onto it
     yields: bool = True  # idm: drivers keep the intent of their log, and give way where paths cross or merge
     policy: str | None = None  # custom: a class, or function, that makes one: my_package.my_module:MyPolicy
 

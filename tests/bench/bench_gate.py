@@ -13,7 +13,7 @@ import csv
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import cv2
@@ -58,8 +58,9 @@ class Labelled:
 def labelled(seed: int, clips: int, most: int, every: int, share_min: float, out: Path) -> list[Labelled]:
     """Runs the seed's towns, writes the labels and the sheet."""
     overrides = [f"clips.seed={seed}", f"clips.n_clips={clips}", f"out={out}/town{seed}", "render.psnr_gate=mark"]
-    overrides.append(f"render.gate.vehicle_share={share_min}")
-    work = assemble(load_config(["preset=demo", *overrides])).work
+    config = load_config(["preset=demo", *overrides])
+    gate = replace(config.render.gate, vehicle_share=share_min)
+    work = assemble(replace(config, render=replace(config.render, gate=gate))).work
     settings, began = work.render.gate, time.perf_counter()
     rows: list[Labelled] = []
     worst: list[tuple[float, Shown]] = []

@@ -3,23 +3,25 @@
 import math
 from dataclasses import dataclass
 
+from tasks.settings import fixed
+
 
 @dataclass(frozen=True)
 class PdmSettings:
     """PDM-Closed as published with NAVSIM (docs/reward.md 4); raises ValueError where a value makes no sense.
 
     The three switches at the end are faults of the published planner, kept so that plans and progress compare with
-    everything published; False corrects each.
+    everything published; False corrects each. The fixed numbers are the published IDM's: another expert has others.
     """
 
     speed_fractions: tuple[float, ...] = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the lane's speed limit
     lateral_offsets_m: tuple[float, ...] = (0.0, -1.0, 1.0)  # + is to the left
-    fallback_speed_mps: float = 15.0  # where the lane has no speed limit
-    min_gap_m: float = 1.0
+    fallback_speed_mps: float = fixed(15.0)  # where the lane has no speed limit
+    min_gap_m: float = fixed(1.0)
     headway_s: float = 1.5
-    accel_max_mps2: float = 1.5
-    decel_max_mps2: float = 3.0
-    exponent: int = 10  # of IDM's free-road term
+    accel_max_mps2: float = fixed(1.5)
+    decel_max_mps2: float = fixed(3.0)
+    exponent: int = fixed(10)  # of IDM's free-road term
     shared_lead_memory: bool = True  # within one path, a speed inherits lead fields its own search did not write
     brakes_at_first_step: bool = True  # no lead is looked for before 0.2 s: until then one seems to stand at the bumper
     speed_below_zero: bool = True  # a stop before an oncoming car overshoots into creeping backwards

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from tasks.settings import fixed
+
 
 @dataclass(frozen=True)
 class FeasibleSettings:
@@ -32,5 +34,6 @@ class RecoverySettings:
     """How to retrieve and what to do with what was found."""
 
     smooth: bool = True  # False: the retrieved trajectory as it is, as published
-    weights: tuple[float, float, float, float, float, float] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)  # of the matching vector
-    feasible: FeasibleSettings = DEFAULTS  # of the smoothing
+    # Of the matching vector: vx, vy, heading now; x, y, heading at the end. The paper weighs none.
+    weights: tuple[float, float, float, float, float, float] = fixed((1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
+    feasible: FeasibleSettings = fixed(DEFAULTS)  # of the smoothing

@@ -27,7 +27,7 @@ from factory.setup.settings import (
 )
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
-from tasks.render.settings import RenderMode, RenderSettings
+from tasks.render.settings import RenderMode, RenderSettings, SceneDtype
 from tasks.rollout.simulate import TrafficSettings
 from tests.factory.data_folders import add_companions
 from tests.factory.text_keys import held, text_keys
@@ -62,6 +62,22 @@ def test_every_setting_has_a_default_and_a_meaning_and_is_shown_with_both() -> N
     assert yaml.safe_load("\n".join(shown)) == composed_run([])
     silent = [line for line in shown if "  # " not in line and not re.search(r"_target_|name: |kind: |^  \w+:$", line)]
     assert [line for line in silent if not re.search(r"_(m|mps|s|mps2|deg)\b", line)] == []
+
+
+def test_what_is_fixed_is_no_setting_and_stays_in_the_record() -> None:
+    assert RenderSettings().scene_dtype is SceneDtype.FLOAT16 and "scene_dtype" in dataclasses.asdict(RenderSettings())
+    for key in ("render.scene_dtype=float32", "render.asset.stereo_photos=2", "traffic.exponent=2"):
+        with pytest.raises(ConfigError, match="there is no such setting"):
+            load_config([key])
+    with pytest.raises(ConfigError, match="there is no such setting"):
+        fill(RenderSettings, {"rig": {"width": 640}}, "render")
+
+
+def test_a_plain_run_shows_at_most_120_keys() -> None:
+    with pytest.raises(SettingsShown) as settings:
+        composed_run(["--cfg"])
+    lines = str(settings.value).splitlines()
+    assert 100 < sum(bool(re.match(r" *[\w.]+: [^ #]", line)) for line in lines) <= 120
 
 
 def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
@@ -132,6 +148,7 @@ def test_a_plug_in_s_key_is_led_home_too_and_a_stranger_s_home_is_told(
 
 
 @pytest.mark.parametrize(
+        ("+render.fit.gap=3", "render.fit.gap"),
     ("name", "values"),
     [
         ("width", (0, 15, -320)),

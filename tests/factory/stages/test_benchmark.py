@@ -198,14 +198,14 @@ def test_a_pair_falls_together_at_the_pictures(tmp_path: Path) -> None:
     small += ["clips.settings.steps_per_photo=5"]
     render = ["render=auto", "render.frames=now", "render.width=64", "render.height=36", "render.scene=discs"]
     lenient = [*small, *render, "render.psnr_min=0", "render.gate.vehicle_min=0", "vocabulary.k=300"]
-    strict = assemble(load_config(overrides(tmp_path, *lenient, "render.gate.contrast_min=1.0", settings=SMALL))).work
+    drawn = assemble(load_config(overrides(tmp_path, *lenient, settings=SMALL))).work
+    strict = replace(drawn, render=replace(drawn.render, gate=replace(drawn.render.gate, contrast_min=1.0)))
     prepared = strict.prepare(strict.reader.index().refs[1])
     assert isinstance(prepared, PreparedClip) and prepared.candidates
     pair = [attempted(strict, prepared, 0, expert) for expert in ("follow_up", "follow_up_before")]
     assert all(isinstance(result, Dropped) and result.rejected.reason == "blank" for result in pair)
     assert pair[0].rejected == pair[1].rejected  # type: ignore[union-attr]
     assert "at step 50" in pair[0].rejected.detail  # type: ignore[union-attr]
-    drawn = assemble(load_config(overrides(tmp_path, *lenient, settings=SMALL))).work
     for expert, at in (("human_before", -1), ("follow_up", 0), ("follow_up_before", 0)):
         result = attempted(drawn, prepared, at, expert)
         assert isinstance(result, Columns)

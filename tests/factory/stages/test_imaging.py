@@ -82,7 +82,8 @@ def test_lidar_s_grey_pictures_are_drawn_only_where_every_one_is_near_a_sweep(tm
         shutil.rmtree(photos)
 
     def sample(reach_m: float) -> Columns:
-        work, prepared = prepared_by(reader.root, tmp_path, f"render.lidar_only_reach_m={reach_m}")
+        work, prepared = prepared_by(reader.root, tmp_path)
+        work = replace(work, render=replace(work.render, lidar_only_reach_m=reach_m))
         results = (attempted(work, prepared, row.index, "pdm_closed") for row in prepared.candidates)
         return next(result for result in results if isinstance(result, Columns))
 

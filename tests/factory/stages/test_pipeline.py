@@ -35,6 +35,14 @@ def work_on(root: Path, out: Path, *overrides: str) -> FactoryWork:
     return assemble(load_config(["clips=av2", f"clips.root={root}", f"out={out}", *SIZE, *overrides])).work
 
 
+def strict_on(root: Path, out: Path, *overrides: str, **gate: float) -> FactoryWork:
+    """With measures of the pictures' gate that no configuration offers."""
+    work = work_on(root, out, *overrides)
+    return dataclasses.replace(
+        work, render=dataclasses.replace(work.render, gate=dataclasses.replace(work.render.gate, **gate))
+    )
+
+
 def prepared_by(work: FactoryWork) -> PreparedClip:
     prepared = work.prepare(work.reader.index().refs[0])
     assert isinstance(prepared, PreparedClip)
@@ -68,7 +76,7 @@ def test_a_marked_block_keeps_its_candidates_and_tags_its_samples(small_town: Pa
 
 @pytest.mark.slow
 def test_a_drive_that_cannot_be_shown_is_dropped_and_the_human_s_is_not(small_town: Path, tmp_path: Path) -> None:
-    strict = work_on(small_town, tmp_path, "render.gate.contrast_min=1.0")
+    strict = strict_on(small_town, tmp_path, contrast_min=1.0)
     prepared = prepared_by(strict)
     results = [attempted(strict, prepared, row.index, "pdm_closed") for row in prepared.candidates]
     dropped = [result for result in results if isinstance(result, Dropped) and result.rejected.stage == "render"]
@@ -77,7 +85,7 @@ def test_a_drive_that_cannot_be_shown_is_dropped_and_the_human_s_is_not(small_to
     assert dropped[0].subscores["nc"] == 1.0  # the reward had accepted it
     assert isinstance(attempted(strict, prepared, HUMAN_CANDIDATE, HUMAN), Columns)
     for override in ("render.gate.enabled=false", "render=none", "render=map"):
-        lenient = work_on(small_town, tmp_path, "render.gate.contrast_min=1.0", override)
+        lenient = strict_on(small_town, tmp_path, override, contrast_min=1.0)
         assert isinstance(first_sample(lenient, prepared), Columns)
 
 
@@ -85,15 +93,14 @@ def test_a_drive_that_cannot_be_shown_is_dropped_and_the_human_s_is_not(small_to
 def test_a_drive_past_a_vehicle_unlike_its_photos_is_dropped_and_at_zero_it_is_not(
     small_town: Path, tmp_path: Path
 ) -> None:
-    small = "render.gate.vehicle_share=0.001"
     stored = {f"ring_front_center at step {step}" for step in (40, 45, 50, 55)}  # 1.5 s before T+H to T+H
-    strict = work_on(small_town, tmp_path, "render.gate.vehicle_min=1.0", small)
+    strict = strict_on(small_town, tmp_path, vehicle_min=1.0, vehicle_share=0.001)
     prepared = prepared_by(strict)
     found = [attempted(strict, prepared, row.index, "pdm_closed") for row in prepared.candidates]
     dropped = [result.rejected for result in found if isinstance(result, Dropped)]
     details = [rejected.detail for rejected in dropped if rejected.reason == "unlike_photos"]
     assert details and {detail.split(":")[0] for detail in details} <= stored
-    lenient = work_on(small_town, tmp_path, "render.gate.vehicle_min=0", small)
+    lenient = strict_on(small_town, tmp_path, vehicle_min=0.0, vehicle_share=0.001)
     assert isinstance(first_sample(lenient, prepared), Columns)
 
 
