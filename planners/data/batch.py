@@ -7,6 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from tasks.settings import fixed
 from tasks.world.arrays import FloatArray
 
 COMMANDS = ("left", "straight", "right", "unknown")  # order of the one-hot driving command
@@ -23,8 +24,8 @@ class ImageLayout:
     cameras: tuple[str, ...] = ()  # left to right; empty: the front camera and its neighbours, by their yaw
     width: int = 2048  # pixels of the stitched picture
     height: int = 512
-    rows_cut: float = 28 / 1080  # share of the height, above and below
-    sides_cut: float = 416 / 1920  # share of the width, on both sides of every camera but the middle one
+    rows_cut: float = fixed(28 / 1080)  # share of the height, above and below
+    sides_cut: float = fixed(416 / 1920)  # share of the width, on both sides of every camera but the middle one
     decoding: Literal["reduced", "full"] = "reduced"  # full: as the public code does, see planners.data.images
 
 

@@ -25,6 +25,7 @@ from planners.data.batch import ImageLayout, Needs, TrainingData
 from planners.data.files import SampleFile, files_of, group_bytes, leaves, read_all
 from planners.data.images import chosen_cameras
 from planners.data.mix import MixSettings, Samples, check_sides, sample_weights
+from tasks.settings import fixed
 from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
 
 HUMAN = "human"
@@ -57,7 +58,7 @@ class DataSettings:
     psnr_max: float | None = None  # [dB] and worse than this
     real_share: float = 1.0  # of the real clips; simulated samples of other clips are left out too
     limit_sim: int | None = None  # as many simulated samples, drawn from those that the rest leaves
-    seed: int = 0  # of the two draws; a smaller share or limit is a part of a larger one
+    seed: int = fixed(0)  # of the two draws; a smaller share or limit is a part of a larger one
     storage_options: dict[str, str] = field(default_factory=dict)  # of object stores, as deltalake calls them
     format: Format = "parquet"  # mcap: read the MCAP shards of a run with store.episodes=all; batches are the same
     copy: str | None = None  # folder of this machine for a compact copy of what is read, see planners.data.files

@@ -23,6 +23,7 @@ from planners.models.planner import (
     planned_from,
     seen_status,
 )
+from tasks.settings import fixed
 from tasks.world.arrays import FloatArray
 
 
@@ -37,11 +38,11 @@ class LtfSettings:
     hidden: int = 1024
     layers: int = 3
     heads: int = 8
-    dropout: float = 0.0
+    dropout: float = fixed(0.0)  # of the decoder; the public code has none
     plan_from: PlanFrom = "zero"  # what the regressed positions are added to
     status: Status = "all"  # what of the ego's own it sees; speed: no acceleration
     agents: int = 30
-    trajectory_weight: float = 10.0
+    trajectory_weight: float = fixed(10.0)  # the unit that the others are weighed against
     agent_class_weight: float = 10.0
     agent_box_weight: float = 1.0
     bev_weight: float = 10.0

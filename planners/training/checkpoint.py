@@ -16,7 +16,7 @@ import os
 import shutil
 import zipfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from factory.config.compose import ConfigError
+from factory.config.shapes import plain
 from factory.readers.pickles import load_tensors
 from factory.wording import one_line
 from planners.models.planner import Planner, PlannerChoice, build_planner, planner_class
@@ -85,9 +86,9 @@ def best(out: Path, measure: str) -> Path | None:
 
 
 def as_record(settings: Any) -> dict[str, Any]:
-    """A planner's settings as a checkpoint keeps them."""
-    plain: dict[str, Any] = json.loads(json.dumps(asdict(settings)))
-    return plain
+    """A planner's settings as a checkpoint keeps them, those that configuration offers."""
+    record: dict[str, Any] = json.loads(json.dumps(plain(settings)))
+    return record
 
 
 def checkpoints(out: Path) -> list[Path]:
