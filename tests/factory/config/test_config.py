@@ -148,7 +148,7 @@ def test_a_plug_in_s_key_is_led_home_too_and_a_stranger_s_home_is_told(
 
 
 @pytest.mark.parametrize(
-        ("+render.fit.gap=3", "render.fit.gap"),
+    ("+render.fit.gap=3", "render.fit.gap"),
     ("name", "values"),
     [
         ("width", (0, 15, -320)),
