@@ -148,14 +148,12 @@ def test_a_plug_in_s_key_is_led_home_too_and_a_stranger_s_home_is_told(
 
 
 @pytest.mark.parametrize(
-    ("+render.fit.gap=3", "render.fit.gap"),
     ("name", "values"),
     [
         ("width", (0, 15, -320)),
         ("height", (0, 15)),
         ("jpeg_quality", (0, 101)),
         ("psnr_min", (-1.0, math.nan, math.inf)),
-        ("lidar_only_reach_m", (-0.1, math.nan, math.inf)),
     ],
 )
 def test_render_settings_out_of_range_are_refused(name: str, values: tuple[float, ...]) -> None:
