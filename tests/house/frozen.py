@@ -25,7 +25,7 @@ from deltalake import DeltaTable
 REPOSITORY = Path(__file__).parents[2]
 LEFT_OUT = (
     *("settings_hash", "stage_versions", "expert_digest", "attempt_id", "clip_id", "content_digest"),
-    *("vocabulary_digest", "asset_digest", "seconds", "error", "run_id", "worker", "machine"),
+    *("vocabulary_digest", "asset_digest", "prepare_digest", "seconds", "error", "run_id", "worker", "machine"),
 )
 RUNS = {
     "town": ["preset=demo", "clips.n_clips=4", "rounds=2"],
