@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.graph.work import Built, Columns, Driven, Dropped, NotReady, PreparedClip, Stopped, never
+from factory.graph.work import AcceptedDrive, Built, Columns, NotReady, PreparedClip, RejectedAttempt, StopCheck, never
 from factory.readers.base import BadClip, ClipReader, ClipRef, Unreadable
 from factory.readers.validate import read_clip
 from factory.stages.assets import fits_going_on
@@ -235,10 +235,10 @@ class FactoryWork:
         name = named(ref)
         return None if name is None else str(name)
 
-    def reconstruct(self, ref: ClipRef, threads: int, stopped: Stopped = never) -> Built:
+    def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never) -> Built:
         """The clip's block into this machine's cache, of a run of the log's own drives what their photos need of it.
 
-        Raises BadClip, and Halted where a fit is `stopped`.
+        Raises BadClip, and TaskStopped where a fit is `stopped`.
         """
         watch = Stopwatch()
         with watch.of("reconstruct"):
@@ -252,13 +252,13 @@ class FactoryWork:
         """The fits that are going on here."""
         return "; ".join(fits_going_on(Path(self.cache_dir)))
 
-    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
         """Rollout, expert, rollout and reward; candidate -1 with experts that are tried once."""
         watch = Stopwatch()
         drive = self.trace(prepared, candidate, expert, watch.of)
         if drive.rejected is not None:
-            return Dropped(drive.rejected, _subscores(drive), watch.seconds)
-        return Driven(drive, watch.seconds)
+            return RejectedAttempt(drive.rejected, _subscores(drive), watch.seconds)
+        return AcceptedDrive(drive, watch.seconds)
 
     def trace(self, prepared: PreparedClip, candidate: int, expert: str, timed: Timed = nullcontext) -> Drive:
         """The same with nothing left out."""
@@ -274,15 +274,15 @@ class FactoryWork:
         result = attempt(scene, driver, self.gate, self.traffic, self.pdm, rng, timed)
         return Drive(payload.ref, chosen, *((None, result) if isinstance(result, Rejected) else result))
 
-    def draw(self, driven: Driven) -> Columns | Dropped:
-        """The pictures; Dropped where they are no sample's. Raises BadClip."""
+    def draw(self, driven: AcceptedDrive) -> Columns | RejectedAttempt:
+        """The pictures; RejectedAttempt where they are no sample's. Raises BadClip."""
         watch, drive, before = Stopwatch(), drive_of(driven), scene_lookups()
         with watch.of("render"):
             sensed = self._with_sensors(drive)
             unfit = self.unfit(sensed, drive)
             pictures = {} if unfit is not None else self.imaging.pictures(sensed, drive.candidate, drive.sampled)
         if unfit is not None:
-            return Dropped(unfit, _subscores(drive), watch.seconds, _at_hand(before))
+            return RejectedAttempt(unfit, _subscores(drive), watch.seconds, _at_hand(before))
         return Columns(pictures, watch.seconds, _at_hand(before))
 
     def unfit(self, clip: Clip, drive: Drive) -> Rejected | None:
@@ -294,7 +294,7 @@ class FactoryWork:
             return None
         return self.imaging.unfit(clip, drive.candidate, drive.judged, drive.shared)
 
-    def label(self, driven: Driven) -> Columns:
+    def label(self, driven: AcceptedDrive) -> Columns:
         """All but the pictures, the vocabulary labels among it."""
         watch, drive = Stopwatch(), drive_of(driven)
         judged = drive.sampled
@@ -349,7 +349,7 @@ def payload_of(prepared: PreparedClip) -> PerturbedClip:
     return prepared.payload
 
 
-def drive_of(driven: Driven) -> Drive:
+def drive_of(driven: AcceptedDrive) -> Drive:
     """What FactoryWork drove."""
     assert isinstance(driven.payload, Drive)
     return driven.payload
@@ -450,7 +450,7 @@ class BenchmarkWork(FactoryWork):
             assert prepared.scenes is not None, "prepared by a run without frames"
             rng = stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
             judged = human_sample(scene_of_clip(prepared.scenes.before), Human(), self.pdm, rng, timed)
-            return Drive(_earlier_ref(payload.ref), None, judged, None, told=_lineage(payload.clip))
+            return Drive(_earlier_ref(payload.ref), None, judged, None, told=_lineage_of_earlier_frame(payload.clip))
         chosen = payload.candidates[candidate]
         led_to = follow_up(payload.clip, chosen.rollout, self.traffic, self.pdm, timed)
         if isinstance(led_to, Rejected):
@@ -460,7 +460,7 @@ class BenchmarkWork(FactoryWork):
         return Drive(payload.ref, chosen, led_to, None, shared=(now - BEFORE_STEPS, now), shown=shown)
 
 
-def _lineage(clip: Clip) -> dict[str, object]:
+def _lineage_of_earlier_frame(clip: Clip) -> dict[str, object]:
     """What the row of the log 0.5 s before T says about its clip, instead of the earlier window it was read from."""
     return {
         "clip_id": clip.clip_id,

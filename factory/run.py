@@ -38,7 +38,7 @@ def main(argv: Sequence[str]) -> int:
     return run(asked_of(argv), only_plan=False)
 
 
-def dealt(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
+def interleave_by_log(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
     """The clips in the order of work: log by log, the logs in groups of `hands` whose clips alternate.
 
     Each worker then begins with a log, and so a block, of its own instead of waiting for another's reconstruction.
@@ -156,7 +156,7 @@ def _run(
     elsewhere = config.executor == "ray" and "RAY_ADDRESS" in os.environ  # a cluster's nodes compile for themselves
     with nullcontext() if elsewhere else compiling_ahead(kernels_of(config)):
         assembled = assemble(config)
-        refs = dealt(assembled.refs, config.workers or os.cpu_count() or 1)
+        refs = interleave_by_log(assembled.refs, config.workers or os.cpu_count() or 1)
         print(plan_text(assembled, refs), flush=True)
         if only_plan:
             print(calibrate(assembled, refs, store))

@@ -24,7 +24,7 @@ from factory.datasets.navsim.log import read_frames
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.execute import Execution, RunSummary, execute
 from factory.graph.limits import Limits
-from factory.graph.work import Driven, Dropped, PreparedClip
+from factory.graph.work import AcceptedDrive, PreparedClip, RejectedAttempt
 from factory.readers.base import ClipRef
 from factory.stages.sensors import load_sweeps
 from factory.store.samples import Store
@@ -80,13 +80,13 @@ class PoisonWork(WildWork):
                 load_sweeps([SensorFile("lidar", str(Path(self.folder, "truncated.pcd")), 0.0, np.eye(4))])
         return super().prepare(ref)
 
-    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
         assert isinstance(prepared.payload, dict)
         how = dict(self.harm).get(prepared.payload["name"])
         if how == "raise":
             raise ZeroDivisionError("a bug in a stage")
         driven = super().drive(prepared, candidate, expert)
-        if how == "NaN" and isinstance(driven, Driven):
+        if how == "NaN" and isinstance(driven, AcceptedDrive):
             name, row = driven.payload  # type: ignore[misc]
             return replace(driven, payload=(name, row | {"label_10hz": np.full((40, 3), np.nan, np.float32)}))
         return driven

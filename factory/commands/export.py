@@ -126,7 +126,7 @@ def _export_all(request: Request) -> int:
     from factory.datasets.navsim.export import export as export_all
     from factory.datasets.navsim.settings import ExportSettings
     from factory.graph.each import WorkerDied, each
-    from factory.graph.work import Halted
+    from factory.graph.work import TaskStopped
     from factory.store.location import Location
     from factory.store.reader import sample_table
 
@@ -151,8 +151,8 @@ def _export_all(request: Request) -> int:
         done = export_all(table, Path(target.uri), settings, trajectories, dealt)
     except (OSError, ValueError, WorkerDied) as error:  # no folder, a full disk, what cannot be written as asked
         raise Refused(str(error)) from error
-    except (Halted, KeyboardInterrupt) as error:
-        at_once = "" if isinstance(error, Halted) else " at once"
+    except (TaskStopped, KeyboardInterrupt) as error:
+        at_once = "" if isinstance(error, TaskStopped) else " at once"
         print(f"interrupted{at_once}; run the same command again to go on", file=sys.stderr)
         return INTERRUPTED
     for note in done.notes:

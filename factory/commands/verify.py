@@ -50,13 +50,13 @@ def main(request: Request) -> int:
             print(f"{len(found)} damages of the tables' logs; the tables were not read. repair=true puts them back")
             return DAMAGED
         store = open_store(request.out)
-        verdict = _verdict(request.out)
+        verdict = _verify_again(request.out)
         if request.repair and verdict.files:
             hold(store)
             drop_damaged(store, verdict)
             for name in verdict.files:
                 print(f"taken out {name}")
-            verdict = _verdict(request.out)
+            verdict = _verify_again(request.out)
     except DamagedLog as error:
         print(f"DAMAGED {error}")
         return DAMAGED
@@ -75,7 +75,7 @@ def main(request: Request) -> int:
     return DAMAGED if verdict.damage else COMPLETE
 
 
-def _verdict(out: str) -> "Verdict":
+def _verify_again(out: str) -> "Verdict":
     """Of the tables and of the blocks in the cache, opened anew."""
     from factory.stages.assets import damaged_blocks
     from factory.store.verify import Verdict, verify

@@ -114,7 +114,7 @@ def answered(
 
 def _end_of(error: Exception, refused: tuple[type[Exception], ...], resumes: bool, elsewhere: str) -> tuple[int, str]:
     """The exit code and the line that an exception ends a command with; COMPLETE for a fault of the program."""
-    from factory.store.disk import DiskFull, why_ill, why_not_written
+    from factory.store.disk import DiskFull, machine_fault_of, why_not_written
     from factory.wording import one_line
 
     if isinstance(error, Stopped):
@@ -125,7 +125,7 @@ def _end_of(error: Exception, refused: tuple[type[Exception], ...], resumes: boo
         return BAD_CONFIG, f"error: {error}"
     if resumes and isinstance(error, DiskFull):
         return INTERRUPTED, f"error: {error}; free disk space and run the same command again"
-    if resumes and why_ill(error):
+    if resumes and machine_fault_of(error):
         return INTERRUPTED, f"error: {one_line(error)}; run the same command again to go on"
     if not resumes and (why := why_not_written(error)):
         return BAD_CONFIG, f"error: {why}{elsewhere}"

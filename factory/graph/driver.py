@@ -18,7 +18,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from factory.graph.episodes import Beside
+from factory.graph.episodes import SampleMirror
 from factory.graph.local import Graph, MachineIll, Ticket
 from factory.graph.metrics import RunMetrics
 from factory.graph.plan import (
@@ -267,7 +267,7 @@ class Trial:
     stretch: Stretch | None = None  # of the walk, from this attempt on
 
 
-class Driver:
+class RunDriver:
     """The state of one run, fed by its loop one report at a time."""
 
     def __init__(
@@ -307,7 +307,7 @@ class Driver:
         """Begin nothing more; what is in flight is finished and committed."""
         self._stopping.set()
 
-    def hurry(self) -> None:
+    def stop_soon(self) -> None:
         """As `stop`, for who is soon killed: what is in flight for more than DRAIN_S is left undone."""
         self._deadline = time.monotonic() + DRAIN_S
         self.stop()
@@ -327,7 +327,7 @@ class Driver:
     def interrupted(self) -> bool:
         return self._stopping.is_set()
 
-    def loop(self, graph: Graph, gatherer: Gatherer, metrics: RunMetrics, episodes: Beside | None = None) -> None:
+    def loop(self, graph: Graph, gatherer: Gatherer, metrics: RunMetrics, episodes: SampleMirror | None = None) -> None:
         """Until nothing is left, or until stopped and drained. Raises DiskFull once a disk is full, and MachineIll."""
         self._graph, self._gatherer, self._metrics, self._episodes = graph, gatherer, metrics, episodes
         gatherer.committed = self._committed

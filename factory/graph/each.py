@@ -10,7 +10,7 @@ from itertools import islice
 from typing import Literal, ParamSpec, TypeVar
 
 from factory.exits import as_worker, asked_to_stop, without_terminal
-from factory.graph.work import Halted
+from factory.graph.work import TaskStopped
 from factory.store.location import Location
 
 T = TypeVar("T")
@@ -35,7 +35,7 @@ def each(
     workers: at once; None: 1 here, every core on Ray, which is the cluster of RAY_ADDRESS or one of this machine's own.
     to: the folder that the function writes to, called `to=` where a node of a cluster does not see it. At the first
     SIGINT or SIGTERM nothing new is begun; what is in hand still comes. Close the iterator to have the signals back.
-    Raises Halted where items are left then, WorkerDied, BadLocation, ConnectionError where no cluster answers.
+    Raises TaskStopped where items are left then, WorkerDied, BadLocation, ConnectionError where no cluster answers.
     """
     stopped: list[bool] = []
     waiting = iter(items)
@@ -56,7 +56,7 @@ def each(
                     raise WorkerDied(f"{item}: its worker died ({error}); run the same command again") from error
                 yield result
         if stopped and any(True for _ in waiting):
-            raise Halted
+            raise TaskStopped
 
 
 @contextmanager

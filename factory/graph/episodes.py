@@ -34,7 +34,7 @@ class EpisodesWanted:
     make: MakeEpisode  # a function that workers can import
 
 
-class Beside(Protocol):
+class SampleMirror(Protocol):
     """What a driver keeps in step with the table of samples."""
 
     @property
@@ -199,10 +199,10 @@ class McapShards:
             self._writing.add(self._graph.submit("mcap_shard", *self._queue.popleft()))
 
 
-class Together:
+class SampleMirrors:
     """Several at once."""
 
-    def __init__(self, parts: Sequence[Beside]) -> None:
+    def __init__(self, parts: Sequence[SampleMirror]) -> None:
         self._parts = parts
 
     @property

@@ -18,8 +18,8 @@ from deltalake.exceptions import DeltaError
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
 from factory.graph.apart import AGAIN, NEW_CLUSTERS, begun_anew
-from factory.graph.driver import SHARD_BYTES, SHARD_SECONDS, Driver, Gatherer, WriteFailed
-from factory.graph.episodes import Beside, Episodes, EpisodesWanted, McapShards, Together
+from factory.graph.driver import SHARD_BYTES, SHARD_SECONDS, Gatherer, RunDriver, WriteFailed
+from factory.graph.episodes import Episodes, EpisodesWanted, McapShards, SampleMirror, SampleMirrors
 from factory.graph.guard import CRASHED
 from factory.graph.limits import NO_LIMITS, Limits, notes_folder
 from factory.graph.local import NO_CLAIMS, Claims, ClusterDied, ClusterLacks, Fuse, Graph, LocalGraph, MachineIll
@@ -29,7 +29,7 @@ from factory.graph.progress import Executed
 from factory.graph.work import NotReady, Work
 from factory.readers.base import ClipRef
 from factory.store.attempts import NOTHING, Kind
-from factory.store.disk import DiskFull, why_ill
+from factory.store.disk import DiskFull, machine_fault_of
 from factory.store.funnel import Funnel, funnel_of
 from factory.store.location import BadLocation
 from factory.store.samples import CURRENT_RUN, ChangedRun, OnChange, Store
@@ -125,13 +125,13 @@ class _Run:
             kept = self._how.on_change == "stop" and self._records[-1]["on_change"] == "keep"
             self._on_change: OnChange = "keep" if kept else self._how.on_change
             plan = self._planned(not self._store.starts_over(self._records))
-            parts: list[Beside] = [McapShards(self._store)] if self._how.mcap_shards else []
+            parts: list[SampleMirror] = [McapShards(self._store)] if self._how.mcap_shards else []
             parts += [Episodes(self._store, self._how.episodes, self._refs)] if self._how.episodes else []
-            self._beside = Together(parts) if parts else None
+            self._beside = SampleMirrors(parts) if parts else None
         except ChangedRun as error:
             return RunSummary(BAD_CONFIG, str(error))
         except (OSError, DeltaError) as error:
-            if why_ill(error):
+            if machine_fault_of(error):
                 return RunSummary(INTERRUPTED, f"{one_line(error)}; {AGAIN}")
             damaged = f"python -m factory verify {self._store.location.uri} says what is damaged"
             return RunSummary(BAD_CONFIG, f"{error}; {damaged}")
@@ -151,7 +151,9 @@ class _Run:
 
     def _follow(self, plan: RunPlan) -> None:
         self._plan, work = plan, self._work
-        self._driver = Driver(self._identity, plan, self._digests, self._rounds, self._policy, work.block, work.doing)
+        self._driver = RunDriver(
+            self._identity, plan, self._digests, self._rounds, self._policy, work.block, work.doing
+        )
 
     def open(self) -> RunSummary | None:
         """The executor, where anything is due; how the run ends where this machine or cluster is not ready for it."""
@@ -174,7 +176,7 @@ class _Run:
         except ClusterDied as error:
             return RunSummary(INTERRUPTED, str(error), lost_cluster=error.is_ours)
         except (MachineIll, OSError) as error:  # while kernels are compiled
-            if isinstance(error, OSError) and not why_ill(error):
+            if isinstance(error, OSError) and not machine_fault_of(error):
                 raise
             return RunSummary(INTERRUPTED, _again_after(error))
         except KeyboardInterrupt:
@@ -226,7 +228,7 @@ class _Run:
         store, how, beside = self._store, self._how, self._beside
         self._ended.began_ms = _announce(store, self._plan, self._experts, self._rounds, how.command)
         metrics = RunMetrics(graph.recorder, store.location)
-        with asked_to_stop(self._driver.hurry), _alarm(self._driver.stop, how.minutes):
+        with asked_to_stop(self._driver.stop_soon), _alarm(self._driver.stop, how.minutes):
             if beside is not None:
                 beside.begin(graph)
             self._driver.loop(graph, Gatherer(graph, store, how.shard_bytes, how.shard_seconds), metrics, beside)

@@ -34,7 +34,7 @@ STACK_LINES = 30
 WORK, OVER, CRASHED = ".work", ".over", "crashed"
 
 
-class Guard:
+class WatchedProcess:
     """The watched side: one a process, begun with its first task."""
 
     def __init__(self, folder: Path, alone: bool) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from factory.graph.guard import OVER, WORK, Guard, read_note
+from factory.graph.guard import OVER, WORK, WatchedProcess, read_note
 from factory.graph.steps import Failure
 from factory.readers.base import ClipRef
 from factory.store.attempts import ErrorKind
@@ -104,7 +104,7 @@ def described(step: str, name: str, args: tuple[Any, ...]) -> dict[str, Any]:
     return {"key": f"{name}-{os.getpid()}", "what": name}
 
 
-_GUARDS: dict[Path, Guard] = {}  # of this process
+_GUARDS: dict[Path, WatchedProcess] = {}  # of this process
 
 
 def watched(folder: Path, task: dict[str, Any], call: Callable[..., tuple[Any, Any]], *given: Any) -> tuple[Any, Any]:
@@ -115,6 +115,6 @@ def watched(folder: Path, task: dict[str, Any], call: Callable[..., tuple[Any, A
         where = found["stack"] or "where it stood is not known"
         return Failure(ErrorKind.LIMIT, f"{where}\n{found['what']} {found['why']}"), None
     if folder not in _GUARDS:
-        _GUARDS[folder] = Guard(folder, alone=False)
+        _GUARDS[folder] = WatchedProcess(folder, alone=False)
     with _GUARDS[folder].watching(task):
         return call(*given)

@@ -17,11 +17,11 @@ import numpy as np
 
 from factory.exits import as_worker, without_terminal
 from factory.graph import steps
-from factory.graph.guard import Guard
+from factory.graph.guard import WatchedProcess
 from factory.graph.limits import NO_LIMITS, Costs, Limits, cleared, described, notes_folder, put_away, watched
 from factory.graph.metrics import NoRecorder, Recorder
 from factory.graph.steps import Failure, warm
-from factory.graph.work import NotReady, Stopped, Work, never
+from factory.graph.work import NotReady, StopCheck, Work, never
 from factory.store.attempts import ErrorKind
 from factory.store.disk import DiskFull
 from factory.store.location import Location
@@ -169,7 +169,7 @@ class LocalGraph:
 
     parallelism = 1
 
-    def __init__(self, work: Work, out: Location, stopped: Stopped = never, fuse: Fuse = "auto") -> None:
+    def __init__(self, work: Work, out: Location, stopped: StopCheck = never, fuse: Fuse = "auto") -> None:
         """stopped: asked now and then by tasks that take long, as nobody else can while they are at work."""
         self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(fuse, apart=False)
         self.cores = os.cpu_count() or 1
@@ -177,7 +177,7 @@ class LocalGraph:
         self._supplied = {"work": work, "out": out, "stopped": stopped}
         self._waiting: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
         self._notes = notes_folder(out)
-        self._guard: Guard | None = None
+        self._guard: WatchedProcess | None = None
         work.warm()
 
     def submit(self, step: str, *args: Any) -> Ticket:
@@ -195,7 +195,7 @@ class LocalGraph:
         function, wants = STEPS[step]
         plain = [arg.value if isinstance(arg, _Box) else arg for arg in args]
         ticket.queued_s = time.monotonic() - ticket.submitted
-        self._guard = self._guard or Guard(self._notes, alone=True)
+        self._guard = self._guard or WatchedProcess(self._notes, alone=True)
         with self._guard.watching({**described(step, ticket.step, args), "limited": False}):
             report, result = function(*(self._supplied[name] for name in wants), *plain)
         ticket.result.value = frozen(result)
@@ -237,7 +237,7 @@ class IsolatedGraph:
         self,
         work: Work,
         out: Location,
-        stopped: Stopped = never,
+        stopped: StopCheck = never,
         fuse: Fuse = "auto",
         limits: Limits = NO_LIMITS,
     ) -> None:

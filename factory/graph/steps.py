@@ -13,11 +13,20 @@ from typing import Any
 
 import pyarrow as pa
 
-from factory.graph.work import Dropped, Halted, NotReady, PreparedClip, Stopped, Underway, Work, go_on
+from factory.graph.work import (
+    NotReady,
+    PartialAttempt,
+    PreparedClip,
+    RejectedAttempt,
+    StopCheck,
+    TaskStopped,
+    Work,
+    go_on,
+)
 from factory.readers.base import BadClip, ClipRef, Unreadable
 from factory.store.attempts import ErrorKind
 from factory.store.cache import BadCacheFile, ClipCache, SceneFiles
-from factory.store.disk import own_place, why_disk_full, why_ill
+from factory.store.disk import machine_fault_of, refused_as_the_runs_own, why_disk_full
 from factory.store.location import Location
 from factory.store.mcap_files import FOLDER, episode_name, write_mcap_shard
 from factory.store.parquet_file import Shard, write_shard
@@ -172,7 +181,7 @@ def _keep_scenes(out: Location, clip: PreparedClip) -> None:
     """Before any attempt, so that no row stands without them; written anew each time, they may be of older settings."""
     if clip.scenes is not None:
         scenes = out.child("scenes")
-        with own_place(scenes.uri):
+        with refused_as_the_runs_own(scenes.uri):
             SceneFiles(scenes).store(clip.scenes)
 
 
@@ -183,21 +192,21 @@ def _refuse_changed(ref: ClipRef, found: str | None, wanted: str | None) -> None
 
 
 def attempt(
-    work: Work, stages: Sequence[str], so_far: PreparedClip | Underway, stamp: Stamp
-) -> tuple[Attempted | HandedOn | Failure, pa.Table | Underway | None]:
+    work: Work, stages: Sequence[str], so_far: PreparedClip | PartialAttempt, stamp: Stamp
+) -> tuple[Attempted | HandedOn | Failure, pa.Table | PartialAttempt | None]:
     """Some stages of one attempt, from where it stands; an accepted one is checked against the schema here, where its
     traceback still means something."""
     began, stage = time.perf_counter(), ""
     try:
         for stage in stages:
             result = go_on(work, stage, so_far, stamp.candidate_index, stamp.expert)
-            if not isinstance(result, Underway):
+            if not isinstance(result, PartialAttempt):
                 break
             so_far = result
-        if isinstance(result, Underway):
+        if isinstance(result, PartialAttempt):
             return HandedOn(), result
         seconds = result.seconds or {"attempt": time.perf_counter() - began}
-        if isinstance(result, Dropped):
+        if isinstance(result, RejectedAttempt):
             subscores, at_hand = dict(result.subscores), result.scene_at_hand
             return Attempted(result.rejected, subscores=subscores, seconds=seconds, scene_at_hand=at_hand), None
         row = sample_row_to_table([{**result.row, **vars(stamp)}])
@@ -256,7 +265,7 @@ def mcap_shard(out: Location, path: str, partition: Mapping[str, str]) -> tuple[
 
 
 def reconstruct(
-    work: Work, stopped: Stopped, ref: ClipRef, threads: int
+    work: Work, stopped: StopCheck, ref: ClipRef, threads: int
 ) -> tuple[Reconstructed | HalfBuilt | Failure, None]:
     """The block that the clip is rendered from, into the cache of this machine."""
     if stopped():  # before its sensors are read
@@ -264,7 +273,7 @@ def reconstruct(
     try:
         built = work.reconstruct(ref, threads, stopped)
         return Reconstructed(built.seconds, built.from_cache, built.psnr_db), None
-    except Halted:
+    except TaskStopped:
         return HalfBuilt(), None
     except KeyboardInterrupt:
         raise
@@ -291,6 +300,6 @@ def failure_of(error: BaseException) -> Failure:
         return Failure(ErrorKind.INPUT, str(error))
     raised = error.__cause__ if isinstance(error, Unreadable) else error
     kind = ErrorKind.SYSTEM if isinstance(raised, OSError | MemoryError) else ErrorKind.BUG
-    kind = ErrorKind.MACHINE if why_ill(error) else kind
+    kind = ErrorKind.MACHINE if machine_fault_of(error) else kind
     lines = "".join(traceback.format_exception(error)).strip().splitlines()
     return Failure(kind, "\n".join(lines[-ERROR_LINES:]), why_disk_full(error))

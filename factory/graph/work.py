@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 HUMAN_CANDIDATE = -1  # the only candidate index of experts that are tried once: the log itself
 
-Stopped = Callable[[], bool]  # whether the run was asked to stop: a long task looks now and then
+StopCheck = Callable[[], bool]  # whether the run was asked to stop: a long task looks now and then
 
 
 def never() -> bool:
@@ -26,7 +26,7 @@ def never() -> bool:
     return False
 
 
-class Halted(Exception):
+class TaskStopped(Exception):
     """A long task left off because the run was asked to stop; what it has done is kept, and the next one goes on."""
 
 
@@ -49,7 +49,7 @@ class PreparedClip:
 
 
 @dataclass(frozen=True)
-class Driven:
+class AcceptedDrive:
     """A drive that the reward accepts, on its way to a sample: all that it takes to draw and to label it."""
 
     payload: object  # the work's own; it can be pickled
@@ -66,7 +66,7 @@ class Columns:
 
 
 @dataclass(frozen=True)
-class Dropped:
+class RejectedAttempt:
     """An attempt that was turned down."""
 
     rejected: Rejected
@@ -114,8 +114,8 @@ class Work(Protocol):
         """Name of the block that the clip is rendered from, known without reading it; None: nothing to build ahead."""
         ...
 
-    def reconstruct(self, ref: ClipRef, threads: int, stopped: Stopped = never) -> Built:
-        """Build the clip's block into this machine's cache. Raises BadClip, and Halted soon after it is `stopped`."""
+    def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never) -> Built:
+        """Build the clip's block into this machine's cache. Raises BadClip, TaskStopped soon after `stopped`."""
         ...
 
     def doing(self) -> str:
@@ -129,30 +129,30 @@ class Work(Protocol):
         """
         ...
 
-    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
         """Rollout, expert, rollout and reward of one candidate."""
         ...
 
-    def draw(self, driven: Driven) -> Columns | Dropped:
-        """The columns of its pictures and the `tags` they add; Dropped where the pictures are no sample's."""
+    def draw(self, driven: AcceptedDrive) -> Columns | RejectedAttempt:
+        """The columns of its pictures and the `tags` they add; RejectedAttempt where the pictures are no sample's."""
         ...
 
-    def label(self, driven: Driven) -> Columns:
+    def label(self, driven: AcceptedDrive) -> Columns:
         """All other columns."""
         ...
 
 
 @dataclass(frozen=True)
-class Underway:
+class PartialAttempt:
     """An attempt that some stages are done of."""
 
-    driven: Driven
+    driven: AcceptedDrive
     drawn: Columns | None = None
 
 
 def go_on(
-    work: Work, stage: str, so_far: PreparedClip | Underway, candidate: int, expert: str
-) -> Underway | Columns | Dropped:
+    work: Work, stage: str, so_far: PreparedClip | PartialAttempt, candidate: int, expert: str
+) -> PartialAttempt | Columns | RejectedAttempt:
     """The next stage of an attempt (tasks.stages.ATTEMPT) from where it stands.
 
     Columns: the sample's. Seconds are those of all stages so far.
@@ -160,14 +160,14 @@ def go_on(
     if stage == "drive":
         assert isinstance(so_far, PreparedClip)
         driven = work.drive(so_far, candidate, expert)
-        return driven if isinstance(driven, Dropped) else Underway(driven)
-    assert isinstance(so_far, Underway)
+        return driven if isinstance(driven, RejectedAttempt) else PartialAttempt(driven)
+    assert isinstance(so_far, PartialAttempt)
     driven, drawn = so_far.driven, so_far.drawn
     if stage == "render":
         found = work.draw(driven)
-        if isinstance(found, Dropped):
+        if isinstance(found, RejectedAttempt):
             return replace(found, seconds={**driven.seconds, **found.seconds})
-        return Underway(driven, found)
+        return PartialAttempt(driven, found)
     assert stage == "label" and drawn is not None
     labelled = work.label(driven)
     tags = [*labelled.row["tags"], *drawn.row.get("tags", ())]  # type: ignore[misc]
@@ -175,12 +175,12 @@ def go_on(
     return Columns({**labelled.row, **drawn.row, "tags": tags}, seconds, drawn.scene_at_hand)
 
 
-def attempted(work: Work, prepared: PreparedClip, candidate: int, expert: str) -> Columns | Dropped:
+def attempted(work: Work, prepared: PreparedClip, candidate: int, expert: str) -> Columns | RejectedAttempt:
     """One attempt, whole."""
-    so_far: PreparedClip | Underway = prepared
+    so_far: PreparedClip | PartialAttempt = prepared
     for stage in ATTEMPT:
         result = go_on(work, stage, so_far, candidate, expert)
-        if not isinstance(result, Underway):
+        if not isinstance(result, PartialAttempt):
             return result
         so_far = result
     raise AssertionError(f"{ATTEMPT[-1]} does not end an attempt")

@@ -28,7 +28,7 @@ from factory.setup.vocabulary import (
     train_windows,
 )
 from factory.stages.sensors import chosen_cameras, masks_digest, refuse_unknown_masks
-from factory.store.disk import why_ill
+from factory.store.disk import machine_fault_of
 from factory.store.schema import UNLISTED, RunIdentity, canonical_json
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.settings import PdmSettings
@@ -85,7 +85,7 @@ def open_reader(clips: Mapping[str, Any]) -> tuple[ClipReader, ClipIndex]:
     try:
         index = reader.index()
     except (ValueError, OSError) as error:
-        if why_ill(error):  # a full disk under the user's cache is no wrong setting
+        if machine_fault_of(error):  # a full disk under the user's cache is no wrong setting
             raise
         raise ConfigError(f"clips: {error}") from error
     if not index.refs and not index.broken:

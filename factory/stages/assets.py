@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.graph.work import Halted, Stopped, never
+from factory.graph.work import StopCheck, TaskStopped, never
 from factory.locks import locked
 from factory.readers.pictures import file_and_frame
 from factory.stages.rig import SAID, UsedRig, corrected_rig, known_of, said_again, taken_from, told_of, used_rig, wanted
@@ -34,7 +34,7 @@ from factory.stages.sensors import (
     read_masks,
     taken_by,
 )
-from factory.store.disk import own_place, whole_file
+from factory.store.disk import refused_as_the_runs_own, whole_file
 from factory.store.location import Location
 from factory.wording import time_text
 from tasks.render.fit.losses import Lpips, lpips_of
@@ -67,14 +67,14 @@ def fitted(
     agents: AgentTracks | None,
     settings: FitSettings,
     threads: int,
-    stopped: Stopped = never,
+    stopped: StopCheck = never,
     backend: Backend = Backend.CPU,
     lpips: Lpips | None = None,
 ) -> RenderAsset:
     """The scene of a block's sensors; what is half done lies beside `path`, where the scene will be stored.
 
-    A fit that was killed or halted comes to the same bytes as one that was not. Raises Halted once it is `stopped`,
-    with all of its iterations kept, ValueError without photos to learn from, and BackendMissing.
+    A fit that was killed or halted comes to the same bytes as one that was not. Raises TaskStopped once it is
+    `stopped`, with all of its iterations kept, ValueError without photos to learn from, and BackendMissing.
     """
     drawing = backend_of(backend, threads)
     problem, state = prepare(data.photos, data.sweeps, agents, settings, threads=threads, known=data.known)
@@ -98,7 +98,7 @@ def fitted(
             seal(draft, begun.name)
         if state.iteration < settings.iterations and stopped():
             said.unlink(missing_ok=True)
-            raise Halted(f"{path.stem}: {state.iteration} of {settings.iterations} iterations are done")
+            raise TaskStopped(f"{path.stem}: {state.iteration} of {settings.iterations} iterations are done")
     asset = finish(problem, state, threads, lpips)
     begun.unlink(missing_ok=True)
     said.unlink(missing_ok=True)
@@ -167,13 +167,13 @@ def _with_parallax(photos: Sequence[SensorFile]) -> float:
 
 
 def asset_for(
-    clip: Clip, settings: RenderSettings, cache_dir: str | Path, threads: int = 1, stopped: Stopped = never
+    clip: Clip, settings: RenderSettings, cache_dir: str | Path, threads: int = 1, stopped: StopCheck = never
 ) -> RenderAsset | None:
     """The scene of the clip's block with its digest; None where the clip has nothing to make one from.
 
     Made of photos and lidar, or of either alone (`sensing`); the same on any number of threads.
-    Raises BadClip where a sensor file is broken, ValueError for a camera the rig does not have, and Halted where a fit
-    is `stopped`.
+    Raises BadClip where a sensor file is broken, ValueError for a camera the rig does not have, and TaskStopped where a
+    fit is `stopped`.
     """
     block, rig = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
     cameras = block_cameras(block, rig)
@@ -265,7 +265,7 @@ def range_of(clip: Clip, block: Block) -> BlockRange:
 def only_builder(path: Path) -> Iterator[None]:
     """Held by one process of the machine at a time; the kernel frees it when its holder dies. Raises PlaceRefused."""
     with ExitStack() as held:
-        with own_place(path.parent):
+        with refused_as_the_runs_own(path.parent):
             path.parent.mkdir(parents=True, exist_ok=True)
             file = held.enter_context(path.with_suffix(".lock").open("w"))
         held.enter_context(locked(file))

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.graph.work import Stopped, never
+from factory.graph.work import StopCheck, never
 from factory.readers.base import BadClip
 from factory.stages.assets import Sensing, asset_for, corrected_for, scene_path, sensing
 from factory.stages.painted import town_cameras, town_pictures
@@ -63,10 +63,10 @@ class Imaging:
     settings: RenderSettings
     cache_dir: str
 
-    def build(self, clip: Clip, threads: int, stopped: Stopped = never) -> tuple[bool, float | None]:
+    def build(self, clip: Clip, threads: int, stopped: StopCheck = never) -> tuple[bool, float | None]:
         """Make sure of the clip's block in the cache: whether it was there, and its PSNR in dB where it has one.
 
-        Raises BadClip for a broken sensor file, Halted where a fit is `stopped`.
+        Raises BadClip for a broken sensor file, TaskStopped where a fit is `stopped`.
         """
         found = sensing(clip, self.settings) is not Sensing.NOTHING and (
             scene_path(clip, self.settings, self.cache_dir).exists()

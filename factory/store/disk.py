@@ -119,29 +119,31 @@ class PlaceRefused(OSError):
 
 
 @contextmanager
-def own_place(where: str | os.PathLike[str]) -> Iterator[None]:
+def refused_as_the_runs_own(where: str | os.PathLike[str]) -> Iterator[None]:
     """Around what is written there by the run: whatever goes wrong with it is no clip's. Raises PlaceRefused."""
     try:
         yield
     except OSError as error:
-        if why_ill(error):
+        if machine_fault_of(error):
             raise
         raise PlaceRefused(f"{os.fspath(where)} cannot be written: {error.strerror or error}") from error
 
 
-def why_ill(error: BaseException) -> str:
+def machine_fault_of(error: BaseException) -> str:
     """What the machine said, where its illness is behind the error; else nothing."""
     seen: BaseException | None = error
     while seen is not None:
         if isinstance(seen, MemoryError) and _memory_left() < SHORT_OF_MEMORY:
             return f"out of memory: {seen}"
-        if isinstance(seen, PlaceRefused | DiskFull | NotWritable | ConnectionError | TimeoutError) or _is_ill(seen):
+        if isinstance(seen, PlaceRefused | DiskFull | NotWritable | ConnectionError | TimeoutError) or _is_of_machine(
+            seen
+        ):
             return str(seen)
         seen = seen.__cause__ or seen.__context__
     return ""
 
 
-def _is_ill(error: BaseException) -> bool:
+def _is_of_machine(error: BaseException) -> bool:
     delta = sys.modules.get("deltalake.exceptions")  # who has not loaded it has none of its errors
     if delta is not None and isinstance(error, delta.DeltaError):
         return STORE.search(str(error)) is not None

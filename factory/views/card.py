@@ -111,7 +111,7 @@ def _sources(samples: pa.Table) -> Iterator[str]:
 
 
 def _how(store: Store) -> Iterator[str]:
-    record = _record(store)
+    record = _newest_run_record(store)
     told = json.loads(store.location.read("report.json") or b"{}").get("facts", {})
     command = json.loads(store.location.read(CURRENT_RUN) or b"{}").get("command")
     yield "\n## How it was made\n"
@@ -143,7 +143,7 @@ def _limits(store: Store, samples: pa.Table, outcomes: pa.Table, orphans: int) -
     yield "\n## Known limits\n"
     simulated = samples.filter(pc.greater_equal(samples["candidate_index"], 0)).select(["image_source", "psnr"])
     sources = counted(simulated["image_source"])
-    settings = _record(store)["settings"]
+    settings = _newest_run_record(store)["settings"]
     if simulated.num_rows:
         yield (
             f"- The labels of {simulated.num_rows:,} samples are simulated drives of a pseudo-expert, not of a human. "
@@ -185,7 +185,7 @@ def _limits(store: Store, samples: pa.Table, outcomes: pa.Table, orphans: int) -
 
 def _gate(store: Store) -> str:
     """Which simulated drives became samples."""
-    settings = _record(store)["settings"]
+    settings = _newest_run_record(store)["settings"]
     full, above = settings.get("reward.full", []), settings.get("reward.progress_above", -1.0)
     asked = [f"full marks in {', '.join(full).upper()}"] if full else []
     asked += [f"EP above {above}"] if above >= 0.0 else []
@@ -195,7 +195,7 @@ def _gate(store: Store) -> str:
     return f"{scored} Its end had to {' and '.join(ends)}." if ends else scored
 
 
-def _record(store: Store) -> dict[str, Any]:
+def _newest_run_record(store: Store) -> dict[str, Any]:
     """The newest of run.json; one that says nothing where that file is lost."""
     lost = {"settings": {}, "settings_hash": "lost", "stage_versions": {}, "vocabulary_digest": "lost"}
     return (store.runs() or [lost])[-1]

@@ -29,7 +29,7 @@ from factory.config.compose import ConfigError, need_run_extra
 from factory.exits import Failed, Stopped
 from factory.graph.each import WorkerDied, each
 from factory.graph.progress import Counter
-from factory.graph.work import Halted
+from factory.graph.work import TaskStopped
 from factory.readers.base import ClipRef
 from factory.setup.settings import choose_vocabulary, open_reader
 from factory.store.disk import why_unusable
@@ -83,7 +83,7 @@ def drive_all(settings: DriveSettings) -> tuple[list[Row], list[NotDriven]]:
     try:
         table.claim()
         failed += _drive(asked.work, asked.items, table)
-    except (Halted, KeyboardInterrupt) as error:
+    except (TaskStopped, KeyboardInterrupt) as error:
         raise Stopped("interrupted; what is driven is kept, and the same command goes on") from error
     except (WorkerDied, AnotherWriter) as error:
         raise Failed(str(error)) from error

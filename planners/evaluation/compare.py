@@ -86,7 +86,7 @@ def is_clear(found: ByLevel) -> bool:
     return all(one.is_clear for one in found.values())
 
 
-def row_of(found: ByLevel | None, scale: float = 100.0) -> dict[str, float | str]:
+def difference_columns(found: ByLevel | None, scale: float = 100.0) -> dict[str, float | str]:
     """Columns of tables: the difference and its bounds over each of LEVELS, empty where there is none."""
     row: dict[str, float | str] = {"difference": "" if found is None else scale * found["clip"].difference}
     for level in LEVELS:
@@ -142,7 +142,7 @@ def write_csv(path: Path, found: Mapping[Measure, ByLevel]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         for n, (name, by_level) in enumerate(found.items()):
-            row = row_of(by_level, scale=1.0)
+            row = difference_columns(by_level, scale=1.0)
             if n == 0:
                 table.writerow(["stage", "human_filter", "a", "b", *row])
             table.writerow([*name, by_level["clip"].a, by_level["clip"].b, *row.values()])

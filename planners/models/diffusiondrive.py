@@ -39,8 +39,8 @@ from planners.models.layers import (
     LatentFusion,
     Start,
     auxiliary_losses,
-    begin,
     clone_first,
+    initialise_weights,
 )
 from planners.models.planner import Planner, TrainingData, evaluating, read_array
 from tasks.world.arrays import FloatArray
@@ -356,7 +356,7 @@ class DiffusionDrive(Planner):
         reach_m = max(settings.bev.ahead_m, settings.bev.side_m)
         self.agent_head = AgentHead(settings.width, settings.hidden, reach_m)
         self.bev_head = BevHead(settings.fusion.bev_channels, settings.bev.shape)
-        begin(self, settings.start)
+        initialise_weights(self, settings.start)
         if settings.start == "public":
             clone_first(self.decoder.layers)
 

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from planners.data.batch import Batch, ImageLayout, Needs
 from planners.models.backbones import STRIDES, BackboneSettings, build_backbone
-from planners.models.layers import Decoder, FusionSettings, LatentFusion, Layer, Start, begin
+from planners.models.layers import Decoder, FusionSettings, LatentFusion, Layer, Start, initialise_weights
 from planners.models.planner import Planner, TrainingData, evaluating, read_array
 from tasks.reward.label_bytes import Normalise
 from tasks.subscores import HALVES, LABELLED
@@ -226,7 +226,7 @@ class GtrsDense(Planner):
         else:
             self.tokens = PictureTokens(settings.backbone, settings.image, settings.width)
         self.scorer = TrajectoryScorer(settings)
-        begin(self, settings.start)
+        initialise_weights(self, settings.start)
 
     @classmethod
     def fixed_arrays(cls, settings: GtrsDenseSettings, data: TrainingData) -> dict[str, FloatArray]:

@@ -304,7 +304,7 @@ Start = Literal["torch", "public"]  # whose draw weights are
 GPT_DEVIATION = 0.02
 
 
-def begin(model: nn.Module, start: Start) -> None:
+def initialise_weights(model: nn.Module, start: Start) -> None:
     """Draw a planner's weights anew, in place, as the public code draws them, where `start` says so.
 
     Public: navsim/agents/*/transfuser_backbone.py, GPT._init_weights (OpenDriveLab/SimScale @ f51ad64); timm's ResNet

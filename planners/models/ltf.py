@@ -12,7 +12,15 @@ import torch
 from torch import Tensor, nn
 
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
-from planners.models.layers import AgentHead, BevHead, FusionSettings, LatentFusion, Start, auxiliary_losses, begin
+from planners.models.layers import (
+    AgentHead,
+    BevHead,
+    FusionSettings,
+    LatentFusion,
+    Start,
+    auxiliary_losses,
+    initialise_weights,
+)
 from planners.models.planner import (
     PlanFrom,
     Planner,
@@ -69,7 +77,7 @@ class Ltf(Planner):
         self.plan_head = nn.Sequential(nn.Linear(width, settings.hidden), nn.ReLU(), nn.Linear(settings.hidden, 24))
         self.agent_head = AgentHead(width, settings.hidden, max(settings.bev.ahead_m, settings.bev.side_m))
         self.bev_head = BevHead(settings.fusion.bev_channels, settings.bev.shape)
-        begin(self, settings.start)
+        initialise_weights(self, settings.start)
 
     @property
     def needs(self) -> Needs:

@@ -18,7 +18,7 @@ from planners.drive.settings import DriveSettings, settings_of
 from planners.drive.summary import M_PER_KM, SHARES, highest_level, start_of
 from planners.evaluation.aggregation import BOUNDS, name_of, scores_of_clips, write_csv
 from planners.evaluation.bootstrap import Interval, paired_interval
-from planners.evaluation.compare import CompareSettings, compare, row_of
+from planners.evaluation.compare import CompareSettings, compare, difference_columns
 from planners.study.report import FRAMES, read_study
 from planners.study.setups import Setup
 from planners.training.many import Means, Training
@@ -170,7 +170,7 @@ def against_bounds(report: Path, setups: Sequence[Setup], seeds: int) -> list[di
             for stage in STAGES:
                 each = [scores_of_clips(run)[name_of(*stage)] for run in runs]
                 facts = {"arm": setup.label, "reference": bound, "seeds": len(runs), "stage": stage[0]}
-                rows.append(facts | {"epdms": float(np.mean(each))} | row_of(intervals.get(stage)))
+                rows.append(facts | {"epdms": float(np.mean(each))} | difference_columns(intervals.get(stage)))
     return rows
 
 

@@ -35,7 +35,7 @@ from planners.evaluation.aggregation import (
     write_csv,
 )
 from planners.evaluation.benchmark_folder import logs_of
-from planners.evaluation.compare import CompareSettings, compare, is_clear_row, row_of
+from planners.evaluation.compare import CompareSettings, compare, difference_columns, is_clear_row
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow, read_rows
 from planners.evaluation.score_table import FILTERS_NOTE
@@ -182,7 +182,7 @@ def compared(frames: StudyFrames) -> list[Row]:
             row = {**one.facts, "stage": stage, "human_filter": human_filter, "epdms": float(np.mean(each))}
             row["each"] = " ".join(f"{score:.1f}" for score in each)
             row["reference"] = one.reference.label if one.reference else ""
-            rows.append(row | row_of(intervals.get((stage, human_filter))))
+            rows.append(row | difference_columns(intervals.get((stage, human_filter))))
     return rows
 
 

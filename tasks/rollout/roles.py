@@ -35,7 +35,7 @@ def join_steps(index: LaneIndex, scene: Scene) -> Ints:
     return out
 
 
-def later_join_step(index: LaneIndex, scene: Scene, i: int) -> int:
+def first_later_step_on_lane(index: LaneIndex, scene: Scene, i: int) -> int:
     """First later step at which agent i is on a lane; NEVER if it never is."""
     log, start = scene.clip.agents, scene.step
     steps = start + 1 + np.flatnonzero(log.valid[start + 1 : start + HORIZON_STEPS + 1, i])

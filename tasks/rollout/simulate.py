@@ -39,8 +39,8 @@ from tasks.rollout.policy import SEEN_ROWS, TrafficPolicy, drive_by_policy, poli
 from tasks.rollout.roles import (
     NEVER,
     clocks,
+    first_later_step_on_lane,
     join_steps,
-    later_join_step,
     logged_track,
     numbered,
     stack_paths,
@@ -106,7 +106,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     for i in np.flatnonzero(is_vehicle & ~standing).tolist():
         driven_before = bool(moved[i] and now.valid[start, i])
         if join[i] == NEVER and not driven_before:
-            join[i] = later_join_step(index, scene, i)
+            join[i] = first_later_step_on_lane(index, scene, i)
         step = start if driven_before else int(join[i])
         if step != start:
             logged_ways[i] = logged_path(logged_track(scene, i, int(clock[i])), ahead_m)

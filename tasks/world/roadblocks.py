@@ -165,7 +165,7 @@ def corrected_roadblocks(blocks: Roadblocks, roadblock_ids: Sequence[str], pose:
     route = [block for block in dict.fromkeys(roadblock_ids) if block in blocks.shapes]
     if not route:
         raise NoRoute(f"none of the route's roadblocks {list(roadblock_ids)[:5]} is on the map")
-    start, candidates = starting_roadblocks(blocks, route, pose)
+    start, candidates = roadblocks_at_pose(blocks, route, pose)
     if start not in route:
         back = _search(blocks.incoming, route[0], candidates, DEPTH_BACK)
         if back:
@@ -182,7 +182,7 @@ def corrected_roadblocks(blocks: Roadblocks, roadblock_ids: Sequence[str], pose:
     return _without_loop(blocks, linked)
 
 
-def starting_roadblocks(blocks: Roadblocks, route: Sequence[str], pose: Array) -> tuple[str, list[str]]:
+def roadblocks_at_pose(blocks: Roadblocks, route: Sequence[str], pose: Array) -> tuple[str, list[str]]:
     """The roadblock that the pose (3,) is on, one of the route's before others, and all that it may be on."""
     found = blocks.around(pose[:2])
     on_route: list[tuple[float, str]] = []

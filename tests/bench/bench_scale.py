@@ -32,7 +32,7 @@ from factory.config.arguments import answer
 from factory.exits import COMPLETE
 from factory.graph.execute import Execution, execute
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
-from factory.graph.work import Columns, Driven, Dropped, PreparedClip
+from factory.graph.work import AcceptedDrive, Columns, PreparedClip, RejectedAttempt
 from factory.readers.base import ClipRef
 from factory.store.samples import Store
 from tasks.stages import Rejected
@@ -79,16 +79,18 @@ class WaitingWork(ToyWork):
 
     row_kb: int = 20
 
-    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
         name = f"{prepared.clip_id}:{expert}:{candidate}"
         time.sleep(self.seconds)
         chance = zlib.crc32(name.encode()) / 2**32
         if chance < self.threshold:
-            return Dropped(Rejected("reward", "nc"), {"nc": chance}, {"reward": 0.01})
+            return RejectedAttempt(Rejected("reward", "nc"), {"nc": chance}, {"reward": 0.01})
         digest = prepared.content_digest
-        return Driven((name, any_row() | {"clip_id": prepared.clip_id, "content_digest": digest}), {"reward": 0.01})
+        return AcceptedDrive(
+            (name, any_row() | {"clip_id": prepared.clip_id, "content_digest": digest}), {"reward": 0.01}
+        )
 
-    def draw(self, driven: Driven) -> Columns:
+    def draw(self, driven: AcceptedDrive) -> Columns:
         drawn = super().draw(driven)
         assert isinstance(drawn, Columns)
         name, _ = driven.payload  # type: ignore[misc]

@@ -48,7 +48,7 @@ def killing(kind, name, at):
 
     setattr(kind, name, method)
 
-killing(driver.Driver, "_take_attempt", 6)
+killing(driver.RunDriver, "_take_attempt", 6)
 store = Store(sys.argv[1])
 ended = on_new_clusters(lambda: execute(ToyWork(), refs(5), EXPERTS, 2, store, Execution("ray", 1, shard_seconds=0.05)))
 sys.exit(ended.exit_code)

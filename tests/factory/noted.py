@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from factory.graph.work import Built, Columns, Driven, Dropped, PreparedClip, Stopped, never
+from factory.graph.work import AcceptedDrive, Built, Columns, PreparedClip, RejectedAttempt, StopCheck, never
 from factory.pipeline import FactoryWork
 from factory.readers.base import ClipRef
 from tasks.stages import Rejected
@@ -26,7 +26,7 @@ class NotedWork(FactoryWork):
         with open(self.journal, "a") as file:
             file.write(json.dumps([task, where().split()[1], began, time.time()]) + "\n")
 
-    def reconstruct(self, ref: ClipRef, threads: int, stopped: Stopped = never) -> Built:
+    def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never) -> Built:
         with self.noted("reconstruct"):
             return super().reconstruct(ref, threads, stopped)
 
@@ -34,14 +34,14 @@ class NotedWork(FactoryWork):
         with self.noted("perturb"):
             return super().prepare(ref)
 
-    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
         with self.noted("drive"):
             return super().drive(prepared, candidate, expert)
 
-    def draw(self, driven: Driven) -> Columns | Dropped:
+    def draw(self, driven: AcceptedDrive) -> Columns | RejectedAttempt:
         with self.noted("render"):
             return super().draw(driven)
 
-    def label(self, driven: Driven) -> Columns:
+    def label(self, driven: AcceptedDrive) -> Columns:
         with self.noted("label"):
             return super().label(driven)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from factory.graph.execute import Execution, RunSummary, execute
-from factory.graph.work import Built, Columns, Driven, Dropped, PreparedClip, Stopped, never
+from factory.graph.work import AcceptedDrive, Built, Columns, PreparedClip, RejectedAttempt, StopCheck, never
 from factory.readers.base import BadClip, ClipRef
 from factory.stages.rows import label_columns
 from factory.store.attempts import CandidateRow
@@ -127,7 +127,7 @@ class ToyWork:
     def block(self, ref: ClipRef) -> str | None:
         return ref.log_id if self.blocks else None
 
-    def reconstruct(self, ref: ClipRef, threads: int, stopped: Stopped = never) -> Built:
+    def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never) -> Built:
         self._note(f"reconstruct {ref.log_id}")
         time.sleep(self.seconds)
         self._trouble(ref.log_id)
@@ -156,7 +156,7 @@ class ToyWork:
         counts = {"heading": 7, "lateral": 3}
         return PreparedClip(ref.clip_id, self.content, candidates, counts, payload, dropped, {"perturb": 0.1})
 
-    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
         payload = prepared.payload
         assert isinstance(payload, dict)
         name = f"{payload['name']}:{expert}:{candidate}"
@@ -166,20 +166,20 @@ class ToyWork:
         rng = stream(prepared.clip_id, "attempt", expert, candidate)
         chance = float(rng.random())
         if expert != "human" and chance < self.threshold:
-            return Dropped(Rejected("reward", "nc" if chance < self.threshold / 2 else "ep"), {"nc": chance})
+            return RejectedAttempt(Rejected("reward", "nc" if chance < self.threshold / 2 else "ep"), {"nc": chance})
         row = row_of(rng)
         row["clip_id"], row["content_digest"] = prepared.clip_id, prepared.content_digest
         row["label_10hz"] = payload["states"][candidate % 6, 1:].astype(np.float32)
-        return Driven((name, row), {"reward": 0.01})
+        return AcceptedDrive((name, row), {"reward": 0.01})
 
-    def draw(self, driven: Driven) -> Columns | Dropped:
+    def draw(self, driven: AcceptedDrive) -> Columns | RejectedAttempt:
         name, row = driven.payload  # type: ignore[misc]
         self._note(f"render {name} on {where()}")
         if self._trouble(f"{name}:render") == "unfit":
-            return Dropped(Rejected("render", "blank"), {"nc": 1.0}, {"render": 0.02})
+            return RejectedAttempt(Rejected("render", "blank"), {"nc": 1.0}, {"render": 0.02})
         return Columns({key: row[key] for key in PICTURES} | {"tags": ["drawn"]}, {"render": 0.02}, True)
 
-    def label(self, driven: Driven) -> Columns:
+    def label(self, driven: AcceptedDrive) -> Columns:
         name, row = driven.payload  # type: ignore[misc]
         self._note(f"label {name} on {where()}")
         self._trouble(f"{name}:label")

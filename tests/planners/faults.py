@@ -14,7 +14,7 @@ def interrupted_after_one(command: ModuleType) -> Iterator[None]:
 
     def first_alone(function, items, *arguments) -> Iterator[object]:  # type: ignore[no-untyped-def]
         yield from each(function, list(items)[:1], *arguments)
-        raise command.Halted
+        raise command.TaskStopped
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(command, "each", first_alone)

@@ -93,7 +93,7 @@ def camera_view(intrinsics: Array, world_from_camera: Array) -> tuple[Array, Arr
     return view, world_from_camera[:3, :3] @ np.linalg.inv(intrinsics)
 
 
-def look(scene: LitScene, view: Array, width: int, height: int) -> tuple[ShortInts, Array]:
+def rasterise_view(scene: LitScene, view: Array, width: int, height: int) -> tuple[ShortInts, Array]:
     """Which triangle is visible in each of height x width samples, -1: none; the triangles' planes (T, 9)."""
     ids = np.full((height, width), -1, np.int32)
     return ids, rasterise(scene.mesh, view, np.zeros((height, width), np.float32), ids)
@@ -106,7 +106,7 @@ def paint(scene: LitScene, camera: Camera, world_from_ego: Array) -> Bytes:
     world_from_camera = world_from_ego @ camera.ego_from_camera
     view, rays = camera_view(scale @ camera.intrinsics, world_from_camera)
     height, width = CELLS * camera.height + 2, CELLS * camera.width + 2
-    ids, planes = look(scene, view, SAMPLES * width, SAMPLES * height)
+    ids, planes = rasterise_view(scene, view, SAMPLES * width, SAMPLES * height)
     return _through_optics(shade(scene, ids, planes, np.ascontiguousarray(world_from_camera[:3, 3]), rays))
 
 
@@ -189,7 +189,7 @@ def scan(scene: LitScene, world_from_ego: Array, beams: int, azimuths: int) -> L
         local = direction[mine] @ ego_from_view[:3, :3]  # x right, y down, z forward
         x = local[:, 0] / local[:, 2] * width / 2 + width / 2
         y = local[:, 1] / local[:, 2] * width / 2 + height / 2
-        ids, planes = look(scene, view, width, height)
+        ids, planes = rasterise_view(scene, view, width, height)
         hit = ids[np.clip(y.astype(int), 0, height - 1), np.clip(x.astype(int), 0, width - 1)]
         plane = planes[np.maximum(hit, 0)]
         inverse_depth = plane[:, 0] * x + plane[:, 1] * y + plane[:, 2]

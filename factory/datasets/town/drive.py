@@ -124,7 +124,7 @@ def drive(
     path: TownPath, start_s: float, speed: float, style: DrivingStyle, others: Array, signals: Signals, times_s: Array
 ) -> tuple[Array, Array]:
     """Arc length (S,) [m] and speed (S,) [m/s] of a driver that sees `others` (S, J, 5): IDM with bounded jerk."""
-    rear, along_speed = _on_path(path, style, others)
+    rear, along_speed = _obstacles_and_speeds(path, style, others)
     s_out, v_out = np.empty(len(times_s)), np.empty(len(times_s))
     s, v, a = start_s, speed, 0.0
     for i, time in enumerate(times_s):
@@ -161,7 +161,7 @@ def _follow(gap: float, v: float, lead_v: float, style: DrivingStyle) -> float:
     return style.accel * (1.0 - (wanted / max(gap, 0.3)) ** 2)
 
 
-def _on_path(path: TownPath, style: DrivingStyle, others: Array) -> tuple[Array, Array]:
+def _obstacles_and_speeds(path: TownPath, style: DrivingStyle, others: Array) -> tuple[Array, Array]:
     """Where along the path everybody in the driver's corridor ends (S, J) (inf: not in it), and speeds along it."""
     if others.shape[1] == 0:
         return np.full((len(others), 1), np.inf), np.zeros((len(others), 1))

@@ -49,7 +49,7 @@ from factory.graph.plan import Stretch
 from factory.graph.steps import Failure, Walked, attempt
 from factory.graph.work import NotReady, PreparedClip, Work, never
 from factory.store.attempts import ErrorKind
-from factory.store.disk import DiskFull, existing, why_ill
+from factory.store.disk import DiskFull, existing, machine_fault_of
 from factory.store.location import BadLocation, Location
 from factory.store.schema import Stamp
 from factory.wording import one_line
@@ -386,7 +386,7 @@ def _claiming(name: str, cores: int, gpu: float | None, memory: int | None, retu
 
 def _kind_of(error: RayError) -> ErrorKind:
     """A worker that died may have died of its clip; a node, its memory or its object store are the machine's."""
-    ill = isinstance(error, ILL) or why_ill(error.cause if isinstance(error, RayTaskError) else error)
+    ill = isinstance(error, ILL) or machine_fault_of(error.cause if isinstance(error, RayTaskError) else error)
     return ErrorKind.MACHINE if ill else ErrorKind.SYSTEM
 
 

@@ -52,7 +52,7 @@ class Drives:
         return self._out.read(f"{FILMS}/{drive_id}.mp4")
 
 
-def told(rows: Sequence[Row], with_films: bool = True) -> dict[str, Any]:
+def drives_as_json(rows: Sequence[Row], with_films: bool = True) -> dict[str, Any]:
     """What GET /api/drives answers: a line for each planner, kind of pictures and of start; and drives one by one."""
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:

@@ -7,7 +7,7 @@
 | `/api/samples?page=1&size=12&order=newest&expert=...` | factory.views.board.gallery.gallery; filters: FILTERS there |
 | `/api/samples/<attempt_id>` | factory.views.board.gallery.whole |
 | `/api/failed?page=1` | factory.views.board.gallery.failures |
-| `/api/drives` | factory.views.board.drives.told |
+| `/api/drives` | factory.views.board.drives.drives_as_json |
 | `/picture/<attempt_id>/<name>.jpg` | a JPEG, see factory.views.board.gallery |
 | `/film/<drive_id>.mp4` | a planner's drive as a film |
 | `/episode/<attempt_id>.mcap` | the sample for Foxglove, Lichtblick or Rerun |
@@ -34,7 +34,7 @@ import pyarrow as pa
 from deltalake.exceptions import DeltaError
 
 from factory.store.samples import ChangedRun, Store
-from factory.views.board.drives import Drives, told
+from factory.views.board.drives import Drives, drives_as_json
 from factory.views.board.gallery import BadRequest, NotThere, Pictures, failures, gallery, whole
 from factory.views.board.overview import overview
 from factory.views.board.watch import LOOK_EVERY_S, Watch
@@ -162,7 +162,7 @@ class Board:
             case ["api", "failed"]:
                 return _json(failures(self.watch.now(), _number(query, "page", 1)))
             case ["api", "drives"]:
-                return _json(told(self._drives.rows()))
+                return _json(drives_as_json(self._drives.rows()))
             case ["film", name]:
                 film = self._drives.film(_checked(name.removesuffix(".mp4")))
                 if film is None:

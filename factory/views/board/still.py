@@ -13,7 +13,7 @@ from typing import Any
 from factory.store.reader import decoded
 from factory.store.samples import Store
 from factory.store.schema import NOW_INDEX
-from factory.views.board.drives import Drives, told
+from factory.views.board.drives import Drives, drives_as_json
 from factory.views.board.gallery import Pictures, card_of, failures, gallery, place_of, whole
 from factory.views.board.overview import overview
 from factory.views.board.server import STATIC
@@ -44,7 +44,7 @@ def still_page(store: Store, shot: Snapshot, pictures: Pictures, extra: Mapping[
         f"/api/samples?size={N_LOOKS}&simulated=1": looks,
         "/api/samples": {"total": shot.samples.num_rows, "page": 1, "pages": 1, "items": items},
         "/api/failed?page=1": failures(shot, 1, N_FAILED) | {"pages": 1},
-        "/api/drives": told(Drives(store.location).rows(), with_films=False),
+        "/api/drives": drives_as_json(Drives(store.location).rows(), with_films=False),
     }
     ids = [item["attempt_id"] for item in items]
     for i, attempt_id in enumerate(ids):

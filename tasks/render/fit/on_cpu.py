@@ -44,7 +44,7 @@ class OnCpu:
         compared = shot.compared
         camera = corrected(shot.photo.world_from_camera, state.learned["poses"].values[row])
         scene, parts = compose(problem, state, state.learned["boxes"].values, shot.photo)
-        seen, sky = look(state, scene, shot.photo, camera, self.threads)
+        seen, sky = forward_pass(state, scene, shot.photo, camera, self.threads)
         colours = state.learned["exposure"].values[row]
         picture = exposed(seen.view.rgb, colours)
         loss, d_picture = photo_loss(picture, compared.target, settings.ssim_weight)
@@ -76,7 +76,9 @@ def compose(problem: Problem, state: FitState, off: F32, photo: Photo) -> tuple[
     return (scenes[0] if len(scenes) == 1 else concatenate(scenes)), parts
 
 
-def look(state: FitState, scene: Gaussians, photo: Photo, camera: Array, threads: int) -> tuple[ForwardPass, SkyCells]:
+def forward_pass(
+    state: FitState, scene: Gaussians, photo: Photo, camera: Array, threads: int
+) -> tuple[ForwardPass, SkyCells]:
     """The photo's picture from `camera` (4, 4), and where its sky comes from."""
     height, width = photo.rgb.shape[:2]
     sky = sky_cells(photo.intrinsics, camera, width, height, threads)

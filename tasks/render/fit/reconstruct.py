@@ -10,7 +10,7 @@ from tasks.kernels.compiled import kernel
 from tasks.render.fit.backend import Derivatives, FitBackend, Held
 from tasks.render.fit.corrections import after, between, corrected, exposed, inverse, matrix_of, reference
 from tasks.render.fit.losses import Lpips, Target, ssim
-from tasks.render.fit.on_cpu import OnCpu, compose, look
+from tasks.render.fit.on_cpu import OnCpu, compose, forward_pass
 from tasks.render.fit.start import Problem, Shot, prepare
 from tasks.render.fit.state import BACKGROUND, FitState, Road, above_road, opacities_of, refine
 from tasks.render.scene.asset import ClassQuality, Exposure, RenderAsset, ViewQuality, mean_psnr_db, psnr
@@ -175,7 +175,7 @@ def floaters(problem: Problem, state: FitState) -> Ints:
     means = state.learned["means"].values[rows].astype(np.float64)
     least_m, silent = np.full(len(rows), np.inf), list[Ints]()
     for i in range(len(problem.train)):
-        hiding, depths_m, hidden = _at_bodies(problem, state, i, means)
+        hiding, depths_m, hidden = _hiding_and_hidden_by_bodies(problem, state, i, means)
         least_m[hiding] = np.minimum(least_m[hiding], depths_m)
         silent.append(np.concatenate([hiding, hidden]))
     found = np.flatnonzero(np.isfinite(least_m))
@@ -193,7 +193,7 @@ def floaters(problem: Problem, state: FitState) -> Ints:
     return rows[found[shown <= SHOWN_BY * looked]]
 
 
-def _at_bodies(problem: Problem, state: FitState, i: int, means: Array) -> tuple[Ints, Array, Ints]:
+def _hiding_and_hidden_by_bodies(problem: Problem, state: FitState, i: int, means: Array) -> tuple[Ints, Array, Ints]:
     """Of `means` (M, 3) those that hide the body of a vehicle which drives in photo `i`, their depths in it [m], and
     those that such a body hides."""
     shot, tracks, nothing = problem.train[i], problem.tracks, np.zeros(0, np.int64)
@@ -398,7 +398,7 @@ def picture_of(problem: Problem, state: FitState, photo: Photo, threads: int = 1
     row_pose, row_colour = corrections_at(problem, state, photo.camera, photo.time_s)
     camera = corrected(photo.world_from_camera, row_pose)
     scene, _ = compose(problem, state, boxes_off(problem, state), photo)
-    seen, _ = look(state, scene, photo, camera, threads)
+    seen, _ = forward_pass(state, scene, photo, camera, threads)
     return np.clip(exposed(seen.view.rgb, row_colour), 0.0, 1.0)
 
 

@@ -202,7 +202,7 @@ def comfort_along(
     before = len(history)
     _load(history, rear_axle_to_center, lon[:before], lat[:before], magnitude[:before], heading[:before])
     _load(states, rear_axle_to_center, lon[before:], lat[before:], magnitude[before:], heading[before:])
-    _judge(lon, lat, magnitude, heading, judged)
+    _limited_quantities(lon, lat, magnitude, heading, judged)
     comfortable = True
     for f in range(N_FLAGS):
         flags[f] = _all_within(judged[f], LIMITS[f, 0], LIMITS[f, 1])
@@ -214,7 +214,7 @@ def comfort_along(
 
 
 @kernel
-def _judge(lon: Array, lat: Array, magnitude: Array, heading: Array, judged: Array) -> None:
+def _limited_quantities(lon: Array, lat: Array, magnitude: Array, heading: Array, judged: Array) -> None:
     """The limited quantities (6, T) of a drive that is loaded; overwrites it."""
     unwrap(heading)
     smooth_accel(lon, judged[0])
@@ -274,7 +274,7 @@ def _within_limits(states: Array, rear_axle_to_center: float, within: Bools) -> 
     scratch = np.empty((_SCRATCH_ROWS, n))
     judged, lon, lat, magnitude, heading = scratch[:N_FLAGS], scratch[6], scratch[7], scratch[8], scratch[9]
     _load(states, rear_axle_to_center, lon, lat, magnitude, heading)
-    _judge(lon, lat, magnitude, heading, judged)
+    _limited_quantities(lon, lat, magnitude, heading, judged)
     for t in range(n):
         for f in range(N_FLAGS):
             within[t] &= LIMITS[f, 0] < judged[f, t] and judged[f, t] < LIMITS[f, 1]

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from factory.graph.each import IN_HAND, WorkerDied, each
-from factory.graph.work import Halted
+from factory.graph.work import TaskStopped
 from factory.store.location import BadLocation, Location
 from tests.factory.items import Elsewhere, OddItem, squared
 from tests.factory.test_exits import child_of, has_begun
@@ -74,7 +74,7 @@ def test_after_a_signal_what_is_in_hand_still_comes_and_nothing_new_begins(how: 
     results = each(squared, counted(100, begun), **how)
     came = [next(results)]
     os.kill(os.getpid(), number)
-    with pytest.raises(Halted):
+    with pytest.raises(TaskStopped):
         came.extend(results)
     assert 0 < len(came) < 20 and len(begun) - len(came) == 1, "one was looked at to see whether any was left"
     assert signal.getsignal(number) == before
@@ -134,9 +134,9 @@ def test_workers_end_with_a_driver_that_is_killed(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_workers_that_are_just_starting_do_not_hear_what_a_terminal_sends_to_all() -> None:
     code = (
-        "from factory.graph.each import each; from factory.graph.work import Halted; "
+        "from factory.graph.each import each; from factory.graph.work import TaskStopped; "
         "from tests.factory.items import squared\n"
-        "try:\n    list(each(squared, range(100), workers=2))\nexcept Halted:\n    print('halted')"
+        "try:\n    list(each(squared, range(100), workers=2))\nexcept TaskStopped:\n    print('halted')"
     )
     how: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, start_new_session=True, **how) as driver:

@@ -13,7 +13,7 @@ import pytest
 from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, Execution, execute
 from factory.graph.local import Claims, attempt_tasks
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
-from factory.graph.work import Driven, Dropped, PreparedClip
+from factory.graph.work import AcceptedDrive, PreparedClip, RejectedAttempt
 from factory.pipeline import FactoryWork
 from factory.store.samples import Store
 from tasks.stages import ATTEMPT, TASKS
@@ -87,7 +87,7 @@ def test_memory_bounds_what_a_node_does_at_once(
     """Of four cores, memory fills two; a task that claims more than any node has is alone on one."""
 
     class Timed(ToyWork):
-        def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+        def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
             began, result = time.time(), super().drive(prepared, candidate, expert)
             with open(self.journal, "a") as file:
                 file.write(f"at {began} {time.time()}\n")

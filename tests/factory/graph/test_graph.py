@@ -14,7 +14,7 @@ import pytest
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph import execute as execution
 from factory.graph.execute import Execution, execute
-from factory.graph.work import Built, Driven, Dropped, Halted, PreparedClip, Stopped, never
+from factory.graph.work import AcceptedDrive, Built, PreparedClip, RejectedAttempt, StopCheck, TaskStopped, never
 from factory.readers.base import ClipRef
 from factory.store.cache import BadCacheFile
 from factory.store.samples import Store
@@ -156,7 +156,7 @@ def test_nothing_new_begins_once_a_run_is_stopped(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(execution, "LocalGraph", lambda work, out, stopped, fuse: local(work, out, never, fuse))
 
     class Stopping(ToyWork):
-        def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+        def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
             if not Path(self.journal).read_text().count("attempt"):  # a second signal would end the run at once
                 os.kill(os.getpid(), signal.SIGTERM)
             return super().drive(prepared, candidate, expert)
@@ -169,7 +169,7 @@ def test_nothing_new_begins_once_a_run_is_stopped(tmp_path: Path, monkeypatch: p
 
 def test_a_signal_reaches_a_block_that_is_being_built_in_this_process(tmp_path: Path) -> None:
     class Building(ToyWork):
-        def reconstruct(self, ref: ClipRef, threads: int, stopped: Stopped = never) -> Built:
+        def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never) -> Built:
             if ref.log_id == "log0":
                 return super().reconstruct(ref, threads)
             assert not stopped()
@@ -177,7 +177,7 @@ def test_a_signal_reaches_a_block_that_is_being_built_in_this_process(tmp_path: 
             end = time.monotonic() + 20.0
             while not stopped():
                 assert time.monotonic() < end, "nobody told the task"
-            raise Halted("half of it is done")
+            raise TaskStopped("half of it is done")
 
     stopped = run(tmp_path / "out", Building(blocks=True))
     assert stopped.exit_code == INTERRUPTED

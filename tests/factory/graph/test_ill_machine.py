@@ -10,10 +10,10 @@ import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph.steps import failure_of
-from factory.graph.work import Driven, Dropped, PreparedClip
+from factory.graph.work import AcceptedDrive, PreparedClip, RejectedAttempt
 from factory.store.attempts import ErrorKind
 from factory.store.cache import ClipCache
-from factory.store.disk import DiskFull, PlaceRefused, own_place, why_ill
+from factory.store.disk import DiskFull, PlaceRefused, machine_fault_of, refused_as_the_runs_own
 from tests.factory.graph.runs import run
 from tests.factory.tables import assert_same_tables, tables_of
 from tests.factory.toy import ToyWork
@@ -31,7 +31,7 @@ class IllWork(ToyWork):
     ill: tuple[str, ...] = ()  # starts of the names of attempts, as the toy's journal has them
     number: int = errno.EIO
 
-    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
         name = f"{prepared.payload['name']}:{expert}:{candidate}"  # type: ignore[index]
         if name.startswith(self.ill):
             raise OSError(self.number, os.strerror(self.number), "/mnt/share/log")
@@ -90,9 +90,9 @@ def test_illness_after_illness_stops_the_run_with_its_reason(tmp_path: Path, pla
 
 
 def test_a_place_of_the_run_s_own_that_refuses_is_the_machine_s(tmp_path: Path) -> None:
-    with pytest.raises(PlaceRefused, match="cannot be written: Permission denied"), own_place(tmp_path):
+    with pytest.raises(PlaceRefused, match="cannot be written: Permission denied"), refused_as_the_runs_own(tmp_path):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "x")
-    with pytest.raises(OSError, match="Input/output") as found, own_place(tmp_path):
+    with pytest.raises(OSError, match="Input/output") as found, refused_as_the_runs_own(tmp_path):
         raise OSError(errno.EIO, os.strerror(errno.EIO), "x")
     assert not isinstance(found.value, PlaceRefused)
 
@@ -114,7 +114,7 @@ def test_the_machine_s_errors_are_told_by_number_or_by_what_stores_say(error: OS
     assert failure_of(error).kind is ErrorKind.MACHINE
     wrapped = RuntimeError("a plug-in's own words")
     wrapped.__cause__ = error
-    assert why_ill(wrapped) == str(error)
+    assert machine_fault_of(wrapped) == str(error)
 
 
 @pytest.mark.parametrize(

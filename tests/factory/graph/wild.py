@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from factory.graph.work import Driven, Dropped, PreparedClip
+from factory.graph.work import AcceptedDrive, PreparedClip, RejectedAttempt
 from tests.factory.toy import ToyWork
 
 
@@ -26,7 +26,7 @@ class WildWork(ToyWork):
 
     wild: tuple[tuple[str, str], ...] = ()
 
-    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
         payload = prepared.payload
         assert isinstance(payload, dict)
         match dict(self.wild).get(f"{payload['name']}:{expert}:{candidate}"):

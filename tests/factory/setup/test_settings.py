@@ -9,7 +9,7 @@ from factory.config.compose import ConfigError
 from factory.config.run import SCENARIONET, load_config, refuse_relative_root
 from factory.setup.settings import assemble
 from factory.setup.vocabulary import save_recovery_table
-from factory.store.disk import why_ill
+from factory.store.disk import machine_fault_of
 from factory.store.schema import RunIdentity
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.rollout.policy import SeenTraffic
@@ -117,7 +117,7 @@ def test_a_policy_that_is_changed_under_a_run_makes_no_row_by_the_name_of_the_ol
     monkeypatch.setattr(Standing, "version", "2")
     with pytest.raises(OSError, match="another digest than when the run began") as refused:
         run.work.prepare(ref)
-    assert why_ill(refused.value)
+    assert machine_fault_of(refused.value)
 
 
 @pytest.mark.parametrize(

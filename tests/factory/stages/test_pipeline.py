@@ -10,7 +10,7 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import load_config
-from factory.graph.work import HUMAN_CANDIDATE, Columns, Dropped, PreparedClip, attempted
+from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, RejectedAttempt, attempted
 from factory.pipeline import FactoryWork, WholeClip
 from factory.readers.base import BadClip
 from factory.setup.settings import assemble, identity_of, refuse_missing_backend
@@ -79,7 +79,9 @@ def test_a_drive_that_cannot_be_shown_is_dropped_and_the_human_s_is_not(small_to
     strict = strict_on(small_town, tmp_path, contrast_min=1.0)
     prepared = prepared_by(strict)
     results = [attempted(strict, prepared, row.index, "pdm_closed") for row in prepared.candidates]
-    dropped = [result for result in results if isinstance(result, Dropped) and result.rejected.stage == "render"]
+    dropped = [
+        result for result in results if isinstance(result, RejectedAttempt) and result.rejected.stage == "render"
+    ]
     assert dropped and {result.rejected.reason for result in dropped} == {"blank"}
     assert not any(isinstance(result, Columns) for result in results)
     assert dropped[0].subscores["nc"] == 1.0  # the reward had accepted it
@@ -97,7 +99,7 @@ def test_a_drive_past_a_vehicle_unlike_its_photos_is_dropped_and_at_zero_it_is_n
     strict = strict_on(small_town, tmp_path, vehicle_min=1.0, vehicle_share=0.001)
     prepared = prepared_by(strict)
     found = [attempted(strict, prepared, row.index, "pdm_closed") for row in prepared.candidates]
-    dropped = [result.rejected for result in found if isinstance(result, Dropped)]
+    dropped = [result.rejected for result in found if isinstance(result, RejectedAttempt)]
     details = [rejected.detail for rejected in dropped if rejected.reason == "unlike_photos"]
     assert details and {detail.split(":")[0] for detail in details} <= stored
     lenient = strict_on(small_town, tmp_path, vehicle_min=0.0, vehicle_share=0.001)

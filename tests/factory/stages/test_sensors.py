@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.feather
 import pytest
 
-from factory.graph.work import Halted, Stopped
+from factory.graph.work import StopCheck, TaskStopped
 from factory.readers.base import BadClip
 from factory.stages import assets
 from factory.stages.assets import Sensing, asset_for, block_id, sensing
@@ -296,13 +296,13 @@ def test_a_fit_that_is_asked_to_stop_keeps_every_iteration_and_goes_on_to_the_sa
     undisturbed = asset_for(clip, FITTED, tmp_path / "one")
     begun = tmp_path / "two" / f"block-{block_id(clip, FITTED)}.fit.npz"
 
-    def after(n: int) -> Stopped:
+    def after(n: int) -> StopCheck:
         """Says no so often."""
         asked = count()
         return lambda: next(asked) >= n
 
     for n, done in ((7, 7), (5, 12)):
-        with pytest.raises(Halted, match=f"{done} of 20 iterations are done"):
+        with pytest.raises(TaskStopped, match=f"{done} of 20 iterations are done"):
             asset_for(clip, FITTED, tmp_path / "two", stopped=after(n))
         with np.load(begun) as arrays:
             assert arrays["iteration"] == done

@@ -8,7 +8,7 @@ import pytest
 from factory.exits import COMPLETE
 from factory.store.location import Location
 from factory.store.samples import Store
-from factory.views.board.drives import SCHEMA, Drives, told
+from factory.views.board.drives import SCHEMA, Drives, drives_as_json
 from factory.views.board.server import Board
 from planners.drive import table
 from planners.drive.drive import main
@@ -45,7 +45,7 @@ def test_those_that_failed_come_first_and_a_file_of_its_own_names_no_films(tmp_p
         | {"at_fault_collision": hit, "planner": "a", "pictures": "none"}
         for name, start, events, hit in (("a", -1, 0, False), ("b", 0, 1, True), ("c", 1, 1, False))
     ]  # fmt: skip
-    found = told(rows, with_films=False)
+    found = drives_as_json(rows, with_films=False)
     assert [row["drive_id"] for row in found["drives"]] == ["b", "c", "a"]
     assert "film" not in found["drives"][0]
     logged, perturbed = found["lines"]

@@ -7,7 +7,7 @@ import pytest
 
 from planners.evaluation.aggregation import ClipResult, by_clip, lines_of, measured, score_of, summarise
 from planners.evaluation.bootstrap import paired_interval
-from planners.evaluation.compare import CompareSettings, compare, is_clear, is_clear_row, row_of, text_of
+from planners.evaluation.compare import CompareSettings, compare, difference_columns, is_clear, is_clear_row, text_of
 from planners.evaluation.score_rows import FrameRow
 from tests.planners.made_rows import clip_rows
 
@@ -189,8 +189,8 @@ def test_runs_are_compared_over_clips_logs_and_towns() -> None:
     assert np.isnan(of_one_town["final", "unfiltered"]["town"].low)
     assert not is_clear(of_one_town["final", "unfiltered"])
     assert "only one" in text_of(of_one_town, 0.95)
-    row = row_of(of_one_town["final", "unfiltered"])
-    of_one_log = row_of(compare([run(n_clips=2)], [run(0.1, n_clips=2)], SETTINGS)["final", "unfiltered"])
+    row = difference_columns(of_one_town["final", "unfiltered"])
+    of_one_log = difference_columns(compare([run(n_clips=2)], [run(0.1, n_clips=2)], SETTINGS)["final", "unfiltered"])
     assert is_clear_row(row) and float(of_one_log["low"]) > 0.0 and not is_clear_row(of_one_log)
     assert row["low_town"] == row["high_town"] == "" and row["low_log"] != ""
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from planners.models.backbones import BackboneSettings
-from planners.models.layers import Attention, Decoder, FusionSettings, LatentFusion, Layer, begin
+from planners.models.layers import Attention, Decoder, FusionSettings, LatentFusion, Layer, initialise_weights
 
 
 class Parts(nn.Module):
@@ -32,13 +32,13 @@ def spread(weight: Tensor) -> float:
 
 def test_torch_s_draw_is_left_as_it_is() -> None:
     model, same = parts(), parts()
-    begin(model, "torch")
+    initialise_weights(model, "torch")
     assert all(torch.equal(a, b) for a, b in zip(model.state_dict().values(), same.state_dict().values()))
 
 
 def test_blocks_begin_as_their_shortcuts_and_exchanges_small() -> None:
     model = parts()
-    begin(model, "public")
+    initialise_weights(model, "public")
     for name, value in model.fusion.named_parameters():
         if name.endswith("bn2.weight"):
             assert not value.any(), name
@@ -51,7 +51,7 @@ def test_blocks_begin_as_their_shortcuts_and_exchanges_small() -> None:
 def test_attention_begins_as_torch_s_own() -> None:
     torch.manual_seed(0)
     torch_s, ours = nn.MultiheadAttention(256, 4), Attention(256, 4)
-    begin(ours, "public")
+    initialise_weights(ours, "public")
     whole = torch_s.in_proj_weight.detach()
     for projection in (ours.query, ours.key, ours.value):
         assert float(projection.weight.detach().abs().max()) == pytest.approx(float(whole.abs().max()), rel=1e-3)
@@ -63,14 +63,14 @@ def test_attention_begins_as_torch_s_own() -> None:
 
 def test_attention_without_biases_begins_as_plain_linear_maps() -> None:
     model = parts()
-    begin(model, "public")
+    initialise_weights(model, "public")
     for projection in (model.among.own.query, model.among.own.key, model.among.own.value):
         assert float(projection.weight.detach().abs().max()) == pytest.approx(1.0 / math.sqrt(64), rel=0.01)
 
 
 def test_layers_of_a_decoder_begin_as_clones() -> None:
     model = parts()
-    begin(model, "public")
+    initialise_weights(model, "public")
     first, *others = (layer.state_dict() for layer in model.decoder.layers)
     for other in others:
         assert all(torch.equal(value, other[name]) for name, value in first.items())

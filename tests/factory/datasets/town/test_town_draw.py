@@ -11,8 +11,8 @@ from factory.datasets.town.draw import (
     build_rig,
     camera_view,
     cast,
-    look,
     paint,
+    rasterise_view,
     scan,
     sun_over,
     world_from_ego,
@@ -116,7 +116,7 @@ def test_leaves_leave_gaps() -> None:
     builder.quads(corners, uv, tx.LEAVES, (0.2, 0.4, 0.1), 3)
     scene = staged(builder)
     view, _rays = camera_view(FRONT.intrinsics, world_from_ego(np.zeros(3)) @ FRONT.ego_from_camera)
-    covered = (look(scene, view, 320, 180)[0] >= 0).sum()
+    covered = (rasterise_view(scene, view, 320, 180)[0] >= 0).sum()
     whole = (1.7 / (8 - 1.62) * FRONT.intrinsics[0, 0]) ** 2
     assert 0.15 * whole < covered < 0.9 * whole
 

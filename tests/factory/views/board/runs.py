@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.graph.execute import Execution, RunSummary
-from factory.graph.work import Columns, Driven, Dropped, PreparedClip
+from factory.graph.work import AcceptedDrive, Columns, PreparedClip, RejectedAttempt
 from factory.readers.base import ClipRef
 from factory.store.funnel import funnel_of
 from factory.store.samples import Store
@@ -32,11 +32,11 @@ class PicturedWork(ToyWork):
 
     watching: Callable[[], None] = lambda: None
 
-    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
         self.watching()
         return super().drive(prepared, candidate, expert)
 
-    def draw(self, driven: Driven) -> Columns:
+    def draw(self, driven: AcceptedDrive) -> Columns:
         return Columns(pictures(dict.fromkeys(FRONT_YAWS, VIEW)))
 
 
