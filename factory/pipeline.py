@@ -1,4 +1,7 @@
-"""The stages behind the machine: what `factory.graph.work.Work` asks for, with real clips and the science of tasks/."""
+"""A clip's life, top to bottom: read, perturbed, driven, judged, drawn, labelled. Its row is written by factory/graph.
+
+The stages behind the machine: what `factory.graph.work.Work` asks for, with real clips and the science of tasks/.
+"""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -141,30 +144,7 @@ class FactoryWork:
     photos_alone: bool  # clips may have photos and no lidar
     starts: Mapping[str, Array] = field(default_factory=dict, kw_only=True)  # clip_id -> (S, 40, 3) of its own
 
-    def warm(self, draws: bool = True) -> None:
-        """This run's kernels, and no others, into the on-disk cache. Raises NotReady."""
-        from factory.stages.warm import compile_kernels, parts_of
-
-        if draws and self.render.mode is RenderMode.AUTO:
-            try:
-                check(self.render.backend)
-            except BackendMissing as error:
-                raise NotReady(str(error)) from error
-        label_traffic = None if self.labelling is None else self.labelling.traffic.mode
-        compile_kernels(parts_of(self._simulates, self.traffic.mode, label_traffic, self.render, self.photos_alone))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Whose samples this run makes."""
-        return tuple(self.experts)
-
-    def once(self, expert: str) -> bool:
-        """Whether the expert says so itself."""
-        return tried_once(self.experts[expert])
-
-    def expert_digest(self, expert: str) -> str:
-        """Of the expert's inputs and settings."""
-        return self.experts[expert].digest()
+    # A clip is read, and perturbed into candidates.
 
     def prepare(self, ref: ClipRef) -> PreparedClip | Rejected:
         """Read the clip, check that its block can be rendered, list its candidates.
@@ -174,6 +154,39 @@ class FactoryWork:
         """
         made = self.considered(ref) if self._simulates else self._unlisted(ref)
         return made if isinstance(made, Rejected | PreparedClip) else self.listed(ref, made)
+
+    def _unlisted(self, ref: ClipRef) -> PreparedClip | Rejected:
+        watch = Stopwatch()
+        clip = self._read(ref, watch)
+        if isinstance(clip, Rejected):
+            return clip
+        payload = PerturbedClip(ref, bare(clip), ())
+        return PreparedClip(clip.clip_id, clip.content_digest, (), {}, payload, seconds=watch.seconds)
+
+    def considered(self, ref: ClipRef) -> WholeClip | Rejected:
+        """All that `prepare` decides, and every gated trajectory's fate. Rejected: for every expert. Raises BadClip."""
+        watch = Stopwatch()
+        clip = self._read(ref, watch)
+        return clip if isinstance(clip, Rejected) else self._perturbed(clip, watch)
+
+    def _read(self, ref: ClipRef, watch: Stopwatch) -> Clip | Rejected:
+        if ref in self.broken:
+            raise BrokenLog(ref.log_id, self.broken[ref])
+        with watch.of("clip"):
+            clip = read_clip(self.reader, ref)
+        if not has_route(clip.centerline):
+            return Rejected("clip", "route_ended", "the log ends at the end of its route")
+        return clip
+
+    def _perturbed(self, clip: Clip, watch: Stopwatch) -> WholeClip:
+        with watch.of("render"):  # before perturb work is spent; without a gate only a block that will be needed
+            asked = self.render.refuses_blocks or self._simulates
+            blocked = self.imaging.block_verdict(clip) if asked else None
+        self._refuse_another_policy()
+        with watch.of("perturb"):
+            rng, starts = stream(self.seed, clip.clip_id, "perturb"), self.starts.get(clip.clip_id, NO_STARTS)
+            found = blocked or perturb(clip, self.vocabulary, self.perturb, self.traffic, self.pdm, rng, starts)
+        return WholeClip(clip, found, watch.seconds)
 
     def listed(self, ref: ClipRef, made: WholeClip) -> PreparedClip:
         """What attempts start from."""
@@ -188,43 +201,74 @@ class FactoryWork:
             seconds=made.seconds,
         )
 
-    def considered(self, ref: ClipRef) -> WholeClip | Rejected:
-        """All that `prepare` decides, and every gated trajectory's fate. Rejected: for every expert. Raises BadClip."""
-        watch = Stopwatch()
-        clip = self._read(ref, watch)
-        return clip if isinstance(clip, Rejected) else self._perturbed(clip, watch)
+    # A candidate is driven, an expert drives on from there, and the reward judges it.
 
-    def _perturbed(self, clip: Clip, watch: Stopwatch) -> WholeClip:
-        with watch.of("render"):  # before perturb work is spent; without a gate only a block that will be needed
-            asked = self.render.refuses_blocks or self._simulates
-            blocked = self.imaging.block_verdict(clip) if asked else None
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
+        """Rollout, expert, rollout and reward; candidate -1 with experts that are tried once."""
+        watch = Stopwatch()
+        drive = self.trace(prepared, candidate, expert, watch.of)
+        if drive.rejected is not None:
+            return RejectedAttempt(drive.rejected, _subscores(drive), watch.seconds)
+        return AcceptedDrive(drive, watch.seconds)
+
+    def trace(self, prepared: PreparedClip, candidate: int, expert: str, timed: Timed = nullcontext) -> Drive:
+        """The same with nothing left out."""
+        payload, driver = payload_of(prepared), self.experts[expert]
+        rng = stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
+        if tried_once(driver):
+            judged = human_sample(scene_of_clip(payload.clip), driver, self.pdm, rng, timed)
+            return Drive(payload.ref, None, judged, None)
+        chosen = payload.candidates[candidate]
         self._refuse_another_policy()
-        with watch.of("perturb"):
-            rng, starts = stream(self.seed, clip.clip_id, "perturb"), self.starts.get(clip.clip_id, NO_STARTS)
-            found = blocked or perturb(clip, self.vocabulary, self.perturb, self.traffic, self.pdm, rng, starts)
-        return WholeClip(clip, found, watch.seconds)
+        with timed("rollout"):
+            scene = perturbed_scene(payload.clip, chosen.rollout)
+        result = attempt(scene, driver, self.gate, self.traffic, self.pdm, rng, timed)
+        return Drive(payload.ref, chosen, *((None, result) if isinstance(result, Rejected) else result))
 
-    def _read(self, ref: ClipRef, watch: Stopwatch) -> Clip | Rejected:
-        if ref in self.broken:
-            raise BrokenLog(ref.log_id, self.broken[ref])
-        with watch.of("clip"):
-            clip = read_clip(self.reader, ref)
-        if not has_route(clip.centerline):
-            return Rejected("clip", "route_ended", "the log ends at the end of its route")
-        return clip
+    # What the reward accepts is drawn.
 
-    def _unlisted(self, ref: ClipRef) -> PreparedClip | Rejected:
-        watch = Stopwatch()
-        clip = self._read(ref, watch)
-        if isinstance(clip, Rejected):
+    def draw(self, driven: AcceptedDrive) -> Columns | RejectedAttempt:
+        """The pictures; RejectedAttempt where they are no sample's. Raises BadClip."""
+        watch, drive, before = Stopwatch(), drive_of(driven), scene_lookups()
+        with watch.of("render"):
+            sensed = self._with_sensors(drive)
+            unfit = self.unfit(sensed, drive)
+            pictures = {} if unfit is not None else self.imaging.pictures(sensed, drive.candidate, drive.sampled)
+        if unfit is not None:
+            return RejectedAttempt(unfit, _subscores(drive), watch.seconds, _at_hand(before))
+        return Columns(pictures, watch.seconds, _at_hand(before))
+
+    def unfit(self, clip: Clip, drive: Drive) -> Rejected | None:
+        """Why the pictures of an accepted drive are no sample's; `clip` with its sensor files. Raises BadClip.
+
+        The log's own drive is never filtered.
+        """
+        if drive.candidate is None or drive.judged is None:
+            return None
+        return self.imaging.unfit(clip, drive.candidate, drive.judged, drive.shared)
+
+    def _with_sensors(self, drive: Drive) -> Clip:
+        clip = drive.sampled.scene.clip
+        if self.render.mode is not RenderMode.AUTO:
             return clip
-        payload = PerturbedClip(ref, bare(clip), ())
-        return PreparedClip(clip.clip_id, clip.content_digest, (), {}, payload, seconds=watch.seconds)
+        now = read_clip(self.reader, drive.ref)
+        return replace(clip, images=now.images, sweeps=now.sweeps, block=now.block)
 
-    def content_digest(self, ref: ClipRef) -> str | None:
-        """Of what the clip would be read from now; None where the reader cannot tell."""
-        digest = getattr(self.reader, "digest", None)
-        return None if digest is None else str(digest(ref))
+    # All else of the row; the graph writes it.
+
+    def label(self, driven: AcceptedDrive) -> Columns:
+        """All but the pictures, the vocabulary labels among it."""
+        watch, drive = Stopwatch(), drive_of(driven)
+        judged = drive.sampled
+        labels: dict[str, object] = {}
+        if self.labelling is not None:
+            with watch.of("labels"):
+                labelled = vocabulary_labels(self.labelling, judged.scene, judged.prepared, judged.reference)
+                labels = label_columns(labelled)
+        row = sample_row(judged.scene.clip, drive.candidate, judged)
+        return Columns({**row, **drive.told, **labels}, watch.seconds)
+
+    # The block that a clip's pictures are drawn from is built before.
 
     def block(self, ref: ClipRef) -> str | None:
         """The reader's name of the clip's block; None where it has none, or this run asks nothing of blocks."""
@@ -252,59 +296,37 @@ class FactoryWork:
         """The fits that are going on here."""
         return "; ".join(fits_going_on(Path(self.cache_dir)))
 
-    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
-        """Rollout, expert, rollout and reward; candidate -1 with experts that are tried once."""
-        watch = Stopwatch()
-        drive = self.trace(prepared, candidate, expert, watch.of)
-        if drive.rejected is not None:
-            return RejectedAttempt(drive.rejected, _subscores(drive), watch.seconds)
-        return AcceptedDrive(drive, watch.seconds)
+    # What the machine asks beside.
 
-    def trace(self, prepared: PreparedClip, candidate: int, expert: str, timed: Timed = nullcontext) -> Drive:
-        """The same with nothing left out."""
-        payload, driver = payload_of(prepared), self.experts[expert]
-        rng = stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
-        if tried_once(driver):
-            judged = human_sample(scene_of_clip(payload.clip), driver, self.pdm, rng, timed)
-            return Drive(payload.ref, None, judged, None)
-        chosen = payload.candidates[candidate]
-        self._refuse_another_policy()
-        with timed("rollout"):
-            scene = perturbed_scene(payload.clip, chosen.rollout)
-        result = attempt(scene, driver, self.gate, self.traffic, self.pdm, rng, timed)
-        return Drive(payload.ref, chosen, *((None, result) if isinstance(result, Rejected) else result))
+    def warm(self, draws: bool = True) -> None:
+        """This run's kernels, and no others, into the on-disk cache. Raises NotReady."""
+        from factory.stages.warm import compile_kernels, parts_of
 
-    def draw(self, driven: AcceptedDrive) -> Columns | RejectedAttempt:
-        """The pictures; RejectedAttempt where they are no sample's. Raises BadClip."""
-        watch, drive, before = Stopwatch(), drive_of(driven), scene_lookups()
-        with watch.of("render"):
-            sensed = self._with_sensors(drive)
-            unfit = self.unfit(sensed, drive)
-            pictures = {} if unfit is not None else self.imaging.pictures(sensed, drive.candidate, drive.sampled)
-        if unfit is not None:
-            return RejectedAttempt(unfit, _subscores(drive), watch.seconds, _at_hand(before))
-        return Columns(pictures, watch.seconds, _at_hand(before))
+        if draws and self.render.mode is RenderMode.AUTO:
+            try:
+                check(self.render.backend)
+            except BackendMissing as error:
+                raise NotReady(str(error)) from error
+        label_traffic = None if self.labelling is None else self.labelling.traffic.mode
+        compile_kernels(parts_of(self._simulates, self.traffic.mode, label_traffic, self.render, self.photos_alone))
 
-    def unfit(self, clip: Clip, drive: Drive) -> Rejected | None:
-        """Why the pictures of an accepted drive are no sample's; `clip` with its sensor files. Raises BadClip.
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Whose samples this run makes."""
+        return tuple(self.experts)
 
-        The log's own drive is never filtered.
-        """
-        if drive.candidate is None or drive.judged is None:
-            return None
-        return self.imaging.unfit(clip, drive.candidate, drive.judged, drive.shared)
+    def once(self, expert: str) -> bool:
+        """Whether the expert says so itself."""
+        return tried_once(self.experts[expert])
 
-    def label(self, driven: AcceptedDrive) -> Columns:
-        """All but the pictures, the vocabulary labels among it."""
-        watch, drive = Stopwatch(), drive_of(driven)
-        judged = drive.sampled
-        labels: dict[str, object] = {}
-        if self.labelling is not None:
-            with watch.of("labels"):
-                labelled = vocabulary_labels(self.labelling, judged.scene, judged.prepared, judged.reference)
-                labels = label_columns(labelled)
-        row = sample_row(judged.scene.clip, drive.candidate, judged)
-        return Columns({**row, **drive.told, **labels}, watch.seconds)
+    def expert_digest(self, expert: str) -> str:
+        """Of the expert's inputs and settings."""
+        return self.experts[expert].digest()
+
+    def content_digest(self, ref: ClipRef) -> str | None:
+        """Of what the clip would be read from now; None where the reader cannot tell."""
+        digest = getattr(self.reader, "digest", None)
+        return None if digest is None else str(digest(ref))
 
     def _refuse_another_policy(self) -> None:
         """Raises OSError where the policy that drives is another one than the rows say."""
@@ -313,13 +335,6 @@ class FactoryWork:
     @property
     def _simulates(self) -> bool:
         return self.identity.prepare_digest != UNLISTED
-
-    def _with_sensors(self, drive: Drive) -> Clip:
-        clip = drive.sampled.scene.clip
-        if self.render.mode is not RenderMode.AUTO:
-            return clip
-        now = read_clip(self.reader, drive.ref)
-        return replace(clip, images=now.images, sweeps=now.sweeps, block=now.block)
 
     @property
     def draws_on_gpu(self) -> bool:
