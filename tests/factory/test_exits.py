@@ -191,7 +191,7 @@ def test_a_run_outlives_its_guard_and_ends_by_a_signal_as_ever(tmp_path: Path, t
 
 RUN = ("run", "render=none", *QUICK)
 BEGUN = {  # the command, and a word of the process that it has begun
-    "towns": (*RUN, "clips=synthetic_towns", "clips.n_towns=2", "clips.settings.width=64", "painters"),
+    "towns": (*RUN, "clips=synthetic_towns", "clips.n_towns=2", "clips.settings.width=64", "town.town"),
     "isolated": (*RUN, "clips.n_clips=1", *BLIND, "graph.isolated=always", "spawn_main"),
     "kernels": (*RUN, "clips.n_clips=1", *BLIND, "factory.stages.warm"),
 }

@@ -97,7 +97,7 @@ def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
 def test_tables_of_another_version_are_refused_in_one_line_and_left_as_they_are(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], is_sealed: bool
 ) -> None:
-    executed(ToyWork(), refs(1), ["human"], 1, Store(tmp_path), "local")
+    executed(ToyWork(), refs(1), ["human"], 1, Store(tmp_path), Execution("local"))
     record = {"schema_version": 3, "runs": json.loads((tmp_path / "run.json").read_text())["runs"]}
     (tmp_path / "run.json").write_text(sealed_json(record) if is_sealed else json.dumps(record))
     shutil.rmtree(tmp_path / "samples" / "_commits")  # a repair would make them again

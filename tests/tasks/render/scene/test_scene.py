@@ -116,5 +116,6 @@ def test_the_smallest_scene_reaches_every_kernel_of_the_room() -> None:
     kernels = [value for module in modules for value in vars(module).values() if hasattr(value, "signatures")]
     assert len(kernels) > 10
     parts = {"_nearer", "aligned"}  # of their callers, like all that is inlined; no entry points
+    parts |= {"_anchor", "_chosen", "_confirm", "_stand_on"}  # which fits alone call: tasks.render.warm has theirs
     entries = [kernel for kernel in kernels if not kernel.targetoptions.get("forceinline")]
     assert {kernel.__name__ for kernel in entries if not kernel.signatures} <= parts
