@@ -54,7 +54,7 @@ def stored(scores: Scores) -> None:
     columns |= score_columns("stage2", scores)
     assert columns["stage2_sl"] == columns["stage2_sl_fails_s"] == 0.0
     assert {"stage1_sl", "stage1_sl_fails_s", "stage2_sl", "stage2_sl_fails_s"} <= set(STORED)
-    assert "HC SL of K trajectories" in formats_table() and "| `stage2_sl_fails_s` |" in formats_table()
+    assert "HC SL of K trajectories" in formats_table() and "`stage2_sl_fails_s`" in formats_table()
 
 
 def learned() -> None:

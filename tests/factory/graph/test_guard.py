@@ -13,9 +13,10 @@ from tests.pages import REPOSITORY
 CODE = """
 import sys, time
 from pathlib import Path
-from factory.graph.guard import Guard
+from factory.graph.guard import WatchedProcess
 
-with Guard(Path(sys.argv[1]), alone=False).watching({"key": "one", "what": "sleep", "seconds": float(sys.argv[2])}):
+task = {"key": "one", "what": "sleep", "seconds": float(sys.argv[2])}
+with WatchedProcess(Path(sys.argv[1]), alone=False).watching(task):
     time.sleep(60.0)
 """
 
