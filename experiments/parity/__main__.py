@@ -14,7 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.parity.lesson import (
+from factory.config.compose import ConfigError
+from factory.readers.pickles import load_tensors
+from planners.published.import_planner import imported
+from planners.published.weights import read_public
+from tests.planners.published.lesson import (
     Lesson,
     apart,
     differences_in_learning,
@@ -23,18 +27,15 @@ from experiments.parity.lesson import (
     read_lesson,
     samples,
 )
-from experiments.parity.start import apart as spread_otherwise
-from experiments.parity.start import our_start, start_of
-from factory.config.compose import ConfigError
-from factory.readers.pickles import load_tensors
-from planners.published.import_planner import imported
-from planners.published.weights import read_public
 from tests.planners.published.ours import CASES, Difference, differences, planner_of, preset, read_recorded
+from tests.planners.published.start import Start, our_start, start_of
+from tests.planners.published.start import apart as spread_otherwise
 from tests.planners.published.targets import differences_in_targets
 
 HERE = Path(__file__).resolve().parent
 FORMULA = HERE.parents[1] / "tests" / "planners" / "published"
 ROWS = 20  # of a curve that are printed
+RECORDED = 20  # steps of a training that a record keeps
 
 
 def arguments() -> argparse.Namespace:
@@ -47,7 +48,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--width", type=int, default=256)
     parser.add_argument("--height", type=int, default=64)
     parser.add_argument("--tolerance", type=float, default=1e-4)
-    parser.add_argument("--record", type=Path, help="outputs, targets: keep what the public side said, for the tests")
+    parser.add_argument("--record", type=Path, help="keep what the public side said, for tests without a checkout")
     parser.add_argument("--evaluation-alone", action="store_true", help="outputs: no losses, which takes less memory")
     parser.add_argument("--checkpoints", action="store_true", help="outputs: weights go through a Lightning checkpoint")
     parser.add_argument("--steps", type=int, default=200, help="training: how many")
@@ -101,6 +102,8 @@ def begun_alike(asked: argparse.Namespace, case: str, folder: Path) -> bool:
     planner = imported(preset(case, picture), read_public(drawn), case).planner
     public, arrays = start_of(planner), {name: np.asarray(array) for name, array in planner.arrays.items()}
     origin = load_tensors(drawn)["origin"]
+    if asked.record is not None:
+        write_start(public, case, origin, asked.record / f"{case}_start.npz")
     said = spread_otherwise(public, our_start(case, picture, arrays))
     print(f"{case}; public code: {origin}\n  {len(said)} of {len(public.spread)} arrays begin otherwise")
     print("".join(f"  {line}\n" for line in said), end="")
@@ -115,6 +118,8 @@ def trained_alike(asked: argparse.Namespace, case: str, folder: Path) -> bool:
     write_lesson(wanted, given, first)
     run_beside(asked, "training", [str(given), str(said)], folder)
     public = read_lesson(said)
+    if asked.record is not None:
+        write_beginning(said, asked.record / f"{case}_{asked.width}x{asked.height}_training.npz")
     ours = learned(wanted, public.names, min(first, len(public.learned.losses)), folder / "ours")
     print(f"{case}, {asked.width} x {asked.height}, {first} of {asked.steps} steps; public code: {public.origin}")
     print(f"  {'step':>6}{'rate':>12}{'public loss':>14}{'ours':>14}{'apart':>10}")
@@ -161,6 +166,21 @@ def write_lesson(lesson: Lesson, path: Path, first: int) -> None:
     }
     given = samples(lesson.picture)
     np.savez(path, told=np.array(json.dumps(told)), order=lesson.order[:first], seeds=lesson.seeds, **given)
+
+
+def write_beginning(said: Path, out: Path) -> None:
+    """Keep the first steps of a public training."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with np.load(said, allow_pickle=False) as stored:
+        kept = {name: stored[name][:RECORDED] if name in ("losses", "rates") else stored[name] for name in stored.files}
+    np.savez_compressed(out, **kept)
+
+
+def write_start(start: Start, case: str, origin: str, path: Path) -> None:
+    """Keep a public start."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    told = {"case": case, "origin": origin, "names": list(start.spread), "twins": dict(start.twins)}
+    np.savez_compressed(path, told=np.array(json.dumps(told)), spread=np.array(list(start.spread.values())))
 
 
 def run_beside(asked: argparse.Namespace, what: str, words: list[str], folder: Path) -> None:

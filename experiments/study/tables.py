@@ -1,8 +1,8 @@
 """The README's tables, and all others, from the kept frames alone; nothing is trained or planned.
 
 python -m experiments.study.tables                                         the headline, over clips, logs and towns
-python -m experiments.study.tables frames=towns out=/tmp/towns             every comparison: CSVs and tables.md
-python -m experiments.study.tables frames=nuscenes out=/tmp/nuscenes human_filter=filtered
+python -m experiments.study.tables frames=towns out=runs/towns             every comparison: CSVs and tables.md
+python -m experiments.study.tables frames=nuscenes out=runs/nuscenes human_filter=filtered
 """
 
 import sys

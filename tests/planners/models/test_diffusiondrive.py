@@ -166,3 +166,13 @@ def test_a_batch_that_lacks_something_is_refused() -> None:
         model.losses(replace(batch, bev=None))
     with pytest.raises(ValueError, match="without images"):
         model.plan(replace(batch, image=None))
+
+
+def test_bf16_gives_finite_losses_and_plans_in_full_precision() -> None:
+    batch, model = scene_batch(2), planner()
+    with torch.autocast("cpu", torch.bfloat16):
+        terms = model(batch)
+        summed(terms).backward()
+        plan = model.plan(batch)
+    assert all(term.isfinite() and term.dtype == torch.float32 for term in terms.values())
+    assert plan.dtype == torch.float32 and plan.isfinite().all()

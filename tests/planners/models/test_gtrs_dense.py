@@ -202,3 +202,14 @@ def test_settings_that_contradict_themselves_are_refused() -> None:
         replace(TINY, kept=0.0)
     with pytest.raises(ValueError, match="divisible by 32"):
         planner(replace(TINY, image=ImageLayout(width=100, height=32)))
+
+
+def test_bf16_learns_and_plans() -> None:
+    batch, _ = labelled(2)
+    model = planner()
+    with torch.autocast("cpu", torch.bfloat16):
+        terms = model(batch)
+        torch.stack(list(terms.values())).sum().backward()
+        plan = model.eval().plan(batch)
+    assert all(term.isfinite() and term.dtype == torch.float32 for term in terms.values())
+    assert plan.dtype == torch.float32

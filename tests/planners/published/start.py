@@ -4,10 +4,13 @@ Generators and the order of drawing differ, so that numbers cannot be equal; a b
 reads from a file (V2-99) is left out.
 """
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -64,3 +67,11 @@ def apart(public: Start, ours: Start) -> list[str]:
         if public.twins.get(name) != ours.twins.get(name):
             said.append(f"{name}: a copy of {public.twins.get(name)} there, of {ours.twins.get(name)} here")
     return sorted(said)
+
+
+def read_start(path: Path) -> tuple[Start, str, str]:
+    """A start, its case and its origin."""
+    with np.load(path, allow_pickle=False) as stored:
+        told, spread = json.loads(str(stored["told"])), stored["spread"].tolist()
+    spreads = {name: (mean, deviation, int(n)) for name, (mean, deviation, n) in zip(told["names"], spread)}
+    return Start(spreads, told["twins"]), told["case"], told["origin"]
