@@ -58,6 +58,11 @@ def test_what_cannot_be_meant_is_refused_and_nothing_is_written(
     assert not (tmp_path / "out").exists()
 
 
+def test_an_unknown_planner_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([f"out={tmp_path / 'out'}", "planner=nobody"]) == BAD_CONFIG
+    assert "planner=nobody" in capsys.readouterr().err
+
+
 def test_what_is_driven_is_not_driven_again(
     towns: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
