@@ -1,6 +1,6 @@
 """A clip's life, top to bottom: read, perturbed, driven, judged, drawn, labelled. Its row is written by factory/graph.
 
-The stages behind the machine: what `factory.graph.work.Work` asks for, with real clips and the science of tasks/.
+The stages behind the machine: what `factory.graph.steps.Work` asks for, with real clips and the science of tasks/.
 """
 
 import time
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.graph.work import AcceptedDrive, Built, Columns, NotReady, PreparedClip, RejectedAttempt, StopCheck, never
+from factory.graph.steps import AcceptedDrive, Built, Columns, NotReady, PreparedClip, RejectedAttempt, StopCheck, never
 from factory.readers.base import BadClip, ClipReader, ClipRef, Unreadable
 from factory.readers.validate import read_clip
 from factory.stages.assets import fits_going_on

@@ -35,7 +35,7 @@ import pyarrow.compute as pc
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph.execute import Execution, Executor, execute, on_new_clusters
-from factory.graph.work import PreparedClip
+from factory.graph.steps import PreparedClip
 from factory.readers.base import ClipRef
 from factory.run import main as run_main
 from factory.store.samples import Store

@@ -24,7 +24,7 @@ from factory.datasets.navsim.log import read_frames
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.execute import Execution, RunSummary, execute
 from factory.graph.limits import Limits
-from factory.graph.work import AcceptedDrive, PreparedClip, RejectedAttempt
+from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt
 from factory.readers.base import ClipRef
 from factory.stages.sensors import load_sweeps
 from factory.store.samples import Store

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from factory.config.run import load_config
-from factory.graph.work import HUMAN_CANDIDATE, PreparedClip
+from factory.graph.steps import HUMAN_CANDIDATE, PreparedClip
 from factory.pipeline import Drive, FactoryWork, payload_of
 from factory.setup.settings import assemble
 from tasks.attempt import perturbed_scene, verdict

@@ -126,7 +126,7 @@ def _export_all(request: Request) -> int:
     from factory.datasets.navsim.export import export as export_all
     from factory.datasets.navsim.settings import ExportSettings
     from factory.graph.each import WorkerDied, each
-    from factory.graph.work import TaskStopped
+    from factory.graph.steps import TaskStopped
     from factory.store.location import Location
     from factory.store.reader import sample_table
 

@@ -20,7 +20,7 @@ class Request:
 
 def main(request: Request) -> None:
     """Compile the parts that are named, else all. Raises Refused."""
-    from factory.graph.work import NotReady
+    from factory.graph.steps import NotReady
     from factory.stages.warm import PARTS, compile_kernels, compile_town_kernels
 
     if unknown := sorted(set(request.parts) - PARTS.keys()):

@@ -10,7 +10,7 @@ from itertools import islice
 from typing import Literal, ParamSpec, TypeVar
 
 from factory.exits import as_worker, asked_to_stop, without_terminal
-from factory.graph.work import TaskStopped
+from factory.graph.steps import TaskStopped
 from factory.store.location import Location
 
 T = TypeVar("T")

@@ -26,7 +26,7 @@ from factory.graph.local import NO_CLAIMS, Claims, ClusterDied, ClusterLacks, Fu
 from factory.graph.metrics import RunMetrics
 from factory.graph.plan import Records, RunPlan, Try, counted, crash_of, make_plan, retry_policy
 from factory.graph.progress import Executed
-from factory.graph.work import NotReady, Work
+from factory.graph.steps import NotReady, Work
 from factory.readers.base import ClipRef
 from factory.store.attempts import NOTHING, Kind
 from factory.store.disk import DiskFull, machine_fault_of

@@ -20,8 +20,7 @@ from factory.graph import steps
 from factory.graph.guard import WatchedProcess
 from factory.graph.limits import NO_LIMITS, Costs, Limits, cleared, described, notes_folder, put_away, watched
 from factory.graph.metrics import NoRecorder, Recorder
-from factory.graph.steps import Failure, warm
-from factory.graph.work import NotReady, StopCheck, Work, never
+from factory.graph.steps import Failure, NotReady, StopCheck, Work, never, warm
 from factory.store.attempts import ErrorKind
 from factory.store.disk import DiskFull
 from factory.store.location import Location

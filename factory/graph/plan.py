@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.graph.guard import CRASHED, read_note
-from factory.graph.steps import Failure
-from factory.graph.work import HUMAN_CANDIDATE, PreparedClip
+from factory.graph.steps import HUMAN_CANDIDATE, Failure, PreparedClip
 from factory.readers.base import ClipRef
 from factory.store.attempts import QUARANTINE_AFTER, ClipCandidates, ErrorKind, History, Kind, Listed, Outcome, Past
 from factory.store.samples import WAYS_OUT, ChangedRun, OnChange

@@ -11,7 +11,7 @@ from typing import Any
 
 from factory.config.run import RunConfig, load_config
 from factory.graph.plan import candidate_order
-from factory.graph.work import Columns, attempted
+from factory.graph.steps import Columns, attempted
 from factory.readers.base import ClipRef
 from factory.setup.settings import Run
 from factory.store.funnel import funnel_of

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.graph.work import StopCheck, TaskStopped, never
+from factory.graph.steps import StopCheck, TaskStopped, never
 from factory.locks import locked
 from factory.readers.pictures import file_and_frame
 from factory.stages.rig import SAID, UsedRig, corrected_rig, known_of, said_again, taken_from, told_of, used_rig, wanted

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from factory.config.run import BenchmarkSettings
-from factory.graph.work import HUMAN_CANDIDATE
+from factory.graph.steps import HUMAN_CANDIDATE
 from factory.readers.base import ClipRef
 from factory.store.samples import MADE_UNDER, Store
 from factory.store.schema import RunIdentity

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.graph.work import StopCheck, never
+from factory.graph.steps import StopCheck, never
 from factory.readers.base import BadClip
 from factory.stages.assets import Sensing, asset_for, corrected_for, scene_path, sensing
 from factory.stages.painted import town_cameras, town_pictures

@@ -15,8 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from factory.graph.steps import cache_key
-from factory.graph.work import PreparedClip
+from factory.graph.steps import PreparedClip, cache_key
 from factory.pipeline import FactoryWork, PerturbedClip, payload_of
 from factory.readers.base import BadClip, ClipRef
 from factory.store.attempts import Kind

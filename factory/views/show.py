@@ -7,7 +7,7 @@ from factory.config.arguments import Refused
 from factory.views.status import fate, rows_where
 
 if TYPE_CHECKING:
-    from factory.graph.work import PreparedClip
+    from factory.graph.steps import PreparedClip
     from factory.store.reader import SampleTable
     from factory.store.samples import Store
     from tasks.world.arrays import Array

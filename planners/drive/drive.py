@@ -29,7 +29,7 @@ from factory.config.compose import ConfigError, need_run_extra
 from factory.exits import Failed, Stopped
 from factory.graph.each import WorkerDied, each
 from factory.graph.progress import Counter
-from factory.graph.work import TaskStopped
+from factory.graph.steps import TaskStopped
 from factory.readers.base import ClipRef
 from factory.setup.settings import choose_vocabulary, open_reader
 from factory.store.disk import why_unusable

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from factory.config.run import load_config
-from factory.graph.work import PreparedClip
+from factory.graph.steps import PreparedClip
 from factory.pipeline import FactoryWork
 from factory.setup.settings import assemble
 from factory.stages.assets import asset_for

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from factory.config.run import load_config
-from factory.graph.work import HUMAN_CANDIDATE
+from factory.graph.steps import HUMAN_CANDIDATE
 from factory.pipeline import FactoryWork
 from factory.readers.base import ClipRef
 from factory.setup.settings import assemble

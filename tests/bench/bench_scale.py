@@ -32,7 +32,7 @@ from factory.config.arguments import answer
 from factory.exits import COMPLETE
 from factory.graph.execute import Execution, execute
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
-from factory.graph.work import AcceptedDrive, Columns, PreparedClip, RejectedAttempt
+from factory.graph.steps import AcceptedDrive, Columns, PreparedClip, RejectedAttempt
 from factory.readers.base import ClipRef
 from factory.store.samples import Store
 from tasks.stages import Rejected

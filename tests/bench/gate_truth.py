@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from factory.datasets.town.draw import Theatre, paint
 from factory.datasets.town.drive import TownDrive
 from factory.datasets.town.town import log_name, plan_log
-from factory.graph.work import PreparedClip
+from factory.graph.steps import PreparedClip
 from factory.pipeline import FactoryWork, payload_of
 from factory.stages.imaging import GATE_STRIDE
 from tasks.render.gate import (

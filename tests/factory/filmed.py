@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from factory.graph.work import AcceptedDrive, Columns
+from factory.graph.steps import AcceptedDrive, Columns
 from tests.factory.toy import ToyWork
 from tests.planners.samples import FRONT_YAWS, jpeg, pictures, plain, sample
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from factory.graph.work import AcceptedDrive, Built, Columns, PreparedClip, RejectedAttempt, StopCheck, never
+from factory.graph.steps import AcceptedDrive, Built, Columns, PreparedClip, RejectedAttempt, StopCheck, never
 from factory.pipeline import FactoryWork
 from factory.readers.base import ClipRef
 from tasks.stages import Rejected

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from factory.graph.execute import Execution, RunSummary, execute
-from factory.graph.work import AcceptedDrive, Built, Columns, PreparedClip, RejectedAttempt, StopCheck, never
+from factory.graph.steps import AcceptedDrive, Built, Columns, PreparedClip, RejectedAttempt, StopCheck, never
 from factory.readers.base import BadClip, ClipRef
 from factory.stages.rows import label_columns
 from factory.store.attempts import CandidateRow

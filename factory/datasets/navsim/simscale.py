@@ -33,7 +33,7 @@ from factory.datasets.navsim.scenes import (
 )
 from factory.datasets.navsim.tracks import ego_states
 from factory.files import folders_in, matching, matching_below
-from factory.graph.work import HUMAN_CANDIDATE
+from factory.graph.steps import HUMAN_CANDIDATE
 from factory.readers.base import BadClip
 from factory.readers.pickles import load_plain
 from factory.stages.imaging import NO_IMAGES

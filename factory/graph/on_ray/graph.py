@@ -46,8 +46,7 @@ from factory.graph.local import (
 )
 from factory.graph.metrics import METRICS, Metric, Recorder, Type
 from factory.graph.plan import Stretch
-from factory.graph.steps import Failure, Walked, attempt
-from factory.graph.work import NotReady, PreparedClip, Work, never
+from factory.graph.steps import Failure, NotReady, PreparedClip, Walked, Work, attempt, never
 from factory.store.attempts import ErrorKind
 from factory.store.disk import DiskFull, existing, machine_fault_of
 from factory.store.location import BadLocation, Location

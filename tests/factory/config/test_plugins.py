@@ -9,7 +9,7 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import load_config
-from factory.graph.work import Columns, PreparedClip, RejectedAttempt, attempted
+from factory.graph.steps import Columns, PreparedClip, RejectedAttempt, attempted
 from factory.readers.base import BadClip
 from factory.setup.settings import Run, assemble
 from factory.store.schema import BOOKKEEPING, sample_row_to_table

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from factory.graph.each import IN_HAND, WorkerDied, each
-from factory.graph.work import TaskStopped
+from factory.graph.steps import TaskStopped
 from factory.store.location import BadLocation, Location
 from tests.factory.items import Elsewhere, OddItem, squared
 from tests.factory.test_exits import child_of, has_begun
@@ -134,7 +134,7 @@ def test_workers_end_with_a_driver_that_is_killed(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_workers_that_are_just_starting_do_not_hear_what_a_terminal_sends_to_all() -> None:
     code = (
-        "from factory.graph.each import each; from factory.graph.work import TaskStopped; "
+        "from factory.graph.each import each; from factory.graph.steps import TaskStopped; "
         "from tests.factory.items import squared\n"
         "try:\n    list(each(squared, range(100), workers=2))\nexcept TaskStopped:\n    print('halted')"
     )

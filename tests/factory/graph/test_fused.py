@@ -13,7 +13,7 @@ import pytest
 from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, Execution, execute
 from factory.graph.local import Claims, attempt_tasks
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
-from factory.graph.work import AcceptedDrive, PreparedClip, RejectedAttempt
+from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt
 from factory.pipeline import FactoryWork
 from factory.store.samples import Store
 from tasks.stages import ATTEMPT, TASKS

@@ -14,7 +14,7 @@ import pytest
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph import execute as execution
 from factory.graph.execute import Execution, execute
-from factory.graph.work import AcceptedDrive, Built, PreparedClip, RejectedAttempt, StopCheck, TaskStopped, never
+from factory.graph.steps import AcceptedDrive, Built, PreparedClip, RejectedAttempt, StopCheck, TaskStopped, never
 from factory.readers.base import ClipRef
 from factory.store.cache import BadCacheFile
 from factory.store.samples import Store

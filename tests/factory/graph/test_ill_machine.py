@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
-from factory.graph.steps import failure_of
-from factory.graph.work import AcceptedDrive, PreparedClip, RejectedAttempt
+from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt, failure_of
 from factory.store.attempts import ErrorKind
 from factory.store.cache import ClipCache
 from factory.store.disk import DiskFull, PlaceRefused, machine_fault_of, refused_as_the_runs_own

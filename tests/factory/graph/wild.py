@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from factory.graph.work import AcceptedDrive, PreparedClip, RejectedAttempt
+from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt
 from tests.factory.toy import ToyWork
 
 

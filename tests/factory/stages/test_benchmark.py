@@ -12,7 +12,7 @@ import pytest
 
 from factory.config.run import BenchmarkSettings, load_config
 from factory.exits import COMPLETE
-from factory.graph.work import Columns, PreparedClip, RejectedAttempt, attempted
+from factory.graph.steps import Columns, PreparedClip, RejectedAttempt, attempted
 from factory.pipeline import BenchmarkWork, FactoryWork
 from factory.readers.base import ClipRef
 from factory.readers.settings import TownSettings

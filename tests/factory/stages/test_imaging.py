@@ -10,7 +10,7 @@ import pytest
 
 from factory.config.run import load_config
 from factory.datasets.town.reader import SyntheticReader
-from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
+from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
 from factory.pipeline import FactoryWork
 from factory.readers.base import BadClip
 from factory.readers.settings import TownSettings

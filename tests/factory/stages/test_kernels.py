@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.graph.work import NotReady
+from factory.graph.steps import NotReady
 from factory.stages.warm import compile_kernels, compiling_ahead
 from tasks.kernels.compiled import cache_dir, kernel_sources, remove_unused, sources_digest
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from factory.config.run import load_config
-from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
+from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
 from factory.pipeline import FactoryWork
 from factory.setup.settings import assemble
 from factory.store.funnel import Funnel, funnel_of

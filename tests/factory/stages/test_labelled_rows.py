@@ -8,7 +8,7 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.config.run import load_config
-from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
+from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
 from factory.pipeline import FactoryWork
 from factory.run import main as run_main
 from factory.setup.calibrate import calibrate, measure

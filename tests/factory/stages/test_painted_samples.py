@@ -12,7 +12,7 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import load_config, run_config
-from factory.graph.work import Columns, PreparedClip, attempted
+from factory.graph.steps import Columns, PreparedClip, attempted
 from factory.pipeline import FactoryWork
 from factory.setup.settings import assemble
 from tasks.render.scene.asset import psnr

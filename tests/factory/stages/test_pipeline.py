@@ -10,7 +10,7 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import load_config
-from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, RejectedAttempt, attempted
+from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, RejectedAttempt, attempted
 from factory.pipeline import FactoryWork, WholeClip
 from factory.readers.base import BadClip
 from factory.setup.settings import assemble, identity_of, refuse_missing_backend

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.feather
 import pytest
 
-from factory.graph.work import StopCheck, TaskStopped
+from factory.graph.steps import StopCheck, TaskStopped
 from factory.readers.base import BadClip
 from factory.stages import assets
 from factory.stages.assets import Sensing, asset_for, block_id, sensing

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from factory.commands.table import COMMANDS
-from factory.graph.steps import cache_key
-from factory.graph.work import PreparedClip
+from factory.graph.steps import PreparedClip, cache_key
 from factory.pipeline import PerturbedClip, bare
 from factory.readers.base import ClipRef
 from factory.stages.scene_file import read_scene, write_scene

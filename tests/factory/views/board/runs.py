@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.graph.execute import Execution, RunSummary
-from factory.graph.work import AcceptedDrive, Columns, PreparedClip, RejectedAttempt
+from factory.graph.steps import AcceptedDrive, Columns, PreparedClip, RejectedAttempt
 from factory.readers.base import ClipRef
 from factory.store.funnel import funnel_of
 from factory.store.samples import Store
