@@ -134,8 +134,7 @@ def _run(
 ) -> int:
     from factory.graph.episodes import EpisodesWanted
     from factory.graph.execute import Execution, execute, on_new_clusters
-    from factory.graph.limits import Limits
-    from factory.graph.local import Claims
+    from factory.graph.local import Claims, Limits
     from factory.setup.calibrate import calibrate, plan_text
     from factory.setup.settings import assemble
     from factory.stages.benchmark import NEEDED, write_benchmark

@@ -23,7 +23,7 @@ import pyarrow.compute as pc
 from factory.datasets.navsim.log import read_frames
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.execute import Execution, RunSummary, execute
-from factory.graph.limits import Limits
+from factory.graph.local import Limits
 from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt
 from factory.readers.base import ClipRef
 from factory.stages.sensors import load_sweeps

@@ -21,8 +21,19 @@ from factory.graph.apart import AGAIN, NEW_CLUSTERS, begun_anew
 from factory.graph.driver import SHARD_BYTES, SHARD_SECONDS, Gatherer, RunDriver, WriteFailed
 from factory.graph.episodes import Episodes, EpisodesWanted, McapShards, SampleMirror, SampleMirrors
 from factory.graph.guard import CRASHED
-from factory.graph.limits import NO_LIMITS, Limits, notes_folder
-from factory.graph.local import NO_CLAIMS, Claims, ClusterDied, ClusterLacks, Fuse, Graph, LocalGraph, MachineIll
+from factory.graph.local import (
+    NO_CLAIMS,
+    NO_LIMITS,
+    Claims,
+    ClusterDied,
+    ClusterLacks,
+    Fuse,
+    Graph,
+    Limits,
+    LocalGraph,
+    MachineIll,
+    notes_folder,
+)
 from factory.graph.metrics import RunMetrics
 from factory.graph.plan import Records, RunPlan, Try, counted, crash_of, make_plan, retry_policy
 from factory.graph.progress import Executed

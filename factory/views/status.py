@@ -111,7 +111,7 @@ def status_lines(store: "Store") -> Iterable[str]:
 def _in_work(store: "Store") -> Iterable[str]:
     """Tasks that have been at work for long, as their guards said in the last half minute."""
     from factory.graph.guard import SHOWN_S, WORK, read_note
-    from factory.graph.limits import notes_folder
+    from factory.graph.local import notes_folder
 
     for path in sorted(notes_folder(store.location).glob(f"*{WORK}")):
         if (note := read_note(path)) is None or time.time() - path.stat().st_mtime > 3 * SHOWN_S:

@@ -7,7 +7,7 @@ import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.execute import Execution, RunSummary, execute
-from factory.graph.limits import Limits
+from factory.graph.local import Limits
 from factory.store.samples import Store
 from factory.store.verify import verify
 from tests.factory.graph.wild import WildWork

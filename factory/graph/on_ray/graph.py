@@ -28,21 +28,28 @@ from ray.util.metrics import Counter, Gauge, Histogram
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from factory.exits import without_terminal
-from factory.graph.limits import NO_LIMITS, Costs, Limits, cleared, described, notes_folder, put_away, watched
 from factory.graph.local import (
     MAX_RETRIES,
     NO_CLAIMS,
+    NO_LIMITS,
     STEPS,
     Claims,
     ClusterDied,
     ClusterLacks,
+    Costs,
     Fuse,
+    Limits,
     MachineIll,
     Ticket,
     attempt_tasks,
+    cleared,
     cores_of,
+    described,
     name_of,
+    notes_folder,
+    put_away,
     unready,
+    watched,
 )
 from factory.graph.metrics import METRICS, Metric, Recorder, Type
 from factory.graph.plan import Stretch

@@ -12,8 +12,7 @@ import pytest
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import Execution
-from factory.graph.limits import Limits
-from factory.graph.local import Claims
+from factory.graph.local import Claims, Limits
 from factory.graph.on_ray import graph
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
 from factory.store.samples import Store

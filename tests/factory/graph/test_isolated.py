@@ -15,8 +15,7 @@ import pytest
 from factory.config.run import load_config
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph.guard import CRASHED
-from factory.graph.limits import Costs, Limits, notes_folder
-from factory.graph.local import MAX_RETRIES
+from factory.graph.local import MAX_RETRIES, Costs, Limits, notes_folder
 from factory.run import isolates
 from factory.store.samples import Store
 from factory.views.status import status_lines
