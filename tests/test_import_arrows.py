@@ -163,7 +163,7 @@ def loaded_by(statement: str) -> set[str]:
 
 @pytest.mark.slow
 def test_a_run_in_this_process_needs_no_ray() -> None:
-    assert "ray" not in loaded_by("import factory.run, factory.graph.execute, factory.graph.metrics, factory.pipeline")
+    assert "ray" not in loaded_by("import factory.run, factory.graph.execute, factory.graph.progress, factory.pipeline")
 
 
 def test_importing_the_science_needs_numpy_only() -> None:

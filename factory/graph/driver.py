@@ -20,7 +20,6 @@ import pyarrow as pa
 
 from factory.graph.episodes import SampleMirror
 from factory.graph.local import Graph, MachineIll, Ticket
-from factory.graph.metrics import RunMetrics
 from factory.graph.plan import (
     CLIP_CANDIDATE,
     Blocked,
@@ -38,7 +37,7 @@ from factory.graph.plan import (
     tries_before,
     wants_payload,
 )
-from factory.graph.progress import Executed, ProgressLine, RunForecast, Tally, Workload
+from factory.graph.progress import Executed, ProgressLine, RunForecast, RunMetrics, Tally, Workload
 from factory.graph.steps import Attempted, Failure, HalfBuilt, HandedOn, Prepared, Reconstructed, Walked
 from factory.readers.base import ClipRef
 from factory.store.attempts import ClipCandidates, ErrorKind, Kind, Outcome, Past

@@ -34,9 +34,8 @@ from factory.graph.local import (
     MachineIll,
     notes_folder,
 )
-from factory.graph.metrics import RunMetrics
 from factory.graph.plan import Records, RunPlan, Try, counted, crash_of, make_plan, retry_policy
-from factory.graph.progress import Executed
+from factory.graph.progress import Executed, RunMetrics
 from factory.graph.steps import NotReady, Work
 from factory.readers.base import ClipRef
 from factory.store.attempts import NOTHING, Kind

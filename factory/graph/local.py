@@ -22,7 +22,7 @@ import numpy as np
 from factory.exits import as_worker, without_terminal
 from factory.graph import steps
 from factory.graph.guard import OVER, WORK, WatchedProcess, read_note
-from factory.graph.metrics import NoRecorder, Recorder
+from factory.graph.progress import NoRecorder, Recorder
 from factory.graph.steps import Failure, NotReady, StopCheck, Work, never, warm
 from factory.readers.base import ClipRef
 from factory.store.attempts import ErrorKind

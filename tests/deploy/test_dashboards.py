@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from deploy.grafana.build import DASHBOARDS, FOLDER, text_of
-from factory.graph.metrics import METRICS, Type
+from factory.graph.progress import METRICS, Type
 
 ROOT = Path(__file__).resolve().parents[2]
 ALERTS = ROOT / "deploy" / "prometheus" / "alerts.yml"

@@ -8,7 +8,7 @@ import pytest
 
 from factory.graph import execute as execution
 from factory.graph.local import LocalGraph
-from factory.graph.metrics import (
+from factory.graph.progress import (
     BYTES,
     CLIPS_LEFT,
     IN_FLIGHT,

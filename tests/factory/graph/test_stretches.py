@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from factory.exits import COMPLETE_WITH_FAILURES
-from factory.graph import limits
+from factory.graph import local
 from factory.graph.on_ray import graph
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
 from factory.store.samples import Store
@@ -28,7 +28,7 @@ def two_cpus() -> Iterator[None]:
 @pytest.fixture
 def long(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Stretches as long as they can be, from the second attempt on; how many attempts each has had."""
-    monkeypatch.setattr(limits, "SEEN", 1)
+    monkeypatch.setattr(local, "SEEN", 1)
     monkeypatch.setattr(graph, "AHEAD_S", 1e9)
     lengths: list[int] = []
     waited = graph.RayGraph.wait
