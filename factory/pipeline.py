@@ -17,7 +17,7 @@ from factory.readers.validate import read_clip
 from factory.stages.assets import fits_going_on
 from factory.stages.imaging import Imaging, scene_lookups
 from factory.stages.rows import label_columns, sample_row
-from factory.store.attempts import CandidateRow
+from factory.store.samples import CandidateRow
 from factory.store.schema import UNLISTED, RunIdentity
 from tasks.attempt import ExpertGate, Judged, Timed, attempt, has_route, human_sample, perturbed_scene
 from tasks.experts.human import Human

@@ -21,8 +21,7 @@ class Request:
 
 def main(request: Request) -> None:
     """Merge and say what became of each table. Raises Refused."""
-    from factory.store.location import BadLocation
-    from factory.store.parquet_file import DamagedFile
+    from factory.store.location import BadLocation, DamagedFile
     from factory.store.table import AnotherWriter
     from factory.store.verify import RunGoesOn, compact, hold
 

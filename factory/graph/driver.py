@@ -40,10 +40,9 @@ from factory.graph.plan import (
 from factory.graph.progress import Executed, ProgressLine, RunForecast, RunMetrics, Tally, Workload
 from factory.graph.steps import Attempted, Failure, HalfBuilt, HandedOn, Prepared, Reconstructed, Walked
 from factory.readers.base import ClipRef
-from factory.store.attempts import ClipCandidates, ErrorKind, Kind, Outcome, Past
 from factory.store.disk import DiskFull
-from factory.store.parquet_file import Shard
-from factory.store.samples import Store
+from factory.store.location import Shard
+from factory.store.samples import ClipCandidates, ErrorKind, Kind, Outcome, Past, Store
 from factory.store.schema import RunIdentity, Stamp, attempt_id
 from tasks.stages import Rejected
 

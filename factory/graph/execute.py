@@ -38,11 +38,10 @@ from factory.graph.plan import Records, RunPlan, Try, counted, crash_of, make_pl
 from factory.graph.progress import Executed, RunMetrics
 from factory.graph.steps import NotReady, Work
 from factory.readers.base import ClipRef
-from factory.store.attempts import NOTHING, Kind
 from factory.store.disk import DiskFull, machine_fault_of
 from factory.store.funnel import Funnel, funnel_of
 from factory.store.location import BadLocation
-from factory.store.samples import CURRENT_RUN, ChangedRun, OnChange, Store
+from factory.store.samples import CURRENT_RUN, NOTHING, ChangedRun, Kind, OnChange, Store
 from factory.store.table import AnotherWriter
 from factory.wording import one_line
 

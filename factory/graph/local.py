@@ -25,9 +25,9 @@ from factory.graph.guard import OVER, WORK, WatchedProcess, read_note
 from factory.graph.progress import NoRecorder, Recorder
 from factory.graph.steps import Failure, NotReady, StopCheck, Work, never, warm
 from factory.readers.base import ClipRef
-from factory.store.attempts import ErrorKind
 from factory.store.disk import DiskFull
 from factory.store.location import Location
+from factory.store.samples import ErrorKind
 from factory.store.schema import Stamp
 from tasks.stages import ATTEMPT, TASKS
 

@@ -9,8 +9,19 @@ from typing import Any
 from factory.graph.guard import CRASHED, read_note
 from factory.graph.steps import HUMAN_CANDIDATE, Failure, PreparedClip
 from factory.readers.base import ClipRef
-from factory.store.attempts import QUARANTINE_AFTER, ClipCandidates, ErrorKind, History, Kind, Listed, Outcome, Past
-from factory.store.samples import WAYS_OUT, ChangedRun, OnChange
+from factory.store.samples import (
+    QUARANTINE_AFTER,
+    WAYS_OUT,
+    ChangedRun,
+    ClipCandidates,
+    ErrorKind,
+    History,
+    Kind,
+    Listed,
+    OnChange,
+    Outcome,
+    Past,
+)
 from factory.store.schema import UNLISTED, RunIdentity, Stamp, attempt_id
 from tasks.stages import Rejected
 

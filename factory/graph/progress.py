@@ -16,9 +16,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from factory.graph.steps import Attempted, Failure, Prepared, Reconstructed, Walked
-from factory.store.attempts import Kind, Outcome
-from factory.store.location import Location
-from factory.store.parquet_file import Shard
+from factory.store.location import Location, Shard
+from factory.store.samples import Kind, Outcome
 from factory.wording import rate_text, time_text
 
 LINE_EVERY_S = 15.0

@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 import pyarrow as pa
 
 from factory.readers.base import BadClip, ClipRef, Unreadable
-from factory.store.attempts import CandidateRow, ErrorKind
 from factory.store.cache import BadCacheFile, ClipCache, SceneFiles
 from factory.store.disk import machine_fault_of, refused_as_the_runs_own, why_disk_full
-from factory.store.location import Location
+from factory.store.location import Location, Shard, write_shard
 from factory.store.mcap_files import FOLDER, episode_name, write_mcap_shard
-from factory.store.parquet_file import Shard, write_shard
 from factory.store.reader import samples_of
+from factory.store.samples import CandidateRow, ErrorKind
 from factory.store.schema import SAMPLES, RunIdentity, Stamp, sample_row_to_table
 from factory.wording import one_line
 from tasks.stages import ATTEMPT, Rejected

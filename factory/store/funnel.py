@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from factory.store.attempts import Kind, plans_of
-from factory.store.codes import Codes, Ints, codes, combinations
-from factory.store.samples import MADE_UNDER, Store, run_number
+from factory.store.samples import MADE_UNDER, Kind, Store, plans_of, run_number
+from factory.store.table import Codes, Ints, codes, combinations
 from tasks.stages import ATTEMPT, STAGES, TASKS
 
 # All attempts of a store as columns of integers: what counts over millions of rows is drawn from.

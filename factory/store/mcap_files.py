@@ -32,9 +32,8 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 from numpy.typing import NDArray
 
-from factory.store.location import Location
-from factory.store.parquet_file import Shard, TableSpec, naming, open_parquet, with_partition
-from factory.store.schema import FIELDS, SAMPLES, SCHEMA, Column
+from factory.store.location import Location, Shard, naming, open_parquet, with_partition
+from factory.store.schema import FIELDS, SAMPLES, SCHEMA, Column, TableSpec
 from factory.store.table import KeyedTable
 from tasks.sealed import sealed_json, unsealed_json
 from tasks.world.arrays import Ints

@@ -21,12 +21,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from factory.readers.pictures import BadPicture, decode_rgb
-from factory.store.codes import beginning, fixed_bytes
-from factory.store.location import Location
+from factory.store.location import Location, naming, open_parquet, with_partition
 from factory.store.mcap_files import McapShard, McapTable, open_shard
-from factory.store.parquet_file import naming, open_parquet, with_partition
 from factory.store.schema import SAMPLES, SCHEMA, VERSION_PROPERTY, table_to_rows, why_other_schema
-from factory.store.table import KeyedTable
+from factory.store.table import KeyedTable, beginning, fixed_bytes
 from tasks.reward.label_bytes import VocabularyLabels, decode
 from tasks.world.arrays import Bytes, Ints
 

@@ -11,7 +11,6 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from factory.store.parquet_file import TableSpec
 from tasks.subscores import HALVES, JUDGED, SUBSCORES, WHOLES
 
 # Declared columns: from one `Column` its Arrow type, its validation, its line in the docs, and arrays in and out.
@@ -40,6 +39,18 @@ _ARROW_OF = {  # type of a dataclass' field -> of its column
     dict[str, int]: pa.map_(pa.string(), pa.int64()),
     dict[str, float]: pa.map_(pa.string(), pa.float64()),
 }
+
+
+@dataclass(frozen=True)
+class TableSpec:
+    """What a table is; `key` is its unique column."""
+
+    name: str
+    schema: pa.Schema
+    key: str
+    partition_by: tuple[str, ...] = ()
+    properties: Mapping[str, str] | None = None
+    packed: tuple[str, ...] = ()  # leaves whose values are compressed already, as their paths in a file
 
 
 class BadRow(ValueError):

@@ -21,9 +21,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from factory.store.cache import BadCacheFile, SceneFiles, check_prepared
-from factory.store.codes import codes, fixed_bytes, packed
 from factory.store.disk import why_no_links
-from factory.store.location import BadLocation, Location
+from factory.store.location import BadLocation, DamagedFile, Location, Shard, naming, write_shard
 from factory.store.mcap_files import (
     FOLDER,
     SAMPLES_MCAP,
@@ -34,9 +33,8 @@ from factory.store.mcap_files import (
     write_mcap_shard,
 )
 from factory.store.mcap_files import NAMED as MCAP_NAMED
-from factory.store.parquet_file import DamagedFile, Shard, naming, write_shard
 from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, ChangedRun, Store
-from factory.store.table import COPIES, LOG, CommitCopies, KeyedTable, LiveFile, LogDamage
+from factory.store.table import COPIES, LOG, CommitCopies, KeyedTable, LiveFile, LogDamage, codes, fixed_bytes, packed
 
 TABLES = ("plans", "candidates", "samples", "outcomes", SAMPLES_MCAP.name)
 OF_WALKS = ["clip_id", "expert", "candidate_index", "round", "settings_hash"]

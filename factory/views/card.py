@@ -13,11 +13,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from factory import __version__
-from factory.store.attempts import Kind
-from factory.store.codes import codes
 from factory.store.funnel import Funnel, funnel_of_tables, funnel_tables
-from factory.store.samples import CURRENT_RUN, Store
+from factory.store.samples import CURRENT_RUN, Kind, Store
 from factory.store.schema import SCHEMA_VERSION
+from factory.store.table import codes
 from factory.views.status import counted
 
 FILE = "README.md"

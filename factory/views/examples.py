@@ -18,11 +18,10 @@ import pyarrow.compute as pc
 from factory.graph.steps import PreparedClip, cache_key
 from factory.pipeline import FactoryWork, PerturbedClip, payload_of
 from factory.readers.base import BadClip, ClipRef
-from factory.store.attempts import Kind
 from factory.store.cache import BadCacheFile
-from factory.store.codes import equals, fixed_bytes
 from factory.store.reader import decoded
-from factory.store.samples import Store
+from factory.store.samples import Kind, Store
+from factory.store.table import equals, fixed_bytes
 from factory.views.bev import attempt_picture
 from factory.views.sample_picture import (
     earlier_images,

@@ -35,7 +35,7 @@ def lineage(store: "Store", which: str) -> list[Part]:
 
 
 def _meant(store: "Store", which: str) -> str:
-    from factory.store.codes import beginning
+    from factory.store.table import beginning
 
     ids = store.samples.keys()
     if which.isascii() and which.isdecimal() and int(which) < len(ids):

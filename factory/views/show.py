@@ -27,7 +27,7 @@ def open_samples(store: "Store") -> "SampleTable":
 
 def find(table: "SampleTable", store: "Store", which: str) -> str:
     """The attempt_id meant by an ordinal, an id or the beginning of one. Raises Refused."""
-    from factory.store.codes import beginning
+    from factory.store.table import beginning
 
     if which.isascii() and which.isdecimal() and int(which) < len(table):
         return str(table.sample(int(which), ("attempt_id",))["attempt_id"])

@@ -36,8 +36,8 @@ import pyarrow.parquet as pq
 from pyarrow import fs
 
 from factory.locks import locked
+from factory.store.location import naming
 from factory.store.mcap_files import McapShard, ShardIndex
-from factory.store.parquet_file import naming
 from factory.store.reader import TIME_TOLERANCE_S, Format, StoredFile, group_rows, sample_table
 from tasks.sealed import Damaged, sealed, unsealed
 from tasks.world.arrays import Ints

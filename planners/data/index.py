@@ -17,8 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from factory.store.location import Location
-from factory.store.parquet_file import naming
+from factory.store.location import Location, naming
 from factory.store.reader import TIME_TOLERANCE_S, Format, StoredFile, group_rows
 from factory.store.schema import LABEL_COLUMNS
 from planners.data.batch import ImageLayout, Needs, TrainingData

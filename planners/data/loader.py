@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from factory.store.parquet_file import naming
+from factory.store.location import naming
 from planners.data.batch import Batch, Needs
 from planners.data.decode import BatchBuffer, StoredRows, count_labels
 from planners.data.files import COPY_FORMAT, LocalCopy, leaves, read_group

@@ -8,9 +8,8 @@ from typing import Generic, TypeVar
 
 import pyarrow as pa
 
-from factory.store.location import Location
-from factory.store.parquet_file import TableSpec, write_shard
-from factory.store.schema import canonical_json, schema_of
+from factory.store.location import Location, write_shard
+from factory.store.schema import TableSpec, canonical_json, schema_of
 from factory.store.table import KeyedTable
 from planners.drive.measures import DriveMeasures
 

@@ -41,9 +41,9 @@ from tests.factory.toy import ToyWork, any_row
 EXPERTS = ("pdm_closed", "recovery")
 WAITS = ("_private/worker.py:wait",)
 PARTS = (  # of a profile, from the outside in; they hold one another
-    *("on_ray/graph.py:submit", "ray/remote_function.py:_remote", "_private/worker.py:get", "graph/metrics.py:_add"),
-    *("graph/records.py:stamp", "graph/records.py:outcome", "graph/walk.py:next_step", "graph/batch.py:add"),
-    *("graph/batch.py:send_if_due", "graph/batch.py:_commit", "store/attempts.py:candidates_table"),
+    *("on_ray/graph.py:submit", "ray/remote_function.py:_remote", "_private/worker.py:get", "graph/progress.py:_add"),
+    *("graph/plan.py:stamp", "graph/plan.py:outcome", "graph/plan.py:next_step", "graph/driver.py:add"),
+    *("graph/driver.py:send_if_due", "graph/driver.py:_commit", "store/samples.py:candidates_table"),
 )
 CANDIDATES = 16  # of a clip; where half of them are accepted, five rounds take ten
 

@@ -30,10 +30,9 @@ from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph.execute import Execution, execute
 from factory.graph.plan import make_plan, retry_policy
 from factory.readers.base import ClipRef
-from factory.store.attempts import CANDIDATES, OUTCOMES
-from factory.store.parquet_file import Shard, TableSpec, write_shard
-from factory.store.samples import Store
-from factory.store.schema import SAMPLES, RunIdentity, attempt_id, sample_row_to_table
+from factory.store.location import Shard, write_shard
+from factory.store.samples import CANDIDATES, OUTCOMES, Store
+from factory.store.schema import SAMPLES, RunIdentity, TableSpec, attempt_id, sample_row_to_table
 from tests.factory.toy import ToyWork, row_of, stream
 
 EXPERTS = ("pdm_closed", "recovery")

@@ -18,8 +18,7 @@ from factory.graph.execute import Execution, RunSummary, execute
 from factory.graph.steps import AcceptedDrive, Built, Columns, PreparedClip, RejectedAttempt, StopCheck, never
 from factory.readers.base import BadClip, ClipRef
 from factory.stages.rows import label_columns
-from factory.store.attempts import CandidateRow
-from factory.store.samples import Store
+from factory.store.samples import CandidateRow, Store
 from factory.store.schema import BOOKKEEPING, FIELDS, UNLISTED, Column, RunIdentity
 from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
 from tasks.stages import Rejected

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.stages.rows import label_columns
-from factory.store import parquet_file
-from factory.store.location import Location
-from factory.store.parquet_file import write_shard
+from factory.store import location
+from factory.store.location import Location, write_shard
 from factory.store.samples import Store
 from factory.store.schema import sample_row_to_table
 from planners.data.batch import COMMANDS
@@ -120,7 +119,7 @@ def write_table(
             content = sample_row_to_table(same[start : start + shard_rows])
             body = content.drop_columns(["round", "expert"])
             group_bytes = int((group_rows + 0.5) * body.nbytes / body.num_rows)
-            with patch.object(parquet_file, "ROW_GROUP_BYTES", group_bytes):
+            with patch.object(location, "ROW_GROUP_BYTES", group_bytes):
                 shards.append(write_shard(table.location, table.spec, content))
     table.commit(shards)
     return out

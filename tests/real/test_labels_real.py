@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from factory.stages.rows import label_columns
-from factory.store.parquet_file import write_shard
+from factory.store.location import write_shard
 from factory.store.reader import SampleTable, labels_of
 from factory.store.samples import Store
 from factory.store.schema import LABEL_COLUMNS, SAMPLES, Stamp, sample_row_to_table

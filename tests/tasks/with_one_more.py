@@ -7,9 +7,9 @@ import pyarrow as pa
 
 from factory.config.compose import fill
 from factory.stages.rows import label_columns, score_columns
-from factory.store.attempts import CANDIDATES, OUTCOMES, PLANS, Kind
 from factory.store.funnel import funnel_of_tables
 from factory.store.reader import labels_of
+from factory.store.samples import CANDIDATES, OUTCOMES, PLANS, Kind
 from factory.store.schema import COLUMNS as STORED
 from factory.store.schema import SAMPLES
 from factory.views.board.overview import _reasons

@@ -30,8 +30,7 @@ from factory.datasets.navsim.pickles import dumps, write_rewards
 from factory.datasets.navsim.pictures import BLACK, black_picture, shown
 from factory.datasets.navsim.settings import CannotExport, ExportSettings, Layout
 from factory.store.disk import whole_file
-from factory.store.location import Location
-from factory.store.parquet_file import open_parquet
+from factory.store.location import Location, open_parquet
 from factory.store.reader import Sample, read_rows
 from factory.store.schema import LABEL_COLUMNS, canonical_json
 from factory.store.table import KeyedTable

@@ -12,10 +12,9 @@ from factory.graph.driver import SHARD_BYTES
 from factory.graph.execute import RunSummary, record_summary
 from factory.graph.progress import Counter, Executed
 from factory.readers.base import BadClip, failing_as
-from factory.store.attempts import ErrorKind, Kind, Outcome
 from factory.store.disk import DiskFull
-from factory.store.parquet_file import Shard, write_shard
-from factory.store.samples import IMPORTED, ChangedRun, Store
+from factory.store.location import Shard, write_shard
+from factory.store.samples import IMPORTED, ChangedRun, ErrorKind, Kind, Outcome, Store
 from factory.store.schema import SAMPLES, UNLISTED, BadRow, RunIdentity, Stamp, attempt_id, sample_row_to_table
 
 VERSION = 1  # of what an import makes of a file; stands in stage_versions

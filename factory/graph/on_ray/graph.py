@@ -54,9 +54,9 @@ from factory.graph.local import (
 from factory.graph.plan import Stretch
 from factory.graph.progress import METRICS, Metric, Recorder, Type
 from factory.graph.steps import Failure, NotReady, PreparedClip, Walked, Work, attempt, never
-from factory.store.attempts import ErrorKind
 from factory.store.disk import DiskFull, existing, machine_fault_of
 from factory.store.location import BadLocation, Location
+from factory.store.samples import ErrorKind
 from factory.store.schema import Stamp
 from factory.wording import one_line
 from tasks.stages import TASKS

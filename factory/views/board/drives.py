@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow as pa
 
 from factory.store.location import Location
-from factory.store.parquet_file import TableSpec
+from factory.store.schema import TableSpec
 from factory.store.table import KeyedTable
 
 FILMS = "films"  # folder below the run, <drive_id>.mp4

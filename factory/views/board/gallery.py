@@ -11,13 +11,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from factory.readers.pictures import header_of
-from factory.store.attempts import Kind
-from factory.store.codes import equals
-from factory.store.parquet_file import open_parquet, with_partition
+from factory.store.location import open_parquet, with_partition
 from factory.store.reader import decoded, group_of
-from factory.store.samples import Store
+from factory.store.samples import Kind, Store
 from factory.store.schema import AGENT_STEPS, SAMPLES, SCHEMA, table_to_rows
-from factory.store.table import KeyedTable
+from factory.store.table import KeyedTable, equals
 from factory.views.board.watch import Snapshot, plain
 from factory.views.episode_messages import episode_of
 from factory.views.sample_picture import (

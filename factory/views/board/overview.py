@@ -12,9 +12,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from factory.store.attempts import Kind
-from factory.store.codes import equals
 from factory.store.funnel import Funnel
+from factory.store.samples import Kind
+from factory.store.table import equals
 from factory.views.board.gallery import FILTERS
 from factory.views.board.watch import Snapshot, plain
 from factory.views.status import GATE_WORDS, PAPER_CLIP_PERCENT, REASON_WORDS, STATUS

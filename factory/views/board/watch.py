@@ -22,10 +22,8 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from factory.store import funnel
-from factory.store.attempts import PLANS
-from factory.store.codes import in_packs, packed
-from factory.store.samples import CURRENT_RUN, Store
-from factory.store.table import KeyedTable, LiveFile
+from factory.store.samples import CURRENT_RUN, PLANS, Store
+from factory.store.table import KeyedTable, LiveFile, in_packs, packed
 from tasks.world.arrays import F32, Ints
 
 SAMPLE_COLUMNS = (

@@ -16,7 +16,8 @@ COMMIT = """
 import sys
 import pyarrow as pa
 from factory.store.location import Location
-from factory.store.parquet_file import TableSpec, write_shard
+from factory.store.location import write_shard
+from factory.store.schema import TableSpec
 from factory.store.table import KeyedTable
 spec = TableSpec("t", pa.schema([("k", pa.string())]), "k")
 table = KeyedTable(Location.parse(sys.argv[1]), spec)

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from factory.exits import COMPLETE
-from factory.store.attempts import OUTCOMES, outcomes_table
-from factory.store.parquet_file import write_shard
-from factory.store.samples import Store
+from factory.store.location import write_shard
+from factory.store.samples import OUTCOMES, Store, outcomes_table
 from factory.store.table import AnotherWriter
 from tests.factory.graph.runs import run
 from tests.factory.graph.test_two_drivers import an_outcome

@@ -10,9 +10,9 @@ import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt, failure_of
-from factory.store.attempts import ErrorKind
 from factory.store.cache import ClipCache
 from factory.store.disk import DiskFull, PlaceRefused, machine_fault_of, refused_as_the_runs_own
+from factory.store.samples import ErrorKind
 from tests.factory.graph.runs import run
 from tests.factory.tables import assert_same_tables, tables_of
 from tests.factory.toy import ToyWork

@@ -25,8 +25,7 @@ from factory.graph.progress import (
     RunMetrics,
     Type,
 )
-from factory.store.location import Location
-from factory.store.parquet_file import Shard
+from factory.store.location import Location, Shard
 from factory.store.samples import Store
 from tests.factory.toy import ToyWork, executed, refs
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factory.graph.plan import ClipPlan, RunPlan, make_plan, retry_policy
-from factory.store.attempts import OUTCOME_STATE, OUTCOMES, SAMPLE_STATE, History, Kind, Listed, history_of
+from factory.store.samples import OUTCOME_STATE, OUTCOMES, SAMPLE_STATE, History, Kind, Listed, history_of
 from factory.store.schema import SAMPLES, attempt_id
 from tests.factory.toy import ToyWork, refs
 

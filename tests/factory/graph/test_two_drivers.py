@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from factory.exits import COMPLETE
-from factory.store.attempts import OUTCOMES, Kind, Outcome, outcomes_table
-from factory.store.location import Location
-from factory.store.parquet_file import write_shard
+from factory.store.location import Location, write_shard
+from factory.store.samples import OUTCOMES, Kind, Outcome, outcomes_table
 from factory.store.table import AnotherWriter, KeyedTable
 from tests.factory.graph.runs import run
 from tests.factory.tables import assert_same_tables

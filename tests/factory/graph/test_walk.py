@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factory.graph.plan import Blocked, Complete, Exhausted, Step, Stretch, Try, next_step, retry_policy, stretch
-from factory.store.attempts import ErrorKind, Kind, Past
+from factory.store.samples import ErrorKind, Kind, Past
 
 
 def never(past: Past) -> bool:

@@ -5,7 +5,7 @@ import pyarrow as pa
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from factory.store.codes import PACKED_ROWS, beginning, codes, distinct, equals, fixed_bytes, packed
+from factory.store.table import PACKED_ROWS, beginning, codes, distinct, equals, fixed_bytes, packed
 
 WORDS = st.lists(st.sampled_from(["", "a", "ab", "b", "é", "z"]), max_size=12)
 PARTS = st.lists(WORDS, max_size=5)

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.execute import Execution
-from factory.store.attempts import OUTCOMES, ClipCandidates
 from factory.store.funnel import (
     OUTCOME_COLUMNS,
     SAMPLE_COLUMNS,
@@ -21,7 +20,7 @@ from factory.store.funnel import (
     funnel_of,
     image_sources_text,
 )
-from factory.store.samples import Store
+from factory.store.samples import OUTCOMES, ClipCandidates, Store
 from factory.store.schema import SAMPLES
 from tests.factory.toy import ToyWork, executed, refs
 

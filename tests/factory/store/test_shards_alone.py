@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from deltalake import DeltaTable
 
-from factory.store.parquet_file import Shard
+from factory.store.location import Shard
 from factory.store.samples import Store
 from factory.store.verify import verify
 from tests.factory.toy import ToyWork, executed, refs

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.store.attempts import CandidateRow
 from factory.store.cache import BadCacheFile, ClipCache, decode, encode
 from factory.store.location import Location
+from factory.store.samples import CandidateRow
 from tasks.stages import Rejected
 from tasks.world.agents import AgentKind, AgentTracks
 

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.store.attempts import Kind, Listed, Outcome
-from factory.store.samples import OnChange, Store
+from factory.store.samples import Kind, Listed, OnChange, Outcome, Store
 from tests.factory.toy import ToyWork, executed, refs
 
 

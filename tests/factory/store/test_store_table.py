@@ -11,9 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 
 import factory.store.table as table_module
-from factory.store.location import Location
-from factory.store.parquet_file import Shard, TableSpec, write_shard
-from factory.store.schema import SAMPLES, Stamp, sample_row_to_table
+from factory.store.location import Location, Shard, write_shard
+from factory.store.schema import SAMPLES, Stamp, TableSpec, sample_row_to_table
 from factory.store.table import DuplicateKey, KeyedTable
 from tests.factory.toy import row_of, stream
 

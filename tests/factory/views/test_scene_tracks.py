@@ -11,8 +11,7 @@ from factory.graph.steps import PreparedClip, cache_key
 from factory.pipeline import PerturbedClip, bare
 from factory.readers.base import ClipRef
 from factory.stages.scene_file import read_scene, write_scene
-from factory.store.attempts import ClipCandidates
-from factory.store.samples import Store
+from factory.store.samples import ClipCandidates, Store
 from factory.views.scene_files import logged_vehicles
 from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom
 from tasks.render.scene.engine import Vehicles, render, vehicles_at
