@@ -22,7 +22,7 @@ from factory.graph.execute import Execution, execute
 from factory.graph.steps import prepare
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table
 from factory.stages.scene_file import BadScene, read_scene, write_scene
-from factory.store.cache import encode
+from factory.store.location import encode
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.verify import damaged_logs, restore_logs, verify

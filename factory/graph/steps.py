@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import pyarrow as pa
 
 from factory.readers.base import BadClip, ClipRef, Unreadable
-from factory.store.cache import BadCacheFile, ClipCache, SceneFiles
 from factory.store.disk import machine_fault_of, refused_as_the_runs_own, why_disk_full
-from factory.store.location import Location, Shard, write_shard
+from factory.store.location import BadCacheFile, ClipCache, Location, SceneFiles, Shard, write_shard
 from factory.store.mcap_files import FOLDER, episode_name, write_mcap_shard
 from factory.store.reader import samples_of
 from factory.store.samples import CandidateRow, ErrorKind
@@ -60,7 +59,7 @@ class PreparedClip:
     content_digest: str
     candidates: tuple[CandidateRow, ...]  # empty: no simulated expert has anything to try
     gate_counts: Mapping[str, int]  # gate -> vocabulary entries it dropped, in the gates' order
-    payload: object  # tree of frozen dataclasses, dicts, tuples, numpy arrays and scalars (factory.store.cache)
+    payload: object  # tree of frozen dataclasses, dicts, tuples, numpy arrays and scalars (factory.store.location)
     dropped: Rejected | None = None  # why there are no candidates; the human row is scored all the same
     seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
     scenes: "BenchmarkClip | None" = None  # to be kept beside the tables before any row of the clip is

@@ -18,8 +18,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from factory.store.cache import ClipCache
-from factory.store.location import Location, Shard, write_shard
+from factory.store.location import ClipCache, Location, Shard, write_shard
 from factory.store.schema import (
     LICENCES_PROPERTY,
     SAMPLES,

@@ -20,9 +20,18 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from factory.store.cache import BadCacheFile, SceneFiles, check_prepared
 from factory.store.disk import why_no_links
-from factory.store.location import BadLocation, DamagedFile, Location, Shard, naming, write_shard
+from factory.store.location import (
+    BadCacheFile,
+    BadLocation,
+    DamagedFile,
+    Location,
+    SceneFiles,
+    Shard,
+    check_prepared,
+    naming,
+    write_shard,
+)
 from factory.store.mcap_files import (
     FOLDER,
     SAMPLES_MCAP,

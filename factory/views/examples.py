@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 from factory.graph.steps import PreparedClip, cache_key
 from factory.pipeline import FactoryWork, PerturbedClip, payload_of
 from factory.readers.base import BadClip, ClipRef
-from factory.store.cache import BadCacheFile
+from factory.store.location import BadCacheFile
 from factory.store.reader import decoded
 from factory.store.samples import Kind, Store
 from factory.store.table import equals, fixed_bytes

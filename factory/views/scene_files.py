@@ -17,7 +17,7 @@ from factory.graph.steps import cache_key
 from factory.pipeline import logged_clip
 from factory.readers.pickles import load_tensors
 from factory.stages.scene_file import SUFFIX, BadScene, described_by, read_scene, stored_dtype, stored_views
-from factory.store.cache import BadCacheFile
+from factory.store.location import BadCacheFile
 from factory.wording import one_line
 from tasks.render.scene.asset import BlockRange, RenderAsset, ViewQuality
 from tasks.render.scene.build import plain_sky

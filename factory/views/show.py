@@ -84,7 +84,7 @@ def logged_drive(store: "Store", row: dict[str, Any]) -> "Array | None":
     """(81, 3) the log from T to T+2H, world frame, from the prepared clip; None where the cache has it no more."""
     from factory.graph.steps import cache_key
     from factory.pipeline import logged_poses
-    from factory.store.cache import BadCacheFile
+    from factory.store.location import BadCacheFile
 
     digests = {run["settings_hash"]: run["prepare_digest"] for run in store.runs()}
     if row["settings_hash"] not in digests:

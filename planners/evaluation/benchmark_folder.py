@@ -12,8 +12,7 @@ from typing import Any
 
 from factory.config.compose import ConfigError
 from factory.stages.benchmark import BENCHMARK_FILE, FORMAT
-from factory.store.cache import SceneFiles
-from factory.store.location import Location
+from factory.store.location import Location, SceneFiles
 from factory.store.reader import Sample, SampleTable
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair
 from tasks.hard_scenes import BenchmarkClip, GivenScenes, OneStageClip

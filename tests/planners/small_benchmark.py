@@ -10,8 +10,7 @@ import numpy as np
 
 from factory.stages.benchmark import BENCHMARK_FILE
 from factory.stages.rows import sample_row
-from factory.store.cache import SceneFiles
-from factory.store.location import Location, write_shard
+from factory.store.location import Location, SceneFiles, write_shard
 from factory.store.samples import Store
 from factory.store.schema import COLUMNS, SAMPLES, sample_row_to_table
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair

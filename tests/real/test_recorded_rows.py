@@ -17,8 +17,7 @@ from reference_scenes import loader
 from test_scoring_real import WHOLE, frame_of
 
 from factory.stages.benchmark import BENCHMARK_FILE
-from factory.store.cache import SceneFiles
-from factory.store.location import Location, write_shard
+from factory.store.location import Location, SceneFiles, write_shard
 from factory.store.samples import Store
 from factory.store.schema import SAMPLES, sample_row_to_table
 from planners.evaluation.evaluate import main

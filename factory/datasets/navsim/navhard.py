@@ -35,7 +35,7 @@ from factory.readers.apart import Apart
 from factory.readers.base import BadClip, failing_as
 from factory.stages.benchmark import BENCHMARK_FILE, FORMAT
 from factory.stages.imaging import NO_IMAGES
-from factory.store.cache import SceneFiles
+from factory.store.location import SceneFiles
 from factory.store.samples import Store
 from factory.store.schema import RunIdentity
 from tasks.experts.pdm_closed.planner import PdmSettings, plan_for

@@ -21,7 +21,7 @@ from factory.datasets.navsim.reader import log_files
 from factory.datasets.navsim.scenes import Origin
 from factory.graph.execute import RunSummary
 from factory.stages.benchmark import BENCHMARK_FILE, FORMAT
-from factory.store.cache import SceneFiles
+from factory.store.location import SceneFiles
 from factory.store.samples import Store
 from factory.store.schema import RunIdentity
 from tasks.caches import user_cache

@@ -16,7 +16,7 @@ from factory.graph import execute as execution
 from factory.graph.execute import Execution, execute
 from factory.graph.steps import AcceptedDrive, Built, PreparedClip, RejectedAttempt, StopCheck, TaskStopped, never
 from factory.readers.base import ClipRef
-from factory.store.cache import BadCacheFile
+from factory.store.location import BadCacheFile
 from factory.store.samples import Store
 from factory.store.schema import UNLISTED
 from factory.store.verify import verify

@@ -10,8 +10,8 @@ import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt, failure_of
-from factory.store.cache import ClipCache
 from factory.store.disk import DiskFull, PlaceRefused, machine_fault_of, refused_as_the_runs_own
+from factory.store.location import ClipCache
 from factory.store.samples import ErrorKind
 from tests.factory.graph.runs import run
 from tests.factory.tables import assert_same_tables, tables_of

@@ -18,8 +18,7 @@ from factory.readers.base import ClipRef
 from factory.readers.settings import TownSettings
 from factory.setup.settings import assemble, identity_of
 from factory.stages.benchmark import benchmark_of, write_benchmark
-from factory.store.cache import BadCacheFile, SceneFiles
-from factory.store.location import Location
+from factory.store.location import BadCacheFile, Location, SceneFiles
 from factory.store.samples import Store
 from tasks.stages import Rejected
 from tasks.world.clip import HORIZON_STEPS, NOW

@@ -20,8 +20,7 @@ from factory.stages.assets import _resumed, damaged_blocks
 from factory.stages.rig import SAID, _say, told_of
 from factory.stages.scene_file import BadScene, read_scene, write_scene
 from factory.stages.warm import _is_compiled, marker, tiny_clip
-from factory.store.cache import BadCacheFile, SceneFiles, encode
-from factory.store.location import Location
+from factory.store.location import BadCacheFile, Location, SceneFiles, encode
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.hard_scenes import OneStageClip
 from tasks.kernels.compiled import kernel

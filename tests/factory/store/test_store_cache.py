@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.store.cache import BadCacheFile, ClipCache, decode, encode
-from factory.store.location import Location
+from factory.store.location import BadCacheFile, ClipCache, Location, decode, encode
 from factory.store.samples import CandidateRow
 from tasks.stages import Rejected
 from tasks.world.agents import AgentKind, AgentTracks
@@ -54,7 +53,7 @@ def test_an_array_that_stands_twice_is_stored_once() -> None:
     [
         "os:system",
         "subprocess:Popen",
-        "factory.store.cache:io.BytesIO",
+        "factory.store.location:io.BytesIO",
         "factory.graph.steps:warm",
         "tasks.stages:nothing",
     ],

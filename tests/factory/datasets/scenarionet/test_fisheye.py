@@ -9,8 +9,7 @@ import numpy as np
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.stages.scene_file import read_scene, write_scene
 from factory.stages.sensors import encode_jpeg, load_photos, resized_mask
-from factory.store.cache import ClipCache
-from factory.store.location import Location
+from factory.store.location import ClipCache, Location
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.gaussians import EMPTY

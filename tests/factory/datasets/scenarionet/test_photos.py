@@ -20,8 +20,7 @@ from factory.readers.pictures import file_and_frame, frame_uri, video_frames
 from factory.stages.assets import Sensing, block_id, sensing
 from factory.stages.scene_file import read_scene, write_scene
 from factory.stages.sensors import block_of, encode_jpeg, load_photos, load_sensors
-from factory.store.cache import ClipCache
-from factory.store.location import Location
+from factory.store.location import ClipCache, Location
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.settings import RenderSettings
