@@ -1,13 +1,28 @@
-"""What lies in a folder of somebody's data: the one place that looks, so that all that read see the same.
+"""This machine's files: what lies in a folder, who works on a file alone, where results lie, what a disk refuses.
 
-Links are followed. What macOS and Windows leave beside the files they copy is no data: it is passed over.
+Of folders of somebody's data this is the one place that looks, so that all that read see the same. Links are followed.
+What macOS and Windows leave beside the files they copy is no data: it is passed over.
 """
 
+import errno
+import fcntl
+import hashlib
 import logging
 import os
+import re
+import secrets
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from fnmatch import fnmatchcase
 from functools import cache
 from pathlib import Path
+from typing import IO, Any
+
+from factory.wording import one_line
 
 log = logging.getLogger(__name__)
 
@@ -79,3 +94,301 @@ def _leads_to_folder(entry: os.DirEntry[str], told: bool = True) -> bool:
 def _pass_over(path: str | Path, why: str) -> None:
     """Once a process: a folder is looked at several times."""
     log.warning("%s is passed over: %s", path, why)
+
+
+# Who works on a file alone, among the threads and processes of one machine.
+
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)  # what flock says where there are none
+
+
+@contextmanager
+def locked(file: IO[Any]) -> Iterator[None]:
+    """Alone with an open file until it is left and closed; the kernel frees it when its holder dies.
+
+    On a file system without locks, as mounts of object stores and some network shares are, a file of this machine's
+    temporary folder stands for it. Raises OSError where that cannot be locked either.
+    """
+    with ExitStack() as held:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX)
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise
+            fcntl.flock(held.enter_context(_stand_in(file.name).open("ab")), fcntl.LOCK_EX)
+        yield
+
+
+def _stand_in(name: str) -> Path:
+    """In a folder of this user's own, as others may write to the temporary one."""
+    folder = Path(tempfile.gettempdir(), f"driving-data-factory-locks-{os.getuid()}")
+    folder.mkdir(mode=0o700, exist_ok=True)
+    if folder.is_symlink() or folder.stat().st_uid != os.getuid():
+        raise PermissionError(errno.EPERM, "belongs to another user", str(folder))
+    return folder / f"{hashlib.sha256(os.path.realpath(name).encode()).hexdigest()[:32]}.lock"
+
+
+# What differs inside a submitted Ray job: the working directory is a copy that Ray throws away.
+
+RUNS = "FACTORY_RUNS"  # environment variable: the folder or URL below which results lie that no `out` names
+
+
+def in_submitted_job() -> bool:
+    """This process is the driver of a `ray job submit`."""
+    return "RAY_JOB_CONFIG_JSON_ENV_VAR" in os.environ  # Ray sets it for drivers of jobs alone
+
+
+def runs_root() -> str:
+    """FACTORY_RUNS, else `runs` in the working directory, in a submitted job ~/driving-data-factory/runs."""
+    if named := os.environ.get(RUNS):
+        return named
+    return str(Path.home() / "driving-data-factory" / "runs") if in_submitted_job() else "runs"
+
+
+# What a disk, a store or a machine refuses, told with the path: full, not to be written, ill.
+#
+# Loads neither pyarrow nor deltalake, so that a command can ask for its `out` before anything else.
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
+SAID = re.compile(r"\(os error (\d+)\)")  # how delta-rs says it, in an OSError without a number
+
+
+class DiskFull(OSError):
+    """The disk or the quota of a path is full; the message has the path, what is needed and what is free."""
+
+
+class NotWritable(PermissionError):
+    """Who runs this may not write at a path, or nobody may; the message has the path and the reason."""
+
+
+def _number_of(error: BaseException) -> int | None:
+    """The number of what the system said."""
+    if isinstance(error, OSError) and error.errno is not None:
+        return error.errno
+    said = SAID.search(str(error))
+    return None if said is None else int(said[1])
+
+
+@contextmanager
+def needs_disk(path: str | os.PathLike[str], n_bytes: int) -> Iterator[None]:
+    """For the writing of about `n_bytes` at a local path. Raises DiskFull where they find none, and NotWritable."""
+    try:
+        yield
+    except OSError as error:
+        number = _number_of(error)
+        if isinstance(error, DiskFull | NotWritable) or number not in (*FULL, *REFUSED):
+            raise
+        if number in REFUSED:
+            raise NotWritable(f"{path}: cannot be written: {os.strerror(number)}") from error
+        free = shutil.disk_usage(existing(Path(path))).free
+        raise DiskFull(f"{path}: the disk is full: {n_bytes:,} bytes are needed, {free:,} are free") from error
+
+
+@contextmanager
+def whole_file(path: Path, n_bytes: int) -> Iterator[Path]:
+    """A draft to be filled with about `n_bytes`: then it is `path`, or there is none. Raises DiskFull."""
+    draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    with needs_disk(path, n_bytes):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield draft
+            draft.replace(path)
+        except BaseException:
+            draft.unlink(missing_ok=True)
+            raise
+
+
+def why_disk_full(error: BaseException) -> str:
+    """What a full disk said, where that is behind the error; else nothing."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, DiskFull):
+            return str(seen)
+        if isinstance(seen, OSError) and seen.errno in FULL:
+            return f"{seen.filename or 'a temporary file'}: the disk is full"
+        seen = seen.__cause__ or seen.__context__
+    return ""
+
+
+def why_not_written(error: BaseException) -> str:
+    """What a disk said that is full or not to be written, and what helps, where that is behind the error."""
+    seen: BaseException | None = error
+    while seen is not None:
+        number = _number_of(seen)
+        if isinstance(seen, NotWritable) or number in REFUSED:
+            return f"{one_line(seen)}; run it as a user who may write there, or on a copy"
+        seen = seen.__cause__ or seen.__context__
+    full = why_disk_full(error)
+    return full and f"{full}; free disk space"
+
+
+def existing(path: Path) -> Path:
+    """The path itself, or the nearest folder above it that is there."""
+    return next(place for place in (path, *path.parents) if place.exists())
+
+
+# Illness of the machine, told apart from what is wrong with a clip: it never counts against one.
+
+NUMBERS = frozenset(
+    getattr(errno, name)
+    for name in (
+        *("ENOSPC", "EDQUOT", "EIO", "EROFS", "EREMOTEIO", "ENXIO", "ENODEV"),  # a disk
+        *("ENOMEM", "EMFILE", "ENFILE", "EAGAIN"),  # memory, open files, processes
+        *("ESTALE", "ENOTCONN", "ENETDOWN", "ENETUNREACH", "EHOSTDOWN", "EHOSTUNREACH"),  # a share, a network
+        *("ETIMEDOUT", "ECONNREFUSED", "ECONNRESET", "ECONNABORTED"),
+    )
+    if hasattr(errno, name)
+)
+# What object stores' clients say in an OSError without a number; a file that is not there is no illness.
+STORE = re.compile(
+    r"AWS Error (?!NO_SUCH|RESOURCE_NOT_FOUND)|Generic (?:S3|GCS|MicrosoftAzure) error|lacked the necessary privileges"
+)
+SHORT_OF_MEMORY = 0.1  # of it is left: then a MemoryError is the machine's, else of what was asked for
+
+
+class PlaceRefused(OSError):
+    """A place that the run itself writes to cannot be written."""
+
+
+@contextmanager
+def refused_as_the_runs_own(where: str | os.PathLike[str]) -> Iterator[None]:
+    """Around what is written there by the run: whatever goes wrong with it is no clip's. Raises PlaceRefused."""
+    try:
+        yield
+    except OSError as error:
+        if machine_fault_of(error):
+            raise
+        raise PlaceRefused(f"{os.fspath(where)} cannot be written: {error.strerror or error}") from error
+
+
+def machine_fault_of(error: BaseException) -> str:
+    """What the machine said, where its illness is behind the error; else nothing."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, MemoryError) and _memory_left() < SHORT_OF_MEMORY:
+            return f"out of memory: {seen}"
+        if isinstance(seen, PlaceRefused | DiskFull | NotWritable | ConnectionError | TimeoutError) or _is_of_machine(
+            seen
+        ):
+            return str(seen)
+        seen = seen.__cause__ or seen.__context__
+    return ""
+
+
+def _is_of_machine(error: BaseException) -> bool:
+    delta = sys.modules.get("deltalake.exceptions")  # who has not loaded it has none of its errors
+    if delta is not None and isinstance(error, delta.DeltaError):
+        return STORE.search(str(error)) is not None
+    if not isinstance(error, OSError):
+        return False
+    return _number_of(error) in NUMBERS or (error.errno is None and STORE.search(str(error)) is not None)
+
+
+def _memory_left() -> float:
+    """Share of this machine's memory that is free or can be freed; 1 where it does not say."""
+    try:
+        rows = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        left, all_of_it = (int(rows[name].split()[0]) for name in ("MemAvailable", "MemTotal"))
+    except (OSError, KeyError):  # not Linux
+        return 1.0
+    return left / all_of_it
+
+
+# Whether `out` can be written to, before anything else is done: a folder by a trial file and a link to it, a URL by a
+# trial object.
+#
+# A client of an object store tries for minutes where credentials or the network are missing, so the trial of a URL is a
+# process of its own that is ended after TRIAL_S: `python -m factory.store.table URL`.
+
+TRIAL_BYTES = 4 * 2**20  # a row group, the least that samples with pictures are written in
+TRIAL_S = 20.0
+CREDENTIALS = {  # what both clients read
+    "s3": "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE, and AWS_REGION",
+    "gs": "GOOGLE_APPLICATION_CREDENTIALS",
+    "abfs": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
+    "abfss": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
+}
+
+
+def why_unusable(out: str) -> str:
+    """One line on why no run can write to `out`; nothing where it can. Leaves nothing behind."""
+    if not out.strip():
+        return "out= is empty: name a folder or a URL (a shell variable that is not set?)"
+    scheme, is_url, _ = out.partition("://")
+    if is_url and scheme != "file":
+        return _why_not_remote(out, scheme) if scheme in CREDENTIALS else ""  # others are refused by Location
+    path = Path(out.removeprefix("file://")).expanduser().absolute()
+    above = existing(path)
+    if not above.is_dir():
+        return f"out={out}: {above} is not a folder"
+    return _why_not_local(out, path, above)
+
+
+def _why_not_local(out: str, path: Path, above: Path) -> str:
+    created = [place for place in (path, *path.parents) if place != above and above in place.parents]
+    trial = path / f".trial-{secrets.token_hex(8)}"
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with needs_disk(path, TRIAL_BYTES):
+            try:
+                with trial.open("wb") as file:
+                    file.write(bytes(TRIAL_BYTES))
+                    file.flush()
+                    os.fsync(file.fileno())
+            finally:  # before the free space is told
+                trial.unlink(missing_ok=True)
+        if no_links := why_no_links(path):
+            return f"out={out}: {no_links}"
+    except OSError as error:
+        if isinstance(error, NotWritable):
+            return f"out={out}: {str(error).removeprefix(f'{path}: ')}"
+        if error.errno is None:  # DiskFull, which says it all
+            return f"out={out}: {error}"
+        why = "no file can be made there" if error.errno == errno.ENOENT else error.strerror or str(error)
+        return f"out={out}: cannot be written: {why}"
+    finally:
+        for place in created:
+            if place.is_dir():
+                place.rmdir()
+    return ""
+
+
+def why_no_links(folder: Path) -> str:
+    """One line on why no table can be committed to in a folder that is there; nothing where it can. Leaves nothing.
+
+    A commit is a link that must not be there yet: so of two runs that want the same one alone makes it. Renaming, which
+    replaces what is there, would lose commits. Raises OSError where no file can be made at all.
+    """
+    trial = folder / f".trial-{secrets.token_hex(8)}"
+    link = trial.with_name(f"{trial.name}0")
+    try:
+        with needs_disk(folder, 0):
+            trial.touch()
+        os.link(trial, link)
+    except OSError as error:
+        if not trial.exists():
+            raise
+        why = error.strerror or str(error)
+        return (
+            f"{folder} is on a file system without hard links ({why}), by which commits keep two runs apart: "
+            "choose a folder on another one, or the URL of a bucket (s3://, gs://, abfs://)"
+        )
+    finally:
+        link.unlink(missing_ok=True)
+        trial.unlink(missing_ok=True)
+    return ""
+
+
+def _why_not_remote(out: str, scheme: str) -> str:
+    hint = f"; credentials are read from {CREDENTIALS[scheme]}"
+    command = [sys.executable, "-m", "factory.store.table", out]
+    try:
+        done = subprocess.run(  # noqa: S603  # our own interpreter; the URL is an argument, not a shell's word
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TRIAL_S
+        )
+    except subprocess.TimeoutExpired:
+        return f"out={out}: no answer in {TRIAL_S:.0f} s{hint}"
+    if done.returncode == 0:
+        return ""
+    said = done.stdout.strip() or (done.stderr.strip().splitlines() or ["the trial ended without a word"])[-1]
+    return f"out={out}: cannot be written: {said}{hint}"

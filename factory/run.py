@@ -25,8 +25,8 @@ from factory.config.compose import ConfigError
 from factory.config.run import RunConfig, load_config, photos_alone
 from factory.config.words import Asked, asked_of
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, as_program
+from factory.files import why_unusable
 from factory.setup.early import refuse_what_is_not_there
-from factory.store.disk import why_unusable
 
 if TYPE_CHECKING:
     from factory.readers.base import ClipRef

@@ -43,7 +43,7 @@ class Request:
 
 def main(request: Request) -> None:
     """Remove and name them. Raises Refused."""
-    from factory.store.disk import why_not_written
+    from factory.files import why_not_written
     from factory.store.location import BadLocation
     from factory.store.table import AnotherWriter
     from factory.store.verify import RunGoesOn, hold, leftovers, refuse_held

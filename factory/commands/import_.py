@@ -86,8 +86,8 @@ def main(request: Request) -> int:
         return _cameras(request)
     from deltalake.exceptions import DeltaError
 
+    from factory.files import why_unusable
     from factory.readers.base import BadClip
-    from factory.store.disk import why_unusable
     from factory.store.location import Location
     from factory.store.samples import ChangedRun, Store
     from factory.store.table import AnotherWriter

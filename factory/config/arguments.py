@@ -114,7 +114,7 @@ def answered(
 
 def _end_of(error: Exception, refused: tuple[type[Exception], ...], resumes: bool, elsewhere: str) -> tuple[int, str]:
     """The exit code and the line that an exception ends a command with; COMPLETE for a fault of the program."""
-    from factory.store.disk import DiskFull, machine_fault_of, why_not_written
+    from factory.files import DiskFull, machine_fault_of, why_not_written
     from factory.wording import one_line
 
     if isinstance(error, Stopped):

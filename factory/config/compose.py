@@ -10,8 +10,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 from factory.config.plugins import offer_choices
 from factory.config.shapes import dataclass_in, defaults_of, described, keys_of, merged, to_give
 from factory.config.words import ConfigError, SettingsShown, asked_of, at_home, nearest, no_such_choice, readable
-from factory.files import folders_in
-from factory.job import runs_root
+from factory.files import folders_in, runs_root
 
 T = TypeVar("T")
 WORDS_OF = {  # pydantic's kind of error -> what a value must be

@@ -13,8 +13,7 @@ from factory.config.compose import compose, conf_dir, fill, need_run_extra, refu
 from factory.config.plugins import with_experts
 from factory.config.shapes import defaults_of, keys_of, merged
 from factory.config.words import ConfigError, nearest
-from factory.files import matching
-from factory.job import in_submitted_job
+from factory.files import in_submitted_job, matching
 from factory.readers.settings import (
     LogClips,
     NavsimClips,

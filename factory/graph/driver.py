@@ -18,6 +18,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from factory.files import DiskFull
 from factory.graph.episodes import SampleMirror
 from factory.graph.local import Graph, MachineIll, Ticket
 from factory.graph.plan import (
@@ -40,7 +41,6 @@ from factory.graph.plan import (
 from factory.graph.progress import Executed, ProgressLine, RunForecast, RunMetrics, Tally, Workload
 from factory.graph.steps import Attempted, Failure, HalfBuilt, HandedOn, Prepared, Reconstructed, Walked
 from factory.readers.base import ClipRef
-from factory.store.disk import DiskFull
 from factory.store.location import Shard
 from factory.store.samples import ClipCandidates, ErrorKind, Kind, Outcome, Past, Store
 from factory.store.schema import RunIdentity, Stamp, attempt_id

@@ -17,6 +17,7 @@ from typing import Literal
 from deltalake.exceptions import DeltaError
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
+from factory.files import DiskFull, machine_fault_of
 from factory.graph.apart import AGAIN, NEW_CLUSTERS, begun_anew
 from factory.graph.driver import SHARD_BYTES, SHARD_SECONDS, Gatherer, RunDriver, WriteFailed
 from factory.graph.episodes import Episodes, EpisodesWanted, McapShards, SampleMirror, SampleMirrors
@@ -38,7 +39,6 @@ from factory.graph.plan import Records, RunPlan, Try, counted, crash_of, make_pl
 from factory.graph.progress import Executed, RunMetrics
 from factory.graph.steps import NotReady, Work
 from factory.readers.base import ClipRef
-from factory.store.disk import DiskFull, machine_fault_of
 from factory.store.funnel import Funnel, funnel_of
 from factory.store.location import BadLocation
 from factory.store.samples import CURRENT_RUN, NOTHING, ChangedRun, Kind, OnChange, Store

@@ -20,12 +20,12 @@ from typing import Any, Literal, Protocol, TypeVar
 import numpy as np
 
 from factory.exits import as_worker, without_terminal
+from factory.files import DiskFull
 from factory.graph import steps
 from factory.graph.guard import OVER, WORK, WatchedProcess, read_note
 from factory.graph.progress import NoRecorder, Recorder
 from factory.graph.steps import Failure, NotReady, StopCheck, Work, never, warm
 from factory.readers.base import ClipRef
-from factory.store.disk import DiskFull
 from factory.store.location import Location
 from factory.store.samples import ErrorKind
 from factory.store.schema import Stamp

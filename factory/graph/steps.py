@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import pyarrow as pa
 
+from factory.files import machine_fault_of, refused_as_the_runs_own, why_disk_full
 from factory.readers.base import BadClip, ClipRef, Unreadable
-from factory.store.disk import machine_fault_of, refused_as_the_runs_own, why_disk_full
 from factory.store.location import BadCacheFile, ClipCache, Location, SceneFiles, Shard, write_shard
 from factory.store.mcap_files import FOLDER, episode_name, write_mcap_shard
 from factory.store.reader import samples_of

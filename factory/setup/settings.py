@@ -14,6 +14,7 @@ from typing import Any
 from factory.config.classes import class_of
 from factory.config.compose import ConfigError, build, fill
 from factory.config.run import RecoverySources, RunConfig, VocabularyChoice, photos_alone, refuse_relative_root
+from factory.files import machine_fault_of
 from factory.pipeline import BenchmarkWork, FactoryWork
 from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef
 from factory.readers.pickles import check_checkpoint
@@ -28,7 +29,6 @@ from factory.setup.vocabulary import (
     train_windows,
 )
 from factory.stages.sensors import chosen_cameras, masks_digest, refuse_unknown_masks
-from factory.store.disk import machine_fault_of
 from factory.store.schema import UNLISTED, RunIdentity, canonical_json
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.settings import PdmSettings

@@ -15,9 +15,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from factory.files import whole_file
 from factory.readers.base import BadClip, ClipReader
 from factory.readers.validate import read_clip
-from factory.store.disk import whole_file
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.sealed import seal
 from tasks.world.arrays import Array

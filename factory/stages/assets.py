@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
+from factory.files import locked, refused_as_the_runs_own, whole_file
 from factory.graph.steps import StopCheck, TaskStopped, never
-from factory.locks import locked
 from factory.readers.pictures import file_and_frame
 from factory.stages.rig import SAID, UsedRig, corrected_rig, known_of, said_again, taken_from, told_of, used_rig, wanted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
@@ -34,7 +34,6 @@ from factory.stages.sensors import (
     read_masks,
     taken_by,
 )
-from factory.store.disk import refused_as_the_runs_own, whole_file
 from factory.store.location import Location
 from factory.wording import time_text
 from tasks.render.fit.losses import Lpips, lpips_of

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from factory.files import whole_file
 from factory.stages.scene_file import CALIBRATED
 from factory.stages.sensors import NO_MASKS, SensorData, opened_photos, poses_of, taken_by
-from factory.store.disk import whole_file
 from tasks.render.rig.correct import Correction, corners_of, corrected, ground_below, hidden_by
 from tasks.render.scene.asset import TakenFrom, rises_of
 from tasks.render.scene.driven_road import driven_roads

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from factory.store.disk import whole_file
+from factory.files import whole_file
 from factory.store.schema import canonical_json
 from factory.wording import shown
 from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, OwnBody, RenderAsset, TakenFrom, ViewQuality

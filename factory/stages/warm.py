@@ -17,8 +17,8 @@ from threading import Event, Lock, Thread
 import numpy as np
 
 from factory.exits import as_worker, without_terminal
+from factory.files import locked
 from factory.graph.steps import NotReady
-from factory.locks import locked
 from tasks.attempt import drive_and_judge
 from tasks.experts.pdm_closed.proposals import forecast, proposals
 from tasks.experts.pdm_closed.settings import PdmSettings

@@ -23,9 +23,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pyarrow import fs
 
-from factory.files import is_data
-from factory.job import in_submitted_job
-from factory.store.disk import whole_file
+from factory.files import in_submitted_job, is_data, whole_file
 from factory.store.schema import TableSpec
 from factory.wording import one_line
 from tasks.sealed import Damaged, sealed, unsealed

@@ -53,7 +53,7 @@ class ErrorKind(StrEnum):
     NONE = ""
     INPUT = "input"  # the clip is broken: waits for retry or a raised stage version
     BUG = "bug"  # the code raised: likewise
-    MACHINE = "machine"  # the machine is ill (factory.store.disk): the next run tries again, however often
+    MACHINE = "machine"  # the machine is ill (factory.files): the next run tries again, however often
     SYSTEM = "system"  # a worker died at it, a file could not be read: the next run tries again
     LIMIT = "limit"  # ended over its seconds or its memory: the next run tries again
     POISON = "poison"  # failed(system | limit) in QUARANTINE_AFTER runs: waits like a bug

@@ -33,7 +33,7 @@ from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundErr
 from deltalake.transaction import AddAction, RemoveAction
 from numpy.typing import NDArray
 
-from factory.store.disk import needs_disk
+from factory.files import needs_disk
 from factory.store.location import Location, Shard, encoded_text, read_parquet, with_partition, write_shard
 from factory.store.schema import TableSpec
 from factory.wording import one_line

@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from factory.store.disk import why_no_links
+from factory.files import why_no_links
 from factory.store.location import (
     BadCacheFile,
     BadLocation,

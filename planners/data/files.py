@@ -35,7 +35,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from pyarrow import fs
 
-from factory.locks import locked
+from factory.files import locked
 from factory.store.location import naming
 from factory.store.mcap_files import McapShard, ShardIndex
 from factory.store.reader import TIME_TOLERANCE_S, Format, StoredFile, group_rows, sample_table

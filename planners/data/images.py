@@ -38,7 +38,7 @@ import cv2
 import numpy as np
 import simplejpeg
 
-from factory.locks import locked
+from factory.files import locked
 from factory.readers.pictures import jpeg_size
 from factory.store.reader import TIME_TOLERANCE_S
 from planners.data.batch import ImageLayout

@@ -27,12 +27,12 @@ from pathlib import Path
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, need_run_extra
 from factory.exits import Failed, Stopped
+from factory.files import why_unusable
 from factory.graph.each import WorkerDied, each
 from factory.graph.progress import Counter
 from factory.graph.steps import TaskStopped
 from factory.readers.base import ClipRef
 from factory.setup.settings import choose_vocabulary, open_reader
-from factory.store.disk import why_unusable
 from factory.store.location import Location
 from factory.store.table import AnotherWriter, KeyedTable
 from planners.drive.drivers import driver_of

@@ -31,9 +31,8 @@ from factory.datasets.navsim.filters import Selection, read_selection
 from factory.datasets.navsim.navhard import NavsimFolders, import_navhard
 from factory.datasets.navsim.navtest import import_navtest
 from factory.exits import INTERRUPTED, Stopped
-from factory.files import matching
+from factory.files import matching, why_unusable
 from factory.stages.benchmark import BENCHMARK_FILE
-from factory.store.disk import why_unusable
 from factory.store.location import Location
 from factory.store.samples import Store
 from planners.evaluation.aggregation import HumanFilter, Measured, Summary, by_clip, summary_of

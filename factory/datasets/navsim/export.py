@@ -29,7 +29,7 @@ from factory.datasets.navsim.manifest import File, Journal, Written, file_of, wr
 from factory.datasets.navsim.pickles import dumps, write_rewards
 from factory.datasets.navsim.pictures import BLACK, black_picture, shown
 from factory.datasets.navsim.settings import CannotExport, ExportSettings, Layout
-from factory.store.disk import whole_file
+from factory.files import whole_file
 from factory.store.location import Location, open_parquet
 from factory.store.reader import Sample, read_rows
 from factory.store.schema import LABEL_COLUMNS, canonical_json

@@ -8,11 +8,11 @@ from dataclasses import asdict, dataclass
 import pyarrow as pa
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
+from factory.files import DiskFull
 from factory.graph.driver import SHARD_BYTES
 from factory.graph.execute import RunSummary, record_summary
 from factory.graph.progress import Counter, Executed
 from factory.readers.base import BadClip, failing_as
-from factory.store.disk import DiskFull
 from factory.store.location import Shard, write_shard
 from factory.store.samples import IMPORTED, ChangedRun, ErrorKind, Kind, Outcome, Store
 from factory.store.schema import SAMPLES, UNLISTED, BadRow, RunIdentity, Stamp, attempt_id, sample_row_to_table

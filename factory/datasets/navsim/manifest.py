@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.datasets.navsim.frames import N_FUTURE, N_HISTORY, SplitNames
-from factory.store.disk import needs_disk, whole_file
+from factory.files import needs_disk, whole_file
 from factory.store.schema import canonical_json
 
 MANIFEST, JOURNAL = "manifest.jsonl", ".journal.jsonl"

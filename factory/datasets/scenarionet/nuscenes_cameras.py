@@ -15,9 +15,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factory.datasets.scenarionet.sidecars import NAME
-from factory.files import matching
+from factory.files import matching, whole_file
 from factory.readers.base import BadClip
-from factory.store.disk import whole_file
 from factory.wording import shown
 from tasks.world.arrays import Array
 

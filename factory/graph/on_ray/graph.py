@@ -28,6 +28,7 @@ from ray.util.metrics import Counter, Gauge, Histogram
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from factory.exits import without_terminal
+from factory.files import DiskFull, existing, machine_fault_of
 from factory.graph.local import (
     MAX_RETRIES,
     NO_CLAIMS,
@@ -54,7 +55,6 @@ from factory.graph.local import (
 from factory.graph.plan import Stretch
 from factory.graph.progress import METRICS, Metric, Recorder, Type
 from factory.graph.steps import Failure, NotReady, PreparedClip, Walked, Work, attempt, never
-from factory.store.disk import DiskFull, existing, machine_fault_of
 from factory.store.location import BadLocation, Location
 from factory.store.samples import ErrorKind
 from factory.store.schema import Stamp

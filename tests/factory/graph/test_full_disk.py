@@ -10,10 +10,10 @@ import pyarrow.compute as pc
 import pytest
 
 from factory.exits import COMPLETE, INTERRUPTED
+from factory.files import DiskFull, needs_disk, why_disk_full, why_unusable
 from factory.graph.execute import Execution, RunSummary, execute, on_new_clusters
 from factory.graph.steps import failure_of
 from factory.run import main as run_main
-from factory.store.disk import DiskFull, needs_disk, why_disk_full, why_unusable
 from factory.store.samples import Store
 from factory.store.verify import verify
 from tasks.caches import user_cache

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
+from factory.files import DiskFull, PlaceRefused, machine_fault_of, refused_as_the_runs_own
 from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt, failure_of
-from factory.store.disk import DiskFull, PlaceRefused, machine_fault_of, refused_as_the_runs_own
 from factory.store.location import ClipCache
 from factory.store.samples import ErrorKind
 from tests.factory.graph.runs import run
@@ -131,7 +131,7 @@ def test_a_file_that_is_damaged_or_missing_is_no_illness(error: OSError) -> None
 
 def test_memory_is_the_machine_s_only_where_little_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """A clip that asks for terabytes says nothing of the machine."""
-    monkeypatch.setattr("factory.store.disk._memory_left", lambda: 0.5)
+    monkeypatch.setattr("factory.files._memory_left", lambda: 0.5)
     assert failure_of(MemoryError("Unable to allocate 7.28 TiB")).kind is ErrorKind.SYSTEM
-    monkeypatch.setattr("factory.store.disk._memory_left", lambda: 0.02)
+    monkeypatch.setattr("factory.files._memory_left", lambda: 0.02)
     assert failure_of(MemoryError("Unable to allocate 1.00 MiB")).kind is ErrorKind.MACHINE

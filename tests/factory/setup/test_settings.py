@@ -7,9 +7,9 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import SCENARIONET, load_config, refuse_relative_root
+from factory.files import machine_fault_of
 from factory.setup.settings import assemble
 from factory.setup.vocabulary import save_recovery_table
-from factory.store.disk import machine_fault_of
 from factory.store.schema import RunIdentity
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.rollout.policy import SeenTraffic
