@@ -180,7 +180,6 @@ def _run(
                     shard_seconds=config.shard_seconds,
                     minutes=left(config.minutes, since),
                     episodes=EpisodesWanted(config.one_episode_in, prepared_episode) if config.one_episode_in else None,
-                    mcap_shards=config.store.episodes == "all",
                     command=asked.words,
                 ),
             ),

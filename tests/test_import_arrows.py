@@ -38,7 +38,7 @@ ROOMS = {
         *("render.settings", "render.splatting", "render.scene", "render.rig", "render.fit", "render"),
     ),
     "factory": (
-        *("exits", "wording", "job", "files", "locks", "store.disk"),
+        *("exits", "wording", "files"),
         *("readers.settings", "readers.town.settings", "config", "readers", "store"),
         *("graph", "datasets", "stages", "pipeline", "setup", "datasets.navsim", "views", "views.board"),
         *("run", "commands", "__main__"),

@@ -36,7 +36,7 @@ def drive(out: str, executor: str, journal: str, seconds: float = TASK_S, notes:
         EXPERTS,
         ROUNDS,
         Store(out),
-        Execution(executor, 2, ray_address=address, shard_seconds=0.1, mcap_shards=True),
+        Execution(executor, 2, ray_address=address, shard_seconds=0.1),
         say=str,
     )
     return summary.exit_code

@@ -1,7 +1,7 @@
 """SIGKILL at moments drawn by chance: `python -m experiments.chaos.kills [seed=0] [local=50] [workers=100]...`
 
 A run of toy samples is killed, the same command given and killed again, and at last given until it says that it is
-complete; then samples, outcomes, candidates and MCAP shards must be those of an undisturbed run, nothing missing and
+complete; then samples, outcomes and candidates must be those of an undisturbed run, nothing missing and
 nothing twice, and no attempt that was committed may have been made again. What is killed, and how often:
 
     local     the driver of executor=local          raylet   Ray's process of a node, of a cluster of one
@@ -130,7 +130,7 @@ class Trial:
 
 
 def compare(out: Path, golden: Path, told: Told) -> None:
-    """All tables, their MCAP shards and verify. Raises AssertionError."""
+    """All tables, and verify. Raises AssertionError."""
     wanted = Store(golden).samples.read(["attempt_id"])["attempt_id"].to_pylist()
     keys = Store(out).samples.read(["attempt_id"])["attempt_id"].to_pylist()
     told.missing += len(set(wanted) - set(keys))

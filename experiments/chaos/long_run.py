@@ -29,7 +29,7 @@ from tests.chaos.processes import PROGRAMS, below, kill, put_away, workers_below
 from tests.pages import REPOSITORY
 
 WORDS = (
-    *("clips=synthetic", "render=none", "reward.labels=none", "store.episodes=all"),
+    *("clips=synthetic", "render=none", "reward.labels=none"),
     *("vocabulary.k=2048", "perturb=dense", "perturb.at_most=400", "rounds=1000"),  # until candidates run out
 )
 VICTIMS = {"ray": {"worker": 4, "driver": 1, "raylet": 1, "gcs": 1}, "local": {"worker": 1, "driver": 1}}  # chances

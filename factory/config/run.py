@@ -133,13 +133,6 @@ class GraphChoice:
 
 
 @dataclass(frozen=True)
-class StoreChoice:
-    """In which form samples are stored, beside their Parquet shards."""
-
-    episodes: Literal["none", "all"] = "none"  # all: as MCAP shards of many samples too, under out/samples_mcap
-
-
-@dataclass(frozen=True)
 class RunConfig:
     """Everything on the command line of `python -m factory.run`."""
 
@@ -161,7 +154,6 @@ class RunConfig:
     minutes: float | None = None  # after which nothing new is begun (exit code 4); the same command goes on
     shard_seconds: float = 30.0  # between commits, if no partition reaches 128 MB before; longer: larger files
     episodes: int | Literal["none", "all"] = "none"  # or n for one sample in n: MCAP files under out/episodes
-    store: StoreChoice = field(default_factory=StoreChoice)
     vocabulary: VocabularyChoice = field(default_factory=VocabularyChoice)
     perturb: PerturbSources = field(default_factory=PerturbSources)
     traffic: TrafficSettings = field(default_factory=TrafficSettings)

@@ -19,7 +19,7 @@ from typing import Any
 import pyarrow as pa
 
 from factory.files import DiskFull
-from factory.graph.episodes import SampleMirror
+from factory.graph.episodes import Episodes
 from factory.graph.local import Graph, MachineIll, Ticket
 from factory.graph.plan import (
     CLIP_CANDIDATE,
@@ -325,7 +325,7 @@ class RunDriver:
     def interrupted(self) -> bool:
         return self._stopping.is_set()
 
-    def loop(self, graph: Graph, gatherer: Gatherer, metrics: RunMetrics, episodes: SampleMirror | None = None) -> None:
+    def loop(self, graph: Graph, gatherer: Gatherer, metrics: RunMetrics, episodes: Episodes | None = None) -> None:
         """Until nothing is left, or until stopped and drained. Raises DiskFull once a disk is full, and MachineIll."""
         self._graph, self._gatherer, self._metrics, self._episodes = graph, gatherer, metrics, episodes
         gatherer.committed = self._committed

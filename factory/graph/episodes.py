@@ -1,24 +1,20 @@
-"""What stands beside the table of samples as MCAP, made of what is committed: episodes, and shards of many samples.
-
-**Episodes** are files for people, one for every chosen sample.
+"""Episodes beside the table of samples, made of what is committed: files for people, one for every chosen sample.
 
 The tables say which files there are to be. A file's name holds the sample and what its row was made under, so that a
 name that is there is written, whole and of the present row: what a killed run left out the next one makes up for, and
 what a redo replaced goes. Which samples are chosen follows from their ids, whatever the order they were made in.
-
-**Shards** hold all samples, a shard for every Parquet shard, in a table of their own (factory.store.mcap_shards).
 """
 
 import re
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from factory.graph.local import Graph, Ticket
 from factory.graph.steps import EpisodesOf, EpisodesWritten, Failure, MakeEpisode
 from factory.readers.base import ClipRef
-from factory.store.mcap_files import FOLDER, McapTable, episode_name, is_chosen
+from factory.store.mcap_files import FOLDER, episode_name, is_chosen
 from factory.store.samples import Store
 
 ROWS = ["attempt_id", "clip_id", "settings_hash", "stage_versions"]
@@ -32,45 +28,6 @@ class EpisodesWanted:
 
     every: int  # 1 all, n one in n
     make: MakeEpisode  # a function that workers can import
-
-
-class SampleMirror(Protocol):
-    """What a driver keeps in step with the table of samples."""
-
-    @property
-    def written(self) -> int:
-        """Files."""
-        ...
-
-    @property
-    def errors(self) -> Sequence[str]:
-        """Why others are not written."""
-        ...
-
-    @property
-    def is_due(self) -> bool:
-        """Something is missing or in hand."""
-        ...
-
-    def begin(self, graph: Graph) -> None:
-        """Have the missing ones written."""
-        ...
-
-    def committed(self, paths: Sequence[str]) -> None:
-        """New files of the table."""
-        ...
-
-    def finished(self, ticket: Ticket, report: Any) -> bool:
-        """Take the report of a task; False where the ticket is not one."""
-        ...
-
-    def stop(self) -> None:
-        """Begin no more; the next run makes up for it."""
-        ...
-
-    def tidy(self) -> None:
-        """Remove drafts of killed runs, and what is of rows that are no more."""
-        ...
 
 
 class Episodes:
@@ -142,96 +99,3 @@ class Episodes:
         assert self._graph is not None, "begin() comes first"
         while self._queue and len(self._writing) < self._graph.parallelism:
             self._writing.add(self._graph.submit("episodes", self._queue.popleft()))
-
-
-class McapShards:
-    """Keeps the table of MCAP shards in step with that of samples."""
-
-    def __init__(self, store: Store) -> None:
-        self._samples, self._table = store.samples, McapTable(store.location)
-        self._asked: set[str] = set()
-        self._queue: deque[tuple[str, Mapping[str, str]]] = deque()
-        self._writing: set[Ticket] = set()
-        self._graph: Graph | None = None
-        self.written = 0
-        self.errors: list[str] = []
-
-    @property
-    def is_due(self) -> bool:
-        is_behind = self._graph is None and (self._table.behind(self._samples) or self._table.outdated(self._samples))
-        return bool(self._queue or self._writing or is_behind)
-
-    def begin(self, graph: Graph) -> None:
-        """Raises AnotherWriter."""
-        self._graph = graph
-        self._table.claim(self._samples.epoch)
-        self.committed(())
-
-    def tidy(self) -> None:
-        self._table.keep_up(self._samples)
-
-    def committed(self, paths: Sequence[str]) -> None:
-        for path, partition in sorted(self._table.behind(self._samples).items()):
-            if path not in self._asked:
-                self._asked.add(path)
-                self._queue.append((path, partition))
-        self._submit()
-
-    def finished(self, ticket: Ticket, report: Any) -> bool:
-        """Raises AnotherWriter."""
-        if ticket not in self._writing:
-            return False
-        self._writing.remove(ticket)
-        if isinstance(report, Failure):
-            self.errors.append(report.error.splitlines()[-1])
-        else:
-            self._table.keep_up(self._samples, [report])
-            self.written += 1
-        self._submit()
-        return True
-
-    def stop(self) -> None:
-        self._queue.clear()
-
-    def _submit(self) -> None:
-        assert self._graph is not None, "begin() comes first"
-        while self._queue and len(self._writing) < self._graph.parallelism:
-            self._writing.add(self._graph.submit("mcap_shard", *self._queue.popleft()))
-
-
-class SampleMirrors:
-    """Several at once."""
-
-    def __init__(self, parts: Sequence[SampleMirror]) -> None:
-        self._parts = parts
-
-    @property
-    def written(self) -> int:
-        return sum(part.written for part in self._parts)
-
-    @property
-    def errors(self) -> list[str]:
-        return [error for part in self._parts for error in part.errors]
-
-    @property
-    def is_due(self) -> bool:
-        return any(part.is_due for part in self._parts)
-
-    def begin(self, graph: Graph) -> None:
-        for part in self._parts:
-            part.begin(graph)
-
-    def committed(self, paths: Sequence[str]) -> None:
-        for part in self._parts:
-            part.committed(paths)
-
-    def finished(self, ticket: Ticket, report: Any) -> bool:
-        return any(part.finished(ticket, report) for part in self._parts)
-
-    def stop(self) -> None:
-        for part in self._parts:
-            part.stop()
-
-    def tidy(self) -> None:
-        for part in self._parts:
-            part.tidy()

@@ -20,7 +20,7 @@ from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUP
 from factory.files import DiskFull, machine_fault_of
 from factory.graph.apart import AGAIN, NEW_CLUSTERS, begun_anew
 from factory.graph.driver import SHARD_BYTES, SHARD_SECONDS, Gatherer, RunDriver, WriteFailed
-from factory.graph.episodes import Episodes, EpisodesWanted, McapShards, SampleMirror, SampleMirrors
+from factory.graph.episodes import Episodes, EpisodesWanted
 from factory.graph.guard import CRASHED
 from factory.graph.local import (
     NO_CLAIMS,
@@ -81,7 +81,6 @@ class Execution:
     shard_seconds: float = SHARD_SECONDS
     minutes: float | None = None  # after which nothing new is begun, as after an interruption
     episodes: EpisodesWanted | None = None  # MCAP files to be written beside the samples
-    mcap_shards: bool = False  # all samples as MCAP shards, too
     command: Sequence[str] | None = None  # the settings as they were given, kept for `retry`
 
 
@@ -134,9 +133,8 @@ class _Run:
             kept = self._how.on_change == "stop" and self._records[-1]["on_change"] == "keep"
             self._on_change: OnChange = "keep" if kept else self._how.on_change
             plan = self._planned(not self._store.starts_over(self._records))
-            parts: list[SampleMirror] = [McapShards(self._store)] if self._how.mcap_shards else []
-            parts += [Episodes(self._store, self._how.episodes, self._refs)] if self._how.episodes else []
-            self._beside = SampleMirrors(parts) if parts else None
+            wanted = self._how.episodes
+            self._episodes = Episodes(self._store, wanted, self._refs) if wanted else None
         except ChangedRun as error:
             return RunSummary(BAD_CONFIG, str(error))
         except (OSError, DeltaError) as error:
@@ -166,7 +164,7 @@ class _Run:
 
     def open(self) -> RunSummary | None:
         """The executor, where anything is due; how the run ends where this machine or cluster is not ready for it."""
-        if not self._plan.todo and (self._beside is None or not self._beside.is_due):
+        if not self._plan.todo and (self._episodes is None or not self._episodes.is_due):
             return None
         how, to = self._how, (self._work, self._store.location)
         try:
@@ -200,7 +198,7 @@ class _Run:
             if self._graph is not None:
                 self._loop(self._graph)
             ended.exit_code = COMPLETE_WITH_FAILURES if self._driver.has_failures else COMPLETE
-            if self._beside is not None and (errors := self._beside.errors):
+            if self._episodes is not None and (errors := self._episodes.errors):
                 text = f"{len(errors)} MCAP files were not written ({errors[0]})"
                 ended.exit_code = INTERRUPTED
                 ended.message = f"{text}; run the same command again to write them"
@@ -234,15 +232,15 @@ class _Run:
         (self._notes / CRASHED).unlink(missing_ok=True)
 
     def _loop(self, graph: Graph) -> None:
-        store, how, beside = self._store, self._how, self._beside
+        store, how, episodes = self._store, self._how, self._episodes
         self._ended.began_ms = _announce(store, self._plan, self._experts, self._rounds, how.command)
         metrics = RunMetrics(graph.recorder, store.location)
         with asked_to_stop(self._driver.stop_soon), _alarm(self._driver.stop, how.minutes):
-            if beside is not None:
-                beside.begin(graph)
-            self._driver.loop(graph, Gatherer(graph, store, how.shard_bytes, how.shard_seconds), metrics, beside)
-            if beside is not None:
-                beside.tidy()
+            if episodes is not None:
+                episodes.begin(graph)
+            self._driver.loop(graph, Gatherer(graph, store, how.shard_bytes, how.shard_seconds), metrics, episodes)
+            if episodes is not None:
+                episodes.tidy()
 
     def _break(self, message: str) -> None:
         self._ended.exit_code, self._ended.message, self._ended.is_broken = INTERRUPTED, message, True

@@ -237,7 +237,6 @@ STEPS: Mapping[str, tuple[Any, tuple[str, ...]]] = {  # its function, and what i
     "stretch": (steps.attempt, ("work",)),  # one after the other
     "write": (steps.write, ("out",)),
     "episodes": (steps.episodes, ("work", "out")),
-    "mcap_shard": (steps.mcap_shard, ("out",)),
     "warm": (steps.warm, ("work",)),
 }
 

@@ -17,7 +17,7 @@ import pyarrow as pa
 from factory.files import machine_fault_of, refused_as_the_runs_own, why_disk_full
 from factory.readers.base import BadClip, ClipRef, Unreadable
 from factory.store.location import BadCacheFile, ClipCache, Location, SceneFiles, Shard, write_shard
-from factory.store.mcap_files import FOLDER, episode_name, write_mcap_shard
+from factory.store.mcap_files import FOLDER, episode_name
 from factory.store.reader import samples_of
 from factory.store.samples import CandidateRow, ErrorKind
 from factory.store.schema import SAMPLES, RunIdentity, Stamp, sample_row_to_table
@@ -422,14 +422,6 @@ def episodes(work: Work, out: Location, wanted: EpisodesOf) -> tuple[EpisodesWri
     except BaseException as error:  # the same boundary
         return failure_of(error), None
     return EpisodesWritten(written, tuple(errors)), None
-
-
-def mcap_shard(out: Location, path: str, partition: Mapping[str, str]) -> tuple[Shard | Failure, None]:
-    """A committed shard of samples as an MCAP shard, to be committed."""
-    try:
-        return write_mcap_shard(out, path, partition), None
-    except OSError as error:
-        return failure_of(error), None
 
 
 def reconstruct(

@@ -14,7 +14,7 @@ files they stand in; `iterate` goes file by file instead, which is what a pass o
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -22,7 +22,6 @@ import pyarrow.parquet as pq
 
 from factory.readers.pictures import BadPicture, decode_rgb
 from factory.store.location import Location, naming, open_parquet, with_partition
-from factory.store.mcap_files import McapShard, McapTable, open_shard
 from factory.store.schema import SAMPLES, SCHEMA, VERSION_PROPERTY, table_to_rows, why_other_schema
 from factory.store.table import KeyedTable, beginning, fixed_bytes
 from tasks.reward.label_bytes import VocabularyLabels, decode
@@ -32,61 +31,30 @@ if TYPE_CHECKING:
     import torch
 
 Sample = dict[str, Any]
-Format = Literal["parquet", "mcap"]
-StoredFile: TypeAlias = pq.ParquetFile | McapShard
 TIME_TOLERANCE_S = 0.05
 
 
-def sample_table(
-    path: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None, format: Format = "parquet"
-) -> KeyedTable:
-    """The table of samples at a run's `out`, or at its folder `samples`; format=mcap: that of MCAP shards at its `out`.
+def sample_table(path: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None) -> KeyedTable:
+    """The table of samples at a run's `out`, or at its folder `samples`.
 
-    Raises FileNotFoundError where there is none, ValueError where its columns are those of another version, or where
-    the MCAP shards are not those of the samples beside them.
+    Raises FileNotFoundError where there is none, ValueError where its columns are those of another version.
     """
     location = Location.parse(path, storage_options)
-    if format == "mcap":
-        table: KeyedTable = _mcap_table(location)
-    else:
-        here = KeyedTable(location, SAMPLES)
-        table = here if here.version is not None else KeyedTable(location.child("samples"), SAMPLES)
+    here = KeyedTable(location, SAMPLES)
+    table = here if here.version is not None else KeyedTable(location.child("samples"), SAMPLES)
     if table.version is None:
-        folder = "its folder samples_mcap" if format == "mcap" else "here or in its folder samples"
-        raise FileNotFoundError(f"{location.uri}: no table of samples {folder}")
+        raise FileNotFoundError(f"{location.uri}: no table of samples here or in its folder samples")
     if other := why_other_schema(location.uri, table.properties.get(VERSION_PROPERTY)):
         raise ValueError(other)
-    return table
-
-
-def _mcap_table(out: Location) -> McapTable:
-    """Raises ValueError where its shards are not those of the samples beside it."""
-    table, samples = McapTable(out), KeyedTable(out.child(SAMPLES.name), SAMPLES)
-    if table.version is not None and samples.version is not None:
-        behind, outdated = len(table.behind(samples)), len(table.outdated(samples))
-        if behind or outdated:
-            raise ValueError(
-                f"{table.location.uri}: lacks {behind} shards of the samples and has {outdated} of others; "
-                "the run's command with store.episodes=all brings it up to date"
-            )
     return table
 
 
 class SampleTable:
     """The samples of one store, read-only."""
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        storage_options: Mapping[str, str] | None = None,
-        format: Format = "parquet",
-    ) -> None:
-        """path: the run's `out`, or with Parquet its folder `samples`; format: which of its two tables is read.
-
-        Raises FileNotFoundError where there is no table, ValueError where its columns are those of another version or
-        its MCAP shards are not those of the samples.
-        """
-        self._table = sample_table(path, storage_options, format)
+    def __init__(self, path: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None) -> None:
+        """path: the run's `out`, or its folder `samples`. Raises what `sample_table` does."""
+        self._table = sample_table(path, storage_options)
         self._partitions = self._table.live_files()
         files = [(path, fixed_bytes(rows["attempt_id"])) for path, rows in self._table.files(["attempt_id"])]
         counts = [len(keys) for _, keys in files]
@@ -98,11 +66,9 @@ class SampleTable:
         self._paths = [path for path, _ in files]
         self._file = self._kept_open()
 
-    def _kept_open(self) -> Callable[[str], StoredFile]:
+    def _kept_open(self) -> Callable[[str], pq.ParquetFile]:
         """Path -> file, of those that were read last."""
-        opener: Callable[[Location, str], StoredFile]
-        opener = open_shard if isinstance(self._table, McapTable) else open_parquet
-        return lru_cache(maxsize=32)(partial(opener, self._table.location))
+        return lru_cache(maxsize=32)(partial(open_parquet, self._table.location))
 
     def __getstate__(self) -> dict[str, Any]:
         """For another process, such as a DataLoader's worker: the same snapshot; it opens the files itself."""
@@ -181,15 +147,13 @@ def samples_of(
             yield from read_rows(file, group, partition, None, slice(i, i + 1))
 
 
-def group_rows(file: StoredFile) -> Ints:
+def group_rows(file: pq.ParquetFile) -> Ints:
     """(groups,) rows of each row group of a file."""
-    if isinstance(file, McapShard):
-        return file.rows
     metadata = file.metadata
     return np.array([metadata.row_group(g).num_rows for g in range(metadata.num_row_groups)], np.int64)
 
 
-def group_of(file: StoredFile, row: int) -> tuple[int, int]:
+def group_of(file: pq.ParquetFile, row: int) -> tuple[int, int]:
     """The row group that a file's row stands in, and its place there."""
     group = 0
     for n in group_rows(file).tolist():
@@ -200,7 +164,7 @@ def group_of(file: StoredFile, row: int) -> tuple[int, int]:
 
 
 def read_rows(
-    file: StoredFile,
+    file: pq.ParquetFile,
     group: int,
     partition: Mapping[str, str],
     columns: Sequence[str] | None,
@@ -209,14 +173,8 @@ def read_rows(
     """Rows of one row group of a file of a table of samples; columns None: all. Raises KeyError for unknown ones."""
     _check_columns(columns)
     names = list(SCHEMA.names if columns is None else columns)
-    stored = _stored(file, group, [n for n in names if n not in partition])[rows]
+    stored = file.read_row_group(group, columns=[n for n in names if n not in partition])[rows]
     return table_to_rows(with_partition(stored, pa.schema([SCHEMA.field(n) for n in names]), partition))
-
-
-def _stored(file: StoredFile, group: int, names: Sequence[str]) -> pa.Table:
-    if isinstance(file, McapShard):
-        return file.read_row_group(group, [leaf for leaf in file.leaves if leaf.partition(".")[0] in names])
-    return file.read_row_group(group, columns=names)
 
 
 def _check_columns(columns: Sequence[str] | None) -> None:

@@ -32,20 +32,11 @@ from factory.store.location import (
     naming,
     write_shard,
 )
-from factory.store.mcap_files import (
-    FOLDER,
-    SAMPLES_MCAP,
-    McapShard,
-    McapTable,
-    check_episode,
-    episode_name,
-    write_mcap_shard,
-)
-from factory.store.mcap_files import NAMED as MCAP_NAMED
+from factory.store.mcap_files import FOLDER, check_episode, episode_name
 from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, ChangedRun, Store
 from factory.store.table import COPIES, LOG, CommitCopies, KeyedTable, LiveFile, LogDamage, codes, fixed_bytes, packed
 
-TABLES = ("plans", "candidates", "samples", "outcomes", SAMPLES_MCAP.name)
+TABLES = ("plans", "candidates", "samples", "outcomes")
 OF_WALKS = ["clip_id", "expert", "candidate_index", "round", "settings_hash"]
 PREPARED, SCENES = "cache/prepared", "scenes"
 DRAFT = re.compile(r"\..*\.tmp")  # that a killed run left
@@ -78,17 +69,11 @@ def damaged_logs(out: Location) -> list[tuple[str, LogDamage]]:
     return [(name, damage) for name in TABLES for damage in CommitCopies(out.child(name)).damage()]
 
 
-def tables_in(store: Store) -> list[KeyedTable]:
-    """All that there are, that of MCAP shards where a run wrote some."""
-    mcap = McapTable(store.location)
-    return [*store.tables, *([mcap] if mcap.version is not None else [])]
-
-
 def verify(store: Store) -> Verdict:
     """Read every live file, episode and kept file, and hold the tables against each other."""
     damage = [f"{name}/{found.name}: {found.problem}" for name, found in damaged_logs(store.location)]
     broken: list[DamagedPart] = []
-    for table in tables_in(store):
+    for table in store.tables:
         broken += _damaged_files(table)
     orphans = orphaned(store)
     kept = _damaged_kept(store.location)
@@ -96,7 +81,7 @@ def verify(store: Store) -> Verdict:
         damage += [*map(str, (*broken, *kept)), "keys and rounds were not checked: fix the files first"]
         return Verdict(0, tuple(damage), tuple(orphans), tuple(found.name for found in (*broken, *kept)))
     rows: list[pa.Table] = []
-    for table in tables_in(store):
+    for table in store.tables:
         damage += _twice(table, rows if table is store.samples else None)
     try:
         damage += _broken_rows(rows, store)
@@ -111,7 +96,7 @@ def verify(store: Store) -> Verdict:
 def orphaned(store: Store) -> list[str]:
     """Files in the tables' folders that no log names, relative to `out`."""
     orphans = []
-    for table in tables_in(store):
+    for table in store.tables:
         live, name = table.live_files(), table.spec.name
         files = [file for file in table.location.names() if not file.startswith((f"{LOG}/", f"{COPIES}/"))]
         orphans += [f"{name}/{file}" for file in files if file not in live]
@@ -151,14 +136,10 @@ def _problem_of(table: KeyedTable, path: str, file: LiveFile) -> str:
         return "is missing"
     if len(data) != file.n_bytes:
         return f"has {len(data):,} bytes, the log says {file.n_bytes:,}"
-    is_mcap = isinstance(table, McapTable)
-    named = (MCAP_NAMED if is_mcap else NAMED).fullmatch(path)
+    named = NAMED.fullmatch(path)
     if named and hashlib.sha256(data).hexdigest()[:32] != named[2]:
         return "its content is not what its name says"
     with naming(f"{table.location.uri}/{path}"):
-        if is_mcap:
-            n_rows = int(McapShard(pa.BufferReader(data)).rows.sum())
-            return "" if n_rows == file.n_rows else f"has {n_rows} rows, the log says {file.n_rows}"
         parquet = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
         if file.n_rows and parquet.metadata.num_rows != file.n_rows:
             return f"has {parquet.metadata.num_rows} rows, the log says {file.n_rows}"
@@ -290,9 +271,6 @@ def hold(store: Store) -> None:
     if store.location.folder is not None and (no_links := why_no_links(store.location.folder)):
         raise BadLocation(no_links)
     store.claim(create=False)
-    mcap = McapTable(store.location)
-    if mcap.version is not None:
-        mcap.claim(store.samples.epoch)
 
 
 def refuse_held(store: Store) -> None:
@@ -317,7 +295,7 @@ def restore_logs(out: Location) -> list[str]:
 
 def drop_damaged(store: Store, verdict: Verdict) -> None:
     """Take the damaged files of a verdict out of their tables, a transaction each, and away."""
-    for table in tables_in(store):
+    for table in store.tables:
         if drop := [path for path in table.live_files() if f"{table.spec.name}/{path}" in verdict.files]:
             table.replace_files(drop)
     for name in verdict.files:
@@ -340,11 +318,8 @@ def leftovers(store: Store, older_s: float, now_s: float) -> list[str]:
 def compact(store: Store, full_bytes: int = FULL_BYTES) -> Iterator[Merged]:
     """Merge the small files of each partition of each table. Raises DamagedFile, before anything of its table is done.
 
-    The rows keep their bytes and the times at which they came into the table. MCAP shards, where there are any, follow
-    those of samples: they are written before these are committed, and committed right after them.
+    The rows keep their bytes and the times at which they came into the table.
     """
-    mcap = McapTable(store.location)
-    followers: list[Shard] = []
     for table in store.tables:
         facts = table.file_facts()
         drop: list[str] = []
@@ -354,17 +329,9 @@ def compact(store: Store, full_bytes: int = FULL_BYTES) -> Iterator[Merged]:
             shard = write_shard(table.location, table.spec, rows)
             add.append((shard, max(facts[path].written_ms for path in group)))
             drop += group
-        if table is store.samples and mcap.version is not None:
-            merged = {shard.path: shard.partition for shard, _ in add}
-            others = {path: of for path, of in mcap.behind(table).items() if path not in drop}
-            followers = [write_mcap_shard(store.location, path, of) for path, of in (merged | others).items()]
         if add:
             table.replace_files(drop, add)
         yield Merged(table.spec.name, len(facts), len(table.file_facts()))
-        if table is store.samples and mcap.version is not None:
-            there = len(mcap.live_files())
-            mcap.keep_up(table, followers)
-            yield Merged(mcap.spec.name, there, len(mcap.live_files()))
 
 
 def _groups(table: KeyedTable, full_bytes: int) -> list[list[str]]:

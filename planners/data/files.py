@@ -1,8 +1,7 @@
 """The files of sample tables as the loader reads them: row group by row group, single columns, single leaves.
 
-They are Parquet shards, or with `data.format=mcap` the MCAP shards of the same samples, which have their row groups and
-leaves, so that batches are the same. A column is read with all that is nested in it; of a column of structs single
-members can be named, such as `images.jpeg`, and the others stay on disk.
+A column is read with all that is nested in it; of a column of structs single members can be named, such as
+`images.jpeg`, and the others stay on disk.
 
 With `data.copy` they are read from a compact copy, on a local disk, of what one planner reads of the tables:
 
@@ -10,7 +9,7 @@ With `data.copy` they are read from a compact copy, on a local disk, of what one
 
 It holds all rows with the needed columns alone, of the images those at now of the chosen cameras, uncompressed, and is
 read by mapping it: pictures are decoded from where they lie. A file of a table never changes, and the digest is of its
-name, the columns, the cameras and the format, so that trainings with other rows share the copies and those with other
+name, the columns and the cameras, so that trainings with other rows share the copies and those with other
 columns or cameras have their own. Nothing is ever removed; the folder can be deleted while no training runs.
 
 Each record batch is a stream of Arrow's of its own. Behind them stands where each lies and its checksum, as sealed
@@ -27,7 +26,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import IO, TypeAlias
+from typing import IO
 
 import numpy as np
 import pyarrow as pa
@@ -37,12 +36,10 @@ from pyarrow import fs
 
 from factory.files import locked
 from factory.store.location import naming
-from factory.store.mcap_files import McapShard, ShardIndex
-from factory.store.reader import TIME_TOLERANCE_S, Format, StoredFile, group_rows, sample_table
+from factory.store.reader import TIME_TOLERANCE_S, group_rows, sample_table
 from tasks.sealed import Damaged, sealed, unsealed
 from tasks.world.arrays import Ints
 
-Footer: TypeAlias = pq.FileMetaData | ShardIndex
 FOOTER_BYTES = 2**25  # as they are stored; parsed they take eight times that
 
 
@@ -55,17 +52,17 @@ class Footers:
     def __init__(self, limit: int) -> None:
         """limit: bytes of footers that are kept."""
         self._limit, self._held = limit, 0
-        self._footers: OrderedDict[str, Footer] = OrderedDict()
+        self._footers: OrderedDict[str, pq.FileMetaData] = OrderedDict()
         self._lock = Lock()
 
-    def of(self, path: str) -> Footer | None:
+    def of(self, path: str) -> pq.FileMetaData | None:
         """The footer of a file; None where it must be read."""
         with self._lock:
             if path in self._footers:
                 self._footers.move_to_end(path)
             return self._footers.get(path)
 
-    def keep(self, path: str, footer: Footer) -> None:
+    def keep(self, path: str, footer: pq.FileMetaData) -> None:
         """Keep one footer more, and drop those that were not asked for the longest as far as need be."""
         with self._lock:
             if path not in self._footers:
@@ -88,8 +85,8 @@ class SampleFile:
     round: int
     expert: str
 
-    def open(self, check_pages: bool = True) -> StoredFile:
-        """check_pages: whether reading a damaged page of Parquet raises OSError; damaged chunks of MCAP always do.
+    def open(self, check_pages: bool = True) -> pq.ParquetFile:
+        """check_pages: whether reading a damaged page raises OSError.
 
         Raises OSError with the file's name.
         """
@@ -101,14 +98,10 @@ class SampleFile:
         """For messages."""
         return f"{self.table}: {self.path}"
 
-    def _open(self, check_pages: bool) -> StoredFile:
+    def _open(self, check_pages: bool) -> pq.ParquetFile:
         local = isinstance(self.filesystem, fs.LocalFileSystem)
         filesystem = fs.LocalFileSystem(use_mmap=True) if local else self.filesystem
         footer = _FOOTERS.of(self.path)
-        if self.path.endswith(".mcap"):
-            shard = McapShard(filesystem.open_input_file(self.path), footer)
-            _FOOTERS.keep(self.path, shard.index)
-            return shard
         parquet = pq.ParquetFile(
             self.path,
             metadata=footer,
@@ -120,16 +113,12 @@ class SampleFile:
         return parquet
 
 
-def files_of(
-    table: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None, format: Format = "parquet"
-) -> list[SampleFile]:
+def files_of(table: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None) -> list[SampleFile]:
     """The files of a table of samples in the order of their names, which are their contents' digests.
 
-    Those of MCAP shards begin with their Parquet shards' digests: either way the order is the same. Raises
-    FileNotFoundError where there is no table, ValueError where its columns are those of another version or its MCAP
-    shards are not those of the samples.
+    Raises FileNotFoundError where there is no table, ValueError where its columns are those of another version.
     """
-    found = sample_table(table, storage_options, format)
+    found = sample_table(table, storage_options)
     filesystem, base = found.location.filesystem()
     return [
         SampleFile(os.fspath(table), filesystem, f"{base}/{path}", int(partition["round"]), partition["expert"])
@@ -137,7 +126,7 @@ def files_of(
     ]
 
 
-def leaves(file: StoredFile, columns: Sequence[str]) -> list[str]:
+def leaves(file: pq.ParquetFile, columns: Sequence[str]) -> list[str]:
     """The paths of the leaves under columns and members (`label_2hz`, `images.jpeg`) of a file, for reading.
 
     Raises ValueError naming those it has not.
@@ -149,38 +138,29 @@ def leaves(file: StoredFile, columns: Sequence[str]) -> list[str]:
     return [path for path, plain in paths if any(_under(plain, c) for c in columns)]
 
 
-def read_group(file: StoredFile, group: int, paths: Sequence[str]) -> pa.Table:
+def read_group(file: pq.ParquetFile, group: int, paths: Sequence[str]) -> pa.Table:
     """Leaves of one row group, in this thread."""
-    if isinstance(file, McapShard):
-        return file.read_row_group(group, paths)
     return file.read_row_group(group, columns=paths, use_threads=False)
 
 
-def read_all(file: StoredFile, paths: Sequence[str]) -> pa.Table:
+def read_all(file: pq.ParquetFile, paths: Sequence[str]) -> pa.Table:
     """Leaves of all row groups, in this thread."""
-    return file.read(paths) if isinstance(file, McapShard) else file.read(columns=paths, use_threads=False)
+    return file.read(columns=paths, use_threads=False)
 
 
-def group_bytes(file: StoredFile, columns: Sequence[str]) -> Ints:
+def group_bytes(file: pq.ParquetFile, columns: Sequence[str]) -> Ints:
     """(groups, columns) uncompressed bytes of columns and members in Parquet, as the footer says."""
     paths = _paths(file)
     numbers = [[i for i, (_, plain) in enumerate(paths) if _under(plain, column)] for column in columns]
-    if isinstance(file, McapShard):
-        of_leaf = np.array(list(file.leaves.values()), np.int64).T
-        sizes = [[int(group[under].sum()) for under in numbers] for group in of_leaf]
-    else:
-        groups = (file.metadata.row_group(g) for g in range(file.metadata.num_row_groups))
-        sizes = [[sum(group.column(i).total_uncompressed_size for i in under) for under in numbers] for group in groups]
+    groups = (file.metadata.row_group(g) for g in range(file.metadata.num_row_groups))
+    sizes = [[sum(group.column(i).total_uncompressed_size for i in under) for under in numbers] for group in groups]
     return np.array(sizes, np.int64).reshape(-1, len(columns))
 
 
-def _paths(file: StoredFile) -> list[tuple[str, str]]:
+def _paths(file: pq.ParquetFile) -> list[tuple[str, str]]:
     """Of every leaf its path, and that without what engines put, under several names, between a list and its items."""
-    if isinstance(file, McapShard):
-        paths = list(file.leaves)
-    else:
-        schema = file.metadata.schema
-        paths = [schema.column(i).path for i in range(len(schema))]
+    schema = file.metadata.schema
+    paths = [schema.column(i).path for i in range(len(schema))]
     return [(path, re.sub(r"\.(list\.(element|item)|bag\.array_element)", "", path)) for path in paths]
 
 

@@ -15,10 +15,11 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from factory.store.location import Location, naming
-from factory.store.reader import TIME_TOLERANCE_S, Format, StoredFile, group_rows
+from factory.store.reader import TIME_TOLERANCE_S, group_rows
 from factory.store.schema import LABEL_COLUMNS
 from planners.data.batch import ImageLayout, Needs, TrainingData
 from planners.data.files import SampleFile, files_of, group_bytes, leaves, read_all
@@ -59,7 +60,6 @@ class DataSettings:
     limit_sim: int | None = None  # as many simulated samples, drawn from those that the rest leaves
     seed: int = fixed(0)  # of the two draws; a smaller share or limit is a part of a larger one
     storage_options: dict[str, str] = field(default_factory=dict)  # of object stores, as deltalake calls them
-    format: Format = "parquet"  # mcap: read the MCAP shards of a run with store.episodes=all; batches are the same
     copy: str | None = None  # folder of this machine for a compact copy of what is read, see planners.data.files
     pictures: str | None = None  # folder of this machine for decoded pictures, see planners.data.images
     pictures_gb: float = 100.0  # that it takes at most, 10^9 bytes; what is beyond is decoded in every pass
@@ -186,9 +186,7 @@ def open_dataset(settings: DataSettings) -> Dataset:
         raise ValueError("there are no samples to read: give data.real=[<out of a run>], data.sim=[...] or both")
     files, wanted = [], []
     for uri, kinds in sides.items():
-        found = [
-            file for file in files_of(uri, settings.storage_options, settings.format) if (file.expert != HUMAN) in kinds
-        ]
+        found = [file for file in files_of(uri, settings.storage_options) if (file.expert != HUMAN) in kinds]
         files += found
         wanted.append((uri, kinds, {file.expert != HUMAN for file in found}))
     for uri, kinds, there in wanted:
@@ -219,7 +217,7 @@ def _rows_of(file: SampleFile, number: int) -> SampleRows:
         return _index_of(file, number, parquet, table)
 
 
-def _index_of(file: SampleFile, number: int, parquet: StoredFile, table: pa.Table) -> SampleRows:
+def _index_of(file: SampleFile, number: int, parquet: pq.ParquetFile, table: pa.Table) -> SampleRows:
     counts, n = group_rows(parquet), table.num_rows
 
     def text(name: str) -> NDArray[np.str_]:

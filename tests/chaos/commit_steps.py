@@ -28,7 +28,6 @@ from pathlib import Path
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph.driver import SHARD_BYTES
 from factory.graph.execute import Execution, execute
-from factory.store.mcap_files import McapTable
 from factory.store.reader import SampleTable
 from factory.store.samples import OnChange, Store
 from factory.store.table import KeyedTable
@@ -39,7 +38,7 @@ from tests.factory.toy import ToyWork, refs
 
 EXPERTS = ["recovery", "human"]
 INTERVAL = 10  # commits from one checkpoint of a log to the next; delta-rs's own are 100
-TABLES = ("plans", "candidates", "samples", "outcomes", "samples_mcap")
+TABLES = ("plans", "candidates", "samples", "outcomes")
 COMMIT = re.compile(r"(\w+)/_delta_log/(\d{20})\.json")
 COPY = re.compile(r"(\w+)/_commits/(\d{20})\.json")
 FINE = ("old", "new", "went on")
@@ -69,7 +68,7 @@ def before_checkpoints(out: str) -> int:
 
 
 def _run(out: str, work: ToyWork, clips: int = 1, on_change: OnChange = "stop", shard_bytes: int = 1) -> int:
-    how = Execution("local", on_change=on_change, shard_bytes=shard_bytes, shard_seconds=math.inf, mcap_shards=True)
+    how = Execution("local", on_change=on_change, shard_bytes=shard_bytes, shard_seconds=math.inf)
     summary = execute(work, refs(clips), EXPERTS, 1, Store(out), how, say=str)
     print(summary.message)
     return summary.exit_code
@@ -89,7 +88,7 @@ RUNS = (Run("a new folder", new_store), Run("other settings, with checkpoints", 
 
 def tables_in(out: Path) -> list[KeyedTable]:
     store = Store(out)
-    return [*store.tables, McapTable(store.location)]
+    return list(store.tables)
 
 
 def rows_of(table: KeyedTable) -> Rows:

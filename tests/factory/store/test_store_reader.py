@@ -16,8 +16,7 @@ import pytest
 
 from factory.commands.table import COMMANDS, dispatch
 from factory.exits import BAD_CONFIG
-from factory.graph.execute import Execution, execute
-from factory.store.reader import Format, SampleTable, image_of, labels_of, to_torch
+from factory.store.reader import SampleTable, image_of, labels_of, to_torch
 from factory.store.samples import Store
 from factory.store.schema import LABEL_COLUMNS
 from tasks.reward.label_bytes import VocabularyLabels
@@ -46,22 +45,20 @@ def test_samples_are_the_same_by_place_key_iteration_and_table(out: Path) -> Non
     assert samples.schema.field("label_10hz").metadata[b"frame"] == b"ego at now"
 
 
-@pytest.mark.parametrize(("start", "format"), [("spawn", "parquet"), ("forkserver", "mcap")])
+@pytest.mark.parametrize("start", ["spawn", "forkserver"])
 def test_workers_of_a_data_loader_read_the_snapshot_that_was_opened_however_they_start(
-    start: str, format: Format, tmp_path: Path
+    start: str, tmp_path: Path
 ) -> None:
     from torch.utils.data import DataLoader, Subset
 
     def grown(n: int) -> None:
-        execute(
-            ToyWork(), refs(n), ["recovery", "human"], 2, Store(tmp_path), Execution("local", mcap_shards=True), say=len
-        )
+        executed(ToyWork(), refs(n), ["recovery", "human"], 2, Store(tmp_path))
 
     grown(1)
-    table = SampleTable(tmp_path, format=format)
+    table = SampleTable(tmp_path)
     expected = [table[i] for i in range(len(table))]  # files are open
     grown(3)
-    assert len(SampleTable(tmp_path, format=format)) > len(table)
+    assert len(SampleTable(tmp_path)) > len(table)
     places = [len(table) - 1, 0]
     for chosen, rows in ((table, expected), (Subset(table, places), [expected[i] for i in places])):  # type: ignore[arg-type]
         loader = DataLoader(chosen, 2, num_workers=1, multiprocessing_context=start, collate_fn=list, timeout=300)  # type: ignore[arg-type]
@@ -97,7 +94,7 @@ def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
 def test_tables_of_another_version_are_refused_in_one_line_and_left_as_they_are(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], is_sealed: bool
 ) -> None:
-    executed(ToyWork(), refs(1), ["human"], 1, Store(tmp_path), Execution("local"))
+    executed(ToyWork(), refs(1), ["human"], 1, Store(tmp_path))
     record = {"schema_version": 3, "runs": json.loads((tmp_path / "run.json").read_text())["runs"]}
     (tmp_path / "run.json").write_text(sealed_json(record) if is_sealed else json.dumps(record))
     shutil.rmtree(tmp_path / "samples" / "_commits")  # a repair would make them again
