@@ -132,7 +132,7 @@ def _run(
     begun: int = 0,
     say: Callable[[str], None] = print,
 ) -> int:
-    from factory.graph.episodes import EpisodesWanted
+    from factory.graph.driver import EpisodesWanted
     from factory.graph.execute import Execution, execute, on_new_clusters
     from factory.graph.local import Claims, Limits
     from factory.setup.calibrate import calibrate, plan_text

@@ -19,8 +19,7 @@ from deltalake.exceptions import DeltaError
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
 from factory.files import DiskFull, machine_fault_of
 from factory.graph.apart import AGAIN, NEW_CLUSTERS, begun_anew
-from factory.graph.driver import SHARD_BYTES, SHARD_SECONDS, Gatherer, RunDriver, WriteFailed
-from factory.graph.episodes import Episodes, EpisodesWanted
+from factory.graph.driver import SHARD_BYTES, SHARD_SECONDS, Episodes, EpisodesWanted, Gatherer, RunDriver, WriteFailed
 from factory.graph.guard import CRASHED
 from factory.graph.local import (
     NO_CLAIMS,

@@ -16,8 +16,8 @@ import pyarrow as pa
 
 from factory.files import machine_fault_of, refused_as_the_runs_own, why_disk_full
 from factory.readers.base import BadClip, ClipRef, Unreadable
+from factory.store.episodes import FOLDER, episode_name
 from factory.store.location import BadCacheFile, ClipCache, Location, SceneFiles, Shard, write_shard
-from factory.store.mcap_files import FOLDER, episode_name
 from factory.store.reader import samples_of
 from factory.store.samples import CandidateRow, ErrorKind
 from factory.store.schema import SAMPLES, RunIdentity, Stamp, sample_row_to_table

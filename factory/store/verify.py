@@ -21,6 +21,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from factory.files import why_no_links
+from factory.store.episodes import FOLDER, check_episode, episode_name
 from factory.store.location import (
     BadCacheFile,
     BadLocation,
@@ -32,7 +33,6 @@ from factory.store.location import (
     naming,
     write_shard,
 )
-from factory.store.mcap_files import FOLDER, check_episode, episode_name
 from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, ChangedRun, Store
 from factory.store.table import COPIES, LOG, CommitCopies, KeyedTable, LiveFile, LogDamage, codes, fixed_bytes, packed
 

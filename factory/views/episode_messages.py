@@ -23,7 +23,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.timestamp_pb2 import Timestamp
 from scipy.spatial.transform import Rotation
 
-from factory.store.mcap_files import Message, episode_bytes
+from factory.store.episodes import Message, episode_bytes
 from factory.store.schema import FIELDS, NOW_INDEX, Column
 from factory.views.bev import AGENT_COLOURS, EXPERT, LOGGED, OBJECT, PERTURBED, Colour
 from factory.views.sample_picture import ego_way

@@ -140,7 +140,7 @@ def _attempt_facts(store: "Store", row: Row) -> list[tuple[str, object]]:
 
 
 def _sample_facts(store: "Store", row: Row, path: str) -> list[tuple[str, object]]:
-    from factory.store.mcap_files import FOLDER, episode_name
+    from factory.store.episodes import FOLDER, episode_name
 
     labels = f"{row['label_vocabulary']}, traffic {row['label_traffic']}" if row["label_vocabulary"] else "none"
     episode = f"{FOLDER}/{episode_name(row)}"

@@ -23,8 +23,8 @@ from factory.setup.vocabulary import load_recovery_table, load_vocabulary, save_
 from factory.stages.scene_file import BadScene, read_scene, write_scene
 from factory.stages.sensors import decode_image, load_sweeps
 from factory.stages.warm import tiny_clip
+from factory.store.episodes import Message, check_episode, episode_bytes
 from factory.store.location import BadCacheFile, decode, encode
-from factory.store.mcap_files import Message, check_episode, episode_bytes
 from factory.views.scene_files import background_bytes, read_splats
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.render.splatting.project import CLASSIC

@@ -13,7 +13,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
 from factory.commands.table import COMMANDS
-from factory.store.mcap_files import episode_bytes
+from factory.store.episodes import episode_bytes
 from factory.store.samples import Store
 from factory.views.episode_messages import episode_messages, metadata_of, world_from_now
 from tests.planners.samples import FRONT_YAWS, jpeg, pictures, plain, sample, write_table

@@ -19,7 +19,7 @@ from factory.__main__ import main
 from factory.commands.completion import candidates, settings_of
 from factory.commands.table import COMMANDS, DOORS, PLANNERS
 from factory.exits import MEANING
-from factory.graph.episodes import EpisodesWanted
+from factory.graph.driver import EpisodesWanted
 from factory.graph.execute import Execution
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import COPIES

@@ -9,11 +9,11 @@ from mcap.reader import make_reader
 
 from factory.config.run import load_config
 from factory.exits import COMPLETE, INTERRUPTED
-from factory.graph import episodes
-from factory.graph.episodes import EpisodesWanted
+from factory.graph import driver
+from factory.graph.driver import EpisodesWanted
 from factory.graph.execute import Execution, RunSummary
+from factory.store.episodes import FOLDER, episode_name, is_chosen
 from factory.store.location import Location
-from factory.store.mcap_files import FOLDER, episode_name, is_chosen
 from factory.store.samples import Store
 from factory.store.verify import verify
 from factory.views.show import prepared_episode
@@ -90,12 +90,12 @@ def test_a_run_killed_between_commit_and_episodes_ends_in_the_same_files(
     class Killed(BaseException):
         pass
 
-    def die(self: episodes.Episodes, paths: object) -> None:
+    def die(self: driver.Episodes, paths: object) -> None:
         if paths:
             raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(episodes.Episodes, "committed", die)
+        patch.setattr(driver.Episodes, "committed", die)
         with pytest.raises(Killed):
             run(tmp_path, shard_seconds=0.0)
     (tmp_path / FOLDER).mkdir()

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
-from factory.graph.episodes import EpisodesWanted
+from factory.graph.driver import EpisodesWanted
 from factory.graph.execute import Execution
 from factory.graph.local import Claims, Limits
 from factory.graph.on_ray import graph

@@ -9,10 +9,10 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.exits import BAD_CONFIG, COMPLETE, DAMAGED
-from factory.graph.episodes import EpisodesWanted
+from factory.graph.driver import EpisodesWanted
 from factory.graph.execute import Execution, execute
+from factory.store.episodes import Message, episode_bytes
 from factory.store.location import Location, write_shard
-from factory.store.mcap_files import Message, episode_bytes
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.schema import SAMPLES

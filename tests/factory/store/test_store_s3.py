@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.graph.episodes import EpisodesWanted
+from factory.graph.driver import EpisodesWanted
 from factory.graph.execute import Execution
 from factory.store.location import BadLocation, Location
 from factory.store.reader import SampleTable
