@@ -5,16 +5,13 @@ Everything the driver knows it can know again from the tables, so it can die at 
 """
 
 import ctypes
-import ctypes.util
 import math
 import re
-import sys
 import threading
 import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import Any
 
 import pyarrow as pa
@@ -41,6 +38,7 @@ from factory.graph.plan import (
 from factory.graph.progress import Executed, ProgressLine, RunForecast, RunMetrics, Tally, Workload
 from factory.graph.steps import (
     Attempted,
+    Built,
     EpisodesOf,
     EpisodesWritten,
     Failure,
@@ -48,7 +46,6 @@ from factory.graph.steps import (
     HandedOn,
     MakeEpisode,
     Prepared,
-    Reconstructed,
     Walked,
 )
 from factory.readers.base import ClipRef
@@ -253,11 +250,7 @@ class PendingCommit:
         return max(self.n_bytes.values(), default=0)
 
 
-@cache
-def _trim() -> Callable[[int], int] | None:
-    """glibc's malloc_trim; None where the C library has none."""
-    name = ctypes.util.find_library("c") if sys.platform == "linux" else None
-    return getattr(ctypes.CDLL(name), "malloc_trim", None) if name else None
+_C_LIBRARY = ctypes.CDLL(None)
 
 
 def give_back_freed() -> None:
@@ -266,22 +259,15 @@ def give_back_freed() -> None:
     A driver of days would else hold what each of its threads once needed. About a millisecond.
     """
     pa.default_memory_pool().release_unused()
-    if trim := _trim():
-        trim(0)
+    if hasattr(_C_LIBRARY, "malloc_trim"):  # of glibc
+        _C_LIBRARY.malloc_trim(0)
 
 
 class Gatherer:
     """Fills the open batch, sends full ones to be written, commits the written ones."""
 
-    def __init__(
-        self,
-        graph: Graph,
-        store: Store,
-        shard_bytes: int = SHARD_BYTES,
-        shard_seconds: float = SHARD_SECONDS,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._graph, self._store, self._clock = graph, store, clock
+    def __init__(self, graph: Graph, store: Store, shard_bytes: int, shard_seconds: float) -> None:
+        self._graph, self._store = graph, store
         self.committed: Callable[[Sequence[Shard], float], None] = lambda shards, seconds: None  # told of every commit
         self._shard_bytes, self._shard_seconds = shard_bytes, shard_seconds
         self._open = PendingCommit()
@@ -301,7 +287,7 @@ class Gatherer:
     ) -> None:
         """Results that must become visible together."""
         if self._open.is_empty:
-            self._open.opened = self._clock()
+            self._open.opened = time.monotonic()
         for row in rows:
             self._open.rows[row.partition].append(row)
             self._open.n_bytes[row.partition] += row.n_bytes
@@ -312,7 +298,7 @@ class Gatherer:
 
     def send_if_due(self) -> None:
         batch = self._open
-        age = self._clock() - batch.opened
+        age = time.monotonic() - batch.opened
         if not batch.is_empty and (batch.largest >= self._shard_bytes or age >= self._shard_seconds):
             self.send()
 
@@ -378,8 +364,8 @@ class RunDriver:
         digests: Mapping[str, str],
         rounds: int,
         policy: Callable[[Past], bool],
-        block_of: BlockOf = lambda ref: None,
-        doing: Callable[[], str] = str,
+        block_of: BlockOf,
+        doing: Callable[[], str],
     ) -> None:
         """block_of: name of the block that is to be built before a clip; doing: how far long tasks are."""
         self._identity, self._rounds, self._policy = identity, rounds, policy
@@ -525,12 +511,12 @@ class RunDriver:
             said = report.error.splitlines()[-1]
             raise MachineIll(f"the machine failed {self._ill_in_a_row} tasks in a row, the last one by: {said}")
 
-    def _take_block(self, build: Build, report: Reconstructed | HalfBuilt | Failure) -> None:
+    def _take_block(self, build: Build, report: Built | HalfBuilt | Failure) -> None:
         if isinstance(report, HalfBuilt):
             self.notes.append(f"block {build.block} is not finished; the next run goes on with it")
             return
         self._forecast.blocks.finish(1)
-        if isinstance(report, Reconstructed):
+        if isinstance(report, Built):
             self._count(report.seconds, self._forecast.blocks)
         else:
             last = report.error.splitlines()[-1]

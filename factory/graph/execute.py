@@ -22,8 +22,6 @@ from factory.graph.apart import AGAIN, NEW_CLUSTERS, begun_anew
 from factory.graph.driver import SHARD_BYTES, SHARD_SECONDS, Episodes, EpisodesWanted, Gatherer, RunDriver, WriteFailed
 from factory.graph.guard import CRASHED
 from factory.graph.local import (
-    NO_CLAIMS,
-    NO_LIMITS,
     Claims,
     ClusterDied,
     ClusterLacks,
@@ -40,7 +38,7 @@ from factory.graph.steps import NotReady, Work
 from factory.readers.base import ClipRef
 from factory.store.funnel import Funnel, funnel_of
 from factory.store.location import BadLocation
-from factory.store.samples import CURRENT_RUN, NOTHING, ChangedRun, Kind, OnChange, Store
+from factory.store.samples import CURRENT_RUN, ChangedRun, History, Kind, OnChange, Store
 from factory.store.table import AnotherWriter
 from factory.wording import one_line
 
@@ -72,9 +70,9 @@ class Execution:
     on_change: OnChange = "stop"
     retry: bool = False  # attempts that failed by input or a bug are tried again, too
     ray_address: str | None = None
-    claims: Claims = NO_CLAIMS  # on Ray
+    claims: Claims = field(default_factory=Claims)  # on Ray
     fuse: Fuse = "auto"  # whether the stages of an attempt are one task; auto: not where drawing claims a GPU
-    limits: Limits = NO_LIMITS  # of a task, beyond which it is ended
+    limits: Limits = field(default_factory=Limits)  # of a task, beyond which it is ended
     isolated: bool = False  # executor=local works in a process of its own, which may die
     shard_bytes: int = SHARD_BYTES
     shard_seconds: float = SHARD_SECONDS
@@ -151,7 +149,7 @@ class _Run:
         return None
 
     def _planned(self, has_history: bool) -> RunPlan:
-        history = self._store.history(self._identity, self._digests) if has_history else NOTHING
+        history = self._store.history(self._identity, self._digests) if has_history else History()
         wanted = (self._refs, self._experts, self._rounds)
         return make_plan(*wanted, history, self._identity, self._on_change, self._policy, self._work.once)
 
@@ -264,12 +262,9 @@ class _Run:
 
 def _again_after(error: Exception) -> str:
     """What to do where this machine, or what holds the tables, fails."""
-    return out_of_disk(error) if isinstance(error, DiskFull) else f"{one_line(error)}; {AGAIN}"
-
-
-def out_of_disk(error: DiskFull) -> str:
-    """What to do where a disk is full."""
-    return f"{error}; free disk space and run the same command again: it goes on from what is committed"
+    if isinstance(error, DiskFull):
+        return f"{error}; free disk space and run the same command again: it goes on from what is committed"
+    return f"{one_line(error)}; {AGAIN}"
 
 
 def on_new_clusters(once: Callable[[], RunSummary], say: Callable[[str], None] = print, begun: int = 0) -> RunSummary:

@@ -24,7 +24,7 @@ from factory.files import DiskFull
 from factory.graph import steps
 from factory.graph.guard import OVER, WORK, WatchedProcess, read_note
 from factory.graph.progress import NoRecorder, Recorder
-from factory.graph.steps import Failure, NotReady, StopCheck, Work, never, warm
+from factory.graph.steps import Failure, NotReady, StopCheck, Work, warm
 from factory.readers.base import ClipRef
 from factory.store.location import Location
 from factory.store.samples import ErrorKind
@@ -52,9 +52,6 @@ class Limits:
         memory = [self.gb.get(task.name, task.limit_gb) for task in parts]
         known = [gb for gb in memory if gb is not None]
         return sum(seconds) or None, max(known) if known and len(known) == len(memory) else None
-
-
-NO_LIMITS = Limits()
 
 
 class Costs:
@@ -194,9 +191,6 @@ class ClusterDied(RuntimeError):
         self.is_ours = is_ours
 
 
-NO_CLAIMS = Claims()
-
-
 @dataclass(eq=False)
 class Ticket:
     """A submitted task. `result` stands for its large result and may be an argument of later tasks."""
@@ -275,7 +269,7 @@ class LocalGraph:
 
     parallelism = 1
 
-    def __init__(self, work: Work, out: Location, stopped: StopCheck = never, fuse: Fuse = "auto") -> None:
+    def __init__(self, work: Work, out: Location, stopped: StopCheck, fuse: Fuse) -> None:
         """stopped: asked now and then by tasks that take long, as nobody else can while they are at work."""
         self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(fuse, apart=False)
         self.cores = os.cpu_count() or 1
@@ -339,14 +333,7 @@ class IsolatedGraph:
 
     parallelism = 1
 
-    def __init__(
-        self,
-        work: Work,
-        out: Location,
-        stopped: StopCheck = never,
-        fuse: Fuse = "auto",
-        limits: Limits = NO_LIMITS,
-    ) -> None:
+    def __init__(self, work: Work, out: Location, stopped: StopCheck, fuse: Fuse, limits: Limits) -> None:
         """Raises NotReady where the process cannot be given the work, or is not ready for it."""
         self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(fuse, apart=False)
         self.cores = os.cpu_count() or 1

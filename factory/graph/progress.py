@@ -15,7 +15,7 @@ from typing import Protocol, Self, TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from factory.graph.steps import Attempted, Failure, Prepared, Reconstructed, Walked
+from factory.graph.steps import Attempted, Built, Failure, Prepared, Walked
 from factory.store.location import Location, Shard
 from factory.store.samples import Kind, Outcome
 from factory.wording import rate_text, time_text
@@ -306,13 +306,13 @@ class RunMetrics:
             self._made(each)
 
     def _made(self, report: object) -> None:
-        if isinstance(report, Prepared | Reconstructed | Attempted):
+        if isinstance(report, Prepared | Built | Attempted):
             for stage, spent in report.seconds.items():
                 self._add(STAGE_SECONDS, spent, stage=stage)
                 self._add(STAGE_SPENT, spent, stage=stage)
         if isinstance(report, Prepared):
             self._looked_up("prepared", report.from_cache)
-        elif isinstance(report, Reconstructed):
+        elif isinstance(report, Built):
             self._looked_up("block", report.from_cache)
             self._psnr("block", report.psnr_db)
         elif isinstance(report, Attempted):

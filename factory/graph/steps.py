@@ -228,15 +228,6 @@ class Prepared:
 
 
 @dataclass(frozen=True)
-class Reconstructed:
-    """Report on a block that is in the cache now."""
-
-    seconds: Mapping[str, float]
-    from_cache: bool
-    psnr_db: float | None
-
-
-@dataclass(frozen=True)
 class HalfBuilt:
     """Report on a block that is not finished because the run stops; the next run goes on with it."""
 
@@ -424,15 +415,12 @@ def episodes(work: Work, out: Location, wanted: EpisodesOf) -> tuple[EpisodesWri
     return EpisodesWritten(written, tuple(errors)), None
 
 
-def reconstruct(
-    work: Work, stopped: StopCheck, ref: ClipRef, threads: int
-) -> tuple[Reconstructed | HalfBuilt | Failure, None]:
+def reconstruct(work: Work, stopped: StopCheck, ref: ClipRef, threads: int) -> tuple[Built | HalfBuilt | Failure, None]:
     """The block that the clip is rendered from, into the cache of this machine."""
     if stopped():  # before its sensors are read
         return HalfBuilt(), None
     try:
-        built = work.reconstruct(ref, threads, stopped)
-        return Reconstructed(built.seconds, built.from_cache, built.psnr_db), None
+        return work.reconstruct(ref, threads, stopped), None
     except TaskStopped:
         return HalfBuilt(), None
     except KeyboardInterrupt:

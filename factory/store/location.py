@@ -237,13 +237,9 @@ def _leaf_paths(path: str, kind: pa.DataType) -> list[str]:
 def with_partition(stored: pa.Table, schema: pa.Schema, partition: Mapping[str, object]) -> pa.Table:
     """The columns of `schema` from what a file holds and what the log says of it."""
     n = stored.num_rows
-    arrays = [_repeated(partition[f.name], f.type, n) if f.name in partition else stored[f.name] for f in schema]
-    same = (array if array.type == f.type else array.cast(f.type) for array, f in zip(arrays, schema))
-    return pa.table(list(same), schema=schema)
-
-
-def _repeated(value: object, kind: pa.DataType, n: int) -> pa.Array:
-    return pa.repeat(pa.scalar(value).cast(kind), n)
+    arrays = [pa.repeat(pa.scalar(partition[f.name]), n) if f.name in partition else stored[f.name] for f in schema]
+    same = [array if array.type == f.type else array.cast(f.type) for array, f in zip(arrays, schema)]
+    return pa.table(same, schema=schema)
 
 
 def encoded_text(field: pa.Field) -> pa.Field:

@@ -30,7 +30,7 @@ from factory.store.schema import (
     schema_of,
     why_other_schema,
 )
-from factory.store.table import Bytes, Codes, Ints, KeyedTable, both, codes, distinct, fixed_bytes
+from factory.store.table import Bytes, Codes, Ints, KeyedTable, codes, distinct, fixed_bytes
 from tasks.sealed import MEMBER, sealed_json, unsealed_json
 
 # What became of attempts: the tables `outcomes`, `candidates` and `plans`, and the history that a run goes on from.
@@ -302,9 +302,6 @@ class History:
         return slice(self.starts[walk], self.starts[walk + 1])
 
 
-NOTHING = History()
-
-
 def history_of(
     outcomes: pa.Table,
     samples: pa.Table,
@@ -492,7 +489,7 @@ class Store:
         if list(records) != self.runs():
             document = json.loads(canonical_json({"schema_version": SCHEMA_VERSION, "runs": list(records)}))
             self.location.write(RUN_FILE, sealed_json(document).encode())
-        twice = {key.decode() for key in both(self.outcomes.keys(), self.samples.keys()).tolist()}
+        twice = {key.decode() for key in np.intersect1d(self.outcomes.keys(), self.samples.keys(), True).tolist()}
         if twice:
             age = run_number(records)
             samples, outcomes = (

@@ -150,15 +150,6 @@ def beginning(keys: Bytes, prefix: str) -> list[str]:
     return [key.decode() for key in keys[np.searchsorted(keys, first) : np.searchsorted(keys, behind)].tolist()]
 
 
-def both(a: Bytes, b: Bytes) -> Bytes:
-    """What two sorted arrays without doubles have in common."""
-    few, many = sorted((a, b), key=len)
-    if not len(few):
-        return few
-    at = np.minimum(np.searchsorted(many, few), len(many) - 1)
-    return few[many[at] == few]
-
-
 # Listings of an object store that are behind what was written, or break off. Amazon's list a key as soon as it is
 # there, others may be seconds late; who asks for a key by its name gets it at once. delta-rs's client asks again where
 # a file breaks off, but not where a listing does, or the words by which a store says that there is no such file;
@@ -213,11 +204,14 @@ NUMBERED = re.compile(r"(\d{20})\.(json|checkpoint\.parquet)")
 
 
 @dataclass(frozen=True)
-class LogDamage:
-    """A file of the log, or of the copies, that is not what it was."""
+class DamagedPart:
+    """One file that is not what it was."""
 
-    name: str  # relative to the table
+    name: str  # relative to the table, or of a verdict's to `out`
     problem: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.problem}"
 
 
 class CommitCopies:
@@ -250,7 +244,7 @@ class CommitCopies:
         found = self._log.read(_json(version))
         return found is not None and text.encode() in found
 
-    def damage(self) -> list[LogDamage]:
+    def damage(self) -> list[DamagedPart]:
         """What is not as it was. Of a table without copies nothing can be said."""
         copies, problems = self._unsealed()
         there = set(self._log.names())
@@ -264,13 +258,13 @@ class CommitCopies:
             else:
                 problem = "" if data == copies[name] else "is not what was written"
             if problem:
-                problems.append(LogDamage(f"{LOG}/{name}", problem))
+                problems.append(DamagedPart(f"{LOG}/{name}", problem))
         known = set(self._copies.names())
         last = max((name for name in known if name.endswith(".json")), default="")
         absent = (name for name in there if NUMBERED.fullmatch(name) and name < last and name not in known)
-        return problems + [LogDamage(f"{COPIES}/{name}", "is missing") for name in sorted(absent)]
+        return problems + [DamagedPart(f"{COPIES}/{name}", "is missing") for name in sorted(absent)]
 
-    def restore(self, found: LogDamage) -> None:
+    def restore(self, found: DamagedPart) -> None:
         """Put a file of the log back from its copy, or a copy from its file."""
         folder, _, name = found.name.partition("/")
         if folder == COPIES:
@@ -289,7 +283,7 @@ class CommitCopies:
         """Raises Damaged."""
         return unsealed(self._copies.read(name) or b"", name)
 
-    def _unsealed(self) -> tuple[Mapping[str, bytes], list[LogDamage]]:
+    def _unsealed(self) -> tuple[Mapping[str, bytes], list[DamagedPart]]:
         whole, problems = {}, []
         for name in self._copies.names():
             if name != LAST and not NUMBERED.fullmatch(name):  # a draft that a killed writer left
@@ -297,7 +291,7 @@ class CommitCopies:
             try:
                 whole[name] = self._copy_of(name)
             except Damaged as error:
-                problems.append(LogDamage(f"{COPIES}/{name}", str(error)))
+                problems.append(DamagedPart(f"{COPIES}/{name}", str(error)))
         return whole, problems
 
     def _last_problem(self, data: bytes | None, copy: bytes, there: set[str]) -> str:

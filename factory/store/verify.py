@@ -34,7 +34,7 @@ from factory.store.location import (
     write_shard,
 )
 from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, ChangedRun, Store
-from factory.store.table import COPIES, LOG, CommitCopies, KeyedTable, LiveFile, LogDamage, codes, fixed_bytes, packed
+from factory.store.table import COPIES, LOG, CommitCopies, DamagedPart, KeyedTable, LiveFile, codes, fixed_bytes, packed
 
 TABLES = ("plans", "candidates", "samples", "outcomes")
 OF_WALKS = ["clip_id", "expert", "candidate_index", "round", "settings_hash"]
@@ -53,25 +53,14 @@ class Verdict:
     files: tuple[str, ...] = ()  # relative to `out`: damaged ones that a repair takes out, to be made again
 
 
-@dataclass(frozen=True)
-class DamagedPart:
-    """One file, relative to `out`."""
-
-    name: str
-    problem: str
-
-    def __str__(self) -> str:
-        return f"{self.name}: {self.problem}"
-
-
-def damaged_logs(out: Location) -> list[tuple[str, LogDamage]]:
+def damaged_logs(out: Location) -> list[tuple[str, DamagedPart]]:
     """Table, and what of its log is not what was committed; asked before the tables are opened."""
     return [(name, damage) for name in TABLES for damage in CommitCopies(out.child(name)).damage()]
 
 
 def verify(store: Store) -> Verdict:
     """Read every live file, episode and kept file, and hold the tables against each other."""
-    damage = [f"{name}/{found.name}: {found.problem}" for name, found in damaged_logs(store.location)]
+    damage = [f"{name}/{found}" for name, found in damaged_logs(store.location)]
     broken: list[DamagedPart] = []
     for table in store.tables:
         broken += _damaged_files(table)

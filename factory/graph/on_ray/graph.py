@@ -31,8 +31,6 @@ from factory.exits import without_terminal
 from factory.files import DiskFull, existing, machine_fault_of
 from factory.graph.local import (
     MAX_RETRIES,
-    NO_CLAIMS,
-    NO_LIMITS,
     STEPS,
     Claims,
     ClusterDied,
@@ -242,11 +240,11 @@ class RayGraph:
         self,
         work: Work,
         out: Location,
-        workers: int | None = None,
-        address: str | None = None,
-        claims: Claims = NO_CLAIMS,
-        fuse: Fuse = "auto",
-        limits: Limits = NO_LIMITS,
+        workers: int | None,
+        address: str | None,
+        claims: Claims,
+        fuse: Fuse,
+        limits: Limits,
     ) -> None:
         """workers: CPUs of a cluster started here, tasks at once on one that is there already; None: all its CPUs.
 
