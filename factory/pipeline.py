@@ -11,7 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.graph.steps import AcceptedDrive, Built, Columns, NotReady, PreparedClip, RejectedAttempt, StopCheck, never
+from factory.graph.steps import (
+    AcceptedDrive,
+    BlockReport,
+    Columns,
+    NotReady,
+    PreparedClip,
+    RejectedAttempt,
+    StopCheck,
+    never_stop,
+)
 from factory.readers.base import BadClip, ClipReader, ClipRef, Unreadable
 from factory.readers.validate import read_clip
 from factory.stages.assets import fits_going_on
@@ -279,7 +288,7 @@ class FactoryWork:
         name = named(ref)
         return None if name is None else str(name)
 
-    def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never) -> Built:
+    def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never_stop) -> BlockReport:
         """The clip's block into this machine's cache, of a run of the log's own drives what their photos need of it.
 
         Raises BadClip, and TaskStopped where a fit is `stopped`.
@@ -288,9 +297,9 @@ class FactoryWork:
         with watch.of("reconstruct"):
             clip = read_clip(self.reader, ref)
             if not self._simulates:
-                return Built(watch.seconds, self.imaging.build_rig(clip))
+                return BlockReport(watch.seconds, self.imaging.build_rig(clip))
             found, psnr_db = self.imaging.build(clip, threads, stopped)
-        return Built(watch.seconds, found, psnr_db)
+        return BlockReport(watch.seconds, found, psnr_db)
 
     def doing(self) -> str:
         """The fits that are going on here."""

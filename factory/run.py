@@ -94,10 +94,10 @@ def run(asked: Asked, only_plan: bool) -> int:
     config = _checked(asked)
     if config.executor == "local" or only_plan or ("ray" in sys.modules and sys.modules["ray"].is_initialized()):
         return _run(config, asked, only_plan)
-    from factory.graph.apart import run_apart
+    from factory.graph.apart import run_in_own_process
 
     work = partial(_run_again, tuple(asked.words), time.monotonic())
-    return run_apart(work, not os.environ.get("RAY_ADDRESS"), lambda line: print(line, flush=True))
+    return run_in_own_process(work, not os.environ.get("RAY_ADDRESS"), lambda line: print(line, flush=True))
 
 
 def _checked(asked: Asked) -> RunConfig:
@@ -132,7 +132,7 @@ def _run(
     begun: int = 0,
     say: Callable[[str], None] = print,
 ) -> int:
-    from factory.graph.driver import EpisodesWanted
+    from factory.graph.driver import EpisodeSettings
     from factory.graph.execute import Execution, execute, on_new_clusters
     from factory.graph.local import Claims, Limits
     from factory.setup.calibrate import calibrate, plan_text
@@ -179,7 +179,9 @@ def _run(
                     retry=config.retry_failed,
                     shard_seconds=config.shard_seconds,
                     minutes=left(config.minutes, since),
-                    episodes=EpisodesWanted(config.one_episode_in, prepared_episode) if config.one_episode_in else None,
+                    episodes=EpisodeSettings(config.one_episode_in, prepared_episode)
+                    if config.one_episode_in
+                    else None,
                     command=asked.words,
                 ),
             ),

@@ -125,7 +125,7 @@ def _export_all(request: Request) -> int:
     from factory.config.compose import need_run_extra
     from factory.datasets.navsim.export import export as export_all
     from factory.datasets.navsim.settings import ExportSettings
-    from factory.graph.each import WorkerDied, each
+    from factory.graph.each import WorkerDied, parallel_map
     from factory.graph.steps import TaskStopped
     from factory.store.location import Location
     from factory.store.reader import sample_table
@@ -145,7 +145,7 @@ def _export_all(request: Request) -> int:
             request.map_location,
         )
         target = Location.parse(request.to, setting="to")
-        dealt = partial(each, executor=request.executor, workers=request.workers, to=target)
+        dealt = partial(parallel_map, executor=request.executor, workers=request.workers, to=target)
         table = sample_table(store.location.uri, store.location.options)
         trajectories = _label_trajectories(store, request.vocabulary)
         done = export_all(table, Path(target.uri), settings, trajectories, dealt)

@@ -25,7 +25,7 @@ BY_RAY = 1  # its exit code of a process whose raylet is gone
 Run = Callable[[int, Callable[[str], None]], int]  # clusters begun anew before, says that another is; its exit code
 
 
-def run_apart(run: Run, is_ours: bool, say: Callable[[str], None]) -> int:
+def run_in_own_process(run: Run, is_ours: bool, say: Callable[[str], None]) -> int:
     """run(clusters begun anew before, how it says of another one) in a process of its own; the exit code.
 
     is_ours: the run begins its cluster itself, so another can replace it. Signals that ask it to stop are passed on;
@@ -60,10 +60,10 @@ def run_apart(run: Run, is_ours: bool, say: Callable[[str], None]) -> int:
             print(f"Ray's raylet died; {AGAIN}", file=sys.stderr)
             return INTERRUPTED
         begun += 1
-        say(begun_anew("Ray's raylet died", begun))
+        say(new_cluster_text("Ray's raylet died", begun))
 
 
-def begun_anew(said: str, number: int) -> str:
+def new_cluster_text(said: str, number: int) -> str:
     """The line about one of NEW_CLUSTERS."""
     return f"{said}; a new cluster is started, {number} of {NEW_CLUSTERS}"
 

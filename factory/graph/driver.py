@@ -20,33 +20,33 @@ from factory.files import DiskFull
 from factory.graph.local import Graph, MachineIll, Ticket
 from factory.graph.plan import (
     CLIP_CANDIDATE,
+    AttemptBatch,
     Blocked,
     ClipPlan,
     Complete,
     Exhausted,
-    Records,
     RunPlan,
+    RunRecords,
     Step,
-    Stretch,
     Try,
     WalkState,
-    past_of,
-    stretch,
-    tries_before,
-    wants_payload,
+    needs_prepared_clip,
+    next_batch,
+    past_from_outcome,
+    tries_so_far,
 )
-from factory.graph.progress import Executed, ProgressLine, RunForecast, RunMetrics, Tally, Workload
+from factory.graph.progress import ProgressLine, RunCounts, RunForecast, RunMetrics, RunTotals, Workload
 from factory.graph.steps import (
-    Attempted,
-    Built,
-    EpisodesOf,
-    EpisodesWritten,
+    AttemptReport,
+    AttemptUnfinished,
+    BatchReport,
+    BlockReport,
+    BlockUnfinished,
+    EpisodeBatch,
+    EpisodesReport,
     Failure,
-    HalfBuilt,
-    HandedOn,
     MakeEpisode,
-    Prepared,
-    Walked,
+    PrepareReport,
 )
 from factory.readers.base import ClipRef
 from factory.store.episodes import FOLDER, episode_name, is_chosen
@@ -68,7 +68,7 @@ OURS = re.compile(r"[0-9A-Za-z_-]+-[0-9a-f]{8}\.mcap|\..*\.tmp")  # names that m
 
 
 @dataclass(frozen=True)
-class EpisodesWanted:
+class EpisodeSettings:
     """Which samples are to have an episode, and what makes it."""
 
     every: int  # 1 all, n one in n
@@ -78,13 +78,13 @@ class EpisodesWanted:
 class Episodes:
     """Keeps the episodes of a run in step with its table: says what is missing and has tasks write it."""
 
-    def __init__(self, store: Store, wanted: EpisodesWanted, refs: Iterable[ClipRef]) -> None:
+    def __init__(self, store: Store, wanted: EpisodeSettings, refs: Iterable[ClipRef]) -> None:
         """refs: the run's clips; episodes of others are left as they are."""
         self._store, self._wanted = store, wanted
         self._refs = {ref.clip_id: ref for ref in refs}
         self._folder = store.location.child(FOLDER)
         self._there = set(self._folder.names())
-        self._queue: deque[EpisodesOf] = deque()
+        self._queue: deque[EpisodeBatch] = deque()
         self._writing: set[Ticket] = set()
         self._graph: Graph | None = None
         self.written = 0
@@ -117,7 +117,7 @@ class Episodes:
         if ticket not in self._writing:
             return False
         self._writing.remove(ticket)
-        told = EpisodesWritten(0, (report.error,)) if isinstance(report, Failure) else report
+        told = EpisodesReport(0, (report.error,)) if isinstance(report, Failure) else report
         self.written += told.written
         self.errors += [error.splitlines()[-1] for error in told.errors]
         self._submit()
@@ -137,7 +137,7 @@ class Episodes:
         keys = sorted(missing)
         for i in range(0, len(keys), PER_TASK):
             refs = {key: missing[key] for key in keys[i : i + PER_TASK]}
-            self._queue.append(EpisodesOf(path, partition, refs, self._wanted.make))
+            self._queue.append(EpisodeBatch(path, partition, refs, self._wanted.make))
 
     def _submit(self) -> None:
         """A few at once: walks and episodes share the cores."""
@@ -154,7 +154,7 @@ BlockOf = Callable[[ClipRef], str | None]
 
 
 @dataclass(frozen=True)
-class Build:
+class BlockBuild:
     """The next task: the block of this clip."""
 
     block: str
@@ -170,7 +170,7 @@ class BlockQueue:
         self._waiting: dict[str, list[ClipPlan]] = {}  # block that is being built -> clips
         self._built: set[str] = set()
         self._block_of = block_of
-        needed = {block_of(clip.ref) for clip in clips if wants_payload(clip)} - {None}
+        needed = {block_of(clip.ref) for clip in clips if needs_prepared_clip(clip)} - {None}
         self.n_blocks = len(needed)
         self.at_once = max(1, min(workers, self.n_blocks))
 
@@ -178,20 +178,20 @@ class BlockQueue:
         """Some clip has not been handed out."""
         return bool(self._ahead or self._ready or self._waiting)
 
-    def next(self, wanted: bool) -> ClipPlan | Build | None:
+    def next(self, wanted: bool) -> ClipPlan | BlockBuild | None:
         """A clip to begin with, if one is `wanted`, or a block to build; None: nothing for now."""
         if wanted and self._ready:
             return self._ready.popleft()
         while self._ahead:
             clip = self._ahead[0]
-            block = self._block_of(clip.ref) if wants_payload(clip) else None
+            block = self._block_of(clip.ref) if needs_prepared_clip(clip) else None
             if block is None or block in self._built:
                 return self._ahead.popleft() if wanted else None
             if block in self._waiting:
                 self._waiting[block].append(self._ahead.popleft())
             elif len(self._waiting) < self.at_once:
                 self._waiting[block] = [self._ahead.popleft()]
-                return Build(block, clip.ref)
+                return BlockBuild(block, clip.ref)
             else:
                 return None
         return None
@@ -253,7 +253,7 @@ class PendingCommit:
 _C_LIBRARY = ctypes.CDLL(None)
 
 
-def give_back_freed() -> None:
+def release_free_memory() -> None:
     """Hand memory that is free, but kept for later, back to the machine: of the C library's many arenas and Arrow's.
 
     A driver of days would else hold what each of its threads once needed. About a millisecond.
@@ -263,7 +263,7 @@ def give_back_freed() -> None:
         _C_LIBRARY.malloc_trim(0)
 
 
-class Gatherer:
+class CommitQueue:
     """Fills the open batch, sends full ones to be written, commits the written ones."""
 
     def __init__(self, graph: Graph, store: Store, shard_bytes: int, shard_seconds: float) -> None:
@@ -332,7 +332,7 @@ class Gatherer:
         self._store.commit(batch.candidates, batch.shards, batch.outcomes, batch.replaced, batch.unlisted, licences)
         self.committed(batch.shards, time.perf_counter() - began)
         batch.rows.clear()
-        give_back_freed()
+        release_free_memory()
 
 
 CLIPS_PER_WORKER = 2  # open at once: one works while the next is being prepared
@@ -343,7 +343,7 @@ ILL_IN_A_ROW = 6  # tasks that fail by the machine, or three for every task at o
 
 
 @dataclass(frozen=True)
-class Trial:
+class AttemptInFlight:
     """An attempt in flight."""
 
     clip: ClipPlan
@@ -351,7 +351,7 @@ class Trial:
     prepared: Any  # stands for the prepared clip
     stamp: Stamp
     tasks_done: int = 0  # of the graph's `attempt_tasks`
-    stretch: Stretch | None = None  # of the walk, from this attempt on
+    batch: AttemptBatch | None = None  # of the walk, from this attempt on
 
 
 class RunDriver:
@@ -370,21 +370,21 @@ class RunDriver:
         """block_of: name of the block that is to be built before a clip; doing: how far long tasks are."""
         self._identity, self._rounds, self._policy = identity, rounds, policy
         self._plan, self._block_of, self._doing = plan, block_of, doing
-        self._records = Records(identity, digests)
-        self.executed = Executed(found_done=plan.found_done)
+        self._records = RunRecords(identity, digests)
+        self.executed = RunTotals(found_done=plan.found_done)
         self.notes: list[str] = []
         self._seconds: dict[str, list[float]] = defaultdict(lambda: [0, 0.0])
         self._fresh: set[str] = set()  # attempt_ids that failed in this run
-        self._building: dict[Ticket, Build] = {}
+        self._building: dict[Ticket, BlockBuild] = {}
         self._preparing: dict[Ticket, ClipPlan] = {}
-        self._trying: dict[Ticket, Trial] = {}
+        self._trying: dict[Ticket, AttemptInFlight] = {}
         self._walks_left: dict[str, int] = {}
         self._held: dict[tuple[str, str], tuple[list[PendingRow], list[Outcome]]] = {}  # redo: until the walk ends
         self._stopping = threading.Event()
         self._deadline = math.inf
         self._ill_in_a_row = 0
         self._uncached = ""  # why the first could not be kept
-        self._tally = Tally()
+        self._tally = RunCounts()
         self._wanted = {
             (clip.ref.clip_id, walk.expert): _wanted(walk, rounds) for clip in plan.todo for walk in clip.walks
         }
@@ -414,7 +414,7 @@ class RunDriver:
     def interrupted(self) -> bool:
         return self._stopping.is_set()
 
-    def loop(self, graph: Graph, gatherer: Gatherer, metrics: RunMetrics, episodes: Episodes | None = None) -> None:
+    def loop(self, graph: Graph, gatherer: CommitQueue, metrics: RunMetrics, episodes: Episodes | None = None) -> None:
         """Until nothing is left, or until stopped and drained. Raises DiskFull once a disk is full, and MachineIll."""
         self._graph, self._gatherer, self._metrics, self._episodes = graph, gatherer, metrics, episodes
         gatherer.committed = self._committed
@@ -424,7 +424,7 @@ class RunDriver:
             what = f"{self.executed.uncached} prepared clips could not be kept ({self._uncached})"
             self.notes.append(f"{what}; a later run that needs them prepares them again")
 
-    def _work_through(self, graph: Graph, gatherer: Gatherer, progress: ProgressLine) -> None:
+    def _work_through(self, graph: Graph, gatherer: CommitQueue, progress: ProgressLine) -> None:
         self._queue = BlockQueue(self._plan.todo, self._block_of, graph.parallelism)
         self._forecast.blocks.left = self._queue.n_blocks
         while True:
@@ -462,7 +462,7 @@ class RunDriver:
         self._show_state(last=True)
 
     def _committed(self, shards: Sequence[Shard], seconds: float) -> None:
-        self._metrics.committed(shards, seconds)
+        self._metrics.record_commit(shards, seconds)
         if self._episodes is not None:
             self._episodes.committed([shard.path for shard in shards])
 
@@ -475,20 +475,20 @@ class RunDriver:
             "batches": self._gatherer.n_writing,
         }
         clips = len(self._plan.todo)
-        self._metrics.state(clips, clips - self._tally.clips, in_flight, last)
+        self._metrics.record_state(clips, clips - self._tally.clips, in_flight, last)
 
-    def _open(self, what: ClipPlan | Build) -> None:
-        if isinstance(what, Build):
+    def _open(self, what: ClipPlan | BlockBuild) -> None:
+        if isinstance(what, BlockBuild):
             threads = max(1, self._graph.cores // self._queue.at_once)
             self._building[self._graph.submit("reconstruct", what.ref, threads)] = what
-        elif wants_payload(what):
+        elif needs_prepared_clip(what):
             self._preparing[self._graph.submit("perturb", what.ref, what.content)] = what
         else:
             self._start_walks(what, None)
 
     def _take(self, ticket: Ticket, report: Any) -> None:
-        self._metrics.task(ticket.step, ticket.queued_s, report)
-        last = report.reports[-1] if isinstance(report, Walked) else report
+        self._metrics.record_task(ticket.step, ticket.queued_s, report)
+        last = report.reports[-1] if isinstance(report, BatchReport) else report
         if isinstance(last, Failure) and last.disk_full:
             raise DiskFull(last.disk_full)
         self._count_illness(last)
@@ -511,24 +511,24 @@ class RunDriver:
             said = report.error.splitlines()[-1]
             raise MachineIll(f"the machine failed {self._ill_in_a_row} tasks in a row, the last one by: {said}")
 
-    def _take_block(self, build: Build, report: Built | HalfBuilt | Failure) -> None:
-        if isinstance(report, HalfBuilt):
+    def _take_block(self, build: BlockBuild, report: BlockReport | BlockUnfinished | Failure) -> None:
+        if isinstance(report, BlockUnfinished):
             self.notes.append(f"block {build.block} is not finished; the next run goes on with it")
             return
         self._forecast.blocks.finish(1)
-        if isinstance(report, Built):
+        if isinstance(report, BlockReport):
             self._count(report.seconds, self._forecast.blocks)
         else:
             last = report.error.splitlines()[-1]
             self.notes.append(f"block {build.block} failed ({last}); it is tried again for each of its clips")
         self._queue.built(build.block)
 
-    def _take_prepared(self, clip: ClipPlan, result: Any, report: Prepared | Rejected | Failure) -> None:
+    def _take_prepared(self, clip: ClipPlan, result: Any, report: PrepareReport | Rejected | Failure) -> None:
         clip_id = clip.ref.clip_id
         replaced = [*clip.stale, *([clip.past.attempt_id] if clip.past is not None else [])]
         if isinstance(report, Rejected):
             replaced += [key for walk in clip.walks for key in walk.stale]
-        if isinstance(report, Prepared):
+        if isinstance(report, PrepareReport):
             self._count(report.seconds, self._forecast.samples)
             if report.note:
                 self.notes.append(report.note)
@@ -550,12 +550,12 @@ class RunDriver:
             self._start_walks(clip, result)
             return
         key = attempt_id(clip_id, CLIP_CANDIDATE, self._identity.vocabulary_digest, "", "")
-        outcome = self._records.outcome(clip.ref, key, "", CLIP_CANDIDATE, report, tries_before(clip.past), {}, {})
-        clip.past = past_of(outcome)
+        outcome = self._records.outcome(clip.ref, key, "", CLIP_CANDIDATE, report, tries_so_far(clip.past), {}, {})
+        clip.past = past_from_outcome(outcome)
         clip.failed = outcome.kind == Kind.FAILED
         unlisted = [clip_id] if isinstance(report, Rejected) else []
         self._gatherer.add(outcomes=[outcome], replaced=replaced, unlisted=unlisted)
-        self._metrics.outcome(outcome, None)
+        self._metrics.record_outcome(outcome, None)
         self._tally.rejected += not clip.failed
         self._tally.failed += clip.failed
         self._tally.clips += 1
@@ -572,22 +572,22 @@ class RunDriver:
         clip.steps[walk.expert] = step
         if isinstance(step, Try) and not self.interrupted:
             stamp = self._records.stamp(clip.ref, walk.expert, step)
-            ahead = 1 if walk.one_by_one else self._graph.ahead()
-            along = stretch(walk.once, clip.n_candidates, self._rounds, walk.known, step, ahead)
-            self._try(Trial(clip, walk, prepared, stamp, stretch=along if along.n > 1 else None), prepared)
+            ahead = 1 if walk.one_by_one else self._graph.attempts_per_task()
+            along = next_batch(walk.once, clip.n_candidates, self._rounds, walk.known, step, ahead)
+            self._try(AttemptInFlight(clip, walk, prepared, stamp, batch=along if along.n > 1 else None), prepared)
             return
         self._finish(clip, walk, step)
-        walk.put_away()
+        walk.forget()
         self._walks_left[clip.ref.clip_id] -= 1
         if not self._walks_left[clip.ref.clip_id]:
             del self._walks_left[clip.ref.clip_id]
             self._tally.clips += not self.interrupted
 
-    def _try(self, trial: Trial, so_far: Any) -> None:
+    def _try(self, trial: AttemptInFlight, so_far: Any) -> None:
         """The next task of an attempt, from the result of the one before."""
         stages = self._graph.attempt_tasks[trial.tasks_done]
-        if trial.stretch is not None:
-            ticket = self._graph.submit("stretch", stages, so_far, trial.stamp, trial.stretch)
+        if trial.batch is not None:
+            ticket = self._graph.submit("attempts", stages, so_far, trial.stamp, trial.batch)
         else:
             ticket = self._graph.submit("attempt", stages, so_far, trial.stamp)
         self._trying[ticket] = trial
@@ -606,9 +606,9 @@ class RunDriver:
             assert isinstance(step, Exhausted)
             stamp = self._records.stamp(clip.ref, walk.expert, Try(step.n_tried, -1))
             outcome = self._records.outcome(clip.ref, stamp.attempt_id, walk.expert, step.n_tried, step, 0, {}, {})
-            walk.known[step.n_tried] = past_of(outcome)
+            walk.known[step.n_tried] = past_from_outcome(outcome)
             self._keep(clip, walk, outcomes=[outcome])
-            self._metrics.outcome(outcome, None)
+            self._metrics.record_outcome(outcome, None)
         rows, outcomes = self._held.pop((clip.ref.clip_id, walk.expert), ([], []))
         if isinstance(step, Complete | Exhausted):
             if walk.stale:
@@ -616,53 +616,57 @@ class RunDriver:
         else:  # rows of an unfinished redo are made again, so that readers see the old walk or the new one
             self._gatherer.add(outcomes=[o for o in outcomes if o.kind == Kind.FAILED])
 
-    def _take_attempt(self, trial: Trial, result: Any, report: Attempted | HandedOn | Walked | Failure) -> None:
-        if isinstance(report, HandedOn):
+    def _take_attempt(
+        self, trial: AttemptInFlight, result: Any, report: AttemptReport | AttemptUnfinished | BatchReport | Failure
+    ) -> None:
+        if isinstance(report, AttemptUnfinished):
             self._try(replace(trial, tasks_done=trial.tasks_done + 1), result)
             return
-        if isinstance(report, Walked):
-            self._take_stretch(trial, result, report)
-        elif trial.stretch is not None:  # lost with its worker, and at which of them nobody knows
+        if isinstance(report, BatchReport):
+            self._take_batch(trial, result, report)
+        elif trial.batch is not None:  # lost with its worker, and at which of them nobody knows
             trial.walk.one_by_one = True
         else:
             self._settle_attempt(trial, trial.stamp, result, report)
         self._advance(trial.clip, trial.walk, trial.prepared)
 
-    def _take_stretch(self, trial: Trial, rows: Sequence[Any], walked: Walked) -> None:
+    def _take_batch(self, trial: AttemptInFlight, rows: Sequence[Any], done: BatchReport) -> None:
         stamp, accepted = trial.stamp, 0
-        for i, report in enumerate(walked.reports):
+        for i, report in enumerate(done.reports):
             stamp = stamp.of(trial.clip.ref.clip_id, trial.stamp.candidate_index + i, trial.stamp.round + accepted)
-            is_accepted = isinstance(report, Attempted) and report.rejected is None
+            is_accepted = isinstance(report, AttemptReport) and report.rejected is None
             self._settle_attempt(trial, stamp, rows[accepted] if is_accepted else None, report)
             accepted += is_accepted
 
-    def _settle_attempt(self, trial: Trial, stamp: Stamp, result: Any, report: Attempted | Failure) -> None:
+    def _settle_attempt(
+        self, trial: AttemptInFlight, stamp: Stamp, result: Any, report: AttemptReport | Failure
+    ) -> None:
         """What became of an attempt goes on to the tables; result: stands for the row of an accepted one."""
         clip, walk = trial.clip, trial.walk
         self.executed.attempts += 1
         known = walk.known.get(stamp.candidate_index)
         replaced = [known.attempt_id] if known is not None else []  # under keep perhaps of other expert inputs
-        if isinstance(report, Attempted):
+        if isinstance(report, AttemptReport):
             self._count(report.seconds, self._forecast.samples)
-        if isinstance(report, Attempted) and report.rejected is None:
+        if isinstance(report, AttemptReport) and report.rejected is None:
             walk.known[stamp.candidate_index] = Past(stamp.attempt_id, Kind.ACCEPTED, True, round=stamp.round)
             row = PendingRow(result, report.n_bytes, (stamp.round, stamp.expert), report.licence)
             self._keep(clip, walk, rows=[row], replaced=replaced)
             self._tally.accepted += 1
             self._settle(clip, walk, 1)
-            self._metrics.accepted(stamp.expert, stamp.round)
+            self._metrics.record_accepted(stamp.expert, stamp.round)
         else:
             what = report if isinstance(report, Failure) else report.rejected
             measured = ({}, {}) if isinstance(report, Failure) else (dict(report.subscores), dict(report.seconds))
             assert what is not None
             outcome = self._records.outcome(
-                clip.ref, stamp.attempt_id, stamp.expert, stamp.candidate_index, what, tries_before(known), *measured
+                clip.ref, stamp.attempt_id, stamp.expert, stamp.candidate_index, what, tries_so_far(known), *measured
             )
-            walk.known[stamp.candidate_index] = past_of(outcome)
+            walk.known[stamp.candidate_index] = past_from_outcome(outcome)
             if outcome.kind == Kind.FAILED:
                 self._fresh.add(stamp.attempt_id)
             self._keep(clip, walk, outcomes=[outcome], replaced=replaced)
-            self._metrics.outcome(outcome, stamp.round)
+            self._metrics.record_outcome(outcome, stamp.round)
             self._tally.rejected += outcome.kind == Kind.REJECTED
             self._tally.failed += outcome.kind == Kind.FAILED
 

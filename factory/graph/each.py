@@ -23,7 +23,7 @@ class WorkerDied(RuntimeError):
     """A worker died at an item: killed, or out of memory."""
 
 
-def each(
+def parallel_map(
     function: Callable[[T], R],
     items: Iterable[T],
     executor: Literal["local", "ray"] = "local",

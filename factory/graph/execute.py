@@ -18,8 +18,16 @@ from deltalake.exceptions import DeltaError
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
 from factory.files import DiskFull, machine_fault_of
-from factory.graph.apart import AGAIN, NEW_CLUSTERS, begun_anew
-from factory.graph.driver import SHARD_BYTES, SHARD_SECONDS, Episodes, EpisodesWanted, Gatherer, RunDriver, WriteFailed
+from factory.graph.apart import AGAIN, NEW_CLUSTERS, new_cluster_text
+from factory.graph.driver import (
+    SHARD_BYTES,
+    SHARD_SECONDS,
+    CommitQueue,
+    Episodes,
+    EpisodeSettings,
+    RunDriver,
+    WriteFailed,
+)
 from factory.graph.guard import CRASHED
 from factory.graph.local import (
     Claims,
@@ -32,8 +40,8 @@ from factory.graph.local import (
     MachineIll,
     notes_folder,
 )
-from factory.graph.plan import Records, RunPlan, Try, counted, crash_of, make_plan, retry_policy
-from factory.graph.progress import Executed, RunMetrics
+from factory.graph.plan import RunPlan, RunRecords, Try, count_crash, make_plan, read_crash, retry_policy
+from factory.graph.progress import RunMetrics, RunTotals
 from factory.graph.steps import NotReady, Work
 from factory.readers.base import ClipRef
 from factory.store.funnel import Funnel, funnel_of
@@ -52,7 +60,7 @@ class RunSummary:
     exit_code: int
     message: str = ""
     counts: dict[str, int] = field(default_factory=dict)  # accepted, rejected, failed, exhausted, of the planned clips
-    executed: Executed = field(default_factory=Executed)
+    executed: RunTotals = field(default_factory=RunTotals)
     seconds: dict[str, tuple[int, float]] = field(default_factory=dict)  # stage -> (tasks, seconds) of this run
     notes: list[str] = field(default_factory=list)
     funnel: Funnel | None = None
@@ -77,7 +85,7 @@ class Execution:
     shard_bytes: int = SHARD_BYTES
     shard_seconds: float = SHARD_SECONDS
     minutes: float | None = None  # after which nothing new is begun, as after an interruption
-    episodes: EpisodesWanted | None = None  # MCAP files to be written beside the samples
+    episodes: EpisodeSettings | None = None  # MCAP files to be written beside the samples
     command: Sequence[str] | None = None  # the settings as they were given, kept for `retry`
 
 
@@ -140,8 +148,8 @@ class _Run:
             damaged = f"python -m factory verify {self._store.location.uri} says what is damaged"
             return RunSummary(BAD_CONFIG, f"{error}; {damaged}")
         self._notes = notes_folder(self._store.location)
-        records = Records(self._identity, self._digests)
-        plan, self._died = counted(crash_of(self._notes), plan, records, self._policy)
+        records = RunRecords(self._identity, self._digests)
+        plan, self._died = count_crash(read_crash(self._notes), plan, records, self._policy)
         self._follow(plan)
         if plan.frozen:
             kept_clips = f"{len(plan.frozen)} clips kept as they are"
@@ -235,7 +243,7 @@ class _Run:
         with asked_to_stop(self._driver.stop_soon), _alarm(self._driver.stop, how.minutes):
             if episodes is not None:
                 episodes.begin(graph)
-            self._driver.loop(graph, Gatherer(graph, store, how.shard_bytes, how.shard_seconds), metrics, episodes)
+            self._driver.loop(graph, CommitQueue(graph, store, how.shard_bytes, how.shard_seconds), metrics, episodes)
             if episodes is not None:
                 episodes.tidy()
 
@@ -276,7 +284,7 @@ def on_new_clusters(once: Callable[[], RunSummary], say: Callable[[str], None] =
         summary = once()
         if not summary.lost_cluster:
             return summary
-        say(begun_anew(summary.message, number))
+        say(new_cluster_text(summary.message, number))
     summary = once()
     if summary.lost_cluster:
         summary.message += f"; {AGAIN}"

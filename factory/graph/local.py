@@ -45,7 +45,7 @@ class Limits:
     seconds: Mapping[str, float] = field(default_factory=dict)
     gb: Mapping[str, float] = field(default_factory=dict)
 
-    def of(self, name: str) -> tuple[float | None, float | None]:
+    def for_task(self, name: str) -> tuple[float | None, float | None]:
         """(seconds, GB) of a task; of stages fused into one the sum of their seconds, the most of their memory."""
         parts = [task for task in TASKS if task.name in name.split("+")]
         seconds = [self.seconds.get(task.name, task.limit_s) for task in parts]
@@ -61,19 +61,19 @@ class Costs:
         self._limits = limits
         self._seen: dict[str, list[float]] = defaultdict(lambda: [0, 0.0, 0.0])  # how many, the longest, all together
 
-    def took(self, name: str, seconds: float) -> None:
+    def add(self, name: str, seconds: float) -> None:
         """A task that ended well."""
         n, longest, together = self._seen[name]
         self._seen[name] = [n + 1, max(longest, seconds), together + seconds]
 
-    def within(self, name: str, seconds: float) -> int:
+    def tasks_in(self, name: str, seconds: float) -> int:
         """How many of this name usually end in so many seconds; 1 until that is known."""
         n, _, together = self._seen[name]
         return max(1, int(seconds * n / together)) if n >= SEEN and together > 0.0 else 1
 
-    def limits(self, name: str) -> dict[str, float | None]:
+    def limits_for(self, name: str) -> dict[str, float | None]:
         """Of the next task of this name; what the settings give is not tightened."""
-        seconds, gb = self._limits.of(name)
+        seconds, gb = self._limits.for_task(name)
         n, longest, _ = self._seen[name]
         given = set(name.split("+")) & set(self._limits.seconds)
         if seconds is not None and n >= SEEN and not given:
@@ -89,20 +89,20 @@ def notes_folder(out: Location) -> Path:
     return Path(tempfile.gettempdir()) / f"driving-data-factory-{os.getuid()}" / name
 
 
-def cleared(folder: Path) -> str:
+def clear_notes(folder: Path) -> str:
     """A new run's name in the notes of its guards; those of earlier runs go, but for what was in hand at a crash."""
     for path in (*folder.glob(f"*{OVER}"), *folder.glob(f"*{WORK}")):
         path.unlink(missing_ok=True)
     return secrets.token_hex(8)
 
 
-def put_away(folder: Path) -> None:
+def remove_if_empty(folder: Path) -> None:
     """The folder of notes, where a run leaves none."""
     with suppress(OSError):  # there is none, or something in it
         folder.rmdir()
 
 
-def described(step: str, name: str, args: tuple[Any, ...]) -> dict[str, Any]:
+def task_note(step: str, name: str, args: tuple[Any, ...]) -> dict[str, Any]:
     """Key and words of a task, and which clip, expert and candidate it is of."""
     stamp = next((arg for arg in args if isinstance(arg, Stamp)), None)
     ref = next((arg for arg in args if isinstance(arg, ClipRef)), None)
@@ -118,7 +118,9 @@ def described(step: str, name: str, args: tuple[Any, ...]) -> dict[str, Any]:
 _GUARDS: dict[Path, WatchedProcess] = {}  # of this process
 
 
-def watched(folder: Path, task: dict[str, Any], call: Callable[..., tuple[Any, Any]], *given: Any) -> tuple[Any, Any]:
+def call_watched(
+    folder: Path, task: dict[str, Any], call: Callable[..., tuple[Any, Any]], *given: Any
+) -> tuple[Any, Any]:
     """(report, result) of a task of a supervised process; a Failure where an earlier try was ended over its limits."""
     over = folder / f"{task['key']}{OVER}"
     if (found := read_note(over)) is not None and found["run"] == task["run"]:
@@ -136,7 +138,7 @@ def watched(folder: Path, task: dict[str, Any], call: Callable[..., tuple[Any, A
 T = TypeVar("T")
 
 
-def frozen(value: T) -> T:
+def read_only(value: T) -> T:
     """The same value; every numpy array in its dataclasses, mappings and sequences is read only from here on."""
     seen: set[int] = set()
     waiting: list[object] = [value]
@@ -213,8 +215,8 @@ class Graph(Protocol):
         """Run `step`; arguments may be results of earlier tickets. What STEPS says is supplied to it."""
         ...
 
-    def ahead(self) -> int:
-        """Attempts of a walk that one task is to make: 1, or more of a `stretch`, whose tasks have a list of rows."""
+    def attempts_per_task(self) -> int:
+        """Attempts of a walk that one task is to make: 1, or more of a `attempts`, whose tasks have a list of rows."""
         ...
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
@@ -228,7 +230,7 @@ STEPS: Mapping[str, tuple[Any, tuple[str, ...]]] = {  # its function, and what i
     "reconstruct": (steps.reconstruct, ("work", "stopped")),
     "perturb": (steps.prepare, ("work", "out")),
     "attempt": (steps.attempt, ("work",)),
-    "stretch": (steps.attempt, ("work",)),  # one after the other
+    "attempts": (steps.attempt, ("work",)),  # one after the other
     "write": (steps.write, ("out",)),
     "episodes": (steps.episodes, ("work", "out")),
     "warm": (steps.warm, ("work",)),
@@ -240,12 +242,12 @@ def attempt_tasks(fuse: Fuse, apart: bool) -> tuple[tuple[str, ...], ...]:
     return tuple((stage,) for stage in ATTEMPT) if fuse == "none" or (fuse == "auto" and apart) else (ATTEMPT,)
 
 
-def name_of(step: str, args: tuple[Any, ...]) -> str:
+def task_name(step: str, args: tuple[Any, ...]) -> str:
     """What metrics and Ray call a task: an attempt's by the stages in it."""
-    return "+".join(args[0]) if step in ("attempt", "stretch") else step
+    return "+".join(args[0]) if step in ("attempt", "attempts") else step
 
 
-def cores_of(step: str, args: tuple[Any, ...]) -> int:
+def task_cores(step: str, args: tuple[Any, ...]) -> int:
     """That a task uses: a reconstruction is told how many threads it has."""
     return int(args[1]) if step == "reconstruct" else 1
 
@@ -255,7 +257,7 @@ class _Box:
     value: Any = None
 
 
-def unready(failure: Failure) -> Exception:
+def not_ready_error(failure: Failure) -> Exception:
     """What is to be raised where a machine could not get its kernels."""
     if failure.disk_full:
         return DiskFull(failure.disk_full)
@@ -281,11 +283,11 @@ class LocalGraph:
         work.warm()
 
     def submit(self, step: str, *args: Any) -> Ticket:
-        ticket = Ticket(name_of(step, args), _Box())
+        ticket = Ticket(task_name(step, args), _Box())
         self._waiting.append((ticket, step, args))
         return ticket
 
-    def ahead(self) -> int:
+    def attempts_per_task(self) -> int:
         return 1
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
@@ -296,9 +298,9 @@ class LocalGraph:
         plain = [arg.value if isinstance(arg, _Box) else arg for arg in args]
         ticket.queued_s = time.monotonic() - ticket.submitted
         self._guard = self._guard or WatchedProcess(self._notes, alone=True)
-        with self._guard.watching({**described(step, ticket.step, args), "limited": False}):
+        with self._guard.watching({**task_note(step, ticket.step, args), "limited": False}):
             report, result = function(*(self._supplied[name] for name in wants), *plain)
-        ticket.result.value = frozen(result)
+        ticket.result.value = read_only(result)
         return ticket, report
 
     def close(self) -> None:
@@ -344,18 +346,18 @@ class IsolatedGraph:
             self._stop = self._context.Event()
         self._costs, self._notes = Costs(limits), notes_folder(out)
         self._waiting: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
-        self._numbers, self._run = count(), cleared(self._notes)
+        self._numbers, self._run = count(), clear_notes(self._notes)
         self._in_hand: tuple[Ticket, str, tuple[Any, ...]] | None = None
         self._deaths = 0  # at what is in hand
         self._begin()
 
     def submit(self, step: str, *args: Any) -> Ticket:
-        ticket = Ticket(name_of(step, args), None)
+        ticket = Ticket(task_name(step, args), None)
         ticket.result = KeptResult(next(self._numbers))
         self._waiting.append((ticket, step, args))
         return ticket
 
-    def ahead(self) -> int:
+    def attempts_per_task(self) -> int:
         return 1
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
@@ -382,7 +384,7 @@ class IsolatedGraph:
                     continue
                 report, ticket.result.data, worked_s = answer
                 if not isinstance(report, Failure):
-                    self._costs.took(ticket.step, worked_s)
+                    self._costs.add(ticket.step, worked_s)
                 ticket.queued_s = max(0.0, time.monotonic() - ticket.submitted - worked_s)
             self._in_hand = None
             return ticket, report
@@ -396,12 +398,12 @@ class IsolatedGraph:
         self._process.kill()
         self._process.join()
         self._waiting.clear()
-        put_away(self._notes)
+        remove_if_empty(self._notes)
 
     def _send(self) -> None:
         assert self._in_hand is not None
         ticket, step, args = self._in_hand
-        task = described(step, ticket.step, args) | self._costs.limits(ticket.step) | {"run": self._run}
+        task = task_note(step, ticket.step, args) | self._costs.limits_for(ticket.step) | {"run": self._run}
         self._pipe.send((ticket.result.number, step, task, args))
 
     def _after_death(self, ticket: Ticket) -> Failure | None:
@@ -435,7 +437,7 @@ class IsolatedGraph:
                 self._process.kill()
             raise
         if isinstance(said, Failure):
-            raise unready(said)
+            raise not_ready_error(said)
 
 
 def _serve(pipe: Connection, work: Work, out: Location, stop: Any, notes: Path) -> None:
@@ -450,7 +452,7 @@ def _serve(pipe: Connection, work: Work, out: Location, stop: Any, notes: Path) 
             return arg
         if arg.number not in kept:
             pipe.send(arg)
-            kept[arg.number] = frozen(pickle.loads(pipe.recv()))  # noqa: S301 -- this process made it, or its like
+            kept[arg.number] = read_only(pickle.loads(pipe.recv()))  # noqa: S301 -- this process made it, or its like
         kept.move_to_end(arg.number)
         return kept[arg.number]
 
@@ -464,8 +466,8 @@ def _serve(pipe: Connection, work: Work, out: Location, stop: Any, notes: Path) 
             given = [value_of(arg) for arg in args]
             began = time.perf_counter()
             function, wants = STEPS[step]
-            report, result = watched(notes, task, function, *(supplied[name] for name in wants), *given)
-            kept[number] = frozen(result)
+            report, result = call_watched(notes, task, function, *(supplied[name] for name in wants), *given)
+            kept[number] = read_only(result)
             while len(kept) > KEPT:
                 kept.popitem(last=False)
             pipe.send((report, pickle.dumps(result, 5), time.perf_counter() - began))

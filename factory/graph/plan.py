@@ -93,20 +93,22 @@ def next_step(
 
 
 @dataclass(frozen=True)
-class Stretch:
+class AttemptBatch:
     """Attempts of a walk that one task makes: one after the other until one fails or enough are accepted."""
 
     n: int  # attempts at most
     samples: int  # accepted at most
 
 
-def stretch(once: bool, n_candidates: int, rounds: int, known: Container[int], begins: Try, most: int) -> Stretch:
+def next_batch(
+    once: bool, n_candidates: int, rounds: int, known: Container[int], begins: Try, most: int
+) -> AttemptBatch:
     """Up to `most` attempts that nothing is known of but the first, whatever becomes of those before them."""
     if once:
-        return Stretch(1, 1)
+        return AttemptBatch(1, 1)
     end = min(n_candidates, begins.candidate + most)
     n = next((i for i in range(begins.candidate + 1, end) if i in known), end) - begins.candidate
-    return Stretch(n, min(n, rounds - begins.round))
+    return AttemptBatch(n, min(n, rounds - begins.round))
 
 
 def retry_policy(retry: bool, versions_json: str) -> Callable[[Past], bool]:
@@ -119,7 +121,7 @@ def retry_policy(retry: bool, versions_json: str) -> Callable[[Past], bool]:
     return may_retry
 
 
-def tries_before(past: Past | None) -> int:
+def tries_so_far(past: Past | None) -> int:
     """Runs that already failed at this attempt and count against it."""
     return past.tries if past is not None and past.error_kind in TRIED_AGAIN else 0
 
@@ -144,7 +146,7 @@ class WalkState:
         """Candidate -> what became of it; unpacked when it is asked for, and until it is put away."""
         return self.recall()
 
-    def put_away(self) -> None:
+    def forget(self) -> None:
         """The tables tell it again; of walks that are not at work nothing is kept."""
         self.__dict__.pop("known", None)
 
@@ -236,7 +238,7 @@ def make_plan(
             found += walk.n_found + kinds.count(Kind.REJECTED)
         (todo if _has_work(clip, rounds, may_retry) else done).append(clip)
         for walk in clip.walks:
-            walk.put_away()
+            walk.forget()
     return RunPlan(tuple(todo), tuple(done), tuple(frozen), found)
 
 
@@ -303,7 +305,7 @@ def _has_work(clip: ClipPlan, rounds: int, may_retry: Policy) -> bool:
     return any(isinstance(clip.steps[w.expert], Try) or w.lacks_exhausted(clip.steps[w.expert]) for w in clip.walks)
 
 
-def wants_payload(clip: ClipPlan) -> bool:
+def needs_prepared_clip(clip: ClipPlan) -> bool:
     """Some walk has an attempt to make, or preparing failed before, so that the prepared clip is needed."""
     tries = any(isinstance(step, Try) for step in clip.steps.values())
     return clip.listed is None or clip.past is not None or tries
@@ -313,7 +315,7 @@ def wants_payload(clip: ClipPlan) -> bool:
 
 
 @dataclass(frozen=True)
-class Records:
+class RunRecords:
     """Those of one run."""
 
     identity: RunIdentity
@@ -380,7 +382,7 @@ class Records:
         return ClipCandidates(*read, *under, gates, clip.candidates, dropped.stage, dropped.reason)
 
 
-def past_of(outcome: Outcome) -> Past:
+def past_from_outcome(outcome: Outcome) -> Past:
     """The same as the tables of a later run will tell it."""
     kind = Kind(outcome.kind)
     return Past(outcome.attempt_id, kind, True, -1, outcome.error_kind, outcome.tries, outcome.stage_versions)
@@ -389,13 +391,13 @@ def past_of(outcome: Outcome) -> Past:
 # A run that died at a task: the next one counts it against that clip or attempt, and comes to it last.
 
 
-def crash_of(folder: Path) -> Mapping[str, Any]:
+def read_crash(folder: Path) -> Mapping[str, Any]:
     """What was in hand when the last run died, as its guard wrote it; empty where none did."""
     return read_note(folder / CRASHED) or {}
 
 
-def counted(
-    crash: Mapping[str, Any], plan: RunPlan, records: Records, may_retry: Callable[[Past], bool]
+def count_crash(
+    crash: Mapping[str, Any], plan: RunPlan, records: RunRecords, may_retry: Callable[[Past], bool]
 ) -> tuple[RunPlan, list[Outcome]]:
     """The plan that knows of a crash, and the outcome to be stored before anything is begun."""
     suspect = next((clip for clip in plan.todo if _is_of(crash, clip, records)), None)
@@ -406,21 +408,21 @@ def counted(
     if "expert" in crash:
         walk = next(walk for walk in suspect.walks if walk.expert == crash["expert"])
         candidate, key = crash["candidate"], crash["attempt_id"]
-        tries = tries_before(walk.known.get(candidate))
+        tries = tries_so_far(walk.known.get(candidate))
         outcome = records.outcome(suspect.ref, key, walk.expert, candidate, what, tries, {}, {})
-        walk.known[candidate] = past_of(outcome)
+        walk.known[candidate] = past_from_outcome(outcome)
         return replace(plan, todo=(*others, suspect)), [outcome]
     key = attempt_id(suspect.ref.clip_id, CLIP_CANDIDATE, records.identity.vocabulary_digest, "", "")
-    tries = tries_before(suspect.past)
+    tries = tries_so_far(suspect.past)
     outcome = records.outcome(suspect.ref, key, "", CLIP_CANDIDATE, what, tries, {}, {})
-    suspect.past = past_of(outcome)
+    suspect.past = past_from_outcome(outcome)
     if may_retry(suspect.past):
         return replace(plan, todo=(*others, suspect)), [outcome]
     suspect.failed = True
     return replace(plan, todo=others, done=(*plan.done, suspect)), [outcome]
 
 
-def _is_of(crash: Mapping[str, Any], clip: ClipPlan, records: Records) -> bool:
+def _is_of(crash: Mapping[str, Any], clip: ClipPlan, records: RunRecords) -> bool:
     if "expert" not in crash:
         return bool(crash.get("clip_id") == clip.ref.clip_id)
     if crash["expert"] not in records.digests:

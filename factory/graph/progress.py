@@ -15,7 +15,7 @@ from typing import Protocol, Self, TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from factory.graph.steps import Attempted, Built, Failure, Prepared, Walked
+from factory.graph.steps import AttemptReport, BatchReport, BlockReport, Failure, PrepareReport
 from factory.store.location import Location, Shard
 from factory.store.samples import Kind, Outcome
 from factory.wording import rate_text, time_text
@@ -120,7 +120,7 @@ class RunForecast:
 
 
 @dataclass
-class Tally:
+class RunCounts:
     """Counts of a run; clips that were found done at its start are not among them."""
 
     clips: int = 0
@@ -130,7 +130,7 @@ class Tally:
 
 
 @dataclass
-class Executed:
+class RunTotals:
     """What this run did itself, and what it found done."""
 
     prepared: int = 0  # clip and perturb stages computed
@@ -162,11 +162,11 @@ class ProgressLine(Bar):
         self.left_s, self.doing = left_s, doing
         self._told, self._asked = "", -math.inf
 
-    def show(self, tally: Tally, last: bool = False) -> None:
+    def show(self, tally: RunCounts, last: bool = False) -> None:
         """So far is the run."""
         self.update(tally.clips, lambda elapsed_s: self.text(tally, elapsed_s), last)
 
-    def text(self, tally: Tally, elapsed_s: float) -> str:
+    def text(self, tally: RunCounts, elapsed_s: float) -> str:
         rate = tally.clips / elapsed_s if elapsed_s > 0 else 0.0
         left_s = self.left_s(elapsed_s)
         left = "?" if left_s is None else time_text(left_s)
@@ -265,7 +265,7 @@ IN_FLIGHT = Metric(
     Type.GAUGE,
     "",
     ("what",),
-    "`walks` of open clips, `attempts` (a stretch counts once), `clips` being prepared, `blocks` being built, "
+    "`walks` of open clips, `attempts` (a batch counts once), `clips` being prepared, `blocks` being built, "
     "`batches` being written.",
 )
 DISK = Metric("factory_disk_bytes", Type.GAUGE, "B", (), "Size of the file system of a local `out`.")
@@ -296,35 +296,35 @@ class RunMetrics:
         self._recorder, self._out, self._clock = recorder, out, clock
         self._gauges_at = self._disk_at = -math.inf
 
-    def task(self, step: str, queued_s: float, report: object) -> None:
+    def record_task(self, step: str, queued_s: float, report: object) -> None:
         """A task came back, whatever it was."""
-        attempts = report.reports if isinstance(report, Walked) else (report,)
+        attempts = report.reports if isinstance(report, BatchReport) else (report,)
         failed = isinstance(attempts[-1], Failure)
         self._add(TASKS, 1, task=step, result="failed" if failed else "ok")
         self._add(QUEUE_WAIT, queued_s, task=step)
         for each in attempts:
-            self._made(each)
+            self._record_report(each)
 
-    def _made(self, report: object) -> None:
-        if isinstance(report, Prepared | Built | Attempted):
+    def _record_report(self, report: object) -> None:
+        if isinstance(report, PrepareReport | BlockReport | AttemptReport):
             for stage, spent in report.seconds.items():
                 self._add(STAGE_SECONDS, spent, stage=stage)
                 self._add(STAGE_SPENT, spent, stage=stage)
-        if isinstance(report, Prepared):
-            self._looked_up("prepared", report.from_cache)
-        elif isinstance(report, Built):
-            self._looked_up("block", report.from_cache)
-            self._psnr("block", report.psnr_db)
-        elif isinstance(report, Attempted):
-            self._looked_up("scene", report.scene_at_hand)
+        if isinstance(report, PrepareReport):
+            self._record_lookup("prepared", report.from_cache)
+        elif isinstance(report, BlockReport):
+            self._record_lookup("block", report.from_cache)
+            self._record_psnr("block", report.psnr_db)
+        elif isinstance(report, AttemptReport):
+            self._record_lookup("scene", report.scene_at_hand)
             if report.rejected is None:
-                self._psnr("sample", report.psnr_db)
+                self._record_psnr("sample", report.psnr_db)
 
-    def accepted(self, expert: str, round: int) -> None:
+    def record_accepted(self, expert: str, round: int) -> None:
         """An attempt became a sample that is on its way to the table."""
         self._add(OUTCOMES, 1, kind=Kind.ACCEPTED.value, expert=expert, round=str(round), stage="", reason="")
 
-    def outcome(self, outcome: Outcome, round: int | None) -> None:
+    def record_outcome(self, outcome: Outcome, round: int | None) -> None:
         """Anything else; round: the one that was tried for, None for a clip as a whole and for the end of a list."""
         self._add(
             OUTCOMES,
@@ -336,7 +336,7 @@ class RunMetrics:
             reason=outcome.error_kind or outcome.reason,
         )
 
-    def committed(self, shards: Sequence[Shard], seconds: float) -> None:
+    def record_commit(self, shards: Sequence[Shard], seconds: float) -> None:
         """A batch is in the tables."""
         self._add(COMMIT_SECONDS, seconds)
         for shard in shards:
@@ -344,7 +344,7 @@ class RunMetrics:
             self._add(SAMPLES, len(shard.keys), **where)
             self._add(BYTES, shard.size, **where)
 
-    def state(self, clips: int, left: int, in_flight: Mapping[str, int], last: bool = False) -> None:
+    def record_state(self, clips: int, left: int, in_flight: Mapping[str, int], last: bool = False) -> None:
         """How things stand; may be called as often as one likes, and at the end."""
         now = self._clock()
         if last or now - self._gauges_at >= GAUGES_EVERY_S:
@@ -359,11 +359,11 @@ class RunMetrics:
             self._add(DISK, disk.total)
             self._add(DISK_FREE, disk.free)
 
-    def _looked_up(self, cache: str, hit: bool | None) -> None:
+    def _record_lookup(self, cache: str, hit: bool | None) -> None:
         if hit is not None:
             self._add(LOOKUPS, 1, cache=cache, hit=str(hit).lower())
 
-    def _psnr(self, of: str, psnr_db: float | None) -> None:
+    def _record_psnr(self, of: str, psnr_db: float | None) -> None:
         if psnr_db is not None and math.isfinite(psnr_db):
             self._add(PSNR, psnr_db, of=of)
 

@@ -38,7 +38,7 @@ HUMAN_CANDIDATE = -1  # the only candidate index of experts that are tried once:
 StopCheck = Callable[[], bool]  # whether the run was asked to stop: a long task looks now and then
 
 
-def never() -> bool:
+def never_stop() -> bool:
     """For who is not asked to stop."""
     return False
 
@@ -93,7 +93,7 @@ class RejectedAttempt:
 
 
 @dataclass(frozen=True)
-class Built:
+class BlockReport:
     """A clip's block is in this machine's cache."""
 
     seconds: Mapping[str, float]  # by stage
@@ -131,7 +131,7 @@ class Work(Protocol):
         """Name of the block that the clip is rendered from, known without reading it; None: nothing to build ahead."""
         ...
 
-    def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never) -> Built:
+    def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never_stop) -> BlockReport:
         """Build the clip's block into this machine's cache. Raises BadClip, TaskStopped soon after `stopped`."""
         ...
 
@@ -167,7 +167,7 @@ class PartialAttempt:
     drawn: Columns | None = None
 
 
-def go_on(
+def run_stage(
     work: Work, stage: str, so_far: PreparedClip | PartialAttempt, candidate: int, expert: str
 ) -> PartialAttempt | Columns | RejectedAttempt:
     """The next stage of an attempt (tasks.stages.ATTEMPT) from where it stands.
@@ -192,11 +192,11 @@ def go_on(
     return Columns({**labelled.row, **drawn.row, "tags": tags}, seconds, drawn.scene_at_hand)
 
 
-def attempted(work: Work, prepared: PreparedClip, candidate: int, expert: str) -> Columns | RejectedAttempt:
+def run_attempt(work: Work, prepared: PreparedClip, candidate: int, expert: str) -> Columns | RejectedAttempt:
     """One attempt, whole."""
     so_far: PreparedClip | PartialAttempt = prepared
     for stage in ATTEMPT:
-        result = go_on(work, stage, so_far, candidate, expert)
+        result = run_stage(work, stage, so_far, candidate, expert)
         if not isinstance(result, PartialAttempt):
             return result
         so_far = result
@@ -217,7 +217,7 @@ class Failure:
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PrepareReport:
     """Report on a prepared clip."""
 
     clip: PreparedClip  # without what its attempts alone need
@@ -228,17 +228,17 @@ class Prepared:
 
 
 @dataclass(frozen=True)
-class HalfBuilt:
+class BlockUnfinished:
     """Report on a block that is not finished because the run stops; the next run goes on with it."""
 
 
 @dataclass(frozen=True)
-class HandedOn:
+class AttemptUnfinished:
     """Report on an attempt whose further stages are another task; the result is what that starts from."""
 
 
 @dataclass(frozen=True)
-class Attempted:
+class AttemptReport:
     """Report on an attempt."""
 
     rejected: Rejected | None  # None: accepted, and the result is the row
@@ -251,10 +251,10 @@ class Attempted:
 
 
 @dataclass(frozen=True)
-class Walked:
-    """Report on a stretch of a walk: one attempt after the other, the last one perhaps a failure."""
+class BatchReport:
+    """Report on a batch of a walk: one attempt after the other, the last one perhaps a failure."""
 
-    reports: tuple[Attempted | Failure, ...]
+    reports: tuple[AttemptReport | Failure, ...]
     seconds: tuple[float, ...]  # that each took
 
 
@@ -262,7 +262,7 @@ MakeEpisode = Callable[[Mapping[str, Any], PreparedClip], bytes]  # a sample's r
 
 
 @dataclass(frozen=True)
-class EpisodesOf:
+class EpisodeBatch:
     """Samples of one committed file whose episodes are to be written."""
 
     path: str  # in the table `samples`
@@ -272,7 +272,7 @@ class EpisodesOf:
 
 
 @dataclass(frozen=True)
-class EpisodesWritten:
+class EpisodesReport:
     """Report on them: files that stand now, and why others do not."""
 
     written: int
@@ -286,7 +286,7 @@ def cache_key(clip_id: str, prepare_digest: str) -> str:
 
 def prepare(
     work: Work, out: Location, ref: ClipRef, wanted_content: str | None = None
-) -> tuple[Prepared | Rejected | Failure, PreparedClip | None]:
+) -> tuple[PrepareReport | Rejected | Failure, PreparedClip | None]:
     """The clip from the cache, else prepared and cached; wanted_content: the digest that its stored rows are made of.
 
     A log that was changed is an input failure where its rows are to be continued, else its cached clip is not used.
@@ -308,7 +308,7 @@ def prepare(
             _refuse_changed(ref, stored.content_digest, wanted_content)
             _keep_scenes(out, stored)
             seconds = {"cache": time.perf_counter() - began}
-            return Prepared(replace(stored, payload=None, scenes=None), True, note, "", seconds), stored
+            return PrepareReport(replace(stored, payload=None, scenes=None), True, note, "", seconds), stored
         result = work.prepare(ref)
         if isinstance(result, Rejected):
             _refuse_changed(ref, f"none ({result.reason})", wanted_content)  # the clip had candidates
@@ -318,13 +318,13 @@ def prepare(
         _refuse_changed(ref, result.content_digest, wanted_content)
         uncached = _why_uncached(cache, key, result)
         _keep_scenes(out, result)
-        return Prepared(replace(result, payload=None, scenes=None), False, note, uncached, result.seconds), result
+        return PrepareReport(replace(result, payload=None, scenes=None), False, note, uncached, result.seconds), result
     except KeyboardInterrupt:
         raise
     except (
         BaseException
     ) as error:  # the boundary where whatever a stage or a user's code raises, SystemExit too, becomes data
-        return failure_of(error), None
+        return failure_from_error(error), None
 
 
 def _why_uncached(cache: ClipCache, key: str, clip: PreparedClip) -> str:
@@ -352,25 +352,25 @@ def _refuse_changed(ref: ClipRef, found: str | None, wanted: str | None) -> None
 
 def attempt(
     work: Work, stages: Sequence[str], so_far: PreparedClip | PartialAttempt, stamp: Stamp
-) -> tuple[Attempted | HandedOn | Failure, pa.Table | PartialAttempt | None]:
+) -> tuple[AttemptReport | AttemptUnfinished | Failure, pa.Table | PartialAttempt | None]:
     """Some stages of one attempt, from where it stands; an accepted one is checked against the schema here, where its
     traceback still means something."""
     began, stage = time.perf_counter(), ""
     try:
         for stage in stages:
-            result = go_on(work, stage, so_far, stamp.candidate_index, stamp.expert)
+            result = run_stage(work, stage, so_far, stamp.candidate_index, stamp.expert)
             if not isinstance(result, PartialAttempt):
                 break
             so_far = result
         if isinstance(result, PartialAttempt):
-            return HandedOn(), result
+            return AttemptUnfinished(), result
         seconds = result.seconds or {"attempt": time.perf_counter() - began}
         if isinstance(result, RejectedAttempt):
             subscores, at_hand = dict(result.subscores), result.scene_at_hand
-            return Attempted(result.rejected, subscores=subscores, seconds=seconds, scene_at_hand=at_hand), None
+            return AttemptReport(result.rejected, subscores=subscores, seconds=seconds, scene_at_hand=at_hand), None
         row = sample_row_to_table([{**result.row, **vars(stamp)}])
         (psnr_db,) = row["psnr"].to_pylist()
-        report = Attempted(
+        report = AttemptReport(
             None,
             row.nbytes,
             str(result.row["licence"]),
@@ -382,7 +382,7 @@ def attempt(
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # the same boundary
-        return replace(failure_of(error), task=stage), None
+        return replace(failure_from_error(error), task=stage), None
 
 
 def write(out: Location, *rows: pa.Table) -> tuple[Shard | Failure, None]:
@@ -390,10 +390,10 @@ def write(out: Location, *rows: pa.Table) -> tuple[Shard | Failure, None]:
     try:
         return write_shard(out.child("samples"), SAMPLES, pa.concat_tables(rows)), None
     except OSError as error:
-        return failure_of(error), None
+        return failure_from_error(error), None
 
 
-def episodes(work: Work, out: Location, wanted: EpisodesOf) -> tuple[EpisodesWritten | Failure, None]:
+def episodes(work: Work, out: Location, wanted: EpisodeBatch) -> tuple[EpisodesReport | Failure, None]:
     """Committed samples as MCAP files beside their table; the log's drive comes from the prepared clip."""
     written, errors = 0, []
     try:
@@ -407,26 +407,28 @@ def episodes(work: Work, out: Location, wanted: EpisodesOf) -> tuple[EpisodesWri
                 out.child(FOLDER).write(episode_name(row), wanted.make(row, clip))
                 written += 1
             except Exception as error:  # one that cannot be made costs no other
-                errors.append(f"sample {key}: {failure_of(error).error.splitlines()[-1]}")
+                errors.append(f"sample {key}: {failure_from_error(error).error.splitlines()[-1]}")
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # the same boundary
-        return failure_of(error), None
-    return EpisodesWritten(written, tuple(errors)), None
+        return failure_from_error(error), None
+    return EpisodesReport(written, tuple(errors)), None
 
 
-def reconstruct(work: Work, stopped: StopCheck, ref: ClipRef, threads: int) -> tuple[Built | HalfBuilt | Failure, None]:
+def reconstruct(
+    work: Work, stopped: StopCheck, ref: ClipRef, threads: int
+) -> tuple[BlockReport | BlockUnfinished | Failure, None]:
     """The block that the clip is rendered from, into the cache of this machine."""
     if stopped():  # before its sensors are read
-        return HalfBuilt(), None
+        return BlockUnfinished(), None
     try:
         return work.reconstruct(ref, threads, stopped), None
     except TaskStopped:
-        return HalfBuilt(), None
+        return BlockUnfinished(), None
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # the same boundary
-        return failure_of(error), None
+        return failure_from_error(error), None
 
 
 def warm(work: Work, draws: bool) -> tuple[str | Failure, None]:
@@ -438,11 +440,11 @@ def warm(work: Work, draws: bool) -> tuple[str | Failure, None]:
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # the same boundary
-        return failure_of(error), None
+        return failure_from_error(error), None
     return "", None
 
 
-def failure_of(error: BaseException) -> Failure:
+def failure_from_error(error: BaseException) -> Failure:
     """Broken input, an ailing machine, what may be either, or a bug; with the last lines of the traceback."""
     if isinstance(error, BadClip) and not isinstance(error, Unreadable):
         return Failure(ErrorKind.INPUT, str(error))

@@ -11,7 +11,7 @@ from typing import Any
 
 from factory.config.run import RunConfig, load_config
 from factory.graph.plan import candidate_order
-from factory.graph.steps import Columns, attempted
+from factory.graph.steps import Columns, run_attempt
 from factory.readers.base import ClipRef
 from factory.setup.settings import Run
 from factory.store.funnel import funnel_of
@@ -95,7 +95,7 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
             once = run.work.once(expert)
             wanted = 1 if once else run.config.rounds
             for candidate in candidate_order(once, len(prepared.candidates)):
-                result = attempted(run.work, prepared, candidate, expert)
+                result = run_attempt(run.work, prepared, candidate, expert)
                 sums.attempts += 1
                 sums.seconds.update(result.seconds)
                 if isinstance(result, Columns):

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from factory.files import locked, refused_as_the_runs_own, whole_file
-from factory.graph.steps import StopCheck, TaskStopped, never
+from factory.graph.steps import StopCheck, TaskStopped, never_stop
 from factory.readers.pictures import file_and_frame
 from factory.stages.rig import SAID, UsedRig, corrected_rig, known_of, said_again, taken_from, told_of, used_rig, wanted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
@@ -66,7 +66,7 @@ def fitted(
     agents: AgentTracks | None,
     settings: FitSettings,
     threads: int,
-    stopped: StopCheck = never,
+    stopped: StopCheck = never_stop,
     backend: Backend = Backend.CPU,
     lpips: Lpips | None = None,
 ) -> RenderAsset:
@@ -166,7 +166,7 @@ def _with_parallax(photos: Sequence[SensorFile]) -> float:
 
 
 def asset_for(
-    clip: Clip, settings: RenderSettings, cache_dir: str | Path, threads: int = 1, stopped: StopCheck = never
+    clip: Clip, settings: RenderSettings, cache_dir: str | Path, threads: int = 1, stopped: StopCheck = never_stop
 ) -> RenderAsset | None:
     """The scene of the clip's block with its digest; None where the clip has nothing to make one from.
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.graph.steps import StopCheck, never
+from factory.graph.steps import StopCheck, never_stop
 from factory.readers.base import BadClip
 from factory.stages.assets import Sensing, asset_for, corrected_for, scene_path, sensing
 from factory.stages.painted import town_cameras, town_pictures
@@ -63,7 +63,7 @@ class Imaging:
     settings: RenderSettings
     cache_dir: str
 
-    def build(self, clip: Clip, threads: int, stopped: StopCheck = never) -> tuple[bool, float | None]:
+    def build(self, clip: Clip, threads: int, stopped: StopCheck = never_stop) -> tuple[bool, float | None]:
         """Make sure of the clip's block in the cache: whether it was there, and its PSNR in dB where it has one.
 
         Raises BadClip for a broken sensor file, TaskStopped where a fit is `stopped`.

@@ -28,7 +28,7 @@ from factory.config.arguments import command
 from factory.config.compose import ConfigError, need_run_extra
 from factory.exits import Failed, Stopped
 from factory.files import why_unusable
-from factory.graph.each import WorkerDied, each
+from factory.graph.each import WorkerDied, parallel_map
 from factory.graph.progress import Counter
 from factory.graph.steps import TaskStopped
 from factory.readers.base import ClipRef
@@ -150,7 +150,7 @@ def _drive(work: DriveWork, items: Sequence[DriveItem], table: KeyedTable) -> li
     try:
         with (
             Counter("drives", total, before=n_done) as progress,
-            closing(each(work, waiting, settings.executor, settings.workers, work.out)) as results,
+            closing(parallel_map(work, waiting, settings.executor, settings.workers, work.out)) as results,
         ):
             for made in results:
                 rows.add(row for row in made if isinstance(row, DriveRow))

@@ -47,7 +47,7 @@ def nth(n: int, condition: Callable[..., bool] = lambda *args: True) -> Callable
 MOMENTS: dict[str, Callable[[], None]] = {
     "a clip was just prepared": lambda: after(driver.RunDriver, "_take_prepared", nth(2)),
     "attempts are in flight": lambda: after(driver.RunDriver, "_take_attempt", nth(9)),
-    "shards are written, nothing is committed": lambda: after(driver.Gatherer, "_commit", nth(1), before=True),
+    "shards are written, nothing is committed": lambda: after(driver.CommitQueue, "_commit", nth(1), before=True),
     "samples are committed, outcomes are not": lambda: after(
         KeyedTable, "commit", nth(2, lambda self, add, *rest: self.spec.name == "samples" and bool(add))
     ),

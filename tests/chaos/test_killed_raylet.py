@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from factory.exits import INTERRUPTED, asked_to_stop
-from factory.graph.apart import run_apart
+from factory.graph.apart import run_in_own_process
 from factory.graph.execute import NEW_CLUSTERS, Execution, RunSummary, execute, on_new_clusters
 from factory.run import main as run_main
 from factory.store.samples import Store
@@ -152,7 +152,7 @@ def test_a_command_whose_clusters_all_die_ends_with_a_line(
 ) -> None:
     monkeypatch.setenv("MARK", mark := secrets.token_hex(16))
     said = list[str]()
-    assert run_apart(partial(ended_by_ray, tmp_path / "begun"), is_ours, said.append) == INTERRUPTED
+    assert run_in_own_process(partial(ended_by_ray, tmp_path / "begun"), is_ours, said.append) == INTERRUPTED
     begun = (tmp_path / "begun").read_text().split()
     assert begun == (["0", "2", "3"] if is_ours else ["0"]), "one was begun in the process itself"
     assert [line[-6:] for line in said] == (["2 of 3", "3 of 3"] if is_ours else [])

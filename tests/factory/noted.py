@@ -6,7 +6,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from factory.graph.steps import AcceptedDrive, Built, Columns, PreparedClip, RejectedAttempt, StopCheck, never
+from factory.graph.steps import (
+    AcceptedDrive,
+    BlockReport,
+    Columns,
+    PreparedClip,
+    RejectedAttempt,
+    StopCheck,
+    never_stop,
+)
 from factory.pipeline import FactoryWork
 from factory.readers.base import ClipRef
 from tasks.stages import Rejected
@@ -26,7 +34,7 @@ class NotedWork(FactoryWork):
         with open(self.journal, "a") as file:
             file.write(json.dumps([task, where().split()[1], began, time.time()]) + "\n")
 
-    def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never) -> Built:
+    def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never_stop) -> BlockReport:
         with self.noted("reconstruct"):
             return super().reconstruct(ref, threads, stopped)
 

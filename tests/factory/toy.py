@@ -15,7 +15,15 @@ from typing import Any
 import numpy as np
 
 from factory.graph.execute import Execution, RunSummary, execute
-from factory.graph.steps import AcceptedDrive, Built, Columns, PreparedClip, RejectedAttempt, StopCheck, never
+from factory.graph.steps import (
+    AcceptedDrive,
+    BlockReport,
+    Columns,
+    PreparedClip,
+    RejectedAttempt,
+    StopCheck,
+    never_stop,
+)
 from factory.readers.base import BadClip, ClipRef
 from factory.stages.rows import label_columns
 from factory.store.samples import CandidateRow, Store
@@ -126,11 +134,11 @@ class ToyWork:
     def block(self, ref: ClipRef) -> str | None:
         return ref.log_id if self.blocks else None
 
-    def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never) -> Built:
+    def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never_stop) -> BlockReport:
         self._note(f"reconstruct {ref.log_id}")
         time.sleep(self.seconds)
         self._trouble(ref.log_id)
-        return Built({"reconstruct": 0.5}, from_cache=False, psnr_db=28.0)
+        return BlockReport({"reconstruct": 0.5}, from_cache=False, psnr_db=28.0)
 
     def doing(self) -> str:
         return ""

@@ -11,7 +11,7 @@ from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_t
 from factory.files import DiskFull
 from factory.graph.driver import SHARD_BYTES
 from factory.graph.execute import RunSummary, record_summary
-from factory.graph.progress import Counter, Executed
+from factory.graph.progress import Counter, RunTotals
 from factory.readers.base import BadClip, failing_as
 from factory.store.location import Shard, write_shard
 from factory.store.samples import IMPORTED, ChangedRun, ErrorKind, Kind, Outcome, Store
@@ -67,7 +67,7 @@ def import_rows(store: Store, identity: RunIdentity, entries: Sequence[Entry]) -
         raise ChangedRun(f"{store.location.uri} holds rows of another run or import: choose another out")
     records = store.agree(identity, {stamp.expert: stamp.expert_digest for stamp in stamps}, "stop")
     waiting = [pair for pair in zip(entries, stamps) if pair[1].attempt_id not in store.samples]
-    summary = RunSummary(COMPLETE, executed=Executed(found_done=len(entries) - len(waiting)), began_ms=began_ms)
+    summary = RunSummary(COMPLETE, executed=RunTotals(found_done=len(entries) - len(waiting)), began_ms=began_ms)
     counts = dict.fromkeys((kind.value for kind in Kind), 0)
     stopped: list[bool] = []
     began = time.monotonic()

@@ -41,18 +41,18 @@ from factory.graph.local import (
     MachineIll,
     Ticket,
     attempt_tasks,
-    cleared,
-    cores_of,
-    described,
-    name_of,
+    call_watched,
+    clear_notes,
+    not_ready_error,
     notes_folder,
-    put_away,
-    unready,
-    watched,
+    remove_if_empty,
+    task_cores,
+    task_name,
+    task_note,
 )
-from factory.graph.plan import Stretch
+from factory.graph.plan import AttemptBatch
 from factory.graph.progress import METRICS, Metric, Recorder, Type
-from factory.graph.steps import Failure, NotReady, PreparedClip, Walked, Work, attempt, never
+from factory.graph.steps import BatchReport, Failure, NotReady, PreparedClip, Work, attempt, never_stop
 from factory.store.location import BadLocation, Location
 from factory.store.samples import ErrorKind
 from factory.store.schema import Stamp
@@ -259,9 +259,13 @@ class RayGraph:
         self.parallelism = tasks_at_once(workers, self._is_ours)
         self.cores = min(self.parallelism, *(of_nodes("CPU") or [1]))  # none yet where a cluster grows from nothing
         self.recorder: Recorder = RayRecorder()
-        self._supplied: dict[str, Any] = {"work": [ray.put(work)], "out": out, "stopped": never}  # list: a reference
+        self._supplied: dict[str, Any] = {
+            "work": [ray.put(work)],
+            "out": out,
+            "stopped": never_stop,
+        }  # list: a reference
         self._costs, self._notes = Costs(limits), notes_folder(out)
-        self._run = cleared(self._notes)
+        self._run = clear_notes(self._notes)
         self._tickets: dict[Any, Ticket] = {}
         self._ready: deque[Any] = deque()
         self._held_back: dict[bool, deque[tuple[Ticket, str, tuple[Any, ...]]]] = {False: deque(), True: deque()}
@@ -300,7 +304,7 @@ class RayGraph:
                     continue  # it has left the cluster: no task goes there
                 raise _unready(error, f"node {node} could not get its kernels ready: {one_line(error)}") from error
             if isinstance(answer, Failure):
-                raise unready(answer)
+                raise not_ready_error(answer)
 
     def _must_live(self) -> None:
         """Raises ClusterDied where a cluster of our own has lost one of its processes."""
@@ -308,16 +312,16 @@ class RayGraph:
             raise ClusterDied(f"Ray's {dead} died", is_ours=True)
 
     def submit(self, step: str, *args: Any) -> Ticket:
-        ticket = Ticket(name_of(step, args), None)
+        ticket = Ticket(task_name(step, args), None)
         self._held_back[self._draws(ticket)].append((ticket, step, args))
         self._dispatch()
         return ticket
 
-    def ahead(self) -> int:
+    def attempts_per_task(self) -> int:
         """As many as usually end in AHEAD_S, where one task makes a whole attempt."""
         if len(self.attempt_tasks) > 1:
             return 1
-        return self._costs.within("+".join(self.attempt_tasks[0]), AHEAD_S)
+        return self._costs.tasks_in("+".join(self.attempt_tasks[0]), AHEAD_S)
 
     def _draws(self, ticket: Ticket) -> bool:
         return self._gpu_share > 0.0 and any(task.may_draw for task in TASKS if task.name in ticket.step.split("+"))
@@ -336,12 +340,12 @@ class RayGraph:
                 gpu = self._gpu_share if draws else None
                 memory = self._claims.memory_bytes(ticket.step)
                 memory = memory if self._most_memory is None else min(memory, self._most_memory)
-                cores = cores_of(step, args)
-                n_rows = args[-1].samples if step == "stretch" else 1
+                cores = task_cores(step, args)
+                n_rows = args[-1].samples if step == "attempts" else 1
                 task = _claiming(ticket.step, cores, gpu, memory or None, 1 + n_rows)
-                told = described(step, ticket.step, args) | self._costs.limits(ticket.step) | {"run": self._run}
+                told = task_note(step, ticket.step, args) | self._costs.limits_for(ticket.step) | {"run": self._run}
                 report, *results = task.remote(step, (self._notes, told), len(supplied), *supplied, *args)
-                ticket.result = results if step == "stretch" else results[0]
+                ticket.result = results if step == "attempts" else results[0]
                 self._tickets[report] = ticket
                 self._flying[draws] += 1
 
@@ -367,11 +371,11 @@ class RayGraph:
             raise ClusterDied(said, self._is_ours) from error
         except RayError as error:
             report, worked_s = Failure(_kind_of(error), f"{type(error).__name__}: {error}"[:2000]), 0.0
-        if isinstance(report, Walked):
+        if isinstance(report, BatchReport):
             for seconds in report.seconds:
-                self._costs.took(ticket.step, seconds)
+                self._costs.add(ticket.step, seconds)
         elif not isinstance(report, Failure):
-            self._costs.took(ticket.step, worked_s)
+            self._costs.add(ticket.step, worked_s)
         ticket.queued_s = max(0.0, time.monotonic() - ticket.submitted - worked_s)
         return ticket, report
 
@@ -379,7 +383,7 @@ class RayGraph:
         self._tickets.clear()
         if self._connected:
             ray.shutdown()
-        put_away(self._notes)
+        remove_if_empty(self._notes)
 
 
 @cache
@@ -419,26 +423,26 @@ def _after_drawing(tasks: Sequence[Sequence[str]]) -> frozenset[str]:
 @ray.remote(num_cpus=1, num_returns=2, max_retries=MAX_RETRIES)
 def _run(step: str, watch: tuple[Path, dict[str, Any]], n_supplied: int, *args: Any) -> tuple[Any, ...]:
     """A function of factory.graph.steps in a worker, under watch: its report with the seconds it took, its result; of
-    a stretch each sample's."""
+    a batch each sample's."""
     began = time.perf_counter()
     supplied = [_held(arg) if isinstance(arg, list) else arg for arg in args[:n_supplied]]
     given = [ray.get(arg.reference) if isinstance(arg, Fetched) else arg for arg in args[n_supplied:]]
-    if step == "stretch":
-        report, *results = _stretch(watch, *supplied, *given)
+    if step == "attempts":
+        report, *results = _attempt_batch(watch, *supplied, *given)
     else:
-        report, *results = watched(*watch, STEPS[step][0], *supplied, *given)
+        report, *results = call_watched(*watch, STEPS[step][0], *supplied, *given)
     return (report, time.perf_counter() - began), *results
 
 
-def _stretch(
+def _attempt_batch(
     watch: tuple[Path, dict[str, Any]],
     work: Work,
     stages: Sequence[str],
     prepared: PreparedClip,
     stamp: Stamp,
-    stretch: Stretch,
+    batch: AttemptBatch,
 ) -> list[Any]:
-    """A stretch of a walk from `stamp` on, each attempt under watch: report, then a row or None for each sample.
+    """A batch of a walk from `stamp` on, each attempt under watch: report, then a row or None for each sample.
 
     What it makes does not depend on how long it takes, so that Ray can make lost rows again.
     """
@@ -447,16 +451,16 @@ def _stretch(
     reports: list[Any] = []
     seconds: list[float] = []
     rows: list[Any] = []
-    for candidate in range(stamp.candidate_index, stamp.candidate_index + stretch.n):
+    for candidate in range(stamp.candidate_index, stamp.candidate_index + batch.n):
         began = time.perf_counter()
         given = stages, prepared, stamp.of(prepared.clip_id, candidate, first + len(rows))
-        report, row = watched(notes, told | described("attempt", name, given), attempt, work, *given)
+        report, row = call_watched(notes, told | task_note("attempt", name, given), attempt, work, *given)
         reports.append(report)
         seconds.append(time.perf_counter() - began)
         rows += [row] if row is not None else []
-        if isinstance(report, Failure) or len(rows) == stretch.samples:
+        if isinstance(report, Failure) or len(rows) == batch.samples:
             break
-    return [Walked(tuple(reports), tuple(seconds)), *rows, *[None] * (stretch.samples - len(rows))]
+    return [BatchReport(tuple(reports), tuple(seconds)), *rows, *[None] * (batch.samples - len(rows))]
 
 
 def _held(reference: list[Any]) -> Any:

@@ -19,7 +19,7 @@ from factory.__main__ import main
 from factory.commands.completion import candidates, settings_of
 from factory.commands.table import COMMANDS, DOORS, PLANNERS
 from factory.exits import MEANING
-from factory.graph.driver import EpisodesWanted
+from factory.graph.driver import EpisodeSettings
 from factory.graph.execute import Execution
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import COPIES
@@ -46,7 +46,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ["recovery", "human"],
         2,
         store,
-        Execution("local", episodes=EpisodesWanted(1, prepared_episode), command=given),
+        Execution("local", episodes=EpisodeSettings(1, prepared_episode), command=given),
     )
     return folder
 

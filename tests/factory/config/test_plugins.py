@@ -9,7 +9,7 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import load_config
-from factory.graph.steps import Columns, PreparedClip, RejectedAttempt, attempted
+from factory.graph.steps import Columns, PreparedClip, RejectedAttempt, run_attempt
 from factory.readers.base import BadClip
 from factory.setup.settings import Run, assemble
 from factory.store.schema import BOOKKEEPING, sample_row_to_table
@@ -100,10 +100,10 @@ def test_my_reader_and_my_expert_make_samples(package: Path) -> None:
     prepared = run.work.prepare(run.index.refs[0])
     assert isinstance(prepared, PreparedClip)
     assert prepared.clip_id == run.index.refs[0].clip_id
-    results = [attempted(run.work, prepared, candidate.index, "mine") for candidate in prepared.candidates]
+    results = [run_attempt(run.work, prepared, candidate.index, "mine") for candidate in prepared.candidates]
     rows = [result.row for result in results if isinstance(result, Columns)]
     assert rows, [result.rejected for result in results if isinstance(result, RejectedAttempt)]
-    rows.append(attempted(run.work, prepared, -1, "human").row)  # type: ignore[union-attr]
+    rows.append(run_attempt(run.work, prepared, -1, "human").row)  # type: ignore[union-attr]
     books = {"round": 0, "candidate_index": 0} | {
         name: "x" for name in BOOKKEEPING if name not in ("round", "candidate_index")
     }
@@ -123,7 +123,7 @@ def test_every_attempt_gives_the_same_result_again(package: Path) -> None:
     assert isinstance(second, PreparedClip)
     assert first.candidates == second.candidates
     for index in range(3):
-        a, b = attempted(run.work, first, index, "mine"), attempted(again.work, second, index, "mine")
+        a, b = run_attempt(run.work, first, index, "mine"), run_attempt(again.work, second, index, "mine")
         assert isinstance(a, RejectedAttempt) == isinstance(b, RejectedAttempt)
         if isinstance(a, Columns) and isinstance(b, Columns):
             np.testing.assert_array_equal(a.row["label_10hz"], b.row["label_10hz"])  # type: ignore[arg-type]
@@ -147,7 +147,7 @@ def test_my_expert_s_refusal_is_a_rejection(package: Path) -> None:
     run = assembled(package, "+expert.mine.stubborn=true")
     prepared = run.work.prepare(run.index.refs[0])
     assert isinstance(prepared, PreparedClip)
-    result = attempted(run.work, prepared, 0, "mine")
+    result = run_attempt(run.work, prepared, 0, "mine")
     assert isinstance(result, RejectedAttempt)
     assert result.rejected == Rejected("expert", "no_plan", "will not")
     assert result.subscores == {}

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
-from factory.graph.driver import BlockQueue, Build
+from factory.graph.driver import BlockBuild, BlockQueue
 from factory.graph.plan import ClipPlan
 from factory.readers.base import ClipRef
 from factory.store.samples import Store
@@ -23,7 +23,9 @@ def handed_out(queue: BlockQueue, wanted: bool = True) -> list[str]:
     """What the queue gives until it has nothing for now: clips as log and second, blocks in brackets."""
     out = []
     while (what := queue.next(wanted)) is not None:
-        out.append(f"[{what.block}]" if isinstance(what, Build) else f"{what.ref.log_id}{what.ref.start_ms // 1000}")
+        out.append(
+            f"[{what.block}]" if isinstance(what, BlockBuild) else f"{what.ref.log_id}{what.ref.start_ms // 1000}"
+        )
     return out
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from factory.graph.each import IN_HAND, WorkerDied, each
+from factory.graph.each import IN_HAND, WorkerDied, parallel_map
 from factory.graph.steps import TaskStopped
 from factory.store.location import BadLocation, Location
 from tests.factory.items import Elsewhere, OddItem, squared
@@ -53,14 +53,14 @@ def two_cpus(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.mark.parametrize("how", EXECUTORS)
 def test_every_item_has_its_result(how: dict[str, Any]) -> None:
-    assert sorted(each(squared, range(20), **how)) == [i * i for i in range(20)]
-    assert list(each(squared, [], **how)) == []
+    assert sorted(parallel_map(squared, range(20), **how)) == [i * i for i in range(20)]
+    assert list(parallel_map(squared, [], **how)) == []
 
 
 @pytest.mark.parametrize("how", EXECUTORS)
 def test_few_items_are_in_hand_however_many_there_are(how: dict[str, Any]) -> None:
     begun: list[int] = []
-    with closing(each(squared, counted(1000, begun), **how)) as results:
+    with closing(parallel_map(squared, counted(1000, begun), **how)) as results:
         for done in range(1, 6):
             next(results)
             assert done <= len(begun) <= done + IN_HAND * how.get("workers", 1)
@@ -71,7 +71,7 @@ def test_few_items_are_in_hand_however_many_there_are(how: dict[str, Any]) -> No
 def test_after_a_signal_what_is_in_hand_still_comes_and_nothing_new_begins(how: dict[str, Any], number: int) -> None:
     before = signal.getsignal(number)
     begun: list[int] = []
-    results = each(squared, counted(100, begun), **how)
+    results = parallel_map(squared, counted(100, begun), **how)
     came = [next(results)]
     os.kill(os.getpid(), number)
     with pytest.raises(TaskStopped):
@@ -82,7 +82,7 @@ def test_after_a_signal_what_is_in_hand_still_comes_and_nothing_new_begins(how: 
 
 @pytest.mark.parametrize("how", EXECUTORS)
 def test_a_signal_behind_the_last_item_halts_nothing(how: dict[str, Any]) -> None:
-    results = each(squared, [3], **how)
+    results = parallel_map(squared, [3], **how)
     assert next(results) == 9
     os.kill(os.getpid(), signal.SIGTERM)
     assert list(results) == []
@@ -91,14 +91,14 @@ def test_a_signal_behind_the_last_item_halts_nothing(how: dict[str, Any]) -> Non
 @pytest.mark.parametrize("how", EXECUTORS)
 def test_what_an_item_raises_is_raised_as_it_is(how: dict[str, Any]) -> None:
     with pytest.raises(OddItem) as raised:
-        list(each(partial(squared, odd=3), range(6), **how))
+        list(parallel_map(partial(squared, odd=3), range(6), **how))
     assert str(raised.value) == "3 is odd" and type(raised.value) is OddItem
 
 
 @pytest.mark.parametrize("how", WORKERS)
 def test_a_worker_that_dies_is_told_with_its_item(how: dict[str, Any]) -> None:
     with pytest.raises(WorkerDied, match=r"^3: its worker died \(.*\); run the same command again"):
-        list(each(partial(squared, deadly=3), [3], **how))
+        list(parallel_map(partial(squared, deadly=3), [3], **how))
 
 
 @pytest.mark.slow
@@ -109,9 +109,9 @@ def test_a_folder_that_a_node_does_not_see_is_named(tmp_path: Path, monkeypatch:
 
     node = graph.nodes_of_cluster()
     monkeypatch.setattr(graph, "nodes_of_cluster", lambda having="": node * 2)
-    assert list(each(squared, [3], **RAY, to=Location(str(tmp_path)))) == [9]
+    assert list(parallel_map(squared, [3], **RAY, to=Location(str(tmp_path)))) == [9]
     with pytest.raises(BadLocation, match=rf"^to={tmp_path} is not the same folder on nodes .*storage that all"):
-        list(each(squared, [3], **RAY, to=Elsewhere(str(tmp_path))))
+        list(parallel_map(squared, [3], **RAY, to=Elsewhere(str(tmp_path))))
     assert not list(tmp_path.iterdir()), "the trial file is taken away"
     assert graph.ray.is_initialized(), "a cluster that was there stays"
 

@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from factory.config.run import load_config
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph import driver
-from factory.graph.driver import EpisodesWanted
+from factory.graph.driver import EpisodeSettings
 from factory.graph.execute import Execution, RunSummary
 from factory.store.episodes import FOLDER, episode_name, is_chosen
 from factory.store.location import Location
@@ -26,7 +26,7 @@ EXPERTS = ["recovery", "human"]
 def run(out: Path | Store, every: int = 1, rounds: int = 2, n: int = 3, **options: Any) -> RunSummary:
     store = out if isinstance(out, Store) else Store(out)
     work = options.pop("work", FilmedWork())
-    how = Execution("local", episodes=EpisodesWanted(every, prepared_episode), **options)
+    how = Execution("local", episodes=EpisodeSettings(every, prepared_episode), **options)
     return executed(work, refs(n), EXPERTS, rounds, store, how)
 
 

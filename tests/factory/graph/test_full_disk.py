@@ -12,7 +12,7 @@ import pytest
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.files import DiskFull, needs_disk, why_disk_full, why_unusable
 from factory.graph.execute import Execution, RunSummary, execute, on_new_clusters
-from factory.graph.steps import failure_of
+from factory.graph.steps import failure_from_error
 from factory.run import main as run_main
 from factory.store.samples import Store
 from factory.store.verify import verify
@@ -137,8 +137,8 @@ def test_what_a_full_disk_said_is_found_behind_other_errors_and_in_delta_s_words
         except OSError as error:
             raise RuntimeError("a plug-in's own words") from error
     except RuntimeError as error:
-        assert failure_of(error).disk_full == why_disk_full(error) == "/a/file: the disk is full"
-    assert failure_of(ValueError("else")).disk_full == ""
+        assert failure_from_error(error).disk_full == why_disk_full(error) == "/a/file: the disk is full"
+    assert failure_from_error(ValueError("else")).disk_full == ""
 
 
 def test_a_full_disk_under_the_user_s_cache_is_told_with_its_path_and_is_no_wrong_setting(

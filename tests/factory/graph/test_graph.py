@@ -14,7 +14,15 @@ import pytest
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph import execute as execution
 from factory.graph.execute import Execution, execute
-from factory.graph.steps import AcceptedDrive, Built, PreparedClip, RejectedAttempt, StopCheck, TaskStopped, never
+from factory.graph.steps import (
+    AcceptedDrive,
+    BlockReport,
+    PreparedClip,
+    RejectedAttempt,
+    StopCheck,
+    TaskStopped,
+    never_stop,
+)
 from factory.readers.base import ClipRef
 from factory.store.location import BadCacheFile
 from factory.store.samples import Store
@@ -153,7 +161,7 @@ def test_zero_inputs_and_double_ones_write_nothing(tmp_path: Path) -> None:
 def test_nothing_new_begins_once_a_run_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a cluster, where tasks that were handed over end; in this process those that wait are left undone too."""
     local = execution.LocalGraph
-    monkeypatch.setattr(execution, "LocalGraph", lambda work, out, stopped, fuse: local(work, out, never, fuse))
+    monkeypatch.setattr(execution, "LocalGraph", lambda work, out, stopped, fuse: local(work, out, never_stop, fuse))
 
     class Stopping(ToyWork):
         def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
@@ -169,7 +177,7 @@ def test_nothing_new_begins_once_a_run_is_stopped(tmp_path: Path, monkeypatch: p
 
 def test_a_signal_reaches_a_block_that_is_being_built_in_this_process(tmp_path: Path) -> None:
     class Building(ToyWork):
-        def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never) -> Built:
+        def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never_stop) -> BlockReport:
             if ref.log_id == "log0":
                 return super().reconstruct(ref, threads)
             assert not stopped()

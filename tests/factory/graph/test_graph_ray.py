@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
-from factory.graph.driver import EpisodesWanted
+from factory.graph.driver import EpisodeSettings
 from factory.graph.execute import Execution
 from factory.graph.local import Claims, Limits
 from factory.graph.on_ray import graph
@@ -85,7 +85,7 @@ def test_workers_write_the_same_episodes_as_one_process(tmp_path: Path, two_cpus
             EXPERTS,
             2,
             store,
-            Execution(executor, 2, episodes=EpisodesWanted(1, prepared_episode)),
+            Execution(executor, 2, episodes=EpisodeSettings(1, prepared_episode)),
         )  # type: ignore[arg-type]
     local, ray_s = (
         {path.name: path.read_bytes() for path in (tmp_path / executor / "episodes").iterdir()}

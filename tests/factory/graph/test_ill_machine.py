@@ -10,7 +10,7 @@ import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.files import DiskFull, PlaceRefused, machine_fault_of, refused_as_the_runs_own
-from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt, failure_of
+from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt, failure_from_error
 from factory.store.location import ClipCache
 from factory.store.samples import ErrorKind
 from tests.factory.graph.runs import run
@@ -110,7 +110,7 @@ def test_a_place_of_the_run_s_own_that_refuses_is_the_machine_s(tmp_path: Path) 
     ],
 )
 def test_the_machine_s_errors_are_told_by_number_or_by_what_stores_say(error: OSError) -> None:
-    assert failure_of(error).kind is ErrorKind.MACHINE
+    assert failure_from_error(error).kind is ErrorKind.MACHINE
     wrapped = RuntimeError("a plug-in's own words")
     wrapped.__cause__ = error
     assert machine_fault_of(wrapped) == str(error)
@@ -126,12 +126,12 @@ def test_the_machine_s_errors_are_told_by_number_or_by_what_stores_say(error: OS
     ],
 )
 def test_a_file_that_is_damaged_or_missing_is_no_illness(error: OSError) -> None:
-    assert failure_of(error).kind is ErrorKind.SYSTEM
+    assert failure_from_error(error).kind is ErrorKind.SYSTEM
 
 
 def test_memory_is_the_machine_s_only_where_little_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """A clip that asks for terabytes says nothing of the machine."""
     monkeypatch.setattr("factory.files._memory_left", lambda: 0.5)
-    assert failure_of(MemoryError("Unable to allocate 7.28 TiB")).kind is ErrorKind.SYSTEM
+    assert failure_from_error(MemoryError("Unable to allocate 7.28 TiB")).kind is ErrorKind.SYSTEM
     monkeypatch.setattr("factory.files._memory_left", lambda: 0.02)
-    assert failure_of(MemoryError("Unable to allocate 1.00 MiB")).kind is ErrorKind.MACHINE
+    assert failure_from_error(MemoryError("Unable to allocate 1.00 MiB")).kind is ErrorKind.MACHINE

@@ -151,15 +151,15 @@ def test_a_hanging_walk_is_seen_while_it_hangs_and_a_signal_ends_the_run(tmp_pat
 
 def test_what_tasks_took_so_far_says_what_the_next_may_take() -> None:
     costs, given = Costs(Limits()), Costs(Limits(seconds={"perturb": 2000.0}))
-    assert costs.limits("drive+render+label") == {"seconds": 3000.0, "gb": 8.0}
-    assert costs.limits("reconstruct") == {"seconds": 86_400.0, "gb": None}
+    assert costs.limits_for("drive+render+label") == {"seconds": 3000.0, "gb": 8.0}
+    assert costs.limits_for("reconstruct") == {"seconds": 86_400.0, "gb": None}
     for _ in range(20):
-        costs.took("perturb", 20.0)
-        given.took("perturb", 20.0)
-        costs.took("label", 1.0)
-    assert costs.limits("perturb")["seconds"] == 600.0
-    assert costs.limits("label")["seconds"] == 300.0
-    assert given.limits("perturb")["seconds"] == 2000.0
+        costs.add("perturb", 20.0)
+        given.add("perturb", 20.0)
+        costs.add("label", 1.0)
+    assert costs.limits_for("perturb")["seconds"] == 600.0
+    assert costs.limits_for("label")["seconds"] == 300.0
+    assert given.limits_for("perturb")["seconds"] == 2000.0
 
 
 @pytest.mark.parametrize(

@@ -105,7 +105,7 @@ def test_gauges_are_set_once_a_second_however_often_they_are_offered(tmp_path: P
     recorded, now = Recorded(), [100.0]
     metrics = RunMetrics(recorded, Location.parse(tmp_path), clock=lambda: now[0])
     for _ in range(50):
-        metrics.state(10, 4, {"walks": 3})
+        metrics.record_state(10, 4, {"walks": 3})
         now[0] += 0.1
     assert recorded.total(CLIPS_LEFT) == 5
     assert recorded.last[CLIPS_LEFT.name] == 4
@@ -114,9 +114,9 @@ def test_gauges_are_set_once_a_second_however_often_they_are_offered(tmp_path: P
 def test_a_commit_of_outcomes_alone_adds_no_sample(tmp_path: Path) -> None:
     recorded = Recorded()
     metrics = RunMetrics(recorded, Location.parse("s3://bucket/out"))
-    metrics.committed([], 0.02)
+    metrics.record_commit([], 0.02)
     assert recorded.total(SAMPLES) == 0
-    metrics.committed([Shard("p", 70, {"round": "1", "expert": "recovery"}, ("a", "b"))], 0.02)
+    metrics.record_commit([Shard("p", 70, {"round": "1", "expert": "recovery"}, ("a", "b"))], 0.02)
     assert recorded.total(SAMPLES, round="1", expert="recovery", run="s3://bucket/out") == 2
 
 

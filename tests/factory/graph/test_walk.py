@@ -3,7 +3,17 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factory.graph.plan import Blocked, Complete, Exhausted, Step, Stretch, Try, next_step, retry_policy, stretch
+from factory.graph.plan import (
+    AttemptBatch,
+    Blocked,
+    Complete,
+    Exhausted,
+    Step,
+    Try,
+    next_batch,
+    next_step,
+    retry_policy,
+)
 from factory.store.samples import ErrorKind, Kind, Past
 
 
@@ -51,7 +61,7 @@ def test_in_stretches_a_walk_makes_the_attempts_that_it_makes_one_by_one(
     known = {candidate: p for candidate, p in whole.items() if candidate not in lost}
     made = []
     while isinstance(step := next_step(False, len(accepts), rounds, known, never), Try):
-        along = stretch(False, len(accepts), rounds, known, step, most)
+        along = next_batch(False, len(accepts), rounds, known, step, most)
         assert 1 <= along.n <= most
         accepted = 0
         for candidate in range(step.candidate, step.candidate + along.n):
@@ -68,9 +78,9 @@ def test_in_stretches_a_walk_makes_the_attempts_that_it_makes_one_by_one(
 
 def test_a_stretch_tries_a_failure_again_and_goes_on_behind_it() -> None:
     known = {0: past(Kind.ACCEPTED, 0), 1: past(Kind.FAILED, error="system"), 4: past(Kind.REJECTED)}
-    assert stretch(False, 9, 4, known, Try(1, 1), 6) == Stretch(3, 3)
-    assert stretch(False, 9, 2, known, Try(1, 1), 6) == Stretch(3, 1)
-    assert stretch(True, 9, 4, {}, Try(-1, 0), 6) == Stretch(1, 1)
+    assert next_batch(False, 9, 4, known, Try(1, 1), 6) == AttemptBatch(3, 3)
+    assert next_batch(False, 9, 2, known, Try(1, 1), 6) == AttemptBatch(3, 1)
+    assert next_batch(True, 9, 4, {}, Try(-1, 0), 6) == AttemptBatch(1, 1)
 
 
 def test_a_walk_ends_complete_or_exhausted() -> None:

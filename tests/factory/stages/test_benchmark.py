@@ -12,7 +12,7 @@ import pytest
 
 from factory.config.run import BenchmarkSettings, load_config
 from factory.exits import COMPLETE
-from factory.graph.steps import Columns, PreparedClip, RejectedAttempt, attempted
+from factory.graph.steps import Columns, PreparedClip, RejectedAttempt, run_attempt
 from factory.pipeline import BenchmarkWork, FactoryWork
 from factory.readers.base import ClipRef
 from factory.readers.settings import TownSettings
@@ -201,12 +201,12 @@ def test_a_pair_falls_together_at_the_pictures(tmp_path: Path) -> None:
     strict = replace(drawn, render=replace(drawn.render, gate=replace(drawn.render.gate, contrast_min=1.0)))
     prepared = strict.prepare(strict.reader.index().refs[1])
     assert isinstance(prepared, PreparedClip) and prepared.candidates
-    pair = [attempted(strict, prepared, 0, expert) for expert in ("follow_up", "follow_up_before")]
+    pair = [run_attempt(strict, prepared, 0, expert) for expert in ("follow_up", "follow_up_before")]
     assert all(isinstance(result, RejectedAttempt) and result.rejected.reason == "blank" for result in pair)
     assert pair[0].rejected == pair[1].rejected  # type: ignore[union-attr]
     assert "at step 50" in pair[0].rejected.detail  # type: ignore[union-attr]
     for expert, at in (("human_before", -1), ("follow_up", 0), ("follow_up_before", 0)):
-        result = attempted(drawn, prepared, at, expert)
+        result = run_attempt(drawn, prepared, at, expert)
         assert isinstance(result, Columns)
         assert result.row["image_source"] == ("photo" if at < 0 else "render")
         assert [image["time_s"] for image in result.row["images"]] == [pytest.approx(0.0, abs=1e-6)]  # type: ignore[attr-defined]

@@ -11,7 +11,7 @@ import pytest
 from factory.datasets.navsim.filters import kept_table, make_table
 from factory.datasets.navsim.maps import cache_file, kept_tables
 from factory.datasets.town.reader import SensedReader, SyntheticReader, SyntheticTownsReader
-from factory.graph.steps import Prepared, cache_key, prepare
+from factory.graph.steps import PrepareReport, cache_key, prepare
 from factory.readers.settings import TownSettings
 from factory.readers.whole_folder import SUMS
 from factory.setup.settings import _table_of
@@ -57,11 +57,11 @@ def test_a_prepared_clip(tmp_path: Path) -> None:
     for content in [*damaged(whole), whole[:-SEAL_BYTES]]:
         path.write_bytes(content)
         report, clip = prepare(work, out, ref)
-        assert isinstance(report, Prepared) and not report.from_cache
+        assert isinstance(report, PrepareReport) and not report.from_cache
         assert report.note.startswith(f"cache file {key}: it") and report.note.endswith("; prepared again")
         assert encode(clip) == golden and path.read_bytes() == whole
     report, _ = prepare(work, out, ref)
-    assert isinstance(report, Prepared) and report.from_cache and not report.note
+    assert isinstance(report, PrepareReport) and report.from_cache and not report.note
 
 
 def test_a_clip_s_scenes_are_named(tmp_path: Path) -> None:

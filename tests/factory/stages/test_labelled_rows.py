@@ -8,7 +8,7 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.config.run import load_config
-from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
+from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, run_attempt
 from factory.pipeline import FactoryWork
 from factory.run import main as run_main
 from factory.setup.calibrate import calibrate, measure
@@ -53,7 +53,7 @@ def prepared() -> PreparedClip:
 def sample(work: FactoryWork, expert: str) -> tuple[Columns, Judged]:
     """The first accepted attempt of the street, and what was judged in it."""
     for candidate in [HUMAN_CANDIDATE] if expert == HUMAN else range(len(prepared().candidates)):
-        result = attempted(work, prepared(), candidate, expert)
+        result = run_attempt(work, prepared(), candidate, expert)
         if isinstance(result, Columns):
             judged = work.trace(prepared(), candidate, expert).judged
             assert judged is not None

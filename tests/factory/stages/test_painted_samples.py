@@ -12,7 +12,7 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import load_config, run_config
-from factory.graph.steps import Columns, PreparedClip, attempted
+from factory.graph.steps import Columns, PreparedClip, run_attempt
 from factory.pipeline import FactoryWork
 from factory.setup.settings import assemble
 from tasks.render.scene.asset import psnr
@@ -38,7 +38,7 @@ def prepared_by(towns: Path, *words: str) -> tuple[FactoryWork, PreparedClip]:
 
 
 def row_of(work: FactoryWork, prepared: PreparedClip, candidate: int, expert: str) -> dict[str, object]:
-    found = attempted(work, prepared, candidate, expert)
+    found = run_attempt(work, prepared, candidate, expert)
     assert isinstance(found, Columns)
     return dict(found.row)
 

@@ -10,7 +10,7 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import load_config
-from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, RejectedAttempt, attempted
+from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, RejectedAttempt, run_attempt
 from factory.pipeline import FactoryWork, WholeClip
 from factory.readers.base import BadClip
 from factory.setup.settings import assemble, identity_of, refuse_missing_backend
@@ -50,7 +50,7 @@ def prepared_by(work: FactoryWork) -> PreparedClip:
 
 
 def first_sample(work: FactoryWork, prepared: PreparedClip) -> Columns:
-    results = (attempted(work, prepared, row.index, "pdm_closed") for row in prepared.candidates)
+    results = (run_attempt(work, prepared, row.index, "pdm_closed") for row in prepared.candidates)
     return next(result for result in results if isinstance(result, Columns))
 
 
@@ -59,7 +59,7 @@ def test_a_block_below_the_gate_drops_the_experts_and_keeps_the_human(small_town
     prepared = prepared_by(work)
     assert prepared.dropped is not None and (prepared.dropped.stage, prepared.dropped.reason) == ("render", "psnr")
     assert prepared.candidates == ()
-    human = attempted(work, prepared, HUMAN_CANDIDATE, HUMAN)
+    human = run_attempt(work, prepared, HUMAN_CANDIDATE, HUMAN)
     assert isinstance(human, Columns) and human.row["image_source"] == "photo"
 
 
@@ -70,7 +70,7 @@ def test_a_marked_block_keeps_its_candidates_and_tags_its_samples(small_town: Pa
     assert prepared.dropped is None
     marked = first_sample(work, prepared)
     assert marked.row["image_source"] == "render" and "low_psnr" in marked.row["tags"]  # type: ignore[operator]
-    human = attempted(work, prepared, HUMAN_CANDIDATE, HUMAN)
+    human = run_attempt(work, prepared, HUMAN_CANDIDATE, HUMAN)
     assert isinstance(human, Columns) and "low_psnr" not in human.row["tags"]  # type: ignore[operator]
 
 
@@ -78,14 +78,14 @@ def test_a_marked_block_keeps_its_candidates_and_tags_its_samples(small_town: Pa
 def test_a_drive_that_cannot_be_shown_is_dropped_and_the_human_s_is_not(small_town: Path, tmp_path: Path) -> None:
     strict = strict_on(small_town, tmp_path, contrast_min=1.0)
     prepared = prepared_by(strict)
-    results = [attempted(strict, prepared, row.index, "pdm_closed") for row in prepared.candidates]
+    results = [run_attempt(strict, prepared, row.index, "pdm_closed") for row in prepared.candidates]
     dropped = [
         result for result in results if isinstance(result, RejectedAttempt) and result.rejected.stage == "render"
     ]
     assert dropped and {result.rejected.reason for result in dropped} == {"blank"}
     assert not any(isinstance(result, Columns) for result in results)
     assert dropped[0].subscores["nc"] == 1.0  # the reward had accepted it
-    assert isinstance(attempted(strict, prepared, HUMAN_CANDIDATE, HUMAN), Columns)
+    assert isinstance(run_attempt(strict, prepared, HUMAN_CANDIDATE, HUMAN), Columns)
     for override in ("render.gate.enabled=false", "render=none", "render=map"):
         lenient = strict_on(small_town, tmp_path, override, contrast_min=1.0)
         assert isinstance(first_sample(lenient, prepared), Columns)
@@ -98,7 +98,7 @@ def test_a_drive_past_a_vehicle_unlike_its_photos_is_dropped_and_at_zero_it_is_n
     stored = {f"ring_front_center at step {step}" for step in (40, 45, 50, 55)}  # 1.5 s before T+H to T+H
     strict = strict_on(small_town, tmp_path, vehicle_min=1.0, vehicle_share=0.001)
     prepared = prepared_by(strict)
-    found = [attempted(strict, prepared, row.index, "pdm_closed") for row in prepared.candidates]
+    found = [run_attempt(strict, prepared, row.index, "pdm_closed") for row in prepared.candidates]
     dropped = [result.rejected for result in found if isinstance(result, RejectedAttempt)]
     details = [rejected.detail for rejected in dropped if rejected.reason == "unlike_photos"]
     assert details and {detail.split(":")[0] for detail in details} <= stored
@@ -127,7 +127,7 @@ def test_the_earlier_frame_of_a_pair_shows_its_own_instants_from_where_the_ego_w
     assert isinstance(prepared, PreparedClip)
     log, shown = work.reader.read(ref), []
     for expert, step in ((HUMAN, NOW), (HUMAN_BEFORE, NOW - 5)):
-        accepted = attempted(work, prepared, HUMAN_CANDIDATE, expert)
+        accepted = run_attempt(work, prepared, HUMAN_CANDIDATE, expert)
         assert isinstance(accepted, Columns)
         np.testing.assert_allclose(accepted.row["now_pose"], log.ego_states[step, :3], atol=1e-6)  # type: ignore[arg-type]
         shown.append({round(image["time_s"], 3): image for image in accepted.row["images"]})  # type: ignore[attr-defined]
@@ -148,7 +148,7 @@ def test_with_an_open_gate_the_log_s_future_is_the_label_of_every_perturbed_stat
     work = work_on(small_town, tmp_path, *OPEN, "render=none", "experts=[logged]")
     prepared = prepared_by(work)
     log = work.reader.read(work.reader.index().refs[0]).ego_states
-    results = [attempted(work, prepared, row.index, "logged") for row in prepared.candidates[:4]]
+    results = [run_attempt(work, prepared, row.index, "logged") for row in prepared.candidates[:4]]
     assert len(results) == 4
     for result in results:
         assert isinstance(result, Columns)
@@ -277,7 +277,7 @@ def test_the_log_s_own_drive_alone_needs_no_candidates_and_no_block(small_town: 
     prepared = work.prepare(ref)
     assert isinstance(prepared, PreparedClip)
     assert prepared.candidates == () and prepared.dropped is None and work.identity.prepare_digest == UNLISTED
-    accepted = attempted(work, prepared, HUMAN_CANDIDATE, "human")
+    accepted = run_attempt(work, prepared, HUMAN_CANDIDATE, "human")
     assert isinstance(accepted, Columns) and accepted.row["image_source"] == "photo"
     logged = work.reader.read(ref).ego_states[NOW : NOW + 1 + HORIZON_STEPS, :3]
     label = to_local(logged[0], logged[1:])  # to the last bit of a float32: no tracker drove it

@@ -9,7 +9,7 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.exits import BAD_CONFIG, COMPLETE, DAMAGED
-from factory.graph.driver import EpisodesWanted
+from factory.graph.driver import EpisodeSettings
 from factory.graph.execute import Execution, execute
 from factory.store.episodes import Message, episode_bytes
 from factory.store.location import Location, write_shard
@@ -30,7 +30,7 @@ EPISODE = episode_bytes([Message("/a", 0, {"x": 1})], {"id": "a"})
 
 
 def run(out: Path, *, clips: int = 3) -> int:
-    made = EpisodesWanted(1, lambda row, clip: EPISODE)
+    made = EpisodeSettings(1, lambda row, clip: EPISODE)
     experts, quiet = ["recovery", "human"], lambda line: None
     return execute(
         ToyWork(), refs(clips), experts, 2, Store(out), Execution("local", episodes=made), say=quiet

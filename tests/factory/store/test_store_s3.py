@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.graph.driver import EpisodesWanted
+from factory.graph.driver import EpisodeSettings
 from factory.graph.execute import Execution
 from factory.store.location import BadLocation, Location
 from factory.store.reader import SampleTable
@@ -54,7 +54,7 @@ def test_a_bucket_holds_the_same_episodes_as_a_folder_and_makes_up_for_lost_ones
             ["recovery"],
             1,
             out,
-            Execution("local", episodes=EpisodesWanted(1, prepared_episode)),
+            Execution("local", episodes=EpisodeSettings(1, prepared_episode)),
         )
     there, here = Location.parse(url, s3).child("episodes"), Location.parse(tmp_path).child("episodes")
     names = here.names()
@@ -67,7 +67,7 @@ def test_a_bucket_holds_the_same_episodes_as_a_folder_and_makes_up_for_lost_ones
         ["recovery"],
         1,
         Store(url, s3),
-        Execution("local", episodes=EpisodesWanted(1, prepared_episode)),
+        Execution("local", episodes=EpisodeSettings(1, prepared_episode)),
     )
     assert again.executed.episodes == 1 and there.read(names[0]) == here.read(names[0])
 
