@@ -125,7 +125,7 @@ def _export_all(request: Request) -> int:
     from factory.config.compose import need_run_extra
     from factory.datasets.navsim.export import export as export_all
     from factory.datasets.navsim.settings import ExportSettings
-    from factory.graph.each import WorkerDied, parallel_map
+    from factory.graph.parallel import WorkerDied, parallel_map
     from factory.graph.steps import TaskStopped
     from factory.store.location import Location
     from factory.store.reader import sample_table

@@ -28,7 +28,7 @@ from factory.config.arguments import command
 from factory.config.compose import ConfigError, need_run_extra
 from factory.exits import Failed, Stopped
 from factory.files import why_unusable
-from factory.graph.each import WorkerDied, parallel_map
+from factory.graph.parallel import WorkerDied, parallel_map
 from factory.graph.progress import Counter
 from factory.graph.steps import TaskStopped
 from factory.readers.base import ClipRef

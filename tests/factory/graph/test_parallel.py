@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from factory.graph.each import IN_HAND, WorkerDied, parallel_map
+from factory.graph.parallel import IN_HAND, WorkerDied, parallel_map
 from factory.graph.steps import TaskStopped
 from factory.store.location import BadLocation, Location
 from tests.factory.items import Elsewhere, OddItem, squared
@@ -119,7 +119,7 @@ def test_a_folder_that_a_node_does_not_see_is_named(tmp_path: Path, monkeypatch:
 @pytest.mark.slow
 def test_workers_end_with_a_driver_that_is_killed(tmp_path: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from factory.graph.each import each; "
+        "import sys; from pathlib import Path; from factory.graph.parallel import each; "
         "from tests.factory.items import noted; "
         f"list(each(noted, [Path({str(tmp_path)!r}, str(i)) for i in range(2)], workers=2))"
     )
@@ -134,7 +134,7 @@ def test_workers_end_with_a_driver_that_is_killed(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_workers_that_are_just_starting_do_not_hear_what_a_terminal_sends_to_all() -> None:
     code = (
-        "from factory.graph.each import each; from factory.graph.steps import TaskStopped; "
+        "from factory.graph.parallel import each; from factory.graph.steps import TaskStopped; "
         "from tests.factory.items import squared\n"
         "try:\n    list(each(squared, range(100), workers=2))\nexcept TaskStopped:\n    print('halted')"
     )
