@@ -109,7 +109,7 @@ def _checked(asked: Asked) -> RunConfig:
 
 
 def _run_again(words: Sequence[str], first_began: float, begun: int, tell: Callable[[str], None]) -> int:
-    """The run in its own process. first_began: of the first one, on the monotonic clock; begun: as of run_apart."""
+    """The run in its own process. first_began: of the first one, on the monotonic clock; begun: clusters begun anew."""
 
     def say(line: str) -> None:
         print(line, flush=True)

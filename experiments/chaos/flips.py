@@ -22,7 +22,7 @@ from factory.graph.execute import Execution, execute
 from factory.graph.steps import prepare
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table
 from factory.stages.scene_file import BadScene, read_scene, write_scene
-from factory.store.location import encode
+from factory.store.location import encode_tree
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.verify import damaged_logs, restore_logs, verify
@@ -53,7 +53,7 @@ def flipped(path: Path, flips: int, look: Callable[[], Outcome]) -> Counter[Outc
 def kinds(out: Path) -> dict[str, tuple[Path, int, Callable[[], Outcome]]]:
     """Kind -> a file, the share of the flips that it gets (one in n), and what to do with it."""
     work, store, ref = ToyWork(), Store(out), refs(1)[0]
-    prepared = encode(prepare(work, store.location, ref)[1])
+    prepared = encode_tree(prepare(work, store.location, ref)[1])
     cached = next(path for path in (out / "cache/prepared").iterdir() if path.name.startswith(ref.clip_id))
     shard = sorted(out.glob("samples/*/*/*.parquet"))[0]
     rows = [str(sample) for sample in SampleTable(out)]
@@ -65,7 +65,7 @@ def kinds(out: Path) -> dict[str, tuple[Path, int, Callable[[], Outcome]]]:
 
     def again() -> Outcome:
         report, clip = prepare(work, store.location, ref)
-        return "found" if getattr(report, "note", "") and encode(clip) == prepared else "other"
+        return "found" if getattr(report, "note", "") and encode_tree(clip) == prepared else "other"
 
     originals = {path: path.read_bytes() for path in (commit, copy)}
 

@@ -46,13 +46,13 @@ def main(request: Request) -> None:
     from factory.files import why_not_written
     from factory.store.location import BadLocation
     from factory.store.table import AnotherWriter
-    from factory.store.verify import RunGoesOn, hold, leftovers, refuse_held
+    from factory.store.verify import RunInProgress, claim_for_upkeep, leftovers, refuse_while_running
 
     store = open_store(request.out)
     try:
-        (refuse_held if request.say else hold)(store)
+        (refuse_while_running if request.say else claim_for_upkeep)(store)
         found = leftovers(store, request.older_s, time.time())
-    except (RunGoesOn, AnotherWriter, BadLocation, OSError) as error:
+    except (RunInProgress, AnotherWriter, BadLocation, OSError) as error:
         raise Refused(why_not_written(error) or str(error)) from error
     for name in found:
         if not request.say:

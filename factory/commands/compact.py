@@ -22,14 +22,14 @@ def main(request: Request) -> None:
     """Merge and say what became of each table. Raises Refused."""
     from factory.store.location import BadLocation, DamagedFile
     from factory.store.table import AnotherWriter
-    from factory.store.verify import RunGoesOn, compact, hold
+    from factory.store.verify import RunInProgress, claim_for_upkeep, compact
 
     store = open_store(request.out)
     try:
-        hold(store)
+        claim_for_upkeep(store)
         for merged in compact(store):
             print(f"{merged.table:<13}{merged.before} files, now {merged.after}")
-    except (RunGoesOn, AnotherWriter, BadLocation) as error:
+    except (RunInProgress, AnotherWriter, BadLocation) as error:
         raise Refused(str(error)) from error
     except DamagedFile as error:
         raise Refused(f"{error}; python -m factory verify out={request.out} repair=true takes it out") from error

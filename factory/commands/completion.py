@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from factory.commands.table import COMMANDS, DOORS
-from factory.config.arguments import RUN, WORD, ComposedCommand, given_as, groups_of, keys_of
+from factory.config.arguments import POSITIONAL, RUN_SETTINGS, ComposedCommand, given_as, groups_of, keys_of
 from factory.config.compose import conf_dir
 from factory.config.plugins import choices
 from factory.config.run import EXPERTS, built_in_classes, reader_of
@@ -69,7 +69,7 @@ compdef _factory_python python python3
 class Request:
     """The command line."""
 
-    shell: Literal["bash", "zsh"] = field(metadata=WORD)
+    shell: Literal["bash", "zsh"] = field(metadata=POSITIONAL)
 
 
 def main(request: Request) -> None:
@@ -104,9 +104,9 @@ def candidates(words: Sequence[str], last: str, door: str = "factory") -> Iterab
     if shape is None:
         known = settings_of(given, module.main)
     else:
-        known |= settings_of(given) if given_as(shape, RUN) else {}
+        known |= settings_of(given) if given_as(shape, RUN_SETTINGS) else {}
         known |= {key: choices_of(kind) for key, kind in keys_of(shape).items()}
-        if (words := given_as(shape, WORD)) and not given and known[words[0]]:
+        if (words := given_as(shape, POSITIONAL)) and not given and known[words[0]]:
             return known[words[0]]
     key, equals, _ = last.partition("=")
     if equals:

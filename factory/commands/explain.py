@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from factory.config.arguments import RUN, Refused
+from factory.config.arguments import RUN_SETTINGS, Refused
 from factory.config.run import composed_run, run_config
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 
@@ -33,7 +33,7 @@ class Request:
     expert: str = "pdm_closed"
     tries: int = 6  # candidates to try before giving up on an accepted one
     to: str = "explain"  # folder for the pictures
-    settings: tuple[str, ...] = field(default=(), metadata=RUN)
+    settings: tuple[str, ...] = field(default=(), metadata=RUN_SETTINGS)
 
 
 def main(request: Request) -> int:

@@ -27,7 +27,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from factory.config.arguments import WORD, Refused
+from factory.config.arguments import POSITIONAL, Refused
 from factory.datasets.navsim.settings import Layout, Missing
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.views.show import find, logged_drive, open_samples
@@ -44,7 +44,7 @@ Row = Mapping[str, Any]
 class Request:
     """The command line."""
 
-    format: Literal["mcap", "mp4", "rerun", "navsim"] = field(metadata=WORD)
+    format: Literal["mcap", "mp4", "rerun", "navsim"] = field(metadata=POSITIONAL)
     out: str
     sample: str | None = None
     every: int | None = None

@@ -35,7 +35,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from factory.config.arguments import WORD, Refused
+from factory.config.arguments import POSITIONAL, Refused
 from factory.wording import one_line
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ CAMERAS = "nuscenes-cameras"
 class Request:
     """The command line."""
 
-    source: Literal["simscale", "navhard", "navtest", "nuscenes-cameras"] = field(metadata=WORD)
+    source: Literal["simscale", "navhard", "navtest", "nuscenes-cameras"] = field(metadata=POSITIONAL)
     root: str
     out: str
     maps: str | None = None

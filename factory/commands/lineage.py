@@ -8,7 +8,7 @@ Run -> clip -> candidate -> attempt -> sample, with digests, versions and files.
 
 from dataclasses import dataclass, field
 
-from factory.config.arguments import WORD
+from factory.config.arguments import POSITIONAL
 from factory.views.lineage import lineage
 from factory.views.status import open_store
 
@@ -18,7 +18,7 @@ class Request:
     """The command line."""
 
     out: str
-    sample: str = field(metadata=WORD)
+    sample: str = field(metadata=POSITIONAL)
 
 
 def main(request: Request) -> None:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from factory.config.arguments import SOME, Refused
+from factory.config.arguments import SOME_RUN_SETTINGS, Refused
 from factory.exits import COMPLETE
 from factory.views.status import IMPORT_AGAIN, failed_lines, open_store
 
@@ -31,7 +31,7 @@ class Request:
     """The command line."""
 
     out: str
-    settings: tuple[str, ...] = field(default=(), metadata=SOME)
+    settings: tuple[str, ...] = field(default=(), metadata=SOME_RUN_SETTINGS)
 
 
 def main(request: Request) -> int:

@@ -25,7 +25,7 @@ from pathlib import Path
 from threading import Event
 from typing import Literal
 
-from factory.config.arguments import WORD, Refused
+from factory.config.arguments import POSITIONAL, Refused
 from factory.exits import asked_to_stop
 
 PORT = 8267  # the dashboard is at 8266
@@ -35,8 +35,8 @@ PORT = 8267  # the dashboard is at 8266
 class Request:
     """The command line."""
 
-    action: Literal["info", "export", "import", "view"] = field(metadata=WORD)
-    files: tuple[str, ...] = field(metadata=WORD)
+    action: Literal["info", "export", "import", "view"] = field(metadata=POSITIONAL)
+    files: tuple[str, ...] = field(metadata=POSITIONAL)
     to: str | None = None
     like: str | None = None
     origin: str | None = None

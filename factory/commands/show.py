@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from factory.config.arguments import WORD, Refused
+from factory.config.arguments import POSITIONAL, Refused
 from factory.views.show import (
     find,
     label_lines,
@@ -37,7 +37,7 @@ class Request:
     """The command line."""
 
     out: str
-    sample: str | None = field(default=None, metadata=WORD)  # attempt_id, its beginning, or an ordinal
+    sample: str | None = field(default=None, metadata=POSITIONAL)  # attempt_id, its beginning, or an ordinal
     list: bool = False  # the ids, one a line, and no sample
     to: str | None = None  # folder or .png of the picture
     film: bool = False  # beside the picture

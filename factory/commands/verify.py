@@ -15,7 +15,7 @@ import sys
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from factory.config.arguments import WORD, Refused
+from factory.config.arguments import POSITIONAL, Refused
 from factory.exits import COMPLETE, DAMAGED
 from factory.views.status import open_store, out_of
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 class Request:
     """The command line."""
 
-    out: str = field(metadata=WORD)
+    out: str = field(metadata=POSITIONAL)
     repair: bool = False  # what can be
 
 
@@ -36,7 +36,7 @@ def main(request: Request) -> int:
     from factory.store.location import BadLocation
     from factory.store.samples import OtherSchema, refuse_other_schema
     from factory.store.table import AnotherWriter, DamagedLog
-    from factory.store.verify import RunGoesOn, damaged_logs, drop_damaged, hold, restore_logs
+    from factory.store.verify import RunInProgress, claim_for_upkeep, damaged_logs, drop_damaged, restore_logs
 
     out = out_of(request.out)
     try:
@@ -52,7 +52,7 @@ def main(request: Request) -> int:
         store = open_store(request.out)
         verdict = _verify_again(request.out)
         if request.repair and verdict.files:
-            hold(store)
+            claim_for_upkeep(store)
             drop_damaged(store, verdict)
             for name in verdict.files:
                 print(f"taken out {name}")
@@ -60,7 +60,7 @@ def main(request: Request) -> int:
     except DamagedLog as error:
         print(f"DAMAGED {error}")
         return DAMAGED
-    except (RunGoesOn, AnotherWriter, BadLocation, OtherSchema) as error:
+    except (RunInProgress, AnotherWriter, BadLocation, OtherSchema) as error:
         raise Refused(str(error)) from error
     for line in verdict.damage:
         print(f"DAMAGED {line}")

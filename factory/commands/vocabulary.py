@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from factory.config.arguments import SOME, Refused, keys_of
+from factory.config.arguments import SOME_RUN_SETTINGS, Refused, keys_of
 from factory.config.words import nearest
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class Request:
     vocabularies: tuple[str, ...] = ()  # files whose trajectories go into the table too
     every_s: float = 0.5  # a window starts this often
     kinematic: bool = False  # out: k seeded trajectories, as a run without vocabulary.file has; reads no clips
-    settings: tuple[str, ...] = field(default=(), metadata=SOME)
+    settings: tuple[str, ...] = field(default=(), metadata=SOME_RUN_SETTINGS)
 
     def __post_init__(self) -> None:
         for key, equals, _ in (word.lstrip("+").partition("=") for word in self.settings):

@@ -8,14 +8,14 @@ Each is compiled once per machine, processor and version; what is there is not c
 
 from dataclasses import dataclass, field
 
-from factory.config.arguments import WORD, Refused
+from factory.config.arguments import POSITIONAL, Refused
 
 
 @dataclass(frozen=True)
 class Request:
     """The command line."""
 
-    parts: tuple[str, ...] = field(default=(), metadata=WORD)
+    parts: tuple[str, ...] = field(default=(), metadata=POSITIONAL)
 
 
 def main(request: Request) -> None:

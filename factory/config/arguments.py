@@ -20,10 +20,10 @@ from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUP
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-# Metadata of a field. Of WORD: it may stand without its key; the fields in their order, a tuple for all that is left.
-WORD = {"given": "word"}
-RUN = {"given": "run"}  # it takes every argument that is no field: settings of the run
-SOME = {**RUN, "of": "some"}  # of them what is given alone: the others are recorded, or of no use here
+# Metadata of a field. POSITIONAL: it may stand without its key; such fields in their order, a tuple for what is left.
+POSITIONAL = {"given_as": "positional"}
+RUN_SETTINGS = {"given_as": "run settings"}  # it takes every argument that is no field: settings of the run
+SOME_RUN_SETTINGS = {**RUN_SETTINGS, "of": "some"}  # what is given alone: the rest is recorded, or of no use here
 NOT_FITTING = (ValueError, OSError)  # what settings or files that do not fit raise, where no fault of a stage can
 Request = TypeVar("Request", bound="DataclassInstance")
 Does = Callable[[Sequence[str]], int | None]  # arguments -> exit code, none for 0
@@ -158,7 +158,7 @@ def parse(shape: type[Request], argv: Sequence[str]) -> Request:
     default that is not given; with --cfg SettingsShown instead, whatever is not given yet.
     """
     argv, shows = without_show(argv)
-    kinds, words, rest = keys_of(shape), given_as(shape, WORD), given_as(shape, RUN)
+    kinds, words, rest = keys_of(shape), given_as(shape, POSITIONAL), given_as(shape, RUN_SETTINGS)
     given: dict[str, Any] = dict.fromkeys(rest, ())
     for argument in argv:
         key, equals, value = argument.partition("=")
@@ -195,7 +195,7 @@ def parse(shape: type[Request], argv: Sequence[str]) -> Request:
 
 def keys_of(shape: type["DataclassInstance"]) -> dict[str, Any]:
     """Key -> type of a request's fields, less the one that takes the settings of the run."""
-    hints, rest = get_type_hints(shape), given_as(shape, RUN)
+    hints, rest = get_type_hints(shape), given_as(shape, RUN_SETTINGS)
     return {field.name: hints[field.name] for field in fields(shape) if field.name not in rest}
 
 
@@ -209,11 +209,11 @@ def _shown(shape: type["DataclassInstance"], given: Mapping[str, Any]) -> Iterat
     own = keys_of(shape)
     values = {**_values(shape), **{name: plain(value) for name, value in given.items()}}
     yield from described({name: values[name] for name in own}, shape, {})
-    for name in given_as(shape, RUN):
+    for name in given_as(shape, RUN_SETTINGS):
         groups = {re.split("[=.@]", word.lstrip("+"))[0] for word in given[name]}
         keeps = True
         for line in _settings_of_run(given[name]).splitlines():
-            if name in given_as(shape, SOME) and not line.startswith(" "):
+            if name in given_as(shape, SOME_RUN_SETTINGS) and not line.startswith(" "):
                 keeps = line.partition(":")[0] in groups
             if keeps:
                 yield line

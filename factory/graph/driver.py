@@ -49,9 +49,9 @@ from factory.graph.steps import (
     PrepareReport,
 )
 from factory.readers.base import ClipRef
-from factory.store.episodes import FOLDER, episode_name, is_chosen
+from factory.store.episodes import EPISODES_FOLDER, episode_name, has_episode
 from factory.store.location import Shard
-from factory.store.samples import ClipCandidates, ErrorKind, Kind, Outcome, Past, Store
+from factory.store.samples import ClipCandidates, ErrorKind, Kind, Outcome, PastAttempt, Store
 from factory.store.schema import RunIdentity, Stamp, attempt_id
 from tasks.stages import Rejected
 
@@ -82,7 +82,7 @@ class Episodes:
         """refs: the run's clips; episodes of others are left as they are."""
         self._store, self._wanted = store, wanted
         self._refs = {ref.clip_id: ref for ref in refs}
-        self._folder = store.location.child(FOLDER)
+        self._folder = store.location.child(EPISODES_FOLDER)
         self._there = set(self._folder.names())
         self._queue: deque[EpisodeBatch] = deque()
         self._writing: set[Ticket] = set()
@@ -130,7 +130,7 @@ class Episodes:
         missing: dict[str, ClipRef] = {}
         for row in self._store.samples.read_file(path, partition, ROWS).to_pylist():
             name = episode_name(row)
-            chosen = is_chosen(row["attempt_id"], self._wanted.every)
+            chosen = has_episode(row["attempt_id"], self._wanted.every)
             if chosen and name not in self._there and row["clip_id"] in self._refs:
                 missing[row["attempt_id"]] = self._refs[row["clip_id"]]
                 self._there.add(name)  # asked for once
@@ -363,7 +363,7 @@ class RunDriver:
         plan: RunPlan,
         digests: Mapping[str, str],
         rounds: int,
-        policy: Callable[[Past], bool],
+        policy: Callable[[PastAttempt], bool],
         block_of: BlockOf,
         doing: Callable[[], str],
     ) -> None:
@@ -631,9 +631,9 @@ class RunDriver:
         self._advance(trial.clip, trial.walk, trial.prepared)
 
     def _take_batch(self, trial: AttemptInFlight, rows: Sequence[Any], done: BatchReport) -> None:
-        stamp, accepted = trial.stamp, 0
+        first, accepted = trial.stamp, 0
         for i, report in enumerate(done.reports):
-            stamp = stamp.of(trial.clip.ref.clip_id, trial.stamp.candidate_index + i, trial.stamp.round + accepted)
+            stamp = first.of_attempt(trial.clip.ref.clip_id, first.candidate_index + i, first.round + accepted)
             is_accepted = isinstance(report, AttemptReport) and report.rejected is None
             self._settle_attempt(trial, stamp, rows[accepted] if is_accepted else None, report)
             accepted += is_accepted
@@ -649,7 +649,7 @@ class RunDriver:
         if isinstance(report, AttemptReport):
             self._count(report.seconds, self._forecast.samples)
         if isinstance(report, AttemptReport) and report.rejected is None:
-            walk.known[stamp.candidate_index] = Past(stamp.attempt_id, Kind.ACCEPTED, True, round=stamp.round)
+            walk.known[stamp.candidate_index] = PastAttempt(stamp.attempt_id, Kind.ACCEPTED, True, round=stamp.round)
             row = PendingRow(result, report.n_bytes, (stamp.round, stamp.expert), report.licence)
             self._keep(clip, walk, rows=[row], replaced=replaced)
             self._tally.accepted += 1
@@ -686,7 +686,7 @@ class RunDriver:
         held_rows.extend(rows)
         held_outcomes.extend(outcomes)
 
-    def _may_retry(self, past: Past) -> bool:
+    def _may_retry(self, past: PastAttempt) -> bool:
         return past.attempt_id not in self._fresh and self._policy(past)
 
     def _count(self, seconds: Mapping[str, float], work: Workload) -> None:

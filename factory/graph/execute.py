@@ -134,7 +134,7 @@ class _Run:
     def plan(self) -> RunSummary | None:
         """What is left to do; how the run ends where the tables are another's, or cannot be read."""
         try:
-            self._records = self._store.agree(self._identity, self._digests, self._how.on_change)
+            self._records = self._store.checked_records(self._identity, self._digests, self._how.on_change)
             kept = self._how.on_change == "stop" and self._records[-1]["on_change"] == "keep"
             self._on_change: OnChange = "keep" if kept else self._how.on_change
             plan = self._planned(not self._store.starts_over(self._records))
@@ -225,11 +225,11 @@ class _Run:
     def _begin(self) -> None:
         """The run's first words in the tables; planned again where another run committed while this one got ready."""
         store, once = self._store, self._work.once
-        if store.begin(self._records):
+        if store.begin_run(self._records):
             self._follow(self._planned(True))
             self._died = []
         wanted = {expert: 1 if once(expert) else self._rounds for expert in self._experts}
-        store.plan(wanted, [ref.clip_id for ref in self._refs])
+        store.record_plan(wanted, [ref.clip_id for ref in self._refs])
         if self._died:
             store.commit([], [], self._died)
             died_at = self._died[0].error.partition(": ")[2]

@@ -12,15 +12,15 @@ from factory.readers.base import ClipRef
 from factory.store.samples import (
     QUARANTINE_AFTER,
     WAYS_OUT,
+    CandidateSummary,
     ChangedRun,
     ClipCandidates,
     ErrorKind,
     History,
     Kind,
-    Listed,
     OnChange,
     Outcome,
-    Past,
+    PastAttempt,
 )
 from factory.store.schema import UNLISTED, RunIdentity, Stamp, attempt_id
 from tasks.stages import Rejected
@@ -72,7 +72,11 @@ def candidate_order(once: bool, n_candidates: int) -> Sequence[int]:
 
 
 def next_step(
-    once: bool, n_candidates: int, rounds: int, known: Mapping[int, Past], may_retry: Callable[[Past], bool]
+    once: bool,
+    n_candidates: int,
+    rounds: int,
+    known: Mapping[int, PastAttempt],
+    may_retry: Callable[[PastAttempt], bool],
 ) -> Step:
     """Where the walk stands. An expert that is tried `once` has one attempt in round 0 whatever `rounds` is."""
     wanted = 1 if once else rounds
@@ -111,22 +115,22 @@ def next_batch(
     return AttemptBatch(n, min(n, rounds - begins.round))
 
 
-def retry_policy(retry: bool, versions_json: str) -> Callable[[Past], bool]:
+def retry_policy(retry: bool, versions_json: str) -> Callable[[PastAttempt], bool]:
     """Which failures of earlier runs this run tries again: those of machine, system and limits; with `retry`, or under
     other stage versions than the failure's, all."""
 
-    def may_retry(past: Past) -> bool:
+    def may_retry(past: PastAttempt) -> bool:
         return retry or past.error_kind in TRIED_AGAIN or past.stage_versions != versions_json
 
     return may_retry
 
 
-def tries_so_far(past: Past | None) -> int:
+def tries_so_far(past: PastAttempt | None) -> int:
     """Runs that already failed at this attempt and count against it."""
     return past.tries if past is not None and past.error_kind in TRIED_AGAIN else 0
 
 
-Policy = Callable[[Past], bool]
+Policy = Callable[[PastAttempt], bool]
 CLIP_CANDIDATE = HUMAN_CANDIDATE  # of a row about the clip as a whole (its expert is empty)
 
 
@@ -136,13 +140,13 @@ class WalkState:
 
     expert: str
     once: bool  # tried once, on the log itself
-    recall: Callable[[], dict[int, Past]]  # what the tables say of it
+    recall: Callable[[], dict[int, PastAttempt]]  # what the tables say of it
     stale: frozenset[str] = frozenset()  # redo: attempt_ids whose rows this walk replaces as a whole
     n_found: int = 0  # samples that were there when the run began
     one_by_one: bool = False  # a task that was to make several of its attempts died
 
     @cached_property
-    def known(self) -> dict[int, Past]:
+    def known(self) -> dict[int, PastAttempt]:
         """Candidate -> what became of it; unpacked when it is asked for, and until it is put away."""
         return self.recall()
 
@@ -164,8 +168,8 @@ class ClipPlan:
 
     ref: ClipRef
     walks: tuple[WalkState, ...]
-    past: Past | None  # the clip-level outcome, where there is one
-    listed: Listed | None  # its row in `candidates`, where it is this run's
+    past: PastAttempt | None  # the clip-level outcome, where there is one
+    listed: CandidateSummary | None  # its row in `candidates`, where it is this run's
     stale: frozenset[str]  # redo: clip-level rows to replace
     n_candidates: int
     content: str | None  # digest that the rows which are to stay were made from
@@ -205,7 +209,7 @@ def make_plan(
     found = 0
     others = history.clips_of({*history.experts} - {"", *experts})
     whole_clips = history.clips_of([""])
-    ended = {expert: history.complete(expert, *_asked(once(expert), rounds)) for expert in experts}
+    ended = {expert: history.complete_walks(expert, *_asked(once(expert), rounds)) for expert in experts}
     for ref in refs:
         stored = listed = history.candidates.get(ref.clip_id)
         if stored is not None and _of_other_settings(stored, identity):
@@ -248,11 +252,11 @@ def _asked(once: bool, rounds: int) -> tuple[int, int]:
 
 
 def _complete(
-    history: History, ref: ClipRef, listed: Listed, n_found: Mapping[str, int], once: Callable[[str], bool]
+    history: History, ref: ClipRef, listed: CandidateSummary, n_found: Mapping[str, int], once: Callable[[str], bool]
 ) -> ClipPlan:
     """A clip of which nothing is unpacked; n_found: expert -> samples."""
     walks = tuple(
-        WalkState(expert, once(expert), partial(history.known, ref.clip_id, expert), n_found=n)
+        WalkState(expert, once(expert), partial(history.past_attempts, ref.clip_id, expert), n_found=n)
         for expert, n in n_found.items()
     )
     steps: dict[str, Step] = dict.fromkeys(n_found, Complete())
@@ -279,18 +283,18 @@ def _refuse_mixing(
             )
 
 
-def _of_other_settings(stored: Listed, identity: RunIdentity) -> bool:
+def _of_other_settings(stored: CandidateSummary, identity: RunIdentity) -> bool:
     return stored.prepare_digest not in (identity.prepare_digest, UNLISTED) and identity.prepare_digest != UNLISTED
 
 
 def _walk(history: History, clip_id: str, expert: str, on_change: OnChange, once: bool) -> WalkState:
-    stale = history.stale(clip_id, expert) if on_change == "redo" else frozenset()
+    stale = history.stale_ids(clip_id, expert) if on_change == "redo" else frozenset()
     if stale:  # the walk is made anew from its first candidate; what an earlier redo failed at stands
-        known = history.known(clip_id, expert)
+        known = history.past_attempts(clip_id, expert)
         stale |= {past.attempt_id for past in known.values()}
         failed = {i: past for i, past in known.items() if past.current and past.kind is Kind.FAILED}
         return WalkState(expert, once, partial(dict, failed), stale)
-    return WalkState(expert, once, partial(history.known, clip_id, expert))
+    return WalkState(expert, once, partial(history.past_attempts, clip_id, expert))
 
 
 def _has_work(clip: ClipPlan, rounds: int, may_retry: Policy) -> bool:
@@ -382,10 +386,10 @@ class RunRecords:
         return ClipCandidates(*read, *under, gates, clip.candidates, dropped.stage, dropped.reason)
 
 
-def past_from_outcome(outcome: Outcome) -> Past:
+def past_from_outcome(outcome: Outcome) -> PastAttempt:
     """The same as the tables of a later run will tell it."""
     kind = Kind(outcome.kind)
-    return Past(outcome.attempt_id, kind, True, -1, outcome.error_kind, outcome.tries, outcome.stage_versions)
+    return PastAttempt(outcome.attempt_id, kind, True, -1, outcome.error_kind, outcome.tries, outcome.stage_versions)
 
 
 # A run that died at a task: the next one counts it against that clip or attempt, and comes to it last.
@@ -397,7 +401,7 @@ def read_crash(folder: Path) -> Mapping[str, Any]:
 
 
 def count_crash(
-    crash: Mapping[str, Any], plan: RunPlan, records: RunRecords, may_retry: Callable[[Past], bool]
+    crash: Mapping[str, Any], plan: RunPlan, records: RunRecords, may_retry: Callable[[PastAttempt], bool]
 ) -> tuple[RunPlan, list[Outcome]]:
     """The plan that knows of a crash, and the outcome to be stored before anything is begun."""
     suspect = next((clip for clip in plan.todo if _is_of(crash, clip, records)), None)

@@ -16,9 +16,9 @@ import pyarrow as pa
 
 from factory.files import machine_fault_of, refused_as_the_runs_own, why_disk_full
 from factory.readers.base import BadClip, ClipRef, Unreadable
-from factory.store.episodes import FOLDER, episode_name
+from factory.store.episodes import EPISODES_FOLDER, episode_name
 from factory.store.location import BadCacheFile, ClipCache, Location, SceneFiles, Shard, write_shard
-from factory.store.reader import samples_of
+from factory.store.reader import read_samples
 from factory.store.samples import CandidateRow, ErrorKind
 from factory.store.schema import SAMPLES, RunIdentity, Stamp, sample_row_to_table
 from factory.wording import one_line
@@ -397,14 +397,14 @@ def episodes(work: Work, out: Location, wanted: EpisodeBatch) -> tuple[EpisodesR
     """Committed samples as MCAP files beside their table; the log's drive comes from the prepared clip."""
     written, errors = 0, []
     try:
-        for row in samples_of(out.child("samples"), wanted.path, wanted.partition, wanted.refs):
+        for row in read_samples(out.child("samples"), wanted.path, wanted.partition, wanted.refs):
             key = row["attempt_id"]
             report, clip = prepare(work, out, wanted.refs[key], row["content_digest"])
             if clip is None:
                 errors.append(f"clip {row['clip_id']}: {report.error if isinstance(report, Failure) else report}")
                 continue
             try:
-                out.child(FOLDER).write(episode_name(row), wanted.make(row, clip))
+                out.child(EPISODES_FOLDER).write(episode_name(row), wanted.make(row, clip))
                 written += 1
             except Exception as error:  # one that cannot be made costs no other
                 errors.append(f"sample {key}: {failure_from_error(error).error.splitlines()[-1]}")

@@ -18,7 +18,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
-FOLDER = "episodes"  # beside the table, of those that a run writes
+EPISODES_FOLDER = "episodes"  # beside the table, of those that a run writes
 LIBRARY = "driving-data-factory"
 CHUNK_BYTES = 1 << 20
 DATA_END = b"\x0f" + (4).to_bytes(8, "little")  # opcode and length; the checksum of everything before follows
@@ -34,7 +34,7 @@ class Message:
     content: Any  # a message of protobuf, or a mapping
 
 
-def is_chosen(attempt_id: str, every: int) -> bool:
+def has_episode(attempt_id: str, every: int) -> bool:
     """One sample in `every`, by its id alone; 1: all, 0: none."""
     return every > 0 and zlib.crc32(attempt_id.encode()) % every == 0
 

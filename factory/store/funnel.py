@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from factory.store.samples import MADE_UNDER, Kind, Store, plans_of, run_number
-from factory.store.table import Codes, Ints, codes, combinations
+from factory.store.samples import MADE_UNDER, Kind, Store, plans_of, run_number_lookup
+from factory.store.table import Codes, Ints, distinct_texts, text_codes
 from tasks.stages import ATTEMPT, STAGES, TASKS
 
 # All attempts of a store as columns of integers: what counts over millions of rows is drawn from.
@@ -72,12 +72,12 @@ class Attempts:
         return before
 
 
-def attempts_of(samples: pa.Table, outcomes: pa.Table, runs: Sequence[Mapping[str, Any]]) -> Attempts:
+def attempts_from_tables(samples: pa.Table, outcomes: pa.Table, runs: Sequence[Mapping[str, Any]]) -> Attempts:
     """From rows with the columns SAMPLE_COLUMNS and OUTCOME_COLUMNS; runs: the records of run.json, oldest first."""
     rows = pa.concat_tables([outcomes.select(ATTEMPT_COLUMNS), samples.select(ATTEMPT_COLUMNS)])
     n_outcomes, n_ages = outcomes.num_rows, 2 * len(runs) + 2
-    clip, clip_ids = codes(rows["clip_id"])
-    expert, experts = codes(rows["expert"])
+    clip, clip_ids = text_codes(rows["clip_id"])
+    expert, experts = text_codes(rows["expert"])
     candidate = rows["candidate_index"].to_numpy()
     why, whys, task = _whys(outcomes)
     why = np.concatenate([why, np.zeros(samples.num_rows, np.int32)])
@@ -116,7 +116,7 @@ def _last_of_each(place: Ints, n_ages: int) -> Ints:
 
 def _whys(outcomes: pa.Table) -> tuple[Codes, tuple[str, ...], Codes]:
     """What became of the rows of `outcomes`, in words, of which the first is for samples; the tasks they ended in."""
-    found, at = combinations(outcomes, ("kind", "stage", "reason", "error_kind"))
+    found, at = distinct_texts(outcomes, ("kind", "stage", "reason", "error_kind"))
     words = [_why(*row) for row in found]
     known = list(dict.fromkeys([ACCEPTED, EXHAUSTED, *words]))
     tasks = np.array([_task(stage) for _, stage, _, _ in found], np.int32)
@@ -135,10 +135,10 @@ def _why(kind: str, stage: str, reason: str, error_kind: str) -> str:
 
 
 def _ages(rows: pa.Table, runs: Sequence[Mapping[str, Any]]) -> Codes:
-    """The number of the run that each row is of (factory.store.samples.run_number)."""
+    """The number of the run that each row is of (factory.store.samples.run_number_lookup)."""
     names = [name for name in MADE_UNDER if name != "attempt_id"]
-    found, at = combinations(rows, names)
-    number = run_number(runs)
+    found, at = distinct_texts(rows, names)
+    number = run_number_lookup(runs)
     made = [dict(zip(names, texts)) for texts in found]
     return np.array([number(row) for row in made], np.int32)[at]
 
@@ -195,7 +195,7 @@ class BalanceSheet:
         return sink.getvalue()
 
 
-def balance_of(plans: pa.Table, attempts: Attempts, lists: pa.Table) -> BalanceSheet:
+def balance_sheet(plans: pa.Table, attempts: Attempts, lists: pa.Table) -> BalanceSheet:
     """Of tables in hand; lists: rows of `candidates` with BALANCE_COLUMNS."""
     clips, rounds = planned_rounds(plans)
     if not len(clips):
@@ -412,7 +412,7 @@ def funnel_of_tables(
 
     runs: the records of run.json, oldest first.
     """
-    attempts = attempts_of(samples, outcomes, runs)
+    attempts = attempts_from_tables(samples, outcomes, runs)
     exhausted = np.bincount(attempts.expert[attempts.exhausted], minlength=len(attempts.experts))
     of_clips = np.zeros(len(attempts.whys), np.int64)
     if "" in attempts.experts:
@@ -432,7 +432,7 @@ def funnel_of_tables(
         gates=_gates(lists["gate_counts"]),
         candidates=pc.sum(lists["n_candidates"]).as_py() or 0,
         exhausted={name: n for name, n in zip(attempts.experts, exhausted.tolist()) if n},
-        balance=balance_of(plans, attempts, lists),
+        balance=balance_sheet(plans, attempts, lists),
     )
 
 

@@ -234,7 +234,7 @@ def _leaf_paths(path: str, kind: pa.DataType) -> list[str]:
     return [path]
 
 
-def with_partition(stored: pa.Table, schema: pa.Schema, partition: Mapping[str, object]) -> pa.Table:
+def with_partition_columns(stored: pa.Table, schema: pa.Schema, partition: Mapping[str, object]) -> pa.Table:
     """The columns of `schema` from what a file holds and what the log says of it."""
     n = stored.num_rows
     arrays = [pa.repeat(pa.scalar(partition[f.name]), n) if f.name in partition else stored[f.name] for f in schema]
@@ -242,7 +242,7 @@ def with_partition(stored: pa.Table, schema: pa.Schema, partition: Mapping[str, 
     return pa.table(same, schema=schema)
 
 
-def encoded_text(field: pa.Field) -> pa.Field:
+def dictionary_encoded(field: pa.Field) -> pa.Field:
     """The column with its texts as numbers into a dictionary."""
     return field.with_type(pa.dictionary(pa.int32(), pa.string())) if field.type == pa.string() else field
 
@@ -257,13 +257,13 @@ def open_parquet(location: Location, path: str) -> pq.ParquetFile:
 def read_parquet(location: Location, path: str, schema: pa.Schema, without: Collection[str] = ()) -> pa.Table:
     """The columns of `schema` that stand in a file. Raises DamagedFile for a damaged page."""
     names = [name for name in schema.names if name not in without]
-    with naming(f"{location.uri}/{path}"):
+    with raising_damaged_file(f"{location.uri}/{path}"):
         file = open_parquet(location, path)
         return file.read(columns=names, use_threads=not location.is_local)  # threads cost more than small columns do
 
 
 @contextmanager
-def naming(path: str) -> Iterator[None]:
+def raising_damaged_file(path: str) -> Iterator[None]:
     """What is raised while a Parquet file is read, by a damaged page, footer or schema, is a DamagedFile."""
     try:
         yield
@@ -289,7 +289,7 @@ class BadCacheFile(ValueError):
     """A cache file is damaged or not one of ours."""
 
 
-def encode(value: object) -> bytes:
+def encode_tree(value: object) -> bytes:
     """A tree of dataclasses, enums, dicts, tuples, lists, frozensets, numpy arrays and plain scalars as bytes.
 
     Raises TypeError naming the type of anything else.
@@ -301,7 +301,7 @@ def encode(value: object) -> bytes:
     return sink.getvalue()
 
 
-def decode(data: bytes) -> Any:
+def decode_tree(data: bytes) -> Any:
     """The opposite. Raises BadCacheFile."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as stored:
@@ -322,11 +322,11 @@ class ClipCache:
     def load(self, key: str) -> object | None:
         """The stored value, None where there is none. Raises BadCacheFile."""
         data = self.location.read(f"{key}.npz")
-        return None if data is None else decode(_whole(data, key))
+        return None if data is None else decode_tree(_whole(data, key))
 
     def store(self, key: str, value: object) -> None:
         """Whole or not at all."""
-        self.location.write(f"{key}.npz", sealed(encode(value), key))
+        self.location.write(f"{key}.npz", sealed(encode_tree(value), key))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -337,7 +337,7 @@ class SceneFiles:
 
     def store(self, scenes: "BenchmarkClip | GivenScenes | OneStageClip") -> None:
         """Whole or not at all; in place of an older one."""
-        self.location.write(f"{scenes.clip.clip_id}.npz", sealed(encode(scenes)))
+        self.location.write(f"{scenes.clip.clip_id}.npz", sealed(encode_tree(scenes)))
 
     def load(self, clip_id: str) -> "BenchmarkClip | GivenScenes | OneStageClip":
         """Raises FileNotFoundError where the clip has none, BadCacheFile, naming it, for a damaged or foreign file."""
@@ -347,7 +347,7 @@ class SceneFiles:
         if data is None:
             raise FileNotFoundError(f"{path}: no scenes of this clip; run the factory again")
         try:
-            scenes = decode(_whole(data))
+            scenes = decode_tree(_whole(data))
         except BadCacheFile as error:
             raise BadCacheFile(f"{path}: {error}; remove it, {_AGAIN}") from error
         if not isinstance(scenes, BenchmarkClip | GivenScenes | OneStageClip):

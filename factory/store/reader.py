@@ -21,9 +21,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from factory.readers.pictures import BadPicture, decode_rgb
-from factory.store.location import Location, naming, open_parquet, with_partition
+from factory.store.location import Location, open_parquet, raising_damaged_file, with_partition_columns
 from factory.store.schema import SAMPLES, SCHEMA, VERSION_PROPERTY, table_to_rows, why_other_schema
-from factory.store.table import KeyedTable, beginning, fixed_bytes
+from factory.store.table import KeyedTable, fixed_bytes, keys_with_prefix
 from tasks.reward.label_bytes import VocabularyLabels, decode
 from tasks.world.arrays import Bytes, Ints
 
@@ -91,9 +91,9 @@ class SampleTable:
         """In the table's order."""
         return tuple(key.decode() for key in self._keys.tolist())
 
-    def beginning(self, prefix: str) -> list[str]:
+    def keys_with_prefix(self, prefix: str) -> list[str]:
         """Those attempt_ids that begin so, in the table's order."""
-        return beginning(self._keys, prefix)
+        return keys_with_prefix(self._keys, prefix)
 
     def table(self, columns: Sequence[str] | None = None) -> pa.Table:
         """Some columns of all samples, ordered by attempt_id; reads nothing but these columns."""
@@ -110,8 +110,8 @@ class SampleTable:
         at = self._place(which) if isinstance(which, str) else which
         path = self._paths[self._files[at]]
         _check_columns(columns)
-        with naming(f"{self._table.location.uri}/{path}"):
-            group, row = group_of(self._file(path), int(self._rows[at]))
+        with raising_damaged_file(f"{self._table.location.uri}/{path}"):
+            group, row = find_row_group(self._file(path), int(self._rows[at]))
             (sample,) = read_rows(self._file(path), group, self._partitions[path], columns, slice(row, row + 1))
         return sample
 
@@ -128,15 +128,15 @@ class SampleTable:
         """Every sample once, file by file, one row group in memory."""
         _check_columns(columns)
         for path in sorted(self._partitions):
-            with naming(f"{self._table.location.uri}/{path}"):
+            with raising_damaged_file(f"{self._table.location.uri}/{path}"):
                 groups = len(group_rows(self._file(path)))
             for group in range(groups):
-                with naming(f"{self._table.location.uri}/{path}"):
+                with raising_damaged_file(f"{self._table.location.uri}/{path}"):
                     rows = read_rows(self._file(path), group, self._partitions[path], columns)
                 yield from rows
 
 
-def samples_of(
+def read_samples(
     table: Location, path: str, partition: Mapping[str, str], attempt_ids: Collection[str]
 ) -> Iterator[Sample]:
     """Some whole rows of one file of a table of samples; reads the row groups they stand in, one at a time."""
@@ -153,7 +153,7 @@ def group_rows(file: pq.ParquetFile) -> Ints:
     return np.array([metadata.row_group(g).num_rows for g in range(metadata.num_row_groups)], np.int64)
 
 
-def group_of(file: pq.ParquetFile, row: int) -> tuple[int, int]:
+def find_row_group(file: pq.ParquetFile, row: int) -> tuple[int, int]:
     """The row group that a file's row stands in, and its place there."""
     group = 0
     for n in group_rows(file).tolist():
@@ -174,7 +174,7 @@ def read_rows(
     _check_columns(columns)
     names = list(SCHEMA.names if columns is None else columns)
     stored = file.read_row_group(group, columns=[n for n in names if n not in partition])[rows]
-    return table_to_rows(with_partition(stored, pa.schema([SCHEMA.field(n) for n in names]), partition))
+    return table_to_rows(with_partition_columns(stored, pa.schema([SCHEMA.field(n) for n in names]), partition))
 
 
 def _check_columns(columns: Sequence[str] | None) -> None:
@@ -189,12 +189,12 @@ def image_of(sample: Mapping[str, Any], camera: str, time_s: float) -> Bytes:
     """
     for image in sample["images"] or ():
         if image["camera"] == camera and abs(image["time_s"] - time_s) <= TIME_TOLERANCE_S:
-            return decoded(image)
+            return decode_stored_image(image)
     have = sorted({(i["camera"], round(float(i["time_s"]), 3)) for i in sample["images"] or ()})
     raise KeyError(f"no image of camera {camera!r} at {time_s} s; there are {have}, source {sample['image_source']}")
 
 
-def decoded(image: Mapping[str, Any]) -> Bytes:
+def decode_stored_image(image: Mapping[str, Any]) -> Bytes:
     """The pixels of one of a row's images (height, width, 3) uint8 RGB. Raises ValueError where it is no picture."""
     try:
         return decode_rgb(image["jpeg"])

@@ -30,7 +30,7 @@ from factory.store.schema import (
     schema_of,
     why_other_schema,
 )
-from factory.store.table import Bytes, Codes, Ints, KeyedTable, codes, distinct, fixed_bytes
+from factory.store.table import Bytes, Codes, Ints, KeyedTable, distinct_rows, fixed_bytes, text_codes
 from tasks.sealed import MEMBER, sealed_json, unsealed_json
 
 # What became of attempts: the tables `outcomes`, `candidates` and `plans`, and the history that a run goes on from.
@@ -132,7 +132,7 @@ class ClipCandidates:
 
 
 @dataclass(frozen=True, slots=True)
-class Listed:
+class CandidateSummary:
     """What a run must know of a clip's row; the candidates themselves stay in the table and in the prepared clip."""
 
     prepare_digest: str
@@ -157,10 +157,10 @@ def candidates_table(rows: Sequence[ClipCandidates]) -> pa.Table:
     )
 
 
-def listed_of(table: KeyedTable) -> dict[str, Listed]:
+def candidate_summaries(table: KeyedTable) -> dict[str, CandidateSummary]:
     """clip_id -> what the table says of the clip."""
-    rows = table.read(["clip_id", *(field.name for field in fields(Listed))])
-    return {row.pop("clip_id"): Listed(**row) for row in rows.to_pylist()}
+    rows = table.read(["clip_id", *(field.name for field in fields(CandidateSummary))])
+    return {row.pop("clip_id"): CandidateSummary(**row) for row in rows.to_pylist()}
 
 
 # The table `plans`: what runs set out to do, one row for each different answer, there before its first task is begun.
@@ -207,7 +207,7 @@ OUTCOME_STATE = [*STATE, "kind", "error_kind", "tries"]
 
 
 @dataclass(frozen=True, slots=True)
-class Past:
+class PastAttempt:
     """What the tables say about one attempt."""
 
     attempt_id: str
@@ -223,7 +223,7 @@ class Past:
 class History:
     """Rows by walk, in a walk outcomes before samples; all arrays (N,) but `starts` (W + 1,), W walks."""
 
-    candidates: Mapping[str, Listed] = field(default_factory=dict)  # clip_id -> what is known of its list
+    candidates: Mapping[str, CandidateSummary] = field(default_factory=dict)  # clip_id -> what is known of its list
     clip_ids: Mapping[str, int] = field(default_factory=dict)
     experts: tuple[str, ...] = ()
     starts: Ints = field(default_factory=lambda: np.zeros(1, np.int64))  # by clip, then expert
@@ -233,9 +233,9 @@ class History:
     became: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))  # place in `fates`
     fates: tuple[tuple[Kind, int, str, int, str], ...] = ()  # kind, round, error_kind, tries, stage_versions
 
-    def known(self, clip_id: str, expert: str) -> dict[int, Past]:
+    def past_attempts(self, clip_id: str, expert: str) -> dict[int, PastAttempt]:
         """Candidate -> what became of it; a current row hides one that is not."""
-        known: dict[int, Past] = {}
+        known: dict[int, PastAttempt] = {}
         rows = self._rows(clip_id, expert)
         for candidate, key, current, became in zip(
             self.candidate[rows].tolist(),
@@ -246,10 +246,10 @@ class History:
             there = known.get(candidate)
             if there is None or current or not there.current:
                 kind, round_, error_kind, tries, versions = self.fates[became]
-                known[candidate] = Past(key.decode(), kind, current, round_, error_kind, tries, versions)
+                known[candidate] = PastAttempt(key.decode(), kind, current, round_, error_kind, tries, versions)
         return known
 
-    def stale(self, clip_id: str, expert: str) -> frozenset[str]:
+    def stale_ids(self, clip_id: str, expert: str) -> frozenset[str]:
         """attempt_ids of rows that are not current."""
         rows = self._rows(clip_id, expert)
         return frozenset(key.decode() for key in self.attempt_id[rows][~self.current[rows]].tolist())
@@ -266,7 +266,7 @@ class History:
         clips = set(np.unique(walks[np.isin(walks % max(1, len(self.experts)), numbers)] // max(1, len(self.experts))))
         return {clip_id for clip_id, number in self.clip_ids.items() if number in clips}
 
-    def complete(self, expert: str, first: int, wanted: int) -> dict[str, tuple[int, int]]:
+    def complete_walks(self, expert: str, first: int, wanted: int) -> dict[str, tuple[int, int]]:
         """clip_id -> samples, attempts of those walks of an expert that show at once that they have all they should.
 
         All their rows are current and none failed; candidates are `first`, first + 1 and so on, one row each, and the
@@ -302,10 +302,10 @@ class History:
         return slice(self.starts[walk], self.starts[walk + 1])
 
 
-def history_of(
+def build_history(
     outcomes: pa.Table,
     samples: pa.Table,
-    candidates: Mapping[str, Listed],
+    candidates: Mapping[str, CandidateSummary],
     made_by: tuple[str, str],
     expert_digests: Mapping[str, str],
 ) -> History:
@@ -314,10 +314,10 @@ def history_of(
     Samples win over outcomes of the same attempt.
     """
     rows = pa.concat_tables([outcomes.select(STATE), samples.select(STATE)])
-    clip, clip_ids = codes(rows["clip_id"])
-    columns = [codes(rows[name]) for name in MADE_BY]
+    clip, clip_ids = text_codes(rows["clip_id"])
+    columns = [text_codes(rows[name]) for name in MADE_BY]
     (expert, experts), (versions, version_texts) = columns[0], columns[3]
-    made, at = distinct([numbers for numbers, _ in columns])
+    made, at = distinct_rows([numbers for numbers, _ in columns])
     texts = [[words[i] for i, (_, words) in zip(row, columns)] for row in made.tolist()]
     is_current = [(s, v) == made_by and digest == expert_digests.get(e, digest) for e, digest, s, v in texts]
     became, fates = _fates(outcomes, samples, versions, version_texts)
@@ -342,9 +342,9 @@ def _fates(
 ) -> tuple[NDArray[np.int32], tuple[tuple[Kind, int, str, int, str], ...]]:
     """What became of each row, as a place among the few different fates."""
     n = samples.num_rows
-    kind, kinds = codes(outcomes["kind"])
-    error, errors = codes(outcomes["error_kind"])
-    made, at = distinct(
+    kind, kinds = text_codes(outcomes["kind"])
+    error, errors = text_codes(outcomes["error_kind"])
+    made, at = distinct_rows(
         [
             np.concatenate([kind, np.full(n, len(kinds))]),
             np.concatenate([np.zeros(len(kind), np.int64), samples["round"].to_numpy().astype(np.int64) + 1]),
@@ -417,7 +417,7 @@ class Store:
     def cache(self) -> ClipCache:
         return ClipCache(self.location.child("cache/prepared"))
 
-    def agree(
+    def checked_records(
         self, identity: RunIdentity, expert_digests: Mapping[str, str], on_change: OnChange
     ) -> list[dict[str, Any]]:
         """Hold the run against the newest record of run.json; the records as they are to be, with this run's as newest.
@@ -449,7 +449,7 @@ class Store:
                 f"{self.location.uri}: {RUN_FILE} is missing beside tables with rows; restore it or take another out"
             )
         if records:
-            changes = differences(records[-1], record)
+            changes = record_differences(records[-1], record)
             if changes and on_change == "stop" and not len(self.samples):
                 return [record]  # nothing stands on the settings that were: they were tried, found wrong and corrected
             if changes and on_change == "stop":
@@ -464,11 +464,11 @@ class Store:
         return [*records, record]
 
     def starts_over(self, records: Sequence[Mapping[str, object]]) -> bool:
-        """Whether `records` of agree() take the place of settings that made no sample."""
+        """Whether `records` of checked_records() take the place of settings that made no sample."""
         known = self.runs()
-        return bool(known) and len(records) == 1 and bool(differences(known[-1], records[0]))
+        return bool(known) and len(records) == 1 and bool(record_differences(known[-1], records[0]))
 
-    def begin(self, records: Sequence[Mapping[str, object]]) -> bool:
+    def begin_run(self, records: Sequence[Mapping[str, object]]) -> bool:
         """The first writes of a run: fence off older runs, record its settings, tidy up after a crash.
 
         Of two runs the one that begins later wins: whatever the older has not committed by now it never will. Of runs
@@ -491,7 +491,7 @@ class Store:
             self.location.write(RUN_FILE, sealed_json(document).encode())
         twice = {key.decode() for key in np.intersect1d(self.outcomes.keys(), self.samples.keys(), True).tolist()}
         if twice:
-            age = run_number(records)
+            age = run_number_lookup(records)
             samples, outcomes = (
                 {
                     row["attempt_id"]: age(row)
@@ -534,15 +534,15 @@ class Store:
 
     def history(self, identity: RunIdentity, expert_digests: Mapping[str, str]) -> History:
         """Everything the tables know, samples winning over outcomes of the same attempt."""
-        return history_of(
+        return build_history(
             self.outcomes.read(OUTCOME_STATE, encoded=True),
             self.samples.read(SAMPLE_STATE, encoded=True),
-            listed_of(self.candidates),
+            candidate_summaries(self.candidates),
             (identity.settings_hash, identity.versions_json),
             expert_digests,
         )
 
-    def plan(self, rounds: Mapping[str, int], clip_ids: Sequence[str]) -> None:
+    def record_plan(self, rounds: Mapping[str, int], clip_ids: Sequence[str]) -> None:
         """Write down what a run sets out to do, expert -> samples of each clip; nothing where that is known already.
 
         Raises AnotherWriter.
@@ -581,7 +581,7 @@ class Store:
             self.samples.set_property(LICENCES_PROPERTY, "; ".join(sorted(named)))
 
 
-def run_number(records: Sequence[Mapping[str, Any]]) -> Callable[[Mapping[str, Any]], int]:
+def run_number_lookup(records: Sequence[Mapping[str, Any]]) -> Callable[[Mapping[str, Any]], int]:
     """Of a row with the columns MADE_UNDER: the place of the newest record that it could be made under, -1 for none."""
     made: dict[tuple[str, str], list[tuple[int, Mapping[str, str]]]] = defaultdict(list)
     for number, record in enumerate(records):
@@ -596,7 +596,7 @@ def run_number(records: Sequence[Mapping[str, Any]]) -> Callable[[Mapping[str, A
     return of
 
 
-def differences(old: Mapping[str, object], new: Mapping[str, object]) -> list[str]:
+def record_differences(old: Mapping[str, object], new: Mapping[str, object]) -> list[str]:
     """What differs between two records of run.json, in words; an expert that only one of them has is no difference."""
     found = []
     for part, word in (("settings", ""), ("stage_versions", "stage version "), ("expert_digests", "inputs of expert ")):

@@ -244,7 +244,7 @@ class Stamp:
     settings_hash: str
     stage_versions: str
 
-    def of(self, clip_id: str, candidate: int, round: int) -> "Stamp":
+    def of_attempt(self, clip_id: str, candidate: int, round: int) -> "Stamp":
         """Of another attempt of the same walk."""
         key = attempt_id(clip_id, candidate, self.vocabulary_digest, self.expert, self.expert_digest)
         return replace(self, attempt_id=key, candidate_index=candidate, round=round)

@@ -34,7 +34,14 @@ from deltalake.transaction import AddAction, RemoveAction
 from numpy.typing import NDArray
 
 from factory.files import needs_disk
-from factory.store.location import Location, Shard, encoded_text, read_parquet, with_partition, write_shard
+from factory.store.location import (
+    Location,
+    Shard,
+    dictionary_encoded,
+    read_parquet,
+    with_partition_columns,
+    write_shard,
+)
 from factory.store.schema import TableSpec
 from factory.wording import one_line
 from tasks.sealed import Damaged, sealed, unsealed
@@ -48,7 +55,7 @@ T = TypeVar("T")
 PACKED_ROWS = 2**16
 
 
-def codes(column: pa.ChunkedArray) -> tuple[Codes, tuple[str, ...]]:
+def text_codes(column: pa.ChunkedArray) -> tuple[Codes, tuple[str, ...]]:
     """A number for each text, in the order of the texts, and the texts."""
     if not pa.types.is_dictionary(column.type):
         column = column.dictionary_encode()
@@ -63,7 +70,7 @@ def codes(column: pa.ChunkedArray) -> tuple[Codes, tuple[str, ...]]:
     return number[at], tuple(texts[used])
 
 
-def equals(column: pa.ChunkedArray, text: str) -> NDArray[np.bool_]:
+def text_equals(column: pa.ChunkedArray, text: str) -> NDArray[np.bool_]:
     """(N,) where a column of texts, numbers into dictionaries or not, has this one; without writing the texts out."""
     if not pa.types.is_dictionary(column.type):
         return np.asarray(pc.equal(column, text), bool)
@@ -71,15 +78,15 @@ def equals(column: pa.ChunkedArray, text: str) -> NDArray[np.bool_]:
     return np.concatenate([np.zeros(0, bool), *parts])
 
 
-def packed(parts: Iterable[pa.Table], key: str) -> Iterator[pa.Table]:
+def packed_tables(parts: Iterable[pa.Table], key: str) -> Iterator[pa.Table]:
     """The rows in tables of at least PACKED_ROWS, the last one aside; texts but the key as numbers into a dictionary.
 
     Dictionaries of many small files would cost more than their texts.
     """
-    return (_encoded(pack, key) for pack in in_packs(parts, lambda rows: int(rows.num_rows)))
+    return (_encoded(pack, key) for pack in pack_small(parts, lambda rows: int(rows.num_rows)))
 
 
-def in_packs(parts: Iterable[T], rows_of: Callable[[T], int]) -> Iterator[list[T]]:
+def pack_small(parts: Iterable[T], rows_of: Callable[[T], int]) -> Iterator[list[T]]:
     """In order, as many together as have PACKED_ROWS rows or more; the last ones may have fewer."""
     pack: list[T] = []
     n_rows = 0
@@ -101,21 +108,21 @@ def _encoded(parts: Sequence[pa.Table], key: str) -> pa.Table:
     return rows.combine_chunks()
 
 
-def combinations(rows: pa.Table, names: Sequence[str]) -> tuple[list[tuple[str, ...]], Codes]:
+def distinct_texts(rows: pa.Table, names: Sequence[str]) -> tuple[list[tuple[str, ...]], Codes]:
     """The different combinations of texts that some columns have, and which of them each row has."""
     texts: list[tuple[str, ...]] = []
 
     def one_by_one() -> Iterator[Codes]:  # of millions of rows a column's numbers take their place in memory
         for name in names:
-            numbers, different = codes(rows[name])
+            numbers, different = text_codes(rows[name])
             texts.append(different)
             yield numbers
 
-    found, at = distinct(one_by_one())
+    found, at = distinct_rows(one_by_one())
     return [tuple(words[i] for i, words in zip(row, texts)) for row in found.tolist()], at
 
 
-def distinct(columns: Iterable[Ints | Codes]) -> tuple[Ints, Codes]:
+def distinct_rows(columns: Iterable[Ints | Codes]) -> tuple[Ints, Codes]:
     """The different rows (D, columns) in order, and which of them each row is; of columns of few different numbers."""
     rows, at = np.zeros((1, 0), np.int64), np.zeros(1, np.int32)
     for numbers in columns:
@@ -144,7 +151,7 @@ def _fixed(texts: pa.Array) -> Bytes:
     return np.frombuffer(texts.buffers()[2], f"S{width}", len(texts), start)
 
 
-def beginning(keys: Bytes, prefix: str) -> list[str]:
+def keys_with_prefix(keys: Bytes, prefix: str) -> list[str]:
     """Those of sorted keys that begin so, in order."""
     first, behind = prefix.encode(), prefix.encode() + b"\xff"  # a byte that is in no text
     return [key.decode() for key in keys[np.searchsorted(keys, first) : np.searchsorted(keys, behind)].tolist()]
@@ -166,7 +173,7 @@ class ListingBehind(TimeoutError):
     """What was written is still not listed."""
 
 
-def until_listed(is_seen: Callable[[], bool], name: str) -> None:
+def wait_until_listed(is_seen: Callable[[], bool], name: str) -> None:
     """Look until it is seen. Raises ListingBehind after a minute."""
     for pause_s in PAUSES_S:
         time.sleep(pause_s)
@@ -175,18 +182,18 @@ def until_listed(is_seen: Callable[[], bool], name: str) -> None:
     raise ListingBehind(f"{name} is there, and its store does not list it after {sum(PAUSES_S):.0f} s")
 
 
-def broke_off(error: BaseException) -> bool:
+def is_broken_listing(error: BaseException) -> bool:
     """What delta-rs raised is of an answer that ended before its end, and was not asked for again."""
     return isinstance(error, DeltaError | OSError) and BROKE_OFF.search(str(error)) is not None
 
 
-def listed(ask: Callable[[], T]) -> T:
+def retry_broken_listing(ask: Callable[[], T]) -> T:
     """What delta-rs, which lists meanwhile, answers; asked again, five times at most, where an answer broke off."""
     for pause_s in BROKEN_PAUSES_S:
         try:
             return ask()
         except (DeltaError, OSError) as error:
-            if not broke_off(error):
+            if not is_broken_listing(error):
                 raise
         time.sleep(pause_s)
     return ask()
@@ -220,7 +227,7 @@ class CommitCopies:
     def __init__(self, table: Location) -> None:
         self._log, self._copies = table.child(LOG), table.child(COPIES)
 
-    def note(self, version: int) -> None:
+    def copy_commit(self, version: int) -> None:
         """Copy what the newest commit wrote, and what earlier ones did where a writer was killed before it could.
 
         The commit itself comes last, so that where its copy is there, that of its checkpoint is as well.
@@ -235,7 +242,7 @@ class CommitCopies:
                 self._copy(LAST)
             self._copy(_json(number))
 
-    def lost(self, version: int) -> int | None:
+    def lost_commit(self, version: int) -> int | None:
         """The number of a commit that was made and is newer than `version`, which the table says is its newest."""
         return version + 1 if self._copies.has(_json(version + 1)) else None
 
@@ -427,7 +434,7 @@ class KeyedTable:
         self._delta: DeltaTable | None = None
         self._facts: tuple[int, dict[str, LiveFile]] = (-1, {})  # of a version
         with self._log_naming():
-            self._delta = listed(self._opened)
+            self._delta = retry_broken_listing(self._opened)
 
     def __getstate__(self) -> dict[str, Any]:
         """For another process: the version that is seen here, whatever is committed in the meantime."""
@@ -438,7 +445,7 @@ class KeyedTable:
         self.__dict__.update(state)
         self._token = secrets.token_hex(16)
         with self._log_naming():
-            self._delta = None if version is None else listed(partial(self._opened, version))
+            self._delta = None if version is None else retry_broken_listing(partial(self._opened, version))
 
     def _opened(self, version: int | None = None) -> DeltaTable | None:
         """version: None: the newest."""
@@ -519,9 +526,9 @@ class KeyedTable:
     def refresh(self) -> None:
         """For a reader: see what was committed since the table was opened or last refreshed."""
         if self._delta is not None:
-            listed(self._delta.update_incremental)
+            retry_broken_listing(self._delta.update_incremental)
         else:
-            self._delta = listed(self._opened)
+            self._delta = retry_broken_listing(self._opened)
         self.__dict__.pop("_index", None)
 
     def files(self, columns: Sequence[str] | None = None) -> Iterable[tuple[str, pa.Table]]:
@@ -545,7 +552,7 @@ class KeyedTable:
     def read_file(self, path: str, partition: Mapping[str, str], columns: Sequence[str] | None = None) -> pa.Table:
         """One file's rows in the table's schema, page checksums verified."""
         schema = self.schema_of(columns)
-        return with_partition(read_parquet(self.location, path, schema, partition), schema, partition)
+        return with_partition_columns(read_parquet(self.location, path, schema, partition), schema, partition)
 
     def read(self, columns: Sequence[str] | None = None, encoded: bool = False) -> pa.Table:
         """All rows.
@@ -553,14 +560,14 @@ class KeyedTable:
         encoded: texts but the key as numbers into dictionaries, for what counts over many rows of few different ones.
         """
         parts = (rows for _, rows in self.files(columns))
-        found = packed(parts, self.spec.key) if encoded else parts
+        found = packed_tables(parts, self.spec.key) if encoded else parts
         return pa.concat_tables([self.schema_of(columns, encoded).empty_table(), *found])
 
     def schema_of(self, columns: Sequence[str] | None = None, encoded: bool = False) -> pa.Schema:
         """Of some columns, None: all; encoded: as of `read`."""
         names = self.spec.schema.names if columns is None else columns
         fields = [self.spec.schema.field(name) for name in names]
-        return pa.schema([encoded_text(f) if encoded and f.name != self.spec.key else f for f in fields])
+        return pa.schema([dictionary_encoded(f) if encoded and f.name != self.spec.key else f for f in fields])
 
     def lost_commit(self) -> int | None:
         """The number of a commit that was made and that the log does not have any more; None where it has all."""
@@ -569,10 +576,10 @@ class KeyedTable:
         def is_sure() -> bool:
             nonlocal lost
             self.refresh()
-            lost = self.copies.lost(-1 if self.version is None else self.version)
+            lost = self.copies.lost_commit(-1 if self.version is None else self.version)
             return lost is None or not self.copies.log_has(lost)
 
-        until_listed(is_sure, f"a commit of {self.location.uri}")
+        wait_until_listed(is_sure, f"a commit of {self.location.uri}")
         return lost
 
     @property
@@ -706,34 +713,34 @@ class KeyedTable:
                 with needs_disk(f"{self.location.uri}/_delta_log", ACTION_BYTES * n_actions):
                     commit()
             except (DeltaError, OSError) as error:
-                may_be_made = isinstance(error, DeltaError) or broke_off(error)
+                may_be_made = isinstance(error, DeltaError) or is_broken_listing(error)
                 if may_be_made and self.copies.log_has(version, self._token):
                     return
                 if isinstance(error, CommitFailedError):
                     raise self._lost() from error
                 raise
 
-        listed(once)
+        retry_broken_listing(once)
         self._see(table, version)
         if self.version != version:
             raise self._lost()
         with needs_disk(f"{self.location.uri}/{COPIES}", SCHEMA_BYTES):
-            self.copies.note(version)
+            self.copies.copy_commit(version)
 
     def _see(self, table: DeltaTable, version: int) -> None:
         def is_seen() -> bool:
             with suppress(TableNotFoundError):
-                listed(table.update_incremental)
+                retry_broken_listing(table.update_incremental)
             return table.version() >= version
 
-        until_listed(is_seen, f"commit {version} of {self.location.uri}")
+        wait_until_listed(is_seen, f"commit {version} of {self.location.uri}")
 
     def _create(self) -> DeltaTable:
         with needs_disk(f"{self.location.uri}/_delta_log", SCHEMA_BYTES):
             if self.location.is_local:
                 Path(self.location.uri).mkdir(parents=True, exist_ok=True)
             try:
-                listed(self._create_once)
+                retry_broken_listing(self._create_once)
             except DeltaError:
                 if not self.copies.log_has(0):
                     raise
@@ -742,7 +749,7 @@ class KeyedTable:
             self.refresh()
             return self._delta is not None
 
-        until_listed(is_seen, f"the first commit of {self.location.uri}")
+        wait_until_listed(is_seen, f"the first commit of {self.location.uri}")
         assert self._delta is not None
         return self._delta
 
@@ -769,7 +776,7 @@ def main(arguments: list[str]) -> int:
     try:
         location = Location.parse(arguments[0])
         name = f".trial-{secrets.token_hex(8)}"
-        listed(lambda: DeltaTable.is_deltatable(location.child("samples").uri))
+        retry_broken_listing(lambda: DeltaTable.is_deltatable(location.child("samples").uri))
         location.write(name, b"")
         location.remove(name)
     except (OSError, ValueError, pa.ArrowException, DeltaError) as error:  # BadLocation among them

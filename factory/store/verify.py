@@ -21,7 +21,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from factory.files import why_no_links
-from factory.store.episodes import FOLDER, check_episode, episode_name
+from factory.store.episodes import EPISODES_FOLDER, check_episode, episode_name
 from factory.store.location import (
     BadCacheFile,
     BadLocation,
@@ -30,11 +30,21 @@ from factory.store.location import (
     SceneFiles,
     Shard,
     check_prepared,
-    naming,
+    raising_damaged_file,
     write_shard,
 )
 from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, ChangedRun, Store
-from factory.store.table import COPIES, LOG, CommitCopies, DamagedPart, KeyedTable, LiveFile, codes, fixed_bytes, packed
+from factory.store.table import (
+    COPIES,
+    LOG,
+    CommitCopies,
+    DamagedPart,
+    KeyedTable,
+    LiveFile,
+    fixed_bytes,
+    packed_tables,
+    text_codes,
+)
 
 TABLES = ("plans", "candidates", "samples", "outcomes")
 OF_WALKS = ["clip_id", "expert", "candidate_index", "round", "settings_hash"]
@@ -95,12 +105,12 @@ def orphaned(store: Store) -> list[str]:
 def outdated_episodes(store: Store) -> list[str]:
     """Files beside the episodes that are none of a row that is there, relative to `out`."""
     live = _live_episodes(store)
-    return [f"{FOLDER}/{name}" for name in store.location.child(FOLDER).names() if name not in live]
+    return [f"{EPISODES_FOLDER}/{name}" for name in store.location.child(EPISODES_FOLDER).names() if name not in live]
 
 
 def _live_episodes(store: Store) -> set[str]:
     """Of samples that are there; rows are looked at only where there is an episode."""
-    if not store.location.child(FOLDER).names():
+    if not store.location.child(EPISODES_FOLDER).names():
         return set()
     rows = store.samples.read(["attempt_id", "settings_hash", "stage_versions"]).to_pylist()
     return {episode_name(row) for row in rows}
@@ -128,7 +138,7 @@ def _problem_of(table: KeyedTable, path: str, file: LiveFile) -> str:
     named = NAMED.fullmatch(path)
     if named and hashlib.sha256(data).hexdigest()[:32] != named[2]:
         return "its content is not what its name says"
-    with naming(f"{table.location.uri}/{path}"):
+    with raising_damaged_file(f"{table.location.uri}/{path}"):
         parquet = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
         if file.n_rows and parquet.metadata.num_rows != file.n_rows:
             return f"has {parquet.metadata.num_rows} rows, the log says {file.n_rows}"
@@ -192,8 +202,8 @@ def _twice(table: KeyedTable, kept: list[pa.Table] | None) -> list[str]:
 
 def _broken_rows(parts: Sequence[pa.Table], store: Store) -> list[str]:
     """Of samples, with the columns OF_WALKS: rounds out of order, and settings that nothing is known of."""
-    rows = pa.concat_tables([store.samples.schema_of(OF_WALKS, encoded=True).empty_table(), *packed(parts, "")])
-    unknown = set(codes(rows["settings_hash"])[1]) - {run["settings_hash"] for run in store.runs()}
+    rows = pa.concat_tables([store.samples.schema_of(OF_WALKS, encoded=True).empty_table(), *packed_tables(parts, "")])
+    unknown = set(text_codes(rows["settings_hash"])[1]) - {run["settings_hash"] for run in store.runs()}
     named = [f"samples: settings_hash {name} is not in run.json" for name in sorted(unknown)]
     return [*_broken_rounds(rows, store), *named]
 
@@ -202,7 +212,7 @@ def _broken_rounds(rows: pa.Table, store: Store) -> list[str]:
     """Rounds of a walk count 0, 1, 2 ... in the order of its candidates. Of imported rows they are their source's."""
     imported = {run["settings_hash"] for run in store.runs() if IMPORTED in run["settings"]}
     rows = rows.filter(pc.invert(pc.is_in(rows["settings_hash"], value_set=pa.array(sorted(imported), pa.string()))))
-    (clip, clip_ids), (expert, experts) = codes(rows["clip_id"]), codes(rows["expert"])
+    (clip, clip_ids), (expert, experts) = text_codes(rows["clip_id"]), text_codes(rows["expert"])
     candidate, number = (rows[name].to_numpy() for name in ("candidate_index", "round"))
     walk = clip * max(1, len(experts)) + expert
     order = np.lexsort((number, candidate, walk))
@@ -219,14 +229,14 @@ def _broken_rounds(rows: pa.Table, store: Store) -> list[str]:
 
 
 def _damaged_episodes(store: Store) -> list[DamagedPart]:
-    folder, live, found = store.location.child(FOLDER), _live_episodes(store), []
+    folder, live, found = store.location.child(EPISODES_FOLDER), _live_episodes(store), []
     for name in folder.names():
         try:
             if name in live:
                 check_episode(folder.read(name) or b"")
         except ValueError as error:
             problem = f"{error}; remove it, the command that made the run writes it again"
-            found.append(DamagedPart(f"{FOLDER}/{name}", problem))
+            found.append(DamagedPart(f"{EPISODES_FOLDER}/{name}", problem))
     return found
 
 
@@ -240,12 +250,12 @@ SMALL = 0.5  # of that: shards below are merged
 QUIET_S = 900.0  # a run that said it began and has committed nothing for so long is taken for gone
 
 
-class RunGoesOn(RuntimeError):
+class RunInProgress(RuntimeError):
     """A run writes to the store."""
 
 
 @dataclass(frozen=True)
-class Merged:
+class CompactedTable:
     """What became of the files of one table."""
 
     table: str
@@ -253,22 +263,22 @@ class Merged:
     after: int
 
 
-def hold(store: Store) -> None:
+def claim_for_upkeep(store: Store) -> None:
     """Before a change: claim the tables as a run does, so that one which was quiet for long commits nothing any more,
     no file that is cleaned away among it. Raises RunGoesOn as `refuse_held` does, BadLocation and AnotherWriter."""
-    refuse_held(store)
+    refuse_while_running(store)
     if store.location.folder is not None and (no_links := why_no_links(store.location.folder)):
         raise BadLocation(no_links)
     store.claim(create=False)
 
 
-def refuse_held(store: Store) -> None:
+def refuse_while_running(store: Store) -> None:
     """Raises RunGoesOn where a run has begun, not ended, and done something lately."""
     current, last = store.began_ms(), store.began_ms(ended=True)
     written = (file.written_ms for table in store.tables for file in table.file_facts().values())
     quiet_s = time.time() - max([current, *written]) / 1e3
     if current and current != last and quiet_s < QUIET_S:
-        raise RunGoesOn(
+        raise RunInProgress(
             f"{store.location.uri}: a run is writing here; wait until it has ended. "
             f"If it was killed, give its command again, or wait {(QUIET_S - quiet_s) / 60:.0f} minutes"
         )
@@ -304,7 +314,7 @@ def leftovers(store: Store, older_s: float, now_s: float) -> list[str]:
     )
 
 
-def compact(store: Store, full_bytes: int = FULL_BYTES) -> Iterator[Merged]:
+def compact(store: Store, full_bytes: int = FULL_BYTES) -> Iterator[CompactedTable]:
     """Merge the small files of each partition of each table. Raises DamagedFile, before anything of its table is done.
 
     The rows keep their bytes and the times at which they came into the table.
@@ -320,7 +330,7 @@ def compact(store: Store, full_bytes: int = FULL_BYTES) -> Iterator[Merged]:
             drop += group
         if add:
             table.replace_files(drop, add)
-        yield Merged(table.spec.name, len(facts), len(table.file_facts()))
+        yield CompactedTable(table.spec.name, len(facts), len(table.file_facts()))
 
 
 def _groups(table: KeyedTable, full_bytes: int) -> list[list[str]]:

@@ -16,7 +16,7 @@ from factory import __version__
 from factory.store.funnel import Funnel, funnel_of_tables, funnel_tables
 from factory.store.samples import CURRENT_RUN, Kind, Store
 from factory.store.schema import SCHEMA_VERSION
-from factory.store.table import codes
+from factory.store.table import text_codes
 from factory.views.status import counted
 
 FILE = "README.md"
@@ -216,7 +216,7 @@ def _orphans(store: Store) -> int:
 
 def _counts(samples: pa.Table, by: Sequence[str], distinct: Sequence[str] = ()) -> list[tuple[object, ...]]:
     """Of each group, in order: its values, the different values of other columns, its rows."""
-    texts = {name: codes(samples[name]) for name in (*by, *distinct) if name != "round"}
+    texts = {name: text_codes(samples[name]) for name in (*by, *distinct) if name != "round"}
     numbers = {name: texts[name][0] if name in texts else samples[name].to_numpy() for name in (*by, *distinct)}
     groups = (
         pa.table(numbers)

@@ -19,9 +19,9 @@ from factory.graph.steps import PreparedClip, cache_key
 from factory.pipeline import FactoryWork, PerturbedClip, payload_of
 from factory.readers.base import BadClip, ClipRef
 from factory.store.location import BadCacheFile
-from factory.store.reader import decoded
+from factory.store.reader import decode_stored_image
 from factory.store.samples import Kind, Store
-from factory.store.table import equals, fixed_bytes
+from factory.store.table import fixed_bytes, text_equals
 from factory.views.bev import attempt_picture
 from factory.views.sample_picture import (
     earlier_images,
@@ -90,7 +90,7 @@ def few_of_each(rows: pa.Table, first: str) -> list[dict[str, Any]]:
     """All that `spread` looks at of rows with attempt_ids as their order and a column as its first key."""
     ids, found = rows.select(["attempt_id"]), list[dict[str, Any]]()
     for value in counted(rows[first]):
-        places = np.flatnonzero(equals(rows[first], value))
+        places = np.flatnonzero(text_equals(rows[first], value))
         few = pc.select_k_unstable(ids.take(places), PER_VALUE, [("attempt_id", "ascending")])
         found += rows.take(places[few.to_numpy()]).to_pylist()
     return found
@@ -123,7 +123,7 @@ def strips_of(store: Store, samples: pa.Table, row_of: Callable[[str, Sequence[s
     photos: the log's, each followed by the scene seen from its pose, where that is kept; aside: from beside the ego.
     """
     labels = samples.select(LABELS)
-    pictured = few_of_each(labels.filter(pa.array(~equals(labels["image_source"], "none"))), "image_source")
+    pictured = few_of_each(labels.filter(pa.array(~text_equals(labels["image_source"], "none"))), "image_source")
     order = spread(pictured, lambda r: (r["image_source"], r["expert"], r["clip_id"]), lambda r: str(r["attempt_id"]))
     strips = []
     for row in order[:N_STRIPS]:
@@ -161,7 +161,7 @@ def _again(seen: CaptionedPicture) -> Picture:
 def _frame(image: Mapping[str, Any], width: int) -> Picture:
     caption = f"{image['camera']} {image['time_s']:+.1f} s"
     try:
-        return Picture(small_jpeg(decoded(image), width), caption)
+        return Picture(small_jpeg(decode_stored_image(image), width), caption)
     except ValueError as error:
         return Picture(None, str(error))
 

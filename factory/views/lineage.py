@@ -17,13 +17,13 @@ Part = tuple[str, list[tuple[str, object]]]
 
 def lineage(store: "Store", which: str) -> list[Part]:
     """The chain, part by part. Raises Refused where no attempt, or more than one, is meant."""
-    from factory.store.samples import run_number
+    from factory.store.samples import run_number_lookup
 
     attempt_id = _meant(store, which)
     is_sample = attempt_id in store.samples
     path, row = _row(store.samples if is_sample else store.outcomes, attempt_id)
     records = store.runs()
-    number = run_number(records)(row)
+    number = run_number_lookup(records)(row)
     record = records[number] if number >= 0 else {}
     clip = _clip(store, row)
     parts = [("run", _run_facts(store, record, number, row)), ("clip", _clip_facts(store, row, clip))]
@@ -35,12 +35,12 @@ def lineage(store: "Store", which: str) -> list[Part]:
 
 
 def _meant(store: "Store", which: str) -> str:
-    from factory.store.table import beginning
+    from factory.store.table import keys_with_prefix
 
     ids = store.samples.keys()
     if which.isascii() and which.isdecimal() and int(which) < len(ids):
         return ids[int(which)].decode()
-    found = sorted({*beginning(ids, which), *beginning(store.outcomes.keys(), which)})
+    found = sorted({*keys_with_prefix(ids, which), *keys_with_prefix(store.outcomes.keys(), which)})
     if len(found) != 1:
         some = f": {', '.join(found[:8])}" if found else ""
         raise Refused(f"sample={which} is the beginning of {len(found)} attempts{some}")
@@ -140,10 +140,10 @@ def _attempt_facts(store: "Store", row: Row) -> list[tuple[str, object]]:
 
 
 def _sample_facts(store: "Store", row: Row, path: str) -> list[tuple[str, object]]:
-    from factory.store.episodes import FOLDER, episode_name
+    from factory.store.episodes import EPISODES_FOLDER, episode_name
 
     labels = f"{row['label_vocabulary']}, traffic {row['label_traffic']}" if row["label_vocabulary"] else "none"
-    episode = f"{FOLDER}/{episode_name(row)}"
+    episode = f"{EPISODES_FOLDER}/{episode_name(row)}"
     asset, psnr = row["asset_digest"], row["psnr"]
     return [
         ("round", row["round"]),

@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from factory.store.reader import decoded, labels_of
+from factory.store.reader import decode_stored_image, labels_of
 from factory.store.schema import NOW_INDEX
 from factory.views.bev import (
     BACKGROUND,
@@ -197,7 +197,7 @@ def in_rows(tiles: Sequence[Image], columns: int) -> Image:
 
 def _stored(image: Mapping[str, Any]) -> Image:
     try:
-        return tile(decoded(image), f"{image['camera']}  {image['time_s']:+.1f} s")
+        return tile(decode_stored_image(image), f"{image['camera']}  {image['time_s']:+.1f} s")
     except ValueError as error:
         return note(str(error))
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from factory.stages.scene_file import BadScene
-from factory.store.reader import SampleTable, decoded
+from factory.store.reader import SampleTable, decode_stored_image
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.movers import world_from_boxes
 from tasks.render.splatting.gaussians import Gaussians, quats_of, rotations_of
@@ -159,7 +159,7 @@ def _show(server: "viser.ViserServer", asset: RenderAsset, drives: Sequence[Draw
             edges = EDGES * box[4:] @ pose[:3, :3].T + pose[:3, 3]
             server.scene.add_line_segments(f"/boxes/{track}", edges, BOX, thickness=0.5 * THICKNESS_M)
     for k, (intrinsics, pose, jpeg) in enumerate(drive.cameras):
-        picture = decoded({"jpeg": jpeg})
+        picture = decode_stored_image({"jpeg": jpeg})
         height, width = picture.shape[:2]
         server.scene.add_camera_frustum(
             f"/cameras/{k}",

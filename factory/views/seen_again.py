@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from factory.stages.scene_file import BadScene, find_scene
-from factory.store.reader import SampleTable, decoded
+from factory.store.reader import SampleTable, decode_stored_image
 from factory.store.samples import Store
 from factory.store.schema import AGENT_STEPS, NOW_INDEX, SCHEMA
 from factory.views.bev import BACKGROUND
@@ -117,7 +117,7 @@ def real_and_rendered(
         nearest = min(mine, key=lambda image: abs(_now(photos) + image["time_s"] - at_s), default=None)
         if nearest is None:
             continue
-        photo = decoded(nearest)
+        photo = decode_stored_image(nearest)
         (again,) = drawn(scene, *_as_taken(asset, camera, nearest, _now(photos)), agents, nearest["time_s"])
         gap = _now(photos) + nearest["time_s"] - at_s
         said = "at the sample's now" if abs(gap) < STEP_S / 2 else f"{gap:+.1f} s from the sample's now"
@@ -200,7 +200,7 @@ def _standing(row: Row, time_s: float) -> Iterable[Image]:
         ]
         if taken:
             last = max(taken, key=lambda image: float(image["time_s"]))
-            yield tile(decoded(last), f"{last['camera']}  {last['time_s']:+.1f} s")
+            yield tile(decode_stored_image(last), f"{last['camera']}  {last['time_s']:+.1f} s")
         else:
             yield note(f"{camera['name']}: no image at {time_s:+.1f} s")
 

@@ -27,16 +27,16 @@ def open_samples(store: "Store") -> "SampleTable":
 
 def find(table: "SampleTable", store: "Store", which: str) -> str:
     """The attempt_id meant by an ordinal, an id or the beginning of one. Raises Refused."""
-    from factory.store.table import beginning
+    from factory.store.table import keys_with_prefix
 
     if which.isascii() and which.isdecimal() and int(which) < len(table):
         return str(table.sample(int(which), ("attempt_id",))["attempt_id"])
-    found = table.beginning(which)
+    found = table.keys_with_prefix(which)
     if len(found) == 1:
         return found[0]
     if found:
         raise Refused(f"sample={which} is the beginning of {len(found)} ids: {', '.join(found[:8])}")
-    dropped = beginning(store.outcomes.keys(), which)
+    dropped = keys_with_prefix(store.outcomes.keys(), which)
     if len(dropped) == 1:
         raise Refused(fate(rows_where(store.outcomes, {"attempt_id": dropped[0]})[0]))
     raise Refused(f"no sample {which}: ids begin otherwise, ordinals go from 0 to {len(table) - 1}; see list=true")

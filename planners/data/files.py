@@ -35,7 +35,7 @@ import pyarrow.parquet as pq
 from pyarrow import fs
 
 from factory.files import locked
-from factory.store.location import naming
+from factory.store.location import raising_damaged_file
 from factory.store.reader import TIME_TOLERANCE_S, group_rows, sample_table
 from tasks.sealed import Damaged, sealed, unsealed
 from tasks.world.arrays import Ints
@@ -90,7 +90,7 @@ class SampleFile:
 
         Raises OSError with the file's name.
         """
-        with naming(self.where):
+        with raising_damaged_file(self.where):
             return self._open(check_pages)
 
     @property

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from factory.store.location import Location, naming
+from factory.store.location import Location, raising_damaged_file
 from factory.store.reader import TIME_TOLERANCE_S, group_rows
 from factory.store.schema import LABEL_COLUMNS
 from planners.data.batch import ImageLayout, Needs, TrainingData
@@ -148,7 +148,7 @@ class Dataset:
         labels = np.empty((len(self), 8, 3), np.float32)
         for number in np.unique(self.rows.file):
             here = np.flatnonzero(self.rows.file == number)
-            with naming(self.files[number].where):
+            with raising_damaged_file(self.files[number].where):
                 parquet = self.files[number].open()
                 stored = parquet.read(columns=leaves(parquet, ["label_2hz"]))["label_2hz"].combine_chunks()
                 starts = np.concatenate([[0], np.cumsum(group_rows(parquet))])
@@ -212,7 +212,7 @@ def _rows_of(file: SampleFile, number: int) -> SampleRows:
         columns = leaves(parquet, INDEX_COLUMNS)
     except ValueError as error:
         raise ValueError(f"{file.table}: {error} in {file.path}; make the table again with this version") from error
-    with naming(file.where):
+    with raising_damaged_file(file.where):
         table = read_all(parquet, columns).combine_chunks()
         return _index_of(file, number, parquet, table)
 
@@ -413,7 +413,7 @@ def _file_part(
     if needs.image is not None:
         places = (np.cumsum(rows) - rows)[groups] + dataset.rows.place[here]
         members = leaves(parquet, ["cameras.name", "cameras.ego_from_camera", "images.camera", "images.time_s"])
-        with naming(dataset.files[number].where):
+        with raising_damaged_file(dataset.files[number].where):
             seen = read_all(parquet, members)
         cameras = _cameras(dataset, here, seen, places, needs.image)
         stored = np.add.reduceat(np.diff(_list(seen, "images").offsets.to_numpy()), np.cumsum(rows) - rows)

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from factory.store.location import naming
+from factory.store.location import raising_damaged_file
 from planners.data.batch import Batch, Needs
 from planners.data.decode import BatchBuffer, StoredRows, count_labels
 from planners.data.files import COPY_FORMAT, LocalCopy, leaves, read_group
@@ -176,7 +176,7 @@ class Memory:
         file = self._feed.dataset.files[number]
         groups = self._feed.dataset.rows.group[samples]
         found: dict[int, Place] = {}
-        with naming(file.where):
+        with raising_damaged_file(file.where):
             read = self._reader(number, np.unique(groups))
             for group in np.unique(groups).tolist():
                 found |= self._rows(read(group), samples[groups == group], number in self.copies)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from factory.store.location import Location
-from factory.store.reader import decoded
+from factory.store.reader import decode_stored_image
 from factory.views.bev import (
     BACKGROUND,
     EXPERT,
@@ -73,7 +73,7 @@ def _sheet(made: ClosedLoop, rig: Rig, title: str, step: int) -> Image:
     front = front_camera({"images": images, "cameras": rig})
     if front is not None:
         seen = next(image for image in images if image["camera"] == front)
-        sheet[: CAMERA_PX[1], BEV_PX[0] :] = fitted(decoded(seen), *CAMERA_PX)
+        sheet[: CAMERA_PX[1], BEV_PX[0] :] = fitted(decode_stored_image(seen), *CAMERA_PX)
     for row, line in enumerate(_lines(made, front, step, planned)):
         write(sheet, line, (BEV_PX[0] + 12, CAMERA_PX[1] + 26 + 24 * row), 0.5)
     return sheet

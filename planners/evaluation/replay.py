@@ -14,7 +14,7 @@ import numpy as np
 
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, fill
-from factory.store.reader import Sample, decoded
+from factory.store.reader import Sample, decode_stored_image
 from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, DrawnPath, draw_bev, map_shapes, write_mp4
 from factory.views.sample_picture import earlier_images, fitted, front_camera
 from planners.evaluation.benchmark_folder import BenchmarkFolder
@@ -79,7 +79,7 @@ def film(shown: Shown, logged: Array | None) -> Iterator[Image]:
             ego, shapes, Boxes(agents, drive.agents.kinds), ego, ways if row >= 0 else ways[2:], title, BEV_PX
         )
         seen = [image for image in pictures if image["time_s"] <= row * STEP_S + 1e-6] or pictures[:1]
-        yield _sheet(bev, decoded(seen[-1]) if seen else None, camera, shown.scores)
+        yield _sheet(bev, decode_stored_image(seen[-1]) if seen else None, camera, shown.scores)
 
 
 def _sheet(bev: Image, picture: Image | None, camera: str | None, scores: FrameScores) -> Image:

@@ -88,8 +88,8 @@ def write(out: Path, attempts: int, commits: int) -> None:
     refs, identity = clips(math.ceil(attempts / TRIES / len(EXPERTS))), WORK.identity
     store = Store(out)
     digests = {expert: WORK.expert_digest(expert) for expert in EXPERTS}
-    store.begin(store.agree(identity, digests, "stop"))
-    store.plan(dict.fromkeys(EXPERTS, ROUNDS), [ref.clip_id for ref in refs])
+    store.begin_run(store.checked_records(identity, digests, "stop"))
+    store.record_plan(dict.fromkeys(EXPERTS, ROUNDS), [ref.clip_id for ref in refs])
     sample = sample_row_to_table([_row()])
     for part in np.array_split(np.arange(len(refs)), commits):
         store.candidates.commit([_shard(store, CANDIDATES, _lists([refs[i] for i in part], identity))])
@@ -182,7 +182,7 @@ def open_(out: Path) -> object:
     """As a run begins: its settings held against the tables, its claim."""
     store = Store(out)
     digests = {expert: WORK.expert_digest(expert) for expert in EXPERTS}
-    store.begin(store.agree(WORK.identity, digests, "stop"))
+    store.begin_run(store.checked_records(WORK.identity, digests, "stop"))
     return store
 
 
@@ -190,12 +190,12 @@ def plan(out: Path, rounds: int = ROUNDS) -> object:
     """What of the same command, or of one with more rounds, is left to do."""
     store, identity = Store(out), WORK.identity
     digests = {expert: WORK.expert_digest(expert) for expert in EXPERTS}
-    records = store.agree(identity, digests, "stop")
+    records = store.checked_records(identity, digests, "stop")
     refs = clips(sum(file.n_rows for file in store.candidates.file_facts().values()))
     policy = retry_policy(False, identity.versions_json)
     history = store.history(identity, digests)
     made = make_plan(refs, EXPERTS, rounds, history, identity, "stop", policy, WORK.once)
-    store.begin(records)
+    store.begin_run(records)
     if len(made.todo) != (len(refs) if rounds > ROUNDS else 0):
         raise RuntimeError(f"{len(made.todo)} of {len(refs)} clips are left to do")
     return made

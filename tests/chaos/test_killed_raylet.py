@@ -185,11 +185,11 @@ def waits(journal: str, begun: int, tell: Callable[[str], None]) -> int:
 APART = """
 import sys
 from functools import partial
-from factory.graph.apart import run_apart
+from factory.graph.apart import run_in_own_process
 from tests.chaos.test_killed_raylet import ends, waits
 
 if __name__ == "__main__":
-    sys.exit(run_apart(partial({"ends": ends, "waits": waits}[sys.argv[1]], sys.argv[2]), True, print))
+    sys.exit(run_in_own_process(partial({"ends": ends, "waits": waits}[sys.argv[1]], sys.argv[2]), True, print))
 """
 
 

@@ -65,14 +65,14 @@ def import_rows(store: Store, identity: RunIdentity, entries: Sequence[Entry]) -
     stamps = [entry.stamp(identity) for entry in entries]
     if (known := store.runs()) and known[-1]["settings_hash"] != identity.settings_hash and len(store.samples):
         raise ChangedRun(f"{store.location.uri} holds rows of another run or import: choose another out")
-    records = store.agree(identity, {stamp.expert: stamp.expert_digest for stamp in stamps}, "stop")
+    records = store.checked_records(identity, {stamp.expert: stamp.expert_digest for stamp in stamps}, "stop")
     waiting = [pair for pair in zip(entries, stamps) if pair[1].attempt_id not in store.samples]
     summary = RunSummary(COMPLETE, executed=RunTotals(found_done=len(entries) - len(waiting)), began_ms=began_ms)
     counts = dict.fromkeys((kind.value for kind in Kind), 0)
     stopped: list[bool] = []
     began = time.monotonic()
     try:
-        store.begin(records)
+        store.begin_run(records)
         batch = _Batch(store)
         with asked_to_stop(lambda: stopped.append(True)), Counter("imported", len(waiting)) as progress:
             for done, (entry, stamp) in enumerate(waiting, start=1):

@@ -11,7 +11,7 @@ from scipy.optimize import linear_sum_assignment
 
 from factory.datasets.navsim.frames import FRAME_S, N_FRAMES, N_HISTORY, NOW_FRAME, SampleNames, hex16
 from factory.datasets.navsim.settings import PUBLIC_SIZE, CannotExport, ExportSettings
-from factory.store.reader import decoded
+from factory.store.reader import decode_stored_image
 from tasks.render.rigs import pinhole
 from tasks.world.camera import Camera
 
@@ -152,7 +152,7 @@ def _jpeg(image: Mapping[str, Any], camera: Camera, size: tuple[int, int]) -> by
     if (camera.width, camera.height) == size:
         return bytes(image["jpeg"])
     left, top, width, height = camera.window(*size)
-    pixels = decoded(image)[top : top + height, left : left + width]
+    pixels = decode_stored_image(image)[top : top + height, left : left + width]
     shrinks = size[0] < width
     return _encoded(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR))
 

@@ -453,7 +453,7 @@ def _attempt_batch(
     rows: list[Any] = []
     for candidate in range(stamp.candidate_index, stamp.candidate_index + batch.n):
         began = time.perf_counter()
-        given = stages, prepared, stamp.of(prepared.clip_id, candidate, first + len(rows))
+        given = stages, prepared, stamp.of_attempt(prepared.clip_id, candidate, first + len(rows))
         report, row = call_watched(notes, told | task_note("attempt", name, given), attempt, work, *given)
         reports.append(report)
         seconds.append(time.perf_counter() - began)

@@ -11,11 +11,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from factory.readers.pictures import header_of
-from factory.store.location import open_parquet, with_partition
-from factory.store.reader import decoded, group_of
+from factory.store.location import open_parquet, with_partition_columns
+from factory.store.reader import decode_stored_image, find_row_group
 from factory.store.samples import Kind, Store
 from factory.store.schema import AGENT_STEPS, SAMPLES, SCHEMA, table_to_rows
-from factory.store.table import KeyedTable, equals
+from factory.store.table import KeyedTable, text_equals
 from factory.views.board.watch import Snapshot, plain
 from factory.views.episode_messages import episode_of
 from factory.views.sample_picture import (
@@ -75,7 +75,7 @@ def chosen(shot: Snapshot, wanted: Mapping[str, str], order: str = "newest") -> 
             raise BadRequest(f"{name}: samples can be filtered by {', '.join((*FILTERS, SIMULATED))}")
         if name == "round" and not value.isdecimal():
             raise BadRequest(f"round={value}: must be a number")
-        fits &= rows[name].to_numpy() == int(value) if name == "round" else equals(rows[name], value)
+        fits &= rows[name].to_numpy() == int(value) if name == "round" else text_equals(rows[name], value)
     places = shot.newest_first[fits[shot.newest_first]]
     if not ORDERS[order]:
         return places
@@ -91,7 +91,7 @@ def gallery(shot: Snapshot, wanted: Mapping[str, str], page: int = 1, size: int 
 
 def failures(shot: Snapshot, page: int = 1, size: int = 50) -> Json:
     """A page of failed attempts with their errors, by log; of a failed clip `expert` is empty. Raises BadRequest."""
-    rows = shot.outcomes.filter(pa.array(equals(shot.outcomes["kind"], Kind.FAILED.value)))
+    rows = shot.outcomes.filter(pa.array(text_equals(shot.outcomes["kind"], Kind.FAILED.value)))
     by = [("log_id", "ascending"), ("clip_id", "ascending"), ("attempt_id", "ascending")]
     order = np.asarray(pc.sort_indices(plain(rows.select([name for name, _ in by])), sort_keys=by))
 
@@ -181,7 +181,7 @@ def _siblings(shot: Snapshot, card: Row, candidates: KeyedTable) -> list[Json]:
     """All candidates of the clip in the order of the walk, with what this expert made of them."""
 
     def of_walk(rows: pa.Table) -> list[Json]:
-        mine = equals(rows["clip_id"], card["clip_id"]) & equals(rows["expert"], card["expert"])
+        mine = text_equals(rows["clip_id"], card["clip_id"]) & text_equals(rows["expert"], card["expert"])
         return [row for at in np.flatnonzero(mine) for row in rows.slice(at, 1).to_pylist()]
 
     known: dict[int, Json] = {}
@@ -281,11 +281,11 @@ class Pictures:
         path, row, partition = self._place(shot, attempt_id)
         with self._lock:  # the pictures of a page ask at once; one of them reads for all
             file = self._file(path)
-            group, row = group_of(file, row)
+            group, row = find_row_group(file, row)
             kept = [name for name in COLUMNS if name not in partition]
             stored = self._groups.get((path, group), lambda: file.read_row_group(group, columns=kept))
         schema = pa.schema([SCHEMA.field(name) for name in columns])
-        return table_to_rows(with_partition(stored.slice(row, 1), schema, partition))[0]
+        return table_to_rows(with_partition_columns(stored.slice(row, 1), schema, partition))[0]
 
     def front(self, shot: Snapshot, attempt_id: str) -> bytes:
         """JPEG, small. Raises NotThere where the sample has no image."""
@@ -347,7 +347,7 @@ def _jpeg(image: Mapping[str, Any], small: bool) -> bytes:
     if not small:
         return bytes(image["jpeg"])
     try:
-        pixels = decoded(image) if header_of(image["jpeg"])[1][0] > WIDE_PX else None
+        pixels = decode_stored_image(image) if header_of(image["jpeg"])[1][0] > WIDE_PX else None
     except ValueError as error:
         raise NotThere(str(error)) from error
     if pixels is None:

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from factory.store.funnel import Funnel
 from factory.store.samples import Kind
-from factory.store.table import equals
+from factory.store.table import text_equals
 from factory.views.board.gallery import FILTERS
 from factory.views.board.watch import Snapshot, plain
 from factory.views.status import GATE_WORDS, PAPER_CLIP_PERCENT, REASON_WORDS, STATUS
@@ -42,7 +42,7 @@ def overview(shot: Snapshot, where: str, now_s: float) -> Json:
     """All of it; `now_s` since 1970."""
     funnel = shot.funnel
     simulated = [row for row in funnel.rows if row.simulated]
-    failed = shot.outcomes.filter(pa.array(equals(shot.outcomes["kind"], Kind.FAILED.value)))
+    failed = shot.outcomes.filter(pa.array(text_equals(shot.outcomes["kind"], Kind.FAILED.value)))
     stage_times, of = _stage_times(shot)
     before = Counter(funnel.clip_outcomes) + Counter(funnel.clips_without_candidates)
     return {

@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from factory.store.reader import decoded
+from factory.store.reader import decode_stored_image
 from factory.store.samples import Store
 from factory.store.schema import NOW_INDEX
 from factory.views.board.drives import Drives, drives_as_json
@@ -71,7 +71,7 @@ def _with_pictures(found: Mapping[str, Any], row: Mapping[str, Any], kept: dict[
     for image in found["images"]:
         stored = at_now.get((image["camera"], image["time_s"]))
         try:
-            small = None if stored is None else _text(small_jpeg(decoded(stored), CAMERA_PX))
+            small = None if stored is None else _text(small_jpeg(decode_stored_image(stored), CAMERA_PX))
         except ValueError:  # the page says that there is no picture
             continue
         if small is None:

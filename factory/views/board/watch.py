@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from factory.store import funnel
 from factory.store.samples import CURRENT_RUN, PLANS, Store
-from factory.store.table import KeyedTable, LiveFile, in_packs, packed
+from factory.store.table import KeyedTable, LiveFile, pack_small, packed_tables
 from tasks.world.arrays import F32, Ints
 
 SAMPLE_COLUMNS = (
@@ -76,7 +76,7 @@ class Watched:
         if len(self.parts) > MOST_PARTS:  # of a run that is watched, a few files each
             self.parts = {sum(self.parts, ()): _together(list(self.parts.values()))}
         known = {path for paths in self.parts for path in paths}
-        for pack in in_packs(sorted(self.files.keys() - known), lambda path: self.files[path].n_rows):
+        for pack in pack_small(sorted(self.files.keys() - known), lambda path: self.files[path].n_rows):
             self.parts[tuple(pack)] = self._read(pack)
         return True
 
@@ -90,7 +90,7 @@ class Watched:
 
     def _read(self, paths: Sequence[str]) -> WatchedFiles:
         read = [self._read_file(path) for path in paths]
-        (rows,) = packed([pa.concat_tables(file.rows for file in read)], self.table.spec.key)
+        (rows,) = packed_tables([pa.concat_tables(file.rows for file in read)], self.table.spec.key)
         return WatchedFiles(rows, _summed([file.seconds for file in read]), _joined(read))
 
     def _read_file(self, path: str) -> WatchedFiles:

@@ -24,7 +24,7 @@ from factory.stages.scene_file import BadScene, read_scene, write_scene
 from factory.stages.sensors import decode_image, load_sweeps
 from factory.stages.warm import tiny_clip
 from factory.store.episodes import Message, check_episode, episode_bytes
-from factory.store.location import BadCacheFile, decode, encode
+from factory.store.location import BadCacheFile, decode_tree, encode_tree
 from factory.views.scene_files import background_bytes, read_splats
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.render.splatting.project import CLASSIC
@@ -64,7 +64,7 @@ def write_all(folder: Path) -> None:
     (folder / "filter.yaml").write_text(FILTER)
     save_vocabulary(folder / "vocabulary.npy", Vocabulary(kinematic_trajectories(9, 0)), {})
     save_recovery_table(folder / "table.npz", RecoveryTable(kinematic_trajectories(9, 0)), {})
-    (folder / "clip.npz").write_bytes(encode(replace(tiny_clip())))
+    (folder / "clip.npz").write_bytes(encode_tree(replace(tiny_clip())))
     write_scene(folder / "scene.safetensors", scene())
     for suffix in (".ply", ".spz"):
         (folder / f"splats{suffix}").write_bytes(background_bytes(scene().background, suffix, np.zeros(3), CLASSIC))
@@ -144,9 +144,9 @@ def _table(folder: Path) -> Readable:
 
 def _kept_clip(folder: Path) -> Readable:
     path = folder / "clip.npz"
-    golden = pickle.dumps(encode(decode(path.read_bytes())))
-    same = lambda value: pickle.dumps(encode(value)) == golden  # noqa: E731
-    return Readable(path, lambda: decode(path.read_bytes()), (BadCacheFile,), is_sound=same, named=False)
+    golden = pickle.dumps(encode_tree(decode_tree(path.read_bytes())))
+    same = lambda value: pickle.dumps(encode_tree(value)) == golden  # noqa: E731
+    return Readable(path, lambda: decode_tree(path.read_bytes()), (BadCacheFile,), is_sound=same, named=False)
 
 
 def _scene(folder: Path) -> Readable:

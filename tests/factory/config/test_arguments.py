@@ -8,7 +8,7 @@ from typing import Literal
 import pytest
 
 from factory.commands.table import COMMANDS, DOORS
-from factory.config.arguments import RUN, WORD, Refused, keys_of, parse
+from factory.config.arguments import POSITIONAL, RUN_SETTINGS, Refused, keys_of, parse
 from factory.config.shapes import choices_of
 from factory.config.words import ConfigError
 from tests.factory.text_keys import text_keys
@@ -82,8 +82,8 @@ def test_what_cannot_be_meant_is_refused(argv: list[str], said: str) -> None:
 class Told:
     """Words, a choice, a list and settings of a run."""
 
-    how: Literal["fast", "slow"] = field(metadata=WORD)
-    files: tuple[str, ...] = field(default=(), metadata=WORD)
+    how: Literal["fast", "slow"] = field(metadata=POSITIONAL)
+    files: tuple[str, ...] = field(default=(), metadata=POSITIONAL)
     names: tuple[str, ...] = ()
     every_s: float | None = None
 
@@ -93,7 +93,7 @@ class Passed:
     """A key of its own before settings of a run."""
 
     clip: str = "0"
-    settings: tuple[str, ...] = field(default=(), metadata=RUN)
+    settings: tuple[str, ...] = field(default=(), metadata=RUN_SETTINGS)
 
 
 def test_words_stand_without_keys_and_in_their_order() -> None:

@@ -26,7 +26,7 @@ def begin_and_write(barrier: Barrier, folder: str, name: str, told: Path) -> Non
         store, fate = Store(f"{folder}/{trial}"), "goes on"
         barrier.wait(60.0)
         try:
-            store.begin([])
+            store.begin_run([])
         except AnotherWriter:
             fate = "ended at once"
         barrier.wait(60.0)
@@ -77,7 +77,7 @@ def test_a_claim_above_all_tables_takes_those_that_are_ahead(tmp_path: Path) -> 
     for _ in range(3):
         Store(tmp_path).outcomes.claim()
     store = Store(tmp_path)
-    store.begin([])
+    store.begin_run([])
     assert {store.candidates.epoch, store.samples.epoch, store.outcomes.epoch} == {4}
 
 

@@ -12,7 +12,7 @@ from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph import driver
 from factory.graph.driver import EpisodeSettings
 from factory.graph.execute import Execution, RunSummary
-from factory.store.episodes import FOLDER, episode_name, is_chosen
+from factory.store.episodes import EPISODES_FOLDER, episode_name, has_episode
 from factory.store.location import Location
 from factory.store.samples import Store
 from factory.store.verify import verify
@@ -31,12 +31,12 @@ def run(out: Path | Store, every: int = 1, rounds: int = 2, n: int = 3, **option
 
 
 def there(out: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted((out / FOLDER).glob("*"))}
+    return {path.name: path.read_bytes() for path in sorted((out / EPISODES_FOLDER).glob("*"))}
 
 
 def asked_for(out: Path, every: int = 1) -> set[str]:
     rows = Store(out).samples.read(["attempt_id", "settings_hash", "stage_versions"]).to_pylist()
-    return {episode_name(row) for row in rows if is_chosen(row["attempt_id"], every)}
+    return {episode_name(row) for row in rows if has_episode(row["attempt_id"], every)}
 
 
 def attempt_of(data: bytes) -> str:
@@ -59,7 +59,7 @@ def test_every_sample_has_its_episode_and_none_is_written_unless_asked_for(whole
     assert set(found) == asked_for(whole) and len(found) == len(Store(whole).samples) > 6
     assert all(attempt_of(data) == name.split("-")[0] for name, data in found.items())
     run(tmp_path, every=0)
-    assert not (tmp_path / FOLDER).exists()
+    assert not (tmp_path / EPISODES_FOLDER).exists()
 
 
 def test_one_in_n_is_a_choice_of_the_ids_alone(whole: Path, tmp_path: Path) -> None:
@@ -67,8 +67,8 @@ def test_one_in_n_is_a_choice_of_the_ids_alone(whole: Path, tmp_path: Path) -> N
     run(tmp_path, every=3, rounds=2)
     assert there(tmp_path) == {name: data for name, data in there(whole).items() if name in asked_for(whole, 3)}
     many = [f"{i:016x}" for i in range(9000)]
-    assert 2800 < sum(is_chosen(key, 3) for key in many) < 3200
-    assert set(filter(lambda key: is_chosen(key, 6), many)) < set(filter(lambda key: is_chosen(key, 3), many))
+    assert 2800 < sum(has_episode(key, 3) for key in many) < 3200
+    assert set(filter(lambda key: has_episode(key, 6), many)) < set(filter(lambda key: has_episode(key, 3), many))
 
 
 @pytest.mark.slow
@@ -77,7 +77,7 @@ def test_what_is_missing_is_made_up_for_and_nothing_is_written_twice(whole: Path
     made_up = run(tmp_path)
     assert made_up.executed.attempts == 0 and made_up.executed.episodes == len(there(whole))
     assert there(tmp_path) == there(whole)
-    (tmp_path / FOLDER / min(there(whole))).unlink()
+    (tmp_path / EPISODES_FOLDER / min(there(whole))).unlink()
     assert run(tmp_path).executed.episodes == 1
     assert run(tmp_path).executed.episodes == 0
     assert there(tmp_path) == there(whole)
@@ -98,8 +98,8 @@ def test_a_run_killed_between_commit_and_episodes_ends_in_the_same_files(
         patch.setattr(driver.Episodes, "committed", die)
         with pytest.raises(Killed):
             run(tmp_path, shard_seconds=0.0)
-    (tmp_path / FOLDER).mkdir()
-    (tmp_path / FOLDER / ".half.mcap.0123abcd.tmp").write_bytes(b"half")
+    (tmp_path / EPISODES_FOLDER).mkdir()
+    (tmp_path / EPISODES_FOLDER / ".half.mcap.0123abcd.tmp").write_bytes(b"half")
     assert len(Store(tmp_path).samples) > 0 and len(there(tmp_path)) == 1
     assert run(tmp_path).exit_code == COMPLETE
     assert there(tmp_path) == there(whole)
@@ -128,7 +128,7 @@ def test_an_episode_that_cannot_be_written_costs_no_other_and_the_same_command_w
 def test_a_redo_leaves_the_episodes_of_the_rows_that_are_there(tmp_path: Path) -> None:
     run(tmp_path)
     before = there(tmp_path)
-    (tmp_path / FOLDER / "notes.txt").write_text("a user's own")
+    (tmp_path / EPISODES_FOLDER / "notes.txt").write_text("a user's own")
     run(tmp_path, work=FilmedWork(threshold=0.4, prepare_digest="perturb-2"), on_change="redo")
     after = there(tmp_path)
     assert after.pop("notes.txt") == b"a user's own"
@@ -157,7 +157,7 @@ def test_a_setting_that_says_nothing_is_refused(text: str) -> None:
 def test_verify_finds_every_flipped_bit_of_an_episode_and_tells_outdated_ones(whole: Path, tmp_path: Path) -> None:
     run(tmp_path)
     assert verify(Store(tmp_path)).damage == () and verify(Store(tmp_path)).orphans == ()
-    path = tmp_path / FOLDER / min(there(whole))
+    path = tmp_path / EPISODES_FOLDER / min(there(whole))
     data = path.read_bytes()
     for at in range(8, len(data) - 8, len(data) // 40):
         flipped = bytearray(data)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factory.graph.plan import ClipPlan, RunPlan, make_plan, retry_policy
-from factory.store.samples import OUTCOME_STATE, OUTCOMES, SAMPLE_STATE, History, Kind, Listed, history_of
+from factory.store.samples import OUTCOME_STATE, OUTCOMES, SAMPLE_STATE, CandidateSummary, History, Kind, build_history
 from factory.store.schema import SAMPLES, attempt_id
 from tests.factory.toy import ToyWork, refs
 
@@ -40,10 +40,10 @@ def rows_of(walks: list[list[tuple[str, bool]]], whole: list[Kind | None], doubl
                     outcomes.append(row | {"kind": "failed" if kind == "accepted" else kind, "error_kind": "bug"})
         if (said := whole[place]) is not None:
             outcomes.append(row_of(ref.clip_id, "", -1, True) | {"kind": said.value, "error_kind": "bug"})
-    listed = {ref.clip_id: Listed(WORK.identity.prepare_digest, "content", 4) for ref in CLIPS}
+    listed = {ref.clip_id: CandidateSummary(WORK.identity.prepare_digest, "content", 4) for ref in CLIPS}
     made_by = WORK.identity.settings_hash, WORK.identity.versions_json
     digests = {expert: WORK.expert_digest(expert) for expert in EXPERTS}
-    return history_of(
+    return build_history(
         table(outcomes, OUTCOMES.schema, OUTCOME_STATE),
         table(samples, SAMPLES.schema, SAMPLE_STATE),
         listed,
@@ -88,7 +88,7 @@ def told(clip: ClipPlan) -> tuple[object, ...]:
 class OneByOne(History):
     """Says of no walk at once that it is complete."""
 
-    def complete(self, expert: str, first: int, wanted: int) -> dict[str, tuple[int, int]]:
+    def complete_walks(self, expert: str, first: int, wanted: int) -> dict[str, tuple[int, int]]:
         return {}
 
 
@@ -112,14 +112,14 @@ def test_walks_that_are_complete_at_once_are_those_that_are_complete_one_by_one(
 def test_a_walk_with_a_gap_is_not_complete(broken: str) -> None:
     walk = [("accepted", True), (broken, True), ("accepted", True)]
     history = rows_of([walk, []] * 3, [None] * 3, False)
-    assert history.complete("recovery", 0, 2) == {}
+    assert history.complete_walks("recovery", 0, 2) == {}
 
 
 def test_complete_walks_are_not_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
     walk = [("rejected", True), ("accepted", True), ("accepted", True)]
     history = rows_of([walk, [("accepted", True)]] * 3, [None] * 3, False)
-    assert history.complete("recovery", 0, 2) == {ref.clip_id: (2, 3) for ref in CLIPS}
-    assert history.complete("human", -1, 1) == {ref.clip_id: (1, 1) for ref in CLIPS}
+    assert history.complete_walks("recovery", 0, 2) == {ref.clip_id: (2, 3) for ref in CLIPS}
+    assert history.complete_walks("human", -1, 1) == {ref.clip_id: (1, 1) for ref in CLIPS}
 
     def unpacked(*given: object) -> None:
         raise AssertionError("a walk was unpacked")

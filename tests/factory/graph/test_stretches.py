@@ -35,7 +35,7 @@ def long(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     def wait(self: graph.RayGraph, timeout_s: float):  # type: ignore[no-untyped-def]
         finished = waited(self, timeout_s)
-        if finished is not None and isinstance(finished[1], graph.Walked):
+        if finished is not None and isinstance(finished[1], graph.BatchReport):
             lengths.append(len(finished[1].reports))
         return finished
 

@@ -14,18 +14,20 @@ from factory.graph.plan import (
     next_step,
     retry_policy,
 )
-from factory.store.samples import ErrorKind, Kind, Past
+from factory.store.samples import ErrorKind, Kind, PastAttempt
 
 
-def never(past: Past) -> bool:
+def never(past: PastAttempt) -> bool:
     return False
 
 
-def past(kind: Kind, round_: int = -1, error: str = "", versions: str = "v1") -> Past:
-    return Past("id", kind, True, round_, error, 1, versions)
+def past(kind: Kind, round_: int = -1, error: str = "", versions: str = "v1") -> PastAttempt:
+    return PastAttempt("id", kind, True, round_, error, 1, versions)
 
 
-def walk(accepts: list[bool], rounds: int, known: dict[int, Past] | None = None) -> tuple[dict[int, Past], Step, int]:
+def walk(
+    accepts: list[bool], rounds: int, known: dict[int, PastAttempt] | None = None
+) -> tuple[dict[int, PastAttempt], Step, int]:
     """Walk to the end; (known, last step, attempts made)."""
     known, made = dict(known or {}), 0
     while isinstance(step := next_step(False, len(accepts), rounds, known, never), Try):

@@ -12,7 +12,7 @@ from printed_street import CAMERAS, photographed
 from factory.stages.imaging import Imaging, heights
 from factory.stages.rig import SAID, UsedRig, taken_from, used_rig
 from factory.stages.sensors import load_photos
-from factory.store.reader import decoded
+from factory.store.reader import decode_stored_image
 from tasks.attempt import Judged, human_sample
 from tasks.experts.human import Human
 from tasks.experts.pdm_closed.settings import PdmSettings
@@ -89,7 +89,7 @@ def test_photos_are_cut_by_the_camera_and_stand_at_the_poses_that_the_rig_s_file
         np.testing.assert_array_equal(image["ego_pose"], taken[image["camera"], round(at_s + LATER_S, 3)])
         (file,) = (f for f in clip.images if f.sensor == image["camera"] and abs(f.time_s - at_s) < 1e-6)
         (photo,) = load_photos([file], cameras, SETTINGS.width, SETTINGS.height)
-        assert np.abs(decoded(image).astype(float) - photo.rgb).mean() < 1.0  # JPEG
+        assert np.abs(decode_stored_image(image).astype(float) - photo.rgb).mean() < 1.0  # JPEG
     again = Imaging(SETTINGS, str(tmp_path)).pictures(clip, None, judged)
     assert json.dumps(again["cameras"], default=list) == json.dumps(row["cameras"], default=list)
 

@@ -20,7 +20,7 @@ from factory.stages.assets import _resumed, damaged_blocks
 from factory.stages.rig import SAID, _say, told_of
 from factory.stages.scene_file import BadScene, read_scene, write_scene
 from factory.stages.warm import _is_compiled, marker, tiny_clip
-from factory.store.location import BadCacheFile, Location, SceneFiles, encode
+from factory.store.location import BadCacheFile, Location, SceneFiles, encode_tree
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.hard_scenes import OneStageClip
 from tasks.kernels.compiled import kernel
@@ -50,7 +50,7 @@ def lines(caplog: pytest.LogCaptureFixture) -> Lines:
 
 def test_a_prepared_clip(tmp_path: Path) -> None:
     (ref,), work, out = refs(1), ToyWork(), Location(str(tmp_path))
-    golden = encode(prepare(work, out, ref)[1])
+    golden = encode_tree(prepare(work, out, ref)[1])
     key = cache_key(ref.clip_id, work.identity.prepare_digest)
     path = tmp_path / "cache" / "prepared" / f"{key}.npz"
     whole = path.read_bytes()
@@ -59,7 +59,7 @@ def test_a_prepared_clip(tmp_path: Path) -> None:
         report, clip = prepare(work, out, ref)
         assert isinstance(report, PrepareReport) and not report.from_cache
         assert report.note.startswith(f"cache file {key}: it") and report.note.endswith("; prepared again")
-        assert encode(clip) == golden and path.read_bytes() == whole
+        assert encode_tree(clip) == golden and path.read_bytes() == whole
     report, _ = prepare(work, out, ref)
     assert isinstance(report, PrepareReport) and report.from_cache and not report.note
 
@@ -189,7 +189,7 @@ Kept = tuple[list[Path], Callable[[int], object]]  # two files of a cache, and w
 def prepared_clips(folder: Path) -> Kept:
     work, out, both = ToyWork(), Location(str(folder)), refs(2)
     keys = [cache_key(ref.clip_id, work.identity.prepare_digest) for ref in both]
-    return [folder / f"cache/prepared/{key}.npz" for key in keys], lambda i: encode(prepare(work, out, both[i])[1])
+    return [folder / f"cache/prepared/{key}.npz" for key in keys], lambda i: encode_tree(prepare(work, out, both[i])[1])
 
 
 def city_tables(folder: Path) -> Kept:

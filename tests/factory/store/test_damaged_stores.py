@@ -199,7 +199,7 @@ def test_nothing_is_repaired_while_a_run_writes(out: Path, capsys: pytest.Captur
 
 def test_a_run_that_was_quiet_for_long_commits_nothing_after_its_leftovers_went(out: Path) -> None:
     quiet = Store(out)
-    quiet.begin(quiet.runs())  # it writes a shard and does not come to its commit
+    quiet.begin_run(quiet.runs())  # it writes a shard and does not come to its commit
     rows = quiet.samples.read().slice(0, 1)
     changed = rows.set_column(0, "attempt_id", pa.array(["0" * 16]))
     shard = write_shard(quiet.samples.location, SAMPLES, changed)

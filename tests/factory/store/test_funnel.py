@@ -15,7 +15,7 @@ from factory.store.funnel import (
     SAMPLE_COLUMNS,
     Attempts,
     FunnelRow,
-    attempts_of,
+    attempts_from_tables,
     expert_rows,
     funnel_of,
     image_sources_text,
@@ -44,7 +44,7 @@ def attempts(walks: Walks) -> Attempts:
         pa.Table.from_pylist(rows, schema=pa.schema([spec.schema.field(name) for name in columns]))
         for rows, spec, columns in ((samples, SAMPLES, SAMPLE_COLUMNS), (outcomes, OUTCOMES, OUTCOME_COLUMNS))
     ]
-    return attempts_of(tables[0], tables[1], [RUN])
+    return attempts_from_tables(tables[0], tables[1], [RUN])
 
 
 def slow_rows(expert: str, clips: dict[str, list[tuple[int, str]]]) -> list[FunnelRow]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.store.location import BadCacheFile, ClipCache, Location, decode, encode
+from factory.store.location import BadCacheFile, ClipCache, Location, decode_tree, encode_tree
 from factory.store.samples import CandidateRow
 from tasks.stages import Rejected
 from tasks.world.agents import AgentKind, AgentTracks
@@ -35,7 +35,7 @@ def tracks() -> AgentTracks:
 
 def test_a_tree_of_dataclasses_comes_back_exactly() -> None:
     value = {"tracks": tracks(), "lanes": frozenset({"a", "b"}), "pair": (np.float64(0.1), None), 3: [True, "x"]}
-    back = decode(encode(value))
+    back = decode_tree(encode_tree(value))
     assert list(back) == list(value) and back["lanes"] == value["lanes"] and back["pair"] == value["pair"]
     assert back["tracks"].kinds == tracks().kinds and isinstance(back["tracks"].kinds[0], AgentKind)
     for name in ("boxes", "velocities", "valid", "center_z", "heights"):
@@ -45,7 +45,7 @@ def test_a_tree_of_dataclasses_comes_back_exactly() -> None:
 
 def test_an_array_that_stands_twice_is_stored_once() -> None:
     big = np.random.default_rng(0).random(10_000)
-    assert len(encode((big, big, {"again": big}))) < 1.1 * len(encode((big,)))
+    assert len(encode_tree((big, big, {"again": big}))) < 1.1 * len(encode_tree((big,)))
 
 
 @pytest.mark.parametrize(
@@ -60,21 +60,21 @@ def test_an_array_that_stands_twice_is_stored_once() -> None:
 )
 def test_a_file_cannot_name_what_is_not_a_dataclass_of_ours(name: str) -> None:
     with pytest.raises(BadCacheFile):
-        decode(forged({"format": 1, "root": {"class": name, "members": {}}}))
+        decode_tree(forged({"format": 1, "root": {"class": name, "members": {}}}))
 
 
 def test_a_file_makes_nobody_import_a_module_of_others() -> None:
     """An import runs code: `this` prints a poem, others may do worse."""
     with pytest.raises(BadCacheFile, match="not a class a cache file may name"):
-        decode(forged({"format": 1, "root": {"class": "this:Poem", "members": {}}}))
+        decode_tree(forged({"format": 1, "root": {"class": "this:Poem", "members": {}}}))
     assert "this" not in sys.modules
 
 
 def test_what_cannot_be_stored_is_refused_when_written() -> None:
     with pytest.raises(TypeError, match="cannot be cached"):
-        encode({"f": open})
+        encode_tree({"f": open})
     with pytest.raises(TypeError, match="objects"):
-        encode(np.array([object()]))
+        encode_tree(np.array([object()]))
 
 
 def test_damage_is_found_and_absence_is_none(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from factory.config.run import load_config
 from factory.setup.settings import Run, assemble
-from factory.store.reader import SampleTable, decoded
+from factory.store.reader import SampleTable, decode_stored_image
 from factory.store.samples import Store
 from factory.views.board.gallery import Pictures
 from factory.views.board.watch import Watch
@@ -89,7 +89,7 @@ def test_a_picture_keeps_its_aspect_and_survives_coding() -> None:
     tile = fitted(wide, 200, 100)
     assert tile.shape == (100, 200, 3)
     assert (tile[30:70] == wide[0, 0]).all() and not (tile[:20] == wide[0, 0]).all()
-    back = decoded({"jpeg": encoded(wide), "camera": "front", "time_s": 0.0})
+    back = decode_stored_image({"jpeg": encoded(wide), "camera": "front", "time_s": 0.0})
     assert np.abs(back.astype(int) - wide).max() <= 4
 
 

@@ -12,7 +12,7 @@ import pytest
 from factory.commands.table import COMMANDS
 from factory.config.run import load_config
 from factory.setup.settings import assemble
-from factory.store.reader import SampleTable, decoded
+from factory.store.reader import SampleTable, decode_stored_image
 from factory.store.samples import Store
 from factory.views.board.gallery import Pictures
 from factory.views.board.watch import Watch
@@ -71,7 +71,7 @@ def test_a_row_holds_all_that_its_own_images_were_drawn_from(store: Store) -> No
         pose = pose_at(rendered, step)
         np.testing.assert_allclose(pose, np.reshape(image["ego_pose"], (4, 4)), atol=1e-3)
         (again,) = drawn(scene(store), rendered["cameras"], pose, agents, image["time_s"])
-        assert psnr(again, decoded(image)) > 30.0  # JPEG and float32 poses
+        assert psnr(again, decode_stored_image(image)) > 30.0  # JPEG and float32 poses
 
 
 def test_a_photo_stands_beside_what_the_scene_shows_from_its_pose(store: Store) -> None:
@@ -80,10 +80,10 @@ def test_a_photo_stands_beside_what_the_scene_shows_from_its_pose(store: Store) 
     assert photos is not None and photos["attempt_id"] == human["attempt_id"]
     ((photo, again),) = real_and_rendered(scene(store), photos, rendered["clip_start_s"] + rendered["now_s"])
     assert "photo, -4.0 s from the sample's now" in photo.caption and "dB" in again.caption
-    np.testing.assert_array_equal(photo.pixels, decoded(human["images"][-1]))
+    np.testing.assert_array_equal(photo.pixels, decode_stored_image(human["images"][-1]))
     assert psnr(photo.pixels, again.pixels) > 15.0
     other = real_and_rendered(scene(store), photos, human["clip_start_s"] + human["now_s"] - 1.5)[0]
-    np.testing.assert_array_equal(other[0].pixels, decoded(human["images"][0]))
+    np.testing.assert_array_equal(other[0].pixels, decode_stored_image(human["images"][0]))
 
 
 def test_the_view_from_the_side_moves_what_is_near_and_not_the_horizon(store: Store) -> None:
@@ -94,7 +94,7 @@ def test_the_view_from_the_side_moves_what_is_near_and_not_the_horizon(store: St
     assert strip[2].caption == "ring_front_center, rendered at now"
     assert len(ASIDE_M) == 5 and len({seen.pixels.tobytes() for seen in strip}) == 5
     now = next(image for image in rendered["images"] if abs(image["time_s"]) < 0.05)
-    assert psnr(strip[2].pixels, decoded(now)) > 30.0
+    assert psnr(strip[2].pixels, decode_stored_image(now)) > 30.0
     assert from_the_side(scene(store), {**human, "images": None}) == []
 
 

@@ -24,7 +24,7 @@ from factory.readers.pickles import load_plain
 from factory.readers.settings import MOUNTS, TownSettings
 from factory.run import main as run
 from factory.stages.sensors import decode_image, encode_jpeg
-from factory.store.reader import SampleTable, decoded
+from factory.store.reader import SampleTable, decode_stored_image
 from planners.evaluation.planning import plans_of
 from planners.navsim.agent import RemotePlanner, shown
 from planners.navsim.pilot import FRONT, Pilot, seen_of
@@ -156,7 +156,9 @@ def test_pictures_are_those_of_pinholes_and_the_street_is_found_again(chain: Cha
     at = [frame["token"] for frame in _logged(chain)].index(human["frame_tokens"][0])
     for image in human["images"]:
         key = image["camera"], at + round(2.0 * image["time_s"])
-        far = [np.abs(_small(sensed.images[key]) - _inner(decoded(image))).mean() for sensed in (painted, bent)]
+        far = [
+            np.abs(_small(sensed.images[key]) - _inner(decode_stored_image(image))).mean() for sensed in (painted, bent)
+        ]
         assert far[0] < 6.0 and far[0] < 0.9 * far[1], key
     assert all(row["psnr"] > 18.0 for row in simulated)
 
@@ -214,7 +216,7 @@ def _same_pictures(row: Mapping[str, Any], scene: Scene) -> None:
         shot = scene.frames[round(2.0 * image["time_s"]) + 3].cameras[name]
         middles = shot.image().reshape(45, 24, 80, 24, 3)[:, 11:13, :, 11:13].mean(axis=(1, 3))
         # Grey levels: the export's JPEG and a 48th of the way to the next pixel, 0.3; 1.3 where it is 2 pixels aside.
-        assert np.abs(middles - decoded(image)).mean() < 1.0
+        assert np.abs(middles - decode_stored_image(image)).mean() < 1.0
         scale = np.diag([1920 / 80, 1080 / 45, 1.0])
         np.testing.assert_allclose(shot.intrinsics, scale @ rig[name]["intrinsics"].reshape(3, 3))
         pose = rig[name]["ego_from_camera"].reshape(4, 4)

@@ -104,7 +104,7 @@ def test_the_numbers_are_those_of_the_tables_while_a_run_goes_on(tmp_path: Path)
 
 
 def test_a_run_that_has_only_begun_is_shown(tmp_path: Path) -> None:
-    Store(tmp_path).begin([])
+    Store(tmp_path).begin_run([])
     board = Board(Store(tmp_path), look_every_s=0.0)
     answer = get(board, "/api/overview")
     assert told(answer) == counted(tmp_path) and answer["counts"]["samples"] == 0

@@ -110,6 +110,6 @@ def test_it_goes_where_it_is_asked_to_and_says_what_is_missing(
 
 
 def test_a_run_without_samples_has_a_report(tmp_path: Path) -> None:
-    Store(tmp_path).begin([])
+    Store(tmp_path).begin_run([])
     assert main([f"out={tmp_path}"]) == 0
     assert kept((tmp_path / FILE).read_text())["answers"]["/api/samples"]["items"] == []
