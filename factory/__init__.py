@@ -2,10 +2,10 @@
 
 import sys
 
-from factory.exits import end_at_interrupt
+from factory.exits import exit_on_early_interrupt
 
 if sys.argv[:1] == ["-m"] and {"factory", "planners"} & {word.partition(".")[0] for word in sys.orig_argv}:
-    end_at_interrupt()  # `python -m factory ...` imports this package before all else
+    exit_on_early_interrupt()  # `python -m factory ...` imports this package before all else
 
 import importlib
 import importlib.util

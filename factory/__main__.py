@@ -9,7 +9,7 @@ python -m factory --version
 from collections.abc import Sequence
 
 from factory.commands.table import COMMANDS, PLANNERS, dispatch, listed
-from factory.exits import as_program
+from factory.exits import run_program
 
 
 def help_text() -> str:
@@ -31,7 +31,7 @@ def main(argv: Sequence[str]) -> int:
 
 def program() -> None:
     """The installed program `factory`."""
-    as_program(main)
+    run_program(main)
 
 
 if __name__ == "__main__":

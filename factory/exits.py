@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 COMPLETE, DAMAGED, BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED = range(5)
-MEANING = {
+EXIT_CODE_TEXT = {
     COMPLETE: "complete",
     DAMAGED: "checked, and something is wrong with it",
     BAD_CONFIG: "refused: what was asked for does not exist or does not fit; nothing is written",
     COMPLETE_WITH_FAILURES: "complete with failed attempts",
     INTERRUPTED: "interrupted, the same command goes on",
 }
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-OF_TERMINALS = (signal.SIGINT, signal.SIGHUP)  # Ctrl-C and a closed terminal reach every process that runs in it
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+TERMINAL_SIGNALS = (signal.SIGINT, signal.SIGHUP)  # Ctrl-C and a closed terminal reach every process that runs in it
 
 
 class Failed(Exception):
@@ -35,8 +35,8 @@ class Stopped(Exception):
     """Interrupted or out of minutes; what is done is kept, and the same command goes on."""
 
 
-def end_at_interrupt() -> None:
-    """Until `as_program`, while modules are imported and nothing is begun: SIGINT is one line and INTERRUPTED."""
+def exit_on_early_interrupt() -> None:
+    """Until `run_program`, while modules are imported and nothing is begun: SIGINT is one line and INTERRUPTED."""
 
     def end(number: int, frame: FrameType | None) -> None:
         os.write(2, b"interrupted\n")
@@ -46,22 +46,22 @@ def end_at_interrupt() -> None:
         signal.signal(signal.SIGINT, end)
 
 
-def as_program(main: Callable[[Sequence[str]], int]) -> None:
+def run_program(main: Callable[[Sequence[str]], int]) -> None:
     """Run the command line of this process and end with its exit code."""
-    sys.exit(exit_code_of(lambda: main(sys.argv[1:])))
+    sys.exit(run_for_exit_code(lambda: main(sys.argv[1:])))
 
 
-def exit_code_of(work: Callable[[], int]) -> int:
+def run_for_exit_code(work: Callable[[], int]) -> int:
     """What the work of this process returns; INTERRUPTED, after a line, at a KeyboardInterrupt.
 
-    What it prints decides nothing: see `print_without_failing`. Signals of OF_TERMINALS are heeded from here on, where
-    the process was begun in `without_terminal`.
+    What it prints decides nothing: see `ignore_broken_output`. TERMINAL_SIGNALS are heeded from here on, where the
+    process was begun in `terminal_signals_blocked`.
     """
-    print_without_failing()
+    ignore_broken_output()
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         signal.signal(signal.SIGINT, _interrupt)
     try:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, OF_TERMINALS)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, TERMINAL_SIGNALS)
         return work()
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -77,25 +77,25 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise _Interrupt
 
 
-def as_worker() -> None:
-    """Begin a process that a program has started for itself, in `without_terminal`: only that program ends it."""
-    for number in OF_TERMINALS:
+def become_worker() -> None:
+    """In a process begun in `terminal_signals_blocked`: only the program that started it ends it."""
+    for number in TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, OF_TERMINALS)
-    print_without_failing()
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, TERMINAL_SIGNALS)
+    ignore_broken_output()
 
 
 @contextmanager
-def without_terminal(*signals: signal.Signals) -> Iterator[None]:
-    """Processes begun inside do not receive these signals, all of OF_TERMINALS by default, before `as_worker`.
+def terminal_signals_blocked(*signals: signal.Signals) -> Iterator[None]:
+    """Processes begun inside do not receive these signals, all of TERMINAL_SIGNALS by default, before `become_worker`.
 
     This process heeds them at the end of it, when who began others knows them and can end them.
     """
-    numbers, held, handlers = signals or OF_TERMINALS, list[int](), dict[int, Any]()
+    numbers, held, handlers = signals or TERMINAL_SIGNALS, list[int](), dict[int, Any]()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     if threading.current_thread() is threading.main_thread():  # it handles what another thread receives, too
-        heeded = [number for number in numbers if callable(signal.getsignal(number))]
-        handlers = {number: signal.signal(number, lambda number, _: held.append(number)) for number in heeded}
+        stop_signals = [number for number in numbers if callable(signal.getsignal(number))]
+        handlers = {number: signal.signal(number, lambda number, _: held.append(number)) for number in stop_signals}
     try:
         yield
     finally:
@@ -106,7 +106,7 @@ def without_terminal(*signals: signal.Signals) -> Iterator[None]:
             signal.raise_signal(number)
 
 
-def print_without_failing() -> None:
+def ignore_broken_output() -> None:
     """From now on standard output and error are dropped once nobody reads them: `... | head`, a closed terminal.
 
     Characters that their encoding lacks are replaced: by question marks, which keep tables in line, on standard error
@@ -144,13 +144,13 @@ class _Output(io.FileIO):
             return super().write(data)
 
 
-def heeded() -> list[signal.Signals]:
-    """The signals that ask this process to stop: STOPS, less a SIGHUP that is ignored, as by nohup."""
-    return [number for number in STOPS if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN]
+def stop_signals() -> list[signal.Signals]:
+    """The signals that ask this process to stop: STOP_SIGNALS, less a SIGHUP that is ignored, as by nohup."""
+    return [number for number in STOP_SIGNALS if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN]
 
 
 @contextmanager
-def asked_to_stop(stop: Callable[[], object]) -> Iterator[None]:
+def calling_on_stop_signal(stop: Callable[[], object]) -> Iterator[None]:
     """The first SIGINT, SIGTERM or SIGHUP calls `stop`, a second one raises KeyboardInterrupt.
 
     A SIGHUP is never a second one, and is ignored after the first: a terminal that closes sends it, and its shell once
@@ -171,7 +171,7 @@ def asked_to_stop(stop: Callable[[], object]) -> Iterator[None]:
         elif number != signal.SIGHUP:
             _interrupt(number, frame)
 
-    before = {number: signal.signal(number, handle) for number in heeded()}
+    before = {number: signal.signal(number, handle) for number in stop_signals()}
     try:
         yield
     finally:

@@ -137,7 +137,7 @@ def in_submitted_job() -> bool:
     return "RAY_JOB_CONFIG_JSON_ENV_VAR" in os.environ  # Ray sets it for drivers of jobs alone
 
 
-def runs_root() -> str:
+def default_runs_folder() -> str:
     """FACTORY_RUNS, else `runs` in the working directory, in a submitted job ~/driving-data-factory/runs."""
     if named := os.environ.get(RUNS):
         return named
@@ -150,7 +150,7 @@ def runs_root() -> str:
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
-SAID = re.compile(r"\(os error (\d+)\)")  # how delta-rs says it, in an OSError without a number
+DELTA_ERRNO = re.compile(r"\(os error (\d+)\)")  # how delta-rs says it, in an OSError without a number
 
 
 class DiskFull(OSError):
@@ -165,12 +165,12 @@ def _number_of(error: BaseException) -> int | None:
     """The number of what the system said."""
     if isinstance(error, OSError) and error.errno is not None:
         return error.errno
-    said = SAID.search(str(error))
+    said = DELTA_ERRNO.search(str(error))
     return None if said is None else int(said[1])
 
 
 @contextmanager
-def needs_disk(path: str | os.PathLike[str], n_bytes: int) -> Iterator[None]:
+def naming_disk_errors(path: str | os.PathLike[str], n_bytes: int) -> Iterator[None]:
     """For the writing of about `n_bytes` at a local path. Raises DiskFull where they find none, and NotWritable."""
     try:
         yield
@@ -180,15 +180,15 @@ def needs_disk(path: str | os.PathLike[str], n_bytes: int) -> Iterator[None]:
             raise
         if number in REFUSED:
             raise NotWritable(f"{path}: cannot be written: {os.strerror(number)}") from error
-        free = shutil.disk_usage(existing(Path(path))).free
+        free = shutil.disk_usage(nearest_existing(Path(path))).free
         raise DiskFull(f"{path}: the disk is full: {n_bytes:,} bytes are needed, {free:,} are free") from error
 
 
 @contextmanager
-def whole_file(path: Path, n_bytes: int) -> Iterator[Path]:
+def atomic_file(path: Path, n_bytes: int) -> Iterator[Path]:
     """A draft to be filled with about `n_bytes`: then it is `path`, or there is none. Raises DiskFull."""
     draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    with needs_disk(path, n_bytes):
+    with naming_disk_errors(path, n_bytes):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             yield draft
@@ -222,14 +222,14 @@ def why_not_written(error: BaseException) -> str:
     return full and f"{full}; free disk space"
 
 
-def existing(path: Path) -> Path:
+def nearest_existing(path: Path) -> Path:
     """The path itself, or the nearest folder above it that is there."""
     return next(place for place in (path, *path.parents) if place.exists())
 
 
 # Illness of the machine, told apart from what is wrong with a clip: it never counts against one.
 
-NUMBERS = frozenset(
+MACHINE_ERRNOS = frozenset(
     getattr(errno, name)
     for name in (
         *("ENOSPC", "EDQUOT", "EIO", "EROFS", "EREMOTEIO", "ENXIO", "ENODEV"),  # a disk
@@ -240,7 +240,7 @@ NUMBERS = frozenset(
     if hasattr(errno, name)
 )
 # What object stores' clients say in an OSError without a number; a file that is not there is no illness.
-STORE = re.compile(
+STORE_FAULT = re.compile(
     r"AWS Error (?!NO_SUCH|RESOURCE_NOT_FOUND)|Generic (?:S3|GCS|MicrosoftAzure) error|lacked the necessary privileges"
 )
 SHORT_OF_MEMORY = 0.1  # of it is left: then a MemoryError is the machine's, else of what was asked for
@@ -251,7 +251,7 @@ class PlaceRefused(OSError):
 
 
 @contextmanager
-def refused_as_the_runs_own(where: str | os.PathLike[str]) -> Iterator[None]:
+def raising_place_refused(where: str | os.PathLike[str]) -> Iterator[None]:
     """Around what is written there by the run: whatever goes wrong with it is no clip's. Raises PlaceRefused."""
     try:
         yield
@@ -278,10 +278,10 @@ def machine_fault_of(error: BaseException) -> str:
 def _is_of_machine(error: BaseException) -> bool:
     delta = sys.modules.get("deltalake.exceptions")  # who has not loaded it has none of its errors
     if delta is not None and isinstance(error, delta.DeltaError):
-        return STORE.search(str(error)) is not None
+        return STORE_FAULT.search(str(error)) is not None
     if not isinstance(error, OSError):
         return False
-    return _number_of(error) in NUMBERS or (error.errno is None and STORE.search(str(error)) is not None)
+    return _number_of(error) in MACHINE_ERRNOS or (error.errno is None and STORE_FAULT.search(str(error)) is not None)
 
 
 def _memory_left() -> float:
@@ -318,7 +318,7 @@ def why_unusable(out: str) -> str:
     if is_url and scheme != "file":
         return _why_not_remote(out, scheme) if scheme in CREDENTIALS else ""  # others are refused by Location
     path = Path(out.removeprefix("file://")).expanduser().absolute()
-    above = existing(path)
+    above = nearest_existing(path)
     if not above.is_dir():
         return f"out={out}: {above} is not a folder"
     return _why_not_local(out, path, above)
@@ -329,7 +329,7 @@ def _why_not_local(out: str, path: Path, above: Path) -> str:
     trial = path / f".trial-{secrets.token_hex(8)}"
     try:
         path.mkdir(parents=True, exist_ok=True)
-        with needs_disk(path, TRIAL_BYTES):
+        with naming_disk_errors(path, TRIAL_BYTES):
             try:
                 with trial.open("wb") as file:
                     file.write(bytes(TRIAL_BYTES))
@@ -337,7 +337,7 @@ def _why_not_local(out: str, path: Path, above: Path) -> str:
                     os.fsync(file.fileno())
             finally:  # before the free space is told
                 trial.unlink(missing_ok=True)
-        if no_links := why_no_links(path):
+        if no_links := why_no_hard_links(path):
             return f"out={out}: {no_links}"
     except OSError as error:
         if isinstance(error, NotWritable):
@@ -353,7 +353,7 @@ def _why_not_local(out: str, path: Path, above: Path) -> str:
     return ""
 
 
-def why_no_links(folder: Path) -> str:
+def why_no_hard_links(folder: Path) -> str:
     """One line on why no table can be committed to in a folder that is there; nothing where it can. Leaves nothing.
 
     A commit is a link that must not be there yet: so of two runs that want the same one alone makes it. Renaming, which
@@ -362,7 +362,7 @@ def why_no_links(folder: Path) -> str:
     trial = folder / f".trial-{secrets.token_hex(8)}"
     link = trial.with_name(f"{trial.name}0")
     try:
-        with needs_disk(folder, 0):
+        with naming_disk_errors(folder, 0):
             trial.touch()
         os.link(trial, link)
     except OSError as error:

@@ -169,7 +169,7 @@ class FactoryWork:
         clip = self._read(ref, watch)
         if isinstance(clip, Rejected):
             return clip
-        payload = PerturbedClip(ref, bare(clip), ())
+        payload = PerturbedClip(ref, without_sensors(clip), ())
         return PreparedClip(clip.clip_id, clip.content_digest, (), {}, payload, seconds=watch.seconds)
 
     def considered(self, ref: ClipRef) -> WholeClip | Rejected:
@@ -199,7 +199,7 @@ class FactoryWork:
 
     def listed(self, ref: ClipRef, made: WholeClip) -> PreparedClip:
         """What attempts start from."""
-        clip, found = bare(made.clip), made.found
+        clip, found = without_sensors(made.clip), made.found
         return PreparedClip(
             clip_id=clip.clip_id,
             content_digest=clip.content_digest,
@@ -222,7 +222,7 @@ class FactoryWork:
 
     def trace(self, prepared: PreparedClip, candidate: int, expert: str, timed: Timed = nullcontext) -> Drive:
         """The same with nothing left out."""
-        payload, driver = payload_of(prepared), self.experts[expert]
+        payload, driver = perturbed_clip_of(prepared), self.experts[expert]
         rng = stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
         if tried_once(driver):
             judged = human_sample(scene_of_clip(payload.clip), driver, self.pdm, rng, timed)
@@ -362,12 +362,12 @@ def _at_hand(before: tuple[int, int]) -> bool | None:
     return None if (hits, misses) == before else misses == before[1]
 
 
-def bare(clip: Clip) -> Clip:
+def without_sensors(clip: Clip) -> Clip:
     """Without its sensor files: where data lies may change."""
     return replace(clip, images=(), sweeps=(), block=None)
 
 
-def payload_of(prepared: PreparedClip) -> PerturbedClip:
+def perturbed_clip_of(prepared: PreparedClip) -> PerturbedClip:
     """What FactoryWork prepared."""
     assert isinstance(prepared.payload, PerturbedClip)
     return prepared.payload
@@ -463,13 +463,15 @@ class BenchmarkWork(FactoryWork):
         assert isinstance(made, WholeClipPair)
         prepared = super().listed(ref, made)
         rollouts = tuple((i, candidate.rollout) for i, candidate in enumerate(made.candidates))
-        return replace(prepared, scenes=BenchmarkClip(payload_of(prepared).clip, bare(made.before), rollouts))
+        return replace(
+            prepared, scenes=BenchmarkClip(perturbed_clip_of(prepared).clip, without_sensors(made.before), rollouts)
+        )
 
     def trace(self, prepared: PreparedClip, candidate: int, expert: str, timed: Timed = nullcontext) -> Drive:
         """A frame's drive is never filtered by the reward. The two of a pair fall together at the pictures."""
         if expert not in self.frames:
             return super().trace(prepared, candidate, expert, timed)
-        payload = payload_of(prepared)
+        payload = perturbed_clip_of(prepared)
         if expert == HUMAN_BEFORE:
             assert prepared.scenes is not None, "prepared by a run without frames"
             rng = stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)

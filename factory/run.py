@@ -24,7 +24,7 @@ from factory.config.classes import class_of
 from factory.config.compose import ConfigError
 from factory.config.run import RunConfig, load_config, photos_alone
 from factory.config.words import Asked, asked_of
-from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, as_program
+from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, run_program
 from factory.files import why_unusable
 from factory.setup.early import refuse_what_is_not_there
 
@@ -58,7 +58,7 @@ def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:
     return "\n".join([f"{'stage':<12}{'tasks':>8}{'seconds':>10}{'each':>10}", *lines])
 
 
-def kernels_of(config: RunConfig) -> list[str]:
+def kernel_parts(config: RunConfig) -> list[str]:
     """The parts of factory.stages.warm that the run will ask for."""
     from factory.setup.settings import simulates
     from factory.stages.warm import parts_of
@@ -67,12 +67,12 @@ def kernels_of(config: RunConfig) -> list[str]:
     return parts_of(simulates(config), config.traffic.mode, label_traffic, config.render, photos_alone(config))
 
 
-def labels_limit(config: RunConfig) -> dict[str, float]:
+def label_time_limits(config: RunConfig) -> dict[str, float]:
     """Seconds that labelling may take where traffic answers to each trajectory: up to a second each, of 16,384."""
     return {"label": 6 * 3600.0} if config.reward.traffic == "navsim" and config.reward.labels != "none" else {}
 
 
-def isolates(config: RunConfig) -> bool:
+def needs_own_process(config: RunConfig) -> bool:
     """Whether executor=local works in a process of its own: where asked for, a plug-in works, or logs can do harm."""
     used = [config.clips, *(spec for name, spec in config.expert.items() if name in config.experts)]
     foreign = any(not str(spec.get("_target_", "")).startswith(("factory.", "tasks.")) for spec in used)
@@ -153,7 +153,7 @@ def _run(
     except (BadLocation, DamagedLog, OtherSchema) as error:
         raise ConfigError(str(error)) from error
     elsewhere = config.executor == "ray" and "RAY_ADDRESS" in os.environ  # a cluster's nodes compile for themselves
-    with nullcontext() if elsewhere else compiling_ahead(kernels_of(config)):
+    with nullcontext() if elsewhere else compiling_ahead(kernel_parts(config)):
         assembled = assemble(config)
         refs = interleave_by_log(assembled.refs, config.workers or os.cpu_count() or 1)
         print(plan_text(assembled, refs), flush=True)
@@ -173,8 +173,8 @@ def _run(
                     config.workers,
                     claims=Claims(config.gpu_share if assembled.work.draws_on_gpu else 0.0, config.graph.memory_gb),
                     fuse=config.graph.fuse,
-                    isolated=isolates(config),
-                    limits=Limits({**labels_limit(config), **config.graph.limit_s}, config.graph.limit_gb),
+                    isolated=needs_own_process(config),
+                    limits=Limits({**label_time_limits(config), **config.graph.limit_s}, config.graph.limit_gb),
                     on_change=config.on_change,
                     retry=config.retry_failed,
                     shard_seconds=config.shard_seconds,
@@ -211,4 +211,4 @@ def _run(
 
 
 if __name__ == "__main__":
-    as_program(main)
+    run_program(main)

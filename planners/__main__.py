@@ -11,7 +11,7 @@ minutes, and the same command goes on. What is wrong is told in one line.
 from collections.abc import Sequence
 
 from factory.commands.table import PLANNERS, dispatch, listed
-from factory.exits import as_program
+from factory.exits import run_program
 
 
 def main(argv: Sequence[str]) -> int:
@@ -21,7 +21,7 @@ def main(argv: Sequence[str]) -> int:
 
 def program() -> None:
     """The installed program `planners`."""
-    as_program(main)
+    run_program(main)
 
 
 if __name__ == "__main__":

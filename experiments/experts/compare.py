@@ -18,7 +18,7 @@ import numpy as np
 
 from factory.config.run import load_config
 from factory.graph.steps import HUMAN_CANDIDATE, PreparedClip
-from factory.pipeline import Drive, FactoryWork, payload_of
+from factory.pipeline import Drive, FactoryWork, perturbed_clip_of
 from factory.setup.settings import assemble
 from tasks.attempt import perturbed_scene, verdict
 from tasks.experts.protocol import Plan
@@ -98,7 +98,7 @@ class Sums:
 
 def states_before(work: FactoryWork, prepared: PreparedClip, candidate: int, name: str) -> Array | None:
     """(1, 41, 11) the plan of half a second earlier as the tracker drives it; None where there was none."""
-    payload, expert = payload_of(prepared), work.experts[name]
+    payload, expert = perturbed_clip_of(prepared), work.experts[name]
     if candidate == HUMAN_CANDIDATE:
         now = scene_of_clip(payload.clip)
         step = now.step - BEFORE_STEPS

@@ -15,7 +15,7 @@ from threading import Event
 
 from experiments.study.settings import settings_of
 from factory.config.arguments import NOT_FITTING, answered
-from factory.exits import INTERRUPTED, Failed, Stopped, asked_to_stop
+from factory.exits import INTERRUPTED, Failed, Stopped, calling_on_stop_signal
 from planners.training.many import Means, exit_code
 
 
@@ -53,7 +53,7 @@ def factory(*words: str) -> None:
     """One command of the factory. Raises Stopped where it was interrupted, Failed where it ended with an error."""
     print("python -m factory", *words, file=sys.stderr)
     stop = Event()
-    with asked_to_stop(stop.set):
+    with calling_on_stop_signal(stop.set):
         code = exit_code([sys.executable, "-m", "factory", *words], stop.is_set)
     if code == INTERRUPTED or stop.is_set():
         raise Stopped("the same command goes on")

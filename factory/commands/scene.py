@@ -26,7 +26,7 @@ from threading import Event
 from typing import Literal
 
 from factory.config.arguments import POSITIONAL, Refused
-from factory.exits import asked_to_stop
+from factory.exits import calling_on_stop_signal
 
 PORT = 8267  # the dashboard is at 8266
 
@@ -114,7 +114,7 @@ def view(request: Request) -> None:
     told = f"{len(here.samples)} samples and {len(here.logged)} logged drives" if request.out else "no run's drives"
     ended = Event()
     try:
-        with asked_to_stop(ended.set):
+        with calling_on_stop_signal(ended.set):
             print(
                 f"{request.files[0]}, {told}: http://{server.get_host()}:{server.get_port()}/ until Ctrl-C", flush=True
             )

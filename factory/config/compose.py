@@ -10,7 +10,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 from factory.config.plugins import offer_choices
 from factory.config.shapes import dataclass_in, defaults_of, described, keys_of, merged, to_give
 from factory.config.words import ConfigError, SettingsShown, asked_of, at_home, nearest, no_such_choice, readable
-from factory.files import folders_in, runs_root
+from factory.files import default_runs_folder, folders_in
 
 T = TypeVar("T")
 WORDS_OF = {  # pydantic's kind of error -> what a value must be
@@ -64,7 +64,7 @@ def compose(
     from omegaconf import OmegaConf
     from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
-    OmegaConf.register_new_resolver("runs", runs_root, replace=True)
+    OmegaConf.register_new_resolver("runs", default_runs_folder, replace=True)
     groups = {path.name for root in (conf_dir(), *asked.folders) for path in folders_in(root)}
     overrides = []  # held against the dataclasses and not against conf/, which says few keys: Hydra takes any
     for word in map(readable, asked.overrides):

@@ -16,7 +16,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import FrameType
 
-from factory.exits import INTERRUPTED, exit_code_of, heeded, without_terminal
+from factory.exits import INTERRUPTED, run_for_exit_code, stop_signals, terminal_signals_blocked
 
 AGAIN = "run the same command again to go on"
 NEW_CLUSTERS = 3  # in one run, for those of its own that die
@@ -36,7 +36,7 @@ def run_in_own_process(run: Run, is_ours: bool, say: Callable[[str], None]) -> i
         ours, theirs = context.Pipe(duplex=False)
         process = context.Process(target=_work, args=(theirs, run, begun))
         with _passing_signals(process):
-            with without_terminal():
+            with terminal_signals_blocked():
                 process.start()
             theirs.close()
             process.join()
@@ -81,7 +81,7 @@ def _work(pipe: Connection, run: Run, begun: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
     code = 1
     try:
-        code = exit_code_of(lambda: run(begun, pipe.send))
+        code = run_for_exit_code(lambda: run(begun, pipe.send))
     finally:
         pipe.send(code)
     sys.exit(code)
@@ -108,7 +108,7 @@ def _passing_signals(process: BaseProcess) -> Iterator[None]:
             with suppress(ProcessLookupError):
                 os.kill(process.pid, number)
 
-    before = {number: signal.signal(number, pass_on) for number in heeded()}
+    before = {number: signal.signal(number, pass_on) for number in stop_signals()}
     try:
         yield
     finally:

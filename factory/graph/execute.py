@@ -16,7 +16,7 @@ from typing import Literal
 
 from deltalake.exceptions import DeltaError
 
-from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
+from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, calling_on_stop_signal
 from factory.files import DiskFull, machine_fault_of
 from factory.graph.apart import AGAIN, NEW_CLUSTERS, new_cluster_text
 from factory.graph.driver import (
@@ -240,7 +240,7 @@ class _Run:
         store, how, episodes = self._store, self._how, self._episodes
         self._ended.began_ms = _announce(store, self._plan, self._experts, self._rounds, how.command)
         metrics = RunMetrics(graph.recorder, store.location)
-        with asked_to_stop(self._driver.stop_soon), _alarm(self._driver.stop, how.minutes):
+        with calling_on_stop_signal(self._driver.stop_soon), _alarm(self._driver.stop, how.minutes):
             if episodes is not None:
                 episodes.begin(graph)
             self._driver.loop(graph, CommitQueue(graph, store, how.shard_bytes, how.shard_seconds), metrics, episodes)

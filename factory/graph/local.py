@@ -19,7 +19,7 @@ from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 
-from factory.exits import as_worker, without_terminal
+from factory.exits import become_worker, terminal_signals_blocked
 from factory.files import DiskFull
 from factory.graph import steps
 from factory.graph.guard import OVER, WORK, WatchedProcess, read_note
@@ -342,7 +342,7 @@ class IsolatedGraph:
         self.recorder: Recorder = NoRecorder()
         self._work, self._out, self._stopped = work, out, stopped
         self._context = multiprocessing.get_context("spawn")
-        with without_terminal():  # what keeps its semaphores is a process, too
+        with terminal_signals_blocked():  # what keeps its semaphores is a process, too
             self._stop = self._context.Event()
         self._costs, self._notes = Costs(limits), notes_folder(out)
         self._waiting: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
@@ -423,7 +423,7 @@ class IsolatedGraph:
         given = (theirs, self._work, self._out, self._stop, self._notes)
         self._process = self._context.Process(target=_serve, args=given, daemon=False)
         try:
-            with without_terminal():
+            with terminal_signals_blocked():
                 self._process.start()
             theirs.close()
             said = self._pipe.recv()
@@ -442,7 +442,7 @@ class IsolatedGraph:
 
 def _serve(pipe: Connection, work: Work, out: Location, stop: Any, notes: Path) -> None:
     """The other process: a task at a time, until there is none or the run is gone."""
-    as_worker()
+    become_worker()
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the run decides
     supplied = {"work": work, "out": out, "stopped": stop.is_set}
     kept: OrderedDict[int, Any] = OrderedDict()

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from itertools import islice
 from typing import Literal, ParamSpec, TypeVar
 
-from factory.exits import as_worker, asked_to_stop, without_terminal
+from factory.exits import become_worker, calling_on_stop_signal, terminal_signals_blocked
 from factory.graph.steps import TaskStopped
 from factory.store.location import Location
 
@@ -39,7 +39,7 @@ def parallel_map(
     """
     stopped: list[bool] = []
     waiting = iter(items)
-    with _pool(executor, workers, to) as (pool, most), asked_to_stop(lambda: stopped.append(True)):
+    with _pool(executor, workers, to) as (pool, most), calling_on_stop_signal(lambda: stopped.append(True)):
         in_hand: dict[Future[R], T] = {}
         while True:
             if not stopped:
@@ -71,7 +71,7 @@ def _pool(executor: str, workers: int | None, to: Location | None) -> Iterator[t
     elif workers is None or workers == 1:
         pool, most = _Here(), 1
     else:
-        with without_terminal():  # what keeps the pool's semaphores is a process, too
+        with terminal_signals_blocked():  # what keeps the pool's semaphores is a process, too
             pool = _Processes(workers, multiprocessing.get_context("spawn"), _apart)
         most = IN_HAND * workers
     try:
@@ -96,13 +96,13 @@ class _Processes(ProcessPoolExecutor):
     """Processes that a terminal does not reach, also while they start."""
 
     def submit(self, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        with without_terminal():  # they begin with the first item
+        with terminal_signals_blocked():  # they begin with the first item
             return super().submit(function, *args, **kwargs)
 
 
 def _apart() -> None:
     """A worker process out of reach of what is sent to all of a terminal, that ends when its driver was killed."""
-    as_worker()
+    become_worker()
     os.setpgrp()
     driver = multiprocessing.parent_process()
     assert driver is not None

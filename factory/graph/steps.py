@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import pyarrow as pa
 
-from factory.files import machine_fault_of, refused_as_the_runs_own, why_disk_full
+from factory.files import machine_fault_of, raising_place_refused, why_disk_full
 from factory.readers.base import BadClip, ClipRef, Unreadable
 from factory.store.episodes import EPISODES_FOLDER, episode_name
 from factory.store.location import BadCacheFile, ClipCache, Location, SceneFiles, Shard, write_shard
@@ -340,7 +340,7 @@ def _keep_scenes(out: Location, clip: PreparedClip) -> None:
     """Before any attempt, so that no row stands without them; written anew each time, they may be of older settings."""
     if clip.scenes is not None:
         scenes = out.child("scenes")
-        with refused_as_the_runs_own(scenes.uri):
+        with raising_place_refused(scenes.uri):
             SceneFiles(scenes).store(clip.scenes)
 
 

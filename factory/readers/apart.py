@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection
 from threading import Lock
 from typing import Any, Generic, TypeVar
 
-from factory.exits import as_worker
+from factory.exits import become_worker
 from factory.readers.base import BadClip
 
 LIMIT_S = 300.0  # for one file; the longest logs take seconds
@@ -136,5 +136,5 @@ def _answer_all(pipe: "Connection[Any, Any]") -> None:
 
 
 if __name__ == "__main__":
-    as_worker()
+    become_worker()
     _answer_all(Connection(int(sys.argv[1])))

@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from factory.files import whole_file
+from factory.files import atomic_file
 from factory.readers.base import BadClip, ClipReader
 from factory.readers.validate import read_clip
 from tasks.experts.recovery.expert import RecoveryTable
@@ -169,7 +169,7 @@ def _load(path: str | Path) -> np.ndarray | dict[str, np.ndarray]:
 
 def save_vocabulary(path: str | Path, vocabulary: Vocabulary, origin: dict[str, object]) -> None:
     """Writes the .npy, and a .json beside it with the digest, k and `origin`."""
-    with whole_file(Path(path), vocabulary.trajectories.nbytes) as draft, draft.open("wb") as file:
+    with atomic_file(Path(path), vocabulary.trajectories.nbytes) as draft, draft.open("wb") as file:
         np.save(file, vocabulary.trajectories, allow_pickle=False)
     _describe(Path(path), {"digest": vocabulary.digest, "k": len(vocabulary)} | origin)
 
@@ -179,7 +179,7 @@ def save_recovery_table(path: str | Path, table: RecoveryTable, origin: dict[str
 
     key: that it is sealed with, of a file in a cache.
     """
-    with whole_file(Path(path), table.trajectories.nbytes) as draft:
+    with atomic_file(Path(path), table.trajectories.nbytes) as draft:
         with draft.open("wb") as file:
             np.savez(file, allow_pickle=False, trajectories=table.trajectories, digest=np.array(table.digest))
         if key:
@@ -189,5 +189,5 @@ def save_recovery_table(path: str | Path, table: RecoveryTable, origin: dict[str
 
 def _describe(path: Path, content: dict[str, object]) -> None:
     text = json.dumps(content, indent=2, sort_keys=True) + "\n"
-    with whole_file(path.with_suffix(".json"), len(text)) as draft:
+    with atomic_file(path.with_suffix(".json"), len(text)) as draft:
         draft.write_text(text, encoding="utf-8")

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.files import locked, refused_as_the_runs_own, whole_file
+from factory.files import atomic_file, locked, raising_place_refused
 from factory.graph.steps import StopCheck, TaskStopped, never_stop
 from factory.readers.pictures import file_and_frame
 from factory.stages.rig import SAID, UsedRig, corrected_rig, known_of, said_again, taken_from, told_of, used_rig, wanted
@@ -91,7 +91,7 @@ def fitted(
     while state.iteration < settings.iterations:
         advance(problem, state, settings, state.iteration + STRETCH, say, threads, stopped, drawing)
         arrays = state.arrays()
-        with whole_file(begun, sum(array.nbytes for array in arrays.values())) as draft:
+        with atomic_file(begun, sum(array.nbytes for array in arrays.values())) as draft:
             with draft.open("wb") as file:
                 np.savez(file, **arrays)  # type: ignore[arg-type]
             seal(draft, begun.name)
@@ -264,7 +264,7 @@ def range_of(clip: Clip, block: Block) -> BlockRange:
 def only_builder(path: Path) -> Iterator[None]:
     """Held by one process of the machine at a time; the kernel frees it when its holder dies. Raises PlaceRefused."""
     with ExitStack() as held:
-        with refused_as_the_runs_own(path.parent):
+        with raising_place_refused(path.parent):
             path.parent.mkdir(parents=True, exist_ok=True)
             file = held.enter_context(path.with_suffix(".lock").open("w"))
         held.enter_context(locked(file))

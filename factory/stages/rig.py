@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from factory.files import whole_file
+from factory.files import atomic_file
 from factory.stages.scene_file import CALIBRATED
 from factory.stages.sensors import NO_MASKS, SensorData, opened_photos, poses_of, taken_by
 from tasks.render.rig.correct import Correction, corners_of, corrected, ground_below, hidden_by
@@ -107,7 +107,7 @@ def corrected_rig(
 
 def _say(path: Path, found: dict[str, object]) -> None:
     text = sealed_json({"block": path.stem, **found})
-    with whole_file(path.with_suffix(SAID), len(text)) as draft:
+    with atomic_file(path.with_suffix(SAID), len(text)) as draft:
         draft.write_text(text, encoding="utf-8")
 
 

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from factory.files import whole_file
+from factory.files import atomic_file
 from factory.store.schema import canonical_json
 from factory.wording import shown
 from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, OwnBody, RenderAsset, TakenFrom, ViewQuality
@@ -67,7 +67,7 @@ def write_scene(path: Path, asset: RenderAsset, dtype: SceneDtype = SceneDtype.F
     digest = digest_of(tensors, described)
     header = described | {"digest": digest, "kept_as": path.stem}
     data = save(dict(tensors), metadata={KEY: canonical_json(header)})
-    with whole_file(path, len(data)) as draft:
+    with atomic_file(path, len(data)) as draft:
         draft.write_bytes(data)
     return scene_of(tensors, described, digest)
 

@@ -16,7 +16,7 @@ from threading import Event, Lock, Thread
 
 import numpy as np
 
-from factory.exits import as_worker, without_terminal
+from factory.exits import become_worker, terminal_signals_blocked
 from factory.files import locked
 from factory.graph.steps import NotReady
 from tasks.attempt import drive_and_judge
@@ -146,7 +146,7 @@ def _compile_part(name: str, enough: Event) -> None:
     command = [sys.executable, "-m", "factory.stages.warm", name]
     if enough.is_set():
         raise RuntimeError(f"compiling the kernels of {name} was not begun")
-    with without_terminal():
+    with terminal_signals_blocked():
         part = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)  # noqa: S603 (ours)
     with part:
         said = _ended(part, enough)
@@ -168,7 +168,7 @@ def _ended(part: "subprocess.Popen[str]", enough: Event) -> str:
 
 def _warm(name: str) -> int:
     """One part, in this process; the exit code."""
-    as_worker()
+    become_worker()
     gc.disable()  # a process that ends soon: some 220 MB more for a sixth of its time
     PARTS[name]()
     listed = "\n".join(sorted(path.relative_to(cache_dir()).as_posix() for path in USED))

@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pyarrow import fs
 
-from factory.files import in_submitted_job, is_data, whole_file
+from factory.files import atomic_file, in_submitted_job, is_data
 from factory.store.schema import TableSpec
 from factory.wording import one_line
 from tasks.sealed import Damaged, sealed, unsealed
@@ -105,7 +105,7 @@ class Location:
             with filesystem.open_output_stream(f"{base}/{name}", compression=None) as stream:
                 stream.write(data)
             return
-        with whole_file(Path(self.uri, name), len(data)) as draft, draft.open("wb") as file:
+        with atomic_file(Path(self.uri, name), len(data)) as draft, draft.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())

@@ -33,7 +33,7 @@ from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundErr
 from deltalake.transaction import AddAction, RemoveAction
 from numpy.typing import NDArray
 
-from factory.files import needs_disk
+from factory.files import naming_disk_errors
 from factory.store.location import (
     Location,
     Shard,
@@ -710,7 +710,7 @@ class KeyedTable:
 
         def once() -> None:
             try:
-                with needs_disk(f"{self.location.uri}/_delta_log", ACTION_BYTES * n_actions):
+                with naming_disk_errors(f"{self.location.uri}/_delta_log", ACTION_BYTES * n_actions):
                     commit()
             except (DeltaError, OSError) as error:
                 may_be_made = isinstance(error, DeltaError) or is_broken_listing(error)
@@ -724,7 +724,7 @@ class KeyedTable:
         self._see(table, version)
         if self.version != version:
             raise self._lost()
-        with needs_disk(f"{self.location.uri}/{COPIES}", SCHEMA_BYTES):
+        with naming_disk_errors(f"{self.location.uri}/{COPIES}", SCHEMA_BYTES):
             self.copies.copy_commit(version)
 
     def _see(self, table: DeltaTable, version: int) -> None:
@@ -736,7 +736,7 @@ class KeyedTable:
         wait_until_listed(is_seen, f"commit {version} of {self.location.uri}")
 
     def _create(self) -> DeltaTable:
-        with needs_disk(f"{self.location.uri}/_delta_log", SCHEMA_BYTES):
+        with naming_disk_errors(f"{self.location.uri}/_delta_log", SCHEMA_BYTES):
             if self.location.is_local:
                 Path(self.location.uri).mkdir(parents=True, exist_ok=True)
             try:

@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from factory.files import why_no_links
+from factory.files import why_no_hard_links
 from factory.store.episodes import EPISODES_FOLDER, check_episode, episode_name
 from factory.store.location import (
     BadCacheFile,
@@ -267,7 +267,7 @@ def claim_for_upkeep(store: Store) -> None:
     """Before a change: claim the tables as a run does, so that one which was quiet for long commits nothing any more,
     no file that is cleaned away among it. Raises RunGoesOn as `refuse_held` does, BadLocation and AnotherWriter."""
     refuse_while_running(store)
-    if store.location.folder is not None and (no_links := why_no_links(store.location.folder)):
+    if store.location.folder is not None and (no_links := why_no_hard_links(store.location.folder)):
         raise BadLocation(no_links)
     store.claim(create=False)
 

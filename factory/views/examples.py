@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from factory.graph.steps import PreparedClip, cache_key
-from factory.pipeline import FactoryWork, PerturbedClip, payload_of
+from factory.pipeline import FactoryWork, PerturbedClip, perturbed_clip_of
 from factory.readers.base import BadClip, ClipRef
 from factory.store.location import BadCacheFile
 from factory.store.reader import decode_stored_image
@@ -182,7 +182,7 @@ class Again:
         if prepared is None or outcome["candidate_index"] >= len(prepared.candidates):
             return None
         trace = self._work.trace(prepared, outcome["candidate_index"], outcome["expert"])
-        image = attempt_picture(payload_of(prepared).clip, trace.candidate, trace.judged, "", BEV_PX)
+        image = attempt_picture(perturbed_clip_of(prepared).clip, trace.candidate, trace.judged, "", BEV_PX)
         caption = f"{outcome['expert']}: {outcome['stage']}.{outcome['reason']}"
         detail = f"{outcome['detail']}; log {outcome['log_id']}; candidate {outcome['candidate_index']}"
         if trace.rejected is not None and trace.rejected.reason != outcome["reason"]:

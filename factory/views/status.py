@@ -10,7 +10,7 @@ from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 from factory.config.arguments import Refused
-from factory.exits import MEANING
+from factory.exits import EXIT_CODE_TEXT
 from factory.wording import one_line
 from tasks.subscores import RECORDS
 
@@ -127,7 +127,7 @@ def _last_run(store: "Store") -> Iterable[str]:
         yield "newest run    did not finish; run the same command again to go on"
         return
     run = json.loads(data)
-    yield f"newest run    exit code {run['exit_code']}: {MEANING[run['exit_code']]}"
+    yield f"newest run    exit code {run['exit_code']}: {EXIT_CODE_TEXT[run['exit_code']]}"
     executed = ", ".join(f"{name} {count}" for name, count in run["executed"].items())
     yield f"executed      {executed}"
     seconds = ", ".join(f"{stage} {s['seconds']:.1f} ({s['tasks']})" for stage, s in run["seconds"].items())

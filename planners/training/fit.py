@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from factory.exits import Stopped, asked_to_stop
+from factory.exits import Stopped, calling_on_stop_signal
 from factory.graph.progress import Counter
 from planners.data.batch import Batch
 from planners.models.planner import Planner
@@ -142,7 +142,7 @@ def fit(
         return measured
 
     asked = Event()
-    with asked_to_stop(asked.set), Counter("steps", loop.steps, first, quiet=not process.writes) as counter:
+    with calling_on_stop_signal(asked.set), Counter("steps", loop.steps, first, quiet=not process.writes) as counter:
         step, shown = first, "-"  # until the losses are looked at
         for batch in _endless(batches, loop.steps - first):
             torch.manual_seed(step_seed(loop.seed, step, process.rank))

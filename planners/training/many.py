@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TextIO
 
-from factory.exits import INTERRUPTED, Failed, Stopped, asked_to_stop
+from factory.exits import INTERRUPTED, Failed, Stopped, calling_on_stop_signal
 from factory.graph.progress import Counter
 
 TRAININGS, DONE, LOG = "trainings", "sweep.json", "train.log"
@@ -165,7 +165,7 @@ def stops_after(after_s: float | None) -> Iterator[threading.Event]:
     stop = threading.Event()
     timer = threading.Timer(after_s or 0.0, stop.set)
     timer.daemon = True
-    with asked_to_stop(stop.set):
+    with calling_on_stop_signal(stop.set):
         if after_s is not None:
             timer.start()
         try:

@@ -19,7 +19,7 @@ import ray
 from ray.train import RunConfig, ScalingConfig, WorkerGroupError
 from ray.train.torch import TorchConfig, TorchTrainer, get_device
 
-from factory.exits import without_terminal
+from factory.exits import terminal_signals_blocked
 from planners.training.processes import RaySettings, TrainingProcess, joined
 
 T = TypeVar("T")
@@ -65,7 +65,7 @@ def _connected() -> Iterator[None]:
     if not there:  # Ray warns that a cluster of our own asks for a token, as it should
         logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
     try:
-        with without_terminal(signal.SIGHUP):  # Ray keeps SIGINT from its processes itself
+        with terminal_signals_blocked(signal.SIGHUP):  # Ray keeps SIGINT from its processes itself
             ray.init(
                 address=None if there else "local",
                 include_dashboard=None if there else False,

@@ -15,7 +15,7 @@ from factory.datasets.town.draw import Theatre, paint
 from factory.datasets.town.drive import TownDrive
 from factory.datasets.town.town import log_name, plan_log
 from factory.graph.steps import PreparedClip
-from factory.pipeline import FactoryWork, payload_of
+from factory.pipeline import FactoryWork, perturbed_clip_of
 from factory.stages.imaging import GATE_STRIDE
 from tasks.render.gate import (
     Album,
@@ -81,7 +81,7 @@ class Shown:
 
 def drives(work: FactoryWork, prepared: PreparedClip, experts: Sequence[str], most: int) -> Iterator[Simulated]:
     """Drives that the reward accepts, `most` of each expert, before any picture of them is looked at."""
-    payload = payload_of(prepared)
+    payload = perturbed_clip_of(prepared)
     for expert in experts:
         found = 0
         for index in range(len(payload.candidates)):

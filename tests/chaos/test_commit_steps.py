@@ -52,7 +52,7 @@ def in_place(out: str) -> int:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield path
 
-    location.whole_file = no_draft
+    location.atomic_file = no_draft
     return new_store(out)
 
 

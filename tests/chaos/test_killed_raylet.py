@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.exits import INTERRUPTED, asked_to_stop
+from factory.exits import INTERRUPTED, calling_on_stop_signal
 from factory.graph.apart import run_in_own_process
 from factory.graph.execute import NEW_CLUSTERS, Execution, RunSummary, execute, on_new_clusters
 from factory.run import main as run_main
@@ -76,7 +76,7 @@ COMMAND = """
 import os
 from pathlib import Path
 from ray._private import worker
-from factory.exits import as_program
+from factory.exits import run_program
 from factory.run import main
 
 done, honest = Path(os.environ["DONE"]), worker.connect
@@ -91,7 +91,7 @@ def connect(node, *given, **named):
 
 worker.connect = connect
 if __name__ == "__main__":
-    as_program(main)
+    run_program(main)
 """
 TOWN = (
     "clips.n_clips=1",
@@ -176,7 +176,7 @@ def ends(how: str, begun: int, tell: Callable[[str], None]) -> int:
 def waits(journal: str, begun: int, tell: Callable[[str], None]) -> int:
     """Until it is asked to stop."""
     asked = threading.Event()
-    with asked_to_stop(asked.set):
+    with calling_on_stop_signal(asked.set):
         Path(journal).write_text(str(os.getpid()))
         assert asked.wait(100.0)
     return INTERRUPTED

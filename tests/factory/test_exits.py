@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from factory.exits import COMPLETE, INTERRUPTED, asked_to_stop
+from factory.exits import COMPLETE, INTERRUPTED, calling_on_stop_signal
 from tests.pages import REPOSITORY
 
 PATIENCE_S = 120.0
@@ -85,7 +85,7 @@ def test_the_first_signal_is_noted_and_the_second_interrupts() -> None:
     before = signal.default_int_handler  # a shell starts what runs in the background with the signal ignored
     inherited = signal.signal(signal.SIGINT, before)
     asked = threading.Event()
-    with asked_to_stop(asked.set), pytest.raises(KeyboardInterrupt):
+    with calling_on_stop_signal(asked.set), pytest.raises(KeyboardInterrupt):
         os.kill(os.getpid(), signal.SIGINT)
         assert asked.wait(5.0)
         os.kill(os.getpid(), signal.SIGINT)
@@ -100,7 +100,7 @@ def test_a_terminal_that_closes_asks_once_however_often_it_is_told_and_never_und
     inherited = signal.signal(signal.SIGHUP, before)
     asked: list[bool] = []
     try:
-        with asked_to_stop(lambda: asked.append(True)):
+        with calling_on_stop_signal(lambda: asked.append(True)):
             for _ in range(2):  # the terminal and its shell
                 signal.raise_signal(signal.SIGHUP)
         assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN, "also while a report is being written"
@@ -111,7 +111,7 @@ def test_a_terminal_that_closes_asks_once_however_often_it_is_told_and_never_und
 
 def test_an_interrupt_within_code_that_is_made_up_is_the_exit_code_too() -> None:
     """Python itself ends such a process by the signal."""
-    code = "import signal\nfrom factory.exits import as_program\nas_program(lambda _: exec({!r}))"
+    code = "import signal\nfrom factory.exits import run_program\nrun_program(lambda _: exec({!r}))"
     made_up = "signal.raise_signal(signal.SIGINT)"
     done = subprocess.run(
         [sys.executable, "-c", code.format(made_up)], cwd=REPOSITORY, capture_output=True, text=True, check=False

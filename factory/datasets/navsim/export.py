@@ -29,7 +29,7 @@ from factory.datasets.navsim.manifest import File, Journal, Written, file_of, wr
 from factory.datasets.navsim.pickles import dumps, write_rewards
 from factory.datasets.navsim.pictures import BLACK, black_picture, shown
 from factory.datasets.navsim.settings import CannotExport, ExportSettings, Layout
-from factory.files import whole_file
+from factory.files import atomic_file
 from factory.store.location import Location, open_parquet
 from factory.store.reader import Sample, read_rows
 from factory.store.schema import LABEL_COLUMNS, canonical_json
@@ -360,7 +360,7 @@ def _reward_files(
             continue
         path = Places(split, settings.layout).rewards
         (root / path).parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(root / path, 0) as draft:
+        with atomic_file(root / path, 0) as draft:
             write_rewards(draft, _labelled(table, by_split[split]), before)
         files.append(file_of(root, path))
         earlier[first["expert"]] = root / path

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 
 import pyarrow as pa
 
-from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
+from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, calling_on_stop_signal
 from factory.files import DiskFull
 from factory.graph.driver import SHARD_BYTES
 from factory.graph.execute import RunSummary, record_summary
@@ -74,7 +74,7 @@ def import_rows(store: Store, identity: RunIdentity, entries: Sequence[Entry]) -
     try:
         store.begin_run(records)
         batch = _Batch(store)
-        with asked_to_stop(lambda: stopped.append(True)), Counter("imported", len(waiting)) as progress:
+        with calling_on_stop_signal(lambda: stopped.append(True)), Counter("imported", len(waiting)) as progress:
             for done, (entry, stamp) in enumerate(waiting, start=1):
                 failed = _try(batch, entry, stamp)
                 counts[Kind.FAILED if failed else Kind.ACCEPTED] += 1

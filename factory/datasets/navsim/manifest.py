@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.datasets.navsim.frames import N_FUTURE, N_HISTORY, SplitNames
-from factory.files import needs_disk, whole_file
+from factory.files import atomic_file, naming_disk_errors
 from factory.store.schema import canonical_json
 
 MANIFEST, JOURNAL = "manifest.jsonl", ".journal.jsonl"
@@ -50,7 +50,7 @@ class Written:
 
 def write_file(root: Path, path: str, data: bytes) -> File:
     """A whole file or none. Raises DiskFull."""
-    with whole_file(root / path, len(data)) as draft:
+    with atomic_file(root / path, len(data)) as draft:
         draft.write_bytes(data)
     return File(path, len(data), hashlib.sha256(data).hexdigest())
 
@@ -124,7 +124,7 @@ class Journal:
 
     def _append(self, line: Mapping[str, Any]) -> None:
         path, data = self.root / JOURNAL, canonical_json(line) + "\n"
-        with needs_disk(path, len(data)), path.open("a") as file:
+        with naming_disk_errors(path, len(data)), path.open("a") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())

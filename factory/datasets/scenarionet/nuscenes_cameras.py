@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factory.datasets.scenarionet.sidecars import NAME
-from factory.files import matching, whole_file
+from factory.files import atomic_file, matching
 from factory.readers.base import BadClip
 from factory.wording import shown
 from tasks.world.arrays import Array
@@ -196,7 +196,7 @@ def _write(
         content |= {"lidar": {LIDAR: mount}, "sweeps": sweeps}
     if frames:
         text = json.dumps(content).encode()
-        with whole_file(path, len(text)) as draft:
+        with atomic_file(path, len(text)) as draft:
             draft.write_bytes(text)
     return WrittenSidecar(path, scene, len(cameras), len(frames), len(sweeps), missing)
 

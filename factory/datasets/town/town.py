@@ -27,7 +27,7 @@ from factory.datasets.town.draw import MOUNT_M, REAR_AXLE_Z_M, Theatre, build_ri
 from factory.datasets.town.drive import GREEN, RED, SCENARIOS, YELLOW, TownDrive, TownTrack, parked_cars, plan_drive
 from factory.datasets.town.scenery import Scenery, build_scenery
 from factory.datasets.town.streets import Streets, TownLane, build_streets
-from factory.exits import as_worker, without_terminal
+from factory.exits import become_worker, terminal_signals_blocked
 from factory.readers.settings import LOG_STEPS, LOGS_PER_TOWN, STEPS_PER_SWEEP, TownSettings
 from factory.readers.whole_folder import finish_whole, make_whole, mend, unfinished_folder
 from factory.wording import time_text
@@ -372,7 +372,7 @@ def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
             while waiting and len(painting) < at_once:
                 town = waiting.popleft()
                 begun.append(unfinished_folder(town.root))
-                with without_terminal():
+                with terminal_signals_blocked():
                     painting[_painter(town, begun[-1], settings, lifeline)] = town
             for child in [child for child in painting if child.poll() is not None]:
                 town = painting.pop(child)
@@ -410,7 +410,7 @@ def _refused(ended: "subprocess.Popen[bytes]") -> OSError | None:
 
 def main(told: str) -> None:
     """A painter's process: one town, on one core. Tells on standard output what it is refused."""
-    as_worker()
+    become_worker()
     threading.Thread(target=_end_with_input, daemon=True).start()
     town = json.loads(told)
     arguments = town["indices"], town["seed"], TownSettings(**town["settings"])

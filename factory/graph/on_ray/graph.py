@@ -27,8 +27,8 @@ from ray.exceptions import RayError, RayTaskError
 from ray.util.metrics import Counter, Gauge, Histogram
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from factory.exits import without_terminal
-from factory.files import DiskFull, existing, machine_fault_of
+from factory.exits import terminal_signals_blocked
+from factory.files import DiskFull, machine_fault_of, nearest_existing
 from factory.graph.local import (
     MAX_RETRIES,
     STEPS,
@@ -92,7 +92,7 @@ def connect(workers: int | None, address: str | None) -> bool:
         logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
     try:
         must_answer(named)
-        with without_terminal(signal.SIGHUP):  # Ray keeps SIGINT from its processes itself
+        with terminal_signals_blocked(signal.SIGHUP):  # Ray keeps SIGINT from its processes itself
             ray.init(
                 address=where,
                 runtime_env={"env_vars": environment},
@@ -118,7 +118,7 @@ def connect(workers: int | None, address: str | None) -> bool:
 def _files_of_ray() -> tuple[str, int]:
     """Where a cluster of our own has its files, and the bytes that are free there."""
     folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or tempfile.gettempdir()
-    return folder, shutil.disk_usage(existing(Path(folder))).free
+    return folder, shutil.disk_usage(nearest_existing(Path(folder))).free
 
 
 def tasks_at_once(workers: int | None, is_ours: bool) -> int:

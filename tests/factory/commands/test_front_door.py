@@ -18,7 +18,7 @@ import yaml
 from factory.__main__ import main
 from factory.commands.completion import candidates, settings_of
 from factory.commands.table import COMMANDS, DOORS, PLANNERS
-from factory.exits import MEANING
+from factory.exits import EXIT_CODE_TEXT
 from factory.graph.driver import EpisodeSettings
 from factory.graph.execute import Execution
 from factory.store.samples import CURRENT_RUN, Store
@@ -151,7 +151,7 @@ def test_a_run_with_failures_ends_with_what_failed_how_often_and_what_shows_all(
 def test_the_page_says_what_every_exit_code_means() -> None:
     page = (REPOSITORY / "docs" / "configuration.md").read_text().partition("## Exit codes")[2]
     rows = re.findall(r"^\| (\d) \| (.*?) \|", page, re.M)
-    assert {int(code): meaning for code, meaning in rows} == MEANING
+    assert {int(code): meaning for code, meaning in rows} == EXIT_CODE_TEXT
 
 
 def test_each_door_lists_its_commands_and_names_those_of_the_other(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ import pyarrow.compute as pc
 import pytest
 
 from factory.exits import COMPLETE, INTERRUPTED
-from factory.files import DiskFull, needs_disk, why_disk_full, why_unusable
+from factory.files import DiskFull, naming_disk_errors, why_disk_full, why_unusable
 from factory.graph.execute import Execution, RunSummary, execute, on_new_clusters
 from factory.graph.steps import failure_from_error
 from factory.run import main as run_main
@@ -127,9 +127,9 @@ def test_a_disk_without_room_for_a_row_group_is_refused_at_once(disk: Path) -> N
 
 def test_what_a_full_disk_said_is_found_behind_other_errors_and_in_delta_s_words(tmp_path: Path) -> None:
     full = r"x: the disk is full: 1,234 bytes are needed, [\d,]+ are free"
-    with pytest.raises(DiskFull, match=full), needs_disk(tmp_path / "x", 1234):
+    with pytest.raises(DiskFull, match=full), naming_disk_errors(tmp_path / "x", 1234):
         raise OSError("Generic LocalFileSystem error: No space left on device (os error 28)")
-    with pytest.raises(PermissionError), needs_disk(tmp_path, 1):
+    with pytest.raises(PermissionError), naming_disk_errors(tmp_path, 1):
         raise PermissionError(13, "Permission denied")
     try:
         try:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
-from factory.files import DiskFull, PlaceRefused, machine_fault_of, refused_as_the_runs_own
+from factory.files import DiskFull, PlaceRefused, machine_fault_of, raising_place_refused
 from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt, failure_from_error
 from factory.store.location import ClipCache
 from factory.store.samples import ErrorKind
@@ -89,9 +89,9 @@ def test_illness_after_illness_stops_the_run_with_its_reason(tmp_path: Path, pla
 
 
 def test_a_place_of_the_run_s_own_that_refuses_is_the_machine_s(tmp_path: Path) -> None:
-    with pytest.raises(PlaceRefused, match="cannot be written: Permission denied"), refused_as_the_runs_own(tmp_path):
+    with pytest.raises(PlaceRefused, match="cannot be written: Permission denied"), raising_place_refused(tmp_path):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "x")
-    with pytest.raises(OSError, match="Input/output") as found, refused_as_the_runs_own(tmp_path):
+    with pytest.raises(OSError, match="Input/output") as found, raising_place_refused(tmp_path):
         raise OSError(errno.EIO, os.strerror(errno.EIO), "x")
     assert not isinstance(found.value, PlaceRefused)
 

@@ -16,7 +16,7 @@ from factory.config.run import load_config
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph.guard import CRASHED
 from factory.graph.local import MAX_RETRIES, Costs, Limits, notes_folder
-from factory.run import isolates
+from factory.run import needs_own_process
 from factory.store.samples import Store
 from factory.views.status import status_lines
 from tests.factory.graph.runs import run
@@ -176,4 +176,4 @@ def test_what_tasks_took_so_far_says_what_the_next_may_take() -> None:
     ],
 )
 def test_what_may_bring_a_process_down_works_in_one_of_its_own(words: list[str], apart: bool) -> None:
-    assert isolates(load_config([*words, "out=somewhere"])) is apart
+    assert needs_own_process(load_config([*words, "out=somewhere"])) is apart

@@ -8,7 +8,7 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.graph.steps import PreparedClip, cache_key
-from factory.pipeline import PerturbedClip, bare
+from factory.pipeline import PerturbedClip, without_sensors
 from factory.readers.base import ClipRef
 from factory.stages.scene_file import read_scene, write_scene
 from factory.store.samples import ClipCandidates, Store
@@ -42,7 +42,7 @@ def run(tmp_path: Path) -> Store:
     store, rows = Store(tmp_path / "run"), []
     for clip in clips():
         rows.append(ClipCandidates(clip.clip_id, clip.dataset, clip.log_id, "c", "p", "v", {}, ()))
-        payload = PerturbedClip(ClipRef(clip.dataset, clip.log_id, 0), bare(clip), ())
+        payload = PerturbedClip(ClipRef(clip.dataset, clip.log_id, 0), without_sensors(clip), ())
         store.cache.store(cache_key(clip.clip_id, "p"), PreparedClip(clip.clip_id, "c", (), {}, payload))
     store.claim()
     store.commit(rows, [], [])
