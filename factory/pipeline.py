@@ -107,14 +107,14 @@ class Drive:
     judged: Judged | None  # None where the expert had no plan
     rejected: Rejected | None  # None: the reward accepts it
     shared: tuple[int, ...] = ()  # steps at which samples of this drive have their now, where there are several
-    told: Mapping[str, object] = field(default_factory=dict)  # columns that the row has in place of its own
-    shown: Judged | None = None  # as the sample tells it, where that is not `judged`
+    row_overrides: Mapping[str, object] = field(default_factory=dict)  # columns that the row has in place of its own
+    sampled_instead: Judged | None = None  # as the sample tells it, where that is not `judged`
 
     @property
     def sampled(self) -> Judged:
         """What the sample is made of."""
         assert self.judged is not None, "a drive that was accepted"
-        return self.shown or self.judged
+        return self.sampled_instead or self.judged
 
 
 class Stopwatch:
@@ -124,7 +124,7 @@ class Stopwatch:
         self.seconds: dict[str, float] = {}
 
     @contextmanager
-    def of(self, stage: str) -> Iterator[None]:
+    def timing(self, stage: str) -> Iterator[None]:
         """Adds the time spent inside to the stage."""
         start = time.perf_counter()
         try:
@@ -161,10 +161,10 @@ class FactoryWork:
         In a run of experts that are tried once, on the log itself, the clip is read and nothing more: their drives need
         no block and no candidates.
         """
-        made = self.considered(ref) if self._simulates else self._unlisted(ref)
-        return made if isinstance(made, Rejected | PreparedClip) else self.listed(ref, made)
+        made = self.read_and_perturb(ref) if self._simulates else self._log_only_clip(ref)
+        return made if isinstance(made, Rejected | PreparedClip) else self.prepared_clip(ref, made)
 
-    def _unlisted(self, ref: ClipRef) -> PreparedClip | Rejected:
+    def _log_only_clip(self, ref: ClipRef) -> PreparedClip | Rejected:
         watch = Stopwatch()
         clip = self._read(ref, watch)
         if isinstance(clip, Rejected):
@@ -172,7 +172,7 @@ class FactoryWork:
         payload = PerturbedClip(ref, without_sensors(clip), ())
         return PreparedClip(clip.clip_id, clip.content_digest, (), {}, payload, seconds=watch.seconds)
 
-    def considered(self, ref: ClipRef) -> WholeClip | Rejected:
+    def read_and_perturb(self, ref: ClipRef) -> WholeClip | Rejected:
         """All that `prepare` decides, and every gated trajectory's fate. Rejected: for every expert. Raises BadClip."""
         watch = Stopwatch()
         clip = self._read(ref, watch)
@@ -181,23 +181,23 @@ class FactoryWork:
     def _read(self, ref: ClipRef, watch: Stopwatch) -> Clip | Rejected:
         if ref in self.broken:
             raise BrokenLog(ref.log_id, self.broken[ref])
-        with watch.of("clip"):
+        with watch.timing("clip"):
             clip = read_clip(self.reader, ref)
         if not has_route(clip.centerline):
             return Rejected("clip", "route_ended", "the log ends at the end of its route")
         return clip
 
     def _perturbed(self, clip: Clip, watch: Stopwatch) -> WholeClip:
-        with watch.of("render"):  # before perturb work is spent; without a gate only a block that will be needed
+        with watch.timing("render"):  # before perturb work is spent; without a gate only a block that will be needed
             asked = self.render.refuses_blocks or self._simulates
             blocked = self.imaging.block_verdict(clip) if asked else None
         self._refuse_another_policy()
-        with watch.of("perturb"):
+        with watch.timing("perturb"):
             rng, starts = stream(self.seed, clip.clip_id, "perturb"), self.starts.get(clip.clip_id, NO_STARTS)
             found = blocked or perturb(clip, self.vocabulary, self.perturb, self.traffic, self.pdm, rng, starts)
         return WholeClip(clip, found, watch.seconds)
 
-    def listed(self, ref: ClipRef, made: WholeClip) -> PreparedClip:
+    def prepared_clip(self, ref: ClipRef, made: WholeClip) -> PreparedClip:
         """What attempts start from."""
         clip, found = without_sensors(made.clip), made.found
         return PreparedClip(
@@ -215,7 +215,7 @@ class FactoryWork:
     def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
         """Rollout, expert, rollout and reward; candidate -1 with experts that are tried once."""
         watch = Stopwatch()
-        drive = self.trace(prepared, candidate, expert, watch.of)
+        drive = self.trace(prepared, candidate, expert, watch.timing)
         if drive.rejected is not None:
             return RejectedAttempt(drive.rejected, _subscores(drive), watch.seconds)
         return AcceptedDrive(drive, watch.seconds)
@@ -239,7 +239,7 @@ class FactoryWork:
     def draw(self, driven: AcceptedDrive) -> Columns | RejectedAttempt:
         """The pictures; RejectedAttempt where they are no sample's. Raises BadClip."""
         watch, drive, before = Stopwatch(), drive_of(driven), scene_lookups()
-        with watch.of("render"):
+        with watch.timing("render"):
             sensed = self._with_sensors(drive)
             unfit = self.unfit(sensed, drive)
             pictures = {} if unfit is not None else self.imaging.pictures(sensed, drive.candidate, drive.sampled)
@@ -271,11 +271,11 @@ class FactoryWork:
         judged = drive.sampled
         labels: dict[str, object] = {}
         if self.labelling is not None:
-            with watch.of("labels"):
+            with watch.timing("labels"):
                 labelled = vocabulary_labels(self.labelling, judged.scene, judged.prepared, judged.reference)
                 labels = label_columns(labelled)
         row = sample_row(judged.scene.clip, drive.candidate, judged)
-        return Columns({**row, **drive.told, **labels}, watch.seconds)
+        return Columns({**row, **drive.row_overrides, **labels}, watch.seconds)
 
     # The block that a clip's pictures are drawn from is built before.
 
@@ -294,7 +294,7 @@ class FactoryWork:
         Raises BadClip, and TaskStopped where a fit is `stopped`.
         """
         watch = Stopwatch()
-        with watch.of("reconstruct"):
+        with watch.timing("reconstruct"):
             clip = read_clip(self.reader, ref)
             if not self._simulates:
                 return BlockReport(watch.seconds, self.imaging.build_rig(clip))
@@ -434,7 +434,7 @@ class BenchmarkWork(FactoryWork):
         """Of the expert's or frame's inputs and settings."""
         return frame_digest(expert, self.pdm) if expert in self.frames else super().expert_digest(expert)
 
-    def considered(self, ref: ClipRef) -> WholeClipPair | Rejected:
+    def read_and_perturb(self, ref: ClipRef) -> WholeClipPair | Rejected:
         """With the earlier window; Rejected also where there is none."""
         watch = Stopwatch()
         clip = self._read(ref, watch)
@@ -451,17 +451,17 @@ class BenchmarkWork(FactoryWork):
         if earlier.start_ms < 0:
             return Rejected("clip", "no_earlier_frame", f"the log begins {ref.start_ms} ms before the clip")
         try:
-            with watch.of("clip"):
+            with watch.timing("clip"):
                 return read_clip(self.reader, earlier)
         except Unreadable:
             raise
         except BadClip as error:  # the clip itself was read: what lies before it is no drive
             return Rejected("clip", "no_earlier_frame", str(error))
 
-    def listed(self, ref: ClipRef, made: WholeClip) -> PreparedClip:
+    def prepared_clip(self, ref: ClipRef, made: WholeClip) -> PreparedClip:
         """With the clip's scenes."""
         assert isinstance(made, WholeClipPair)
-        prepared = super().listed(ref, made)
+        prepared = super().prepared_clip(ref, made)
         rollouts = tuple((i, candidate.rollout) for i, candidate in enumerate(made.candidates))
         return replace(
             prepared, scenes=BenchmarkClip(perturbed_clip_of(prepared).clip, without_sensors(made.before), rollouts)
@@ -476,17 +476,17 @@ class BenchmarkWork(FactoryWork):
             assert prepared.scenes is not None, "prepared by a run without frames"
             rng = stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
             judged = human_sample(scene_of_clip(prepared.scenes.before), Human(), self.pdm, rng, timed)
-            return Drive(_earlier_ref(payload.ref), None, judged, None, told=_lineage_of_earlier_frame(payload.clip))
+            return Drive(_earlier_ref(payload.ref), None, judged, None, row_overrides=_earlier_lineage(payload.clip))
         chosen = payload.candidates[candidate]
         led_to = follow_up(payload.clip, chosen.rollout, self.traffic, self.pdm, timed)
         if isinstance(led_to, Rejected):
             return Drive(payload.ref, chosen, None, led_to)
         shown = half_a_second_before(led_to, chosen.rollout, self.pdm) if expert == FOLLOW_UP_BEFORE else None
         now = led_to.scene.step
-        return Drive(payload.ref, chosen, led_to, None, shared=(now - BEFORE_STEPS, now), shown=shown)
+        return Drive(payload.ref, chosen, led_to, None, shared=(now - BEFORE_STEPS, now), sampled_instead=shown)
 
 
-def _lineage_of_earlier_frame(clip: Clip) -> dict[str, object]:
+def _earlier_lineage(clip: Clip) -> dict[str, object]:
     """What the row of the log 0.5 s before T says about its clip, instead of the earlier window it was read from."""
     return {
         "clip_id": clip.clip_id,

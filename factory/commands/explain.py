@@ -74,7 +74,7 @@ def explain(request: Request) -> None:
     ref = find((*run.index.refs, *run.index.broken), request.clip)
     work = run.work
     began = time.perf_counter()
-    made = work.considered(ref)
+    made = work.read_and_perturb(ref)
     if isinstance(made, Rejected):
         print(f"clip {ref.clip_id}: log {ref.log_id} at {ref.start_ms / 1000:.1f} s")
         print(f"rejected by {made.stage}: {made.reason}: {made.detail}")
@@ -96,7 +96,7 @@ def explain(request: Request) -> None:
         print("gated trajectories: " + ", ".join(f"{fate} {count}" for fate, count in fates.most_common()))
         cv2.imwrite(f"{stem}_candidates.png", candidates_picture(clip, found.considered)[..., ::-1])
 
-    prepared = work.listed(ref, made)
+    prepared = work.prepared_clip(ref, made)
     order = candidate_order(work.once(expert), min(request.tries, len(made.candidates)))
     shown = None
     for candidate in order:

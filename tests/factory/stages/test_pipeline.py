@@ -172,7 +172,7 @@ def test_a_broken_log_fails_with_the_index_s_own_words(small_town: Path, tmp_pat
 
 def test_what_is_considered_is_what_is_prepared(small_town: Path, tmp_path: Path) -> None:
     work = work_on(small_town, tmp_path, "render=none")
-    made = work.considered(work.reader.index().refs[0])
+    made = work.read_and_perturb(work.reader.index().refs[0])
     assert isinstance(made, WholeClip) and isinstance(made.found, Perturbation)
     assert [row.vocabulary_index for row in prepared_by(work).candidates] == [
         candidate.vocabulary_index for candidate in made.candidates
@@ -185,7 +185,7 @@ def test_a_clip_s_candidates_are_drawn_from_a_stream_of_the_run_s_seed_and_its_o
 ) -> None:
     work = work_on(small_town, tmp_path, "render=none", "seed=3")
     ref = work.reader.index().refs[0]
-    clip, made = work.reader.read(ref), work.considered(ref)
+    clip, made = work.reader.read(ref), work.read_and_perturb(ref)
     assert isinstance(made, WholeClip)
 
     def drawn(seed: int, clip_id: str) -> list[int]:
