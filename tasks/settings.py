@@ -1,4 +1,4 @@
-"""What candidates and experts' drives must come up to. Light: importing it loads no numpy."""
+"""The settings of perturbation, gate, traffic and experts. Light: importing it loads no numpy."""
 
 import math
 from dataclasses import Field, dataclass, field, fields
@@ -66,3 +66,117 @@ class ExpertGate:
         unknown = [name for name in self.full if name not in JUDGED]
         if unknown:
             raise ValueError(f"full names {', '.join(unknown)}; an expert's drive is judged by {', '.join(JUDGED)}")
+
+
+MOST = 1000.0  # of any setting, and of speeds [m/s]: the length of paths grows with it
+
+
+@dataclass(frozen=True)
+class TrafficSettings:
+    """How the others move. IDM's parameters are the public benchmark's (docs/reward.md 5).
+
+    `navsim` asks for the first five and the exponent; its other rules are the public code's own. `custom` asks for
+    those of the ways (target speed, comfortable deceleration), and the gap of who enters. What is fixed is the shape
+    of the model, not a style of driving.
+    """
+
+    mode: Literal["idm", "replay", "navsim", "custom"] = "idm"  # navsim: the public code's; custom: a policy's
+    target_speed_mps: float = 10.0  # where the lane has no speed limit
+    min_gap_m: float = 1.0
+    headway_s: float = 1.5
+    accel_max: float = 1.0  # m/s2
+    decel_max: float = 2.0  # m/s2, comfortable
+    exponent: float = fixed(4.0)  # of the free-road term
+    emergency_decel: float = fixed(8.0)  # m/s2, what tyres can; the public traffic knows no limit
+    lookahead_m: float = fixed(60.0)
+    blend_length_m: float = fixed(20.0)  # over which a start beside the path fades onto it
+    yields: bool = True  # idm: drivers keep the intent of their log, and give way where paths cross or merge
+    policy: str | None = None  # custom: a class, or function, that makes one: my_package.my_module:MyPolicy
+
+    def __post_init__(self) -> None:
+        if self.mode not in ("idm", "replay", "navsim", "custom"):
+            raise ValueError(f"traffic mode must be idm, replay, navsim or custom, not {self.mode!r}")
+        if (self.mode == "custom") != (self.policy is not None):
+            raise ValueError(f"traffic.policy={self.policy} with traffic={self.mode}: traffic=custom takes one, alone")
+        for name in ("target_speed_mps", "headway_s", "accel_max", "decel_max", "blend_length_m"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"traffic {name} must be positive, not {getattr(self, name)}")
+        for name in (each.name for each in fields(self) if each.name not in ("mode", "yields", "policy")):
+            if not 0.0 <= (value := getattr(self, name)) <= MOST:
+                raise ValueError(f"traffic {name} must lie within 0 .. {MOST:g}, not {value}")
+
+    @property
+    def leaves_out_touching(self) -> bool:
+        """Whether who touches the ego at the start is left out of the score: not in the public reactive evaluation."""
+        return self.mode != "navsim"
+
+
+@dataclass(frozen=True)
+class PdmSettings:
+    """PDM-Closed as published with NAVSIM (docs/reward.md 4); raises ValueError where a value makes no sense.
+
+    The three switches at the end are faults of the published planner, kept so that plans and progress compare with
+    everything published; False corrects each. The fixed numbers are the published IDM's: another expert has others.
+    """
+
+    speed_fractions: tuple[float, ...] = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the lane's speed limit
+    lateral_offsets_m: tuple[float, ...] = (0.0, -1.0, 1.0)  # + is to the left
+    fallback_speed_mps: float = fixed(15.0)  # where the lane has no speed limit
+    min_gap_m: float = fixed(1.0)
+    headway_s: float = 1.5
+    accel_max_mps2: float = fixed(1.5)
+    decel_max_mps2: float = fixed(3.0)
+    exponent: int = fixed(10)  # of IDM's free-road term
+    shared_lead_memory: bool = True  # within one path, a speed inherits lead fields its own search did not write
+    brakes_at_first_step: bool = True  # no lead is looked for before 0.2 s: until then one seems to stand at the bumper
+    speed_below_zero: bool = True  # a stop before an oncoming car overshoots into creeping backwards
+
+    def __post_init__(self) -> None:
+        for name in ("speed_fractions", "lateral_offsets_m"):
+            values = getattr(self, name)
+            if not values or not all(map(math.isfinite, values)):
+                raise ValueError(f"pdm {name} must be finite numbers, at least one, not {list(values)}")
+        if min(self.speed_fractions) <= 0.0:
+            raise ValueError(f"pdm speed_fractions must be positive, not {list(self.speed_fractions)}")
+        for name in ("fallback_speed_mps", "min_gap_m", "accel_max_mps2", "decel_max_mps2", "exponent"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"pdm {name} must be positive and finite, not {getattr(self, name)}")
+        if not 0.0 <= self.headway_s < math.inf:
+            raise ValueError(f"pdm headway_s must be finite and not negative, not {self.headway_s}")
+
+
+PDM_DEFAULTS = PdmSettings()
+
+
+@dataclass(frozen=True)
+class FeasibleSettings:
+    """Limits and weights of the two QPs."""
+
+    accel_min_mps2: float = -3.6  # comfort: -4.05
+    accel_max_mps2: float = 2.1  # comfort: 2.40
+    jerk_max_mps3: float = 3.5  # comfort: 4.13
+    lateral_accel_max_mps2: float = 4.0  # comfort: 4.89
+    yaw_rate_max_radps: float = 0.8  # comfort: 0.95
+    yaw_accel_max_radps2: float = 1.5  # comfort: 1.93
+    curvature_max_1pm: float = 0.2  # turning circle of a car of this size, 10 m across
+    curvature_rate_max_1pms: float = 0.2  # steering wheel speed at standstill
+    weight_progress: float = 1.0  # w_s, of distances along the path
+    weight_jerk: float = 0.3  # w_j
+    weight_lateral: float = 1.0  # w_d, of distances beside it
+    weight_heading: float = 10.0  # w_h
+    weight_yaw_accel: float = 0.1  # w_u
+    max_iterations: int = 4000  # of a QP
+    tolerance: float = 1e-4  # of a QP
+
+
+FEASIBLE_DEFAULTS = FeasibleSettings()
+
+
+@dataclass(frozen=True)
+class RecoverySettings:
+    """How to retrieve and what to do with what was found."""
+
+    smooth: bool = True  # False: the retrieved trajectory as it is, as published
+    # Of the matching vector: vx, vy, heading now; x, y, heading at the end. The paper weighs none.
+    weights: tuple[float, float, float, float, float, float] = fixed((1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
+    feasible: FeasibleSettings = fixed(FEASIBLE_DEFAULTS)  # of the smoothing

@@ -23,11 +23,8 @@ from factory.readers.settings import (
     TownsClips,
     TownSettings,
 )
-from tasks.experts.pdm_closed.settings import PdmSettings
-from tasks.experts.recovery.settings import RecoverySettings
 from tasks.render.settings import RenderMode, RenderSettings
-from tasks.rollout.settings import TrafficSettings
-from tasks.settings import ExpertGate, PerturbSettings
+from tasks.settings import ExpertGate, PdmSettings, PerturbSettings, RecoverySettings, TrafficSettings
 from tasks.stages import FRAMES, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use

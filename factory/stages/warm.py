@@ -21,7 +21,6 @@ from factory.files import locked
 from factory.graph.steps import NotReady
 from tasks.attempt import drive_and_judge
 from tasks.experts.pdm_closed.proposals import forecast, proposals
-from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole
 from tasks.render import warm as render_warm
@@ -34,6 +33,7 @@ from tasks.reward.verdicts import INDEX_FROM_ROWS
 from tasks.rollout.policy import SeenTraffic
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.sealed import Damaged, sealed, unsealed
+from tasks.settings import PdmSettings
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, Clip, Scene, scene_of_clip

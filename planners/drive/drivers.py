@@ -12,8 +12,8 @@ from planners.evaluation.planner_names import EvaluatedPlanner, needs_of
 from planners.evaluation.planning import plans_of
 from planners.evaluation.scoring import human_plans, pdm_plans
 from tasks.experts.pdm_closed.planner import PdmClosed
-from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Plan
+from tasks.settings import PdmSettings
 from tasks.world.arrays import Array
 from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene

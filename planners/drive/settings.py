@@ -9,10 +9,8 @@ from factory.config.run import READERS, VocabularyChoice, refuse_missing_root, w
 from factory.config.shapes import defaults_of, merged
 from planners.drive.loop import LoopSettings
 from planners.evaluation.planner_names import composed
-from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.render.settings import RenderSettings
-from tasks.rollout.settings import TrafficSettings
-from tasks.settings import PerturbSettings
+from tasks.settings import PdmSettings, PerturbSettings, TrafficSettings
 
 Pictures = Literal["truth", "engine", "none"]
 

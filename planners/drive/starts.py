@@ -17,7 +17,7 @@ from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
 from tasks.experts.protocol import Plan
 from tasks.perturb import Perturbation
 from tasks.rollout.roles import stands_always
-from tasks.rollout.settings import TrafficSettings
+from tasks.settings import TrafficSettings
 from tasks.world.agents import MOVING_KINDS, PER_STEP, AgentTracks
 from tasks.world.arrays import Array
 from tasks.world.clip import STEP_S, Clip, Scene, scene_of_clip

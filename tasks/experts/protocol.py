@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from tasks.experts.pdm_closed.settings import PdmSettings
+from tasks.settings import PdmSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
 from tasks.world.clip import Scene

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tasks.rollout.settings import TrafficSettings
+from tasks.settings import TrafficSettings
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import STEP_S, Scene

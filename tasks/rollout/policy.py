@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from tasks.rollout.corridor import Paths
 from tasks.rollout.idm import IdmDriver
-from tasks.rollout.settings import TrafficSettings
 from tasks.rollout.traffic import begin_step, finish_step, first_row
 from tasks.rollout.traffic_state import AgentStates, Motion, Roles, RolloutRows
+from tasks.settings import TrafficSettings
 from tasks.world.agents import AgentKind
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.geometry import all_within

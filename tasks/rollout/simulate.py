@@ -47,10 +47,10 @@ from tasks.rollout.roles import (
     stands_always,
     start_step,
 )
-from tasks.rollout.settings import MOST, TrafficSettings
 from tasks.rollout.traffic import drive, drive_many
 from tasks.rollout.traffic_state import AgentStates, Motion, Roles, RolloutRows, Yielding
 from tasks.rollout.yielding import yielding_in
+from tasks.settings import MOST, TrafficSettings
 from tasks.world.agents import MOVING_KINDS, PER_STEP, AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Rollout, Scene

@@ -22,11 +22,11 @@ from tasks.experts.pdm_closed.proposals import (
     path_length_m,
     proposals,
 )
-from tasks.experts.pdm_closed.settings import DEFAULTS, PdmSettings
 from tasks.experts.protocol import Plan, RunContext
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import prepare
 from tasks.rollout.lqr import track
+from tasks.settings import PDM_DEFAULTS, PdmSettings
 from tasks.stages import Rejected
 from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array
@@ -68,7 +68,7 @@ def plan_pdm_closed(
     route_lane_ids: frozenset[str],
     red_lane_ids: frozenset[str] = frozenset(),
     speed_limit_mps: float | None = None,
-    settings: PdmSettings = DEFAULTS,
+    settings: PdmSettings = PDM_DEFAULTS,
 ) -> PdmPlan:
     """Plan from `ego_state` (11,) along `centerline` (N, 3).
 
@@ -109,7 +109,7 @@ def _refuse_nonsense(ego_state: Array, agents: AgentTracks) -> None:
         raise ValueError(f"agents: track {unknown} is valid at the first step but its box or velocity is not finite")
 
 
-def plan_for(scene: Scene, settings: PdmSettings = DEFAULTS) -> PdmPlan:
+def plan_for(scene: Scene, settings: PdmSettings = PDM_DEFAULTS) -> PdmPlan:
     """PDM-Closed from a scene, seeing its agents and lights at the scene's step only."""
     clip = scene.clip
     center = ego_boxes(scene.ego_state, PACIFICA)[:2]
@@ -157,7 +157,7 @@ def speed_limit_of(scene: Scene) -> float | None:
 class PdmClosed:
     """PDM-Closed as an expert."""
 
-    settings: PdmSettings = DEFAULTS
+    settings: PdmSettings = PDM_DEFAULTS
     name: str = "pdm_closed"
 
     @classmethod

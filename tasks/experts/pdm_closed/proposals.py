@@ -13,9 +13,9 @@ import numpy as np
 import shapely
 import shapely.ops
 
-from tasks.experts.pdm_closed.settings import DEFAULTS, PdmSettings
 from tasks.kernels.compiled import kernel
 from tasks.rollout.polylines import extent
+from tasks.settings import PDM_DEFAULTS, PdmSettings
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools, Indices, Ints
 from tasks.world.frames import box_corners
@@ -447,7 +447,7 @@ class Proposals:
 
 
 class PdmDriver(NamedTuple):
-    """The intelligent driver model's constants, and the faults it keeps (tasks.experts.pdm_closed.settings)."""
+    """The intelligent driver model's constants, and the faults it keeps (tasks.settings)."""
 
     min_gap_m: float
     headway_s: float
@@ -460,7 +460,11 @@ class PdmDriver(NamedTuple):
 
 
 def proposals(
-    ego_state: Array, centerline: Array, seen: Forecast, speed_limit_mps: float | None, settings: PdmSettings = DEFAULTS
+    ego_state: Array,
+    centerline: Array,
+    seen: Forecast,
+    speed_limit_mps: float | None,
+    settings: PdmSettings = PDM_DEFAULTS,
 ) -> Proposals:
     """The proposals from `ego_state` (11,) along `centerline` (N, 3) through the forecast traffic.
 

@@ -15,7 +15,7 @@ import osqp
 from scipy import sparse
 
 from tasks.experts.protocol import Plan
-from tasks.experts.recovery.settings import DEFAULTS, FeasibleSettings, RecoverySettings
+from tasks.settings import FEASIBLE_DEFAULTS, FeasibleSettings, RecoverySettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene
@@ -51,7 +51,7 @@ N = HORIZON_STEPS
 SLOW_MPS = 0.5  # limits that divide by the speed stop growing below it
 
 
-def feasible(trajectory: Array, ego_state: Array, settings: FeasibleSettings = DEFAULTS) -> Array | str:
+def feasible(trajectory: Array, ego_state: Array, settings: FeasibleSettings = FEASIBLE_DEFAULTS) -> Array | str:
     """The nearest drivable trajectory (40, 3) to `trajectory` (40, 3), both in the frame of `ego_state` (11,).
 
     Returns the reason as text where a QP does not reach the tolerance within its iterations.

@@ -10,8 +10,7 @@ from planners.drive.loop import LoopSettings, drive
 from planners.drive.measures import measures_of
 from planners.drive.starts import logged_start
 from planners.evaluation.planner_names import planner_of
-from tasks.experts.pdm_closed.settings import PdmSettings
-from tasks.rollout.settings import TrafficSettings
+from tasks.settings import PdmSettings, TrafficSettings
 from tasks.world.clip import NOW
 from tasks.world.vehicle import PACIFICA, VX, X, Y
 from tests.planners.drive.streets import FAR, Steady, car, nobody, start_on, street_with

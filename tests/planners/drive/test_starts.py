@@ -7,8 +7,7 @@ import pytest
 
 from planners.drive.loop import road_from
 from planners.drive.starts import known_places, lengthened, perturbed_starts
-from tasks.experts.pdm_closed.settings import PdmSettings
-from tasks.rollout.settings import TrafficSettings
+from tasks.settings import PdmSettings, TrafficSettings
 from tasks.world.camera import SensorFile
 from tasks.world.clip import CLIP_STEPS, NOW, Block
 from tasks.world.lanes import LightState

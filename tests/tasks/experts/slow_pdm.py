@@ -10,7 +10,7 @@ import shapely
 import shapely.ops
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed.settings import DEFAULTS, PdmSettings
+from tasks.settings import PDM_DEFAULTS, PdmSettings
 from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
 from tasks.world.frames import box_corners, wrap_angle
 from tasks.world.geometry import ego_boxes
@@ -156,7 +156,7 @@ def proposals(
     centerline: Array,
     seen: Forecast,
     speed_limit_mps: float | None,
-    settings: PdmSettings = DEFAULTS,
+    settings: PdmSettings = PDM_DEFAULTS,
     vehicle: Vehicle = PACIFICA,
 ) -> Proposals:
     """The proposals from `ego_state` (11,) along `centerline` (N, 3) through the forecast traffic.

@@ -9,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from tasks.rollout.navsim import IdmAgent, NavsimAgents, bodies
-from tasks.rollout.settings import TrafficSettings
+from tasks.settings import TrafficSettings
 from tasks.world.vehicle import PACIFICA
 
 Array = NDArray[np.float64]
