@@ -19,8 +19,8 @@ LINK = re.compile(r"\]\(([^)\s#]+)[^)]*\)")
 IN_PYTHON = (  # what others build on
     "tasks.trajectories",
     "tasks.world.clip",
-    "tasks.world.agents",
-    "tasks.world.lanes",
+    "tasks.world.clip",
+    "tasks.world.road_map",
     "tasks.experts.protocol",
     "factory.store.reader",
     "factory.readers.base",

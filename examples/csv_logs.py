@@ -23,12 +23,18 @@ import numpy as np
 
 from factory.readers.base import BadClip
 from factory.readers.logs import LoggedDrive, LogReader, Recorded, WholeLog, route_of_drive
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import STEP_S
-from tasks.world.lanes import NO_LIGHTS, Lane, MapLayer, MapPolygon, RoadMap
-from tasks.world.polygons import centerline_from_boundaries, ring_from_boundaries
-from tasks.world.route import roadblocks_of
-from tasks.world.vehicle import AX, EGO_STATE_SIZE, HEADING, VX, YAW_RATE, X, Y
+from tasks.world.clip import STEP_S, AgentKind, AgentTracks
+from tasks.world.frames import AX, EGO_STATE_SIZE, HEADING, VX, YAW_RATE, X, Y
+from tasks.world.road_map import (
+    NO_LIGHTS,
+    Lane,
+    MapLayer,
+    MapPolygon,
+    RoadMap,
+    centerline_from_boundaries,
+    ring_from_boundaries,
+    roadblocks_of,
+)
 
 HEIGHT_M = 1.6  # of every box: the files do not tell
 

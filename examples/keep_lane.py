@@ -13,9 +13,8 @@ import numpy as np
 from tasks.experts.protocol import Plan
 from tasks.stages import Rejected
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene
-from tasks.world.frames import wrap_angle
-from tasks.world.polygons import arc_lengths
-from tasks.world.vehicle import HEADING, VX, X, Y
+from tasks.world.frames import HEADING, VX, X, Y, wrap_angle
+from tasks.world.road_map import arc_lengths
 
 
 @dataclass(frozen=True)

@@ -43,9 +43,8 @@ from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import FOLLOW_UP_BEFORE, HUMAN_BEFORE, Rejected
 from tasks.subscores import OF_ONE_PLAN
 from tasks.world.arrays import Array
-from tasks.world.chance import stream
-from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip
-from tasks.world.vehicle import HEADING
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip, stream
+from tasks.world.frames import HEADING
 from tasks.world.vocabulary import Vocabulary
 
 

@@ -21,8 +21,8 @@ from tasks.settings import ExpertGate
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, Clip, Rollout, Scene, scene_of_clip
-from tasks.world.route import centerline_from
-from tasks.world.vehicle import HEADING
+from tasks.world.frames import HEADING
+from tasks.world.road_map import centerline_from
 
 Timed = Callable[[str], AbstractContextManager[object]]
 

@@ -16,7 +16,7 @@ from tasks.experts.protocol import Plan
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import FOLLOW_UP_BEFORE, HUMAN_BEFORE, Rejected
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
-from tasks.world.vehicle import HEADING
+from tasks.world.frames import HEADING
 
 BEFORE_STEPS = 5  # the earlier frame of a pair: 0.5 s, over which extended comfort compares two plans
 

@@ -24,8 +24,7 @@ from tasks.settings import PerturbSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, scene_of_clip
-from tasks.world.frames import to_local, to_world
-from tasks.world.vehicle import HEADING, VX
+from tasks.world.frames import HEADING, VX, to_local, to_world
 from tasks.world.vocabulary import FIRST_START, OF_LOG, Vocabulary
 
 NO_STARTS = np.empty((0, HORIZON_STEPS, 3))

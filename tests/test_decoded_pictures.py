@@ -18,7 +18,7 @@ from factory.stages.sensors import decode_image, opened_photos, read_masks
 from factory.store.reader import image_of
 from planners.data.batch import ImageLayout
 from planners.data.images import stitched
-from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import Camera, SensorFile
 from tests.pictures import declared, turned
 from tests.planners import samples
 from tests.planners.samples import Pixels

@@ -30,7 +30,7 @@ from factory.stages.sensors import load_sweeps
 from factory.store.samples import Store
 from factory.store.verify import verify
 from tasks.stages import Rejected
-from tasks.world.camera import SensorFile
+from tasks.world.clip import SensorFile
 from tests.factory.datasets.navsim.openscene_writer import merged_pcd
 from tests.factory.graph.wild import WildWork
 from tests.factory.toy import refs

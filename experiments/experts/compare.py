@@ -28,9 +28,8 @@ from tasks.reward.rules.comfort import extended_comfort
 from tasks.rollout.lqr import track
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
-from tasks.world.chance import stream
-from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene, scene_of_clip
-from tasks.world.vehicle import AX, YAW_RATE
+from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene, scene_of_clip, stream
+from tasks.world.frames import AX, YAW_RATE
 
 COLUMNS = {
     "tried": "plans tried",

@@ -15,8 +15,7 @@ from factory.store.location import Location
 from planners.drive.starts import LOGGED
 from planners.drive.table import open_drives
 from tasks.world.clip import HORIZON_STEPS
-from tasks.world.frames import to_local
-from tasks.world.vehicle import HEADING
+from tasks.world.frames import HEADING, to_local
 
 COLUMNS = ("clip_id", "planner", "start", "duration_s", "off_road_events", "at_fault_collision", "ego_states")
 

@@ -22,7 +22,7 @@ A format that may bring its reader down or never end, as pickles may, is `untrus
 another process, and a log that kills it is broken as any other.
 
 Wherever the input is broken, raise `BadClip(file, field, how to fix it)`. Units: metres, radians, seconds, one world
-frame per log; the columns of ego states are named in tasks.world.vehicle, absent agents hold NaN and valid = False.
+frame per log; the columns of ego states are named in tasks.world.frames, absent agents hold NaN and valid = False.
 """
 
 import hashlib
@@ -41,13 +41,21 @@ from factory.readers.apart import Apart
 from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, failing_as, split_of
 from factory.readers.settings import LogClips, WindowSettings, check_traversals
 from factory.readers.validate import validate_clip
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Ints
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import CLIP_STEPS, DRIVES_APART_S, NOW, OTHER_LOG, STEP_S, Block, Clip
-from tasks.world.lanes import RoadMap, Route, TrafficLights
-from tasks.world.route import NoRoute, RouteFinder, route_of_log
-from tasks.world.vehicle import VX, VY, X, Y
+from tasks.world.clip import (
+    CLIP_STEPS,
+    DRIVES_APART_S,
+    NOW,
+    OTHER_LOG,
+    STEP_S,
+    AgentTracks,
+    Block,
+    Camera,
+    Clip,
+    SensorFile,
+)
+from tasks.world.frames import VX, VY, X, Y
+from tasks.world.road_map import NoRoute, RoadMap, Route, RouteFinder, TrafficLights, route_of_log
 
 # Several logs of one place: which other drives lead through a block, and the block with what they saw.
 #

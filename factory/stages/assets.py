@@ -47,10 +47,8 @@ from tasks.render.scene.sensed import own_bodies
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
 from tasks.render.settings import Backend, FitSettings, RenderSettings, SceneDtype, SceneFrom
 from tasks.sealed import Damaged, check, seal
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bools
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import Block, Clip, of_other_log, own_name
+from tasks.world.clip import AgentTracks, Block, Camera, Clip, SensorFile, of_other_log, own_name
 
 # A block's scene fitted to its photos, in stretches: a killed fit goes on where the last stretch ended.
 

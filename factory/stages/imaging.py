@@ -40,11 +40,9 @@ from tasks.render.scene.sensed import Photo
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
 from tasks.render.views import pose_on_ground, render_views
 from tasks.stages import Rejected
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bytes
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, Scene
-from tasks.world.vehicle import HEADING, X, Y
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentTracks, Camera, Clip, Scene, SensorFile
+from tasks.world.frames import HEADING, X, Y
 
 NO_IMAGES: dict[str, object] = {"cameras": None, "images": None, "image_source": str(ImageSource.NONE)}
 TAG_OF = {

@@ -17,12 +17,10 @@ from factory.datasets.town.town import Town, log_name, plan_log
 from factory.readers.settings import TownSettings
 from factory.stages.sensors import chosen_cameras
 from tasks.render.settings import RenderSettings
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bytes
-from tasks.world.camera import Camera
-from tasks.world.clip import STEP_S, Clip
-from tasks.world.lanes import TrafficLights
-from tasks.world.vehicle import HEADING, X, Y
+from tasks.world.clip import STEP_S, AgentTracks, Camera, Clip
+from tasks.world.frames import HEADING, X, Y
+from tasks.world.road_map import TrafficLights
 
 _LOG = re.compile(r"town-(\d+)-(\d{4})-")  # factory.datasets.town.town.log_name
 

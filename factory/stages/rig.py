@@ -23,10 +23,8 @@ from tasks.render.scene.features import Known
 from tasks.render.scene.movers import lifted
 from tasks.render.settings import Adjust, RigSettings
 from tasks.sealed import Damaged, sealed_json, unsealed_json
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bools
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import Block
+from tasks.world.clip import AgentTracks, Block, Camera, SensorFile
 
 SAID = ".rig.json"
 SAME_S = 1e-3  # between the stamp of a photo counted from its clip and from its block

@@ -11,12 +11,10 @@ from tasks.render.views import pose_on_ground
 from tasks.reward.epdms import Scores
 from tasks.reward.label_bytes import VocabularyLabels, encode
 from tasks.subscores import OF_ONE_PLAN, SUBSCORES
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array
-from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, Scene
-from tasks.world.frames import points_to_local, to_local
-from tasks.world.route import driving_command
-from tasks.world.vehicle import AX, AY, HEADING, VX, VY
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Clip, Scene
+from tasks.world.frames import AX, AY, HEADING, VX, VY, points_to_local, to_local
+from tasks.world.road_map import driving_command
 
 NEAR_M = 30.0  # for the tags
 

@@ -41,7 +41,7 @@ from tasks.render.scene.sky import SkyMap
 from tasks.render.settings import SceneDtype
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.project import ScreenFilter
-from tasks.world.camera import Camera, Fisheye
+from tasks.world.clip import Camera, Fisheye
 
 FORMAT = "driving-data-factory scene"
 VERSION_OF = {SceneDtype.FLOAT32: 1, SceneDtype.FLOAT16: 2}

@@ -20,8 +20,7 @@ from tasks.render.scene.sensed import Photo, Sweep, on_ego
 from tasks.render.settings import Chroma
 from tasks.render.views import straightened, undistorted
 from tasks.world.arrays import Array, Bools, Bytes
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import Block, Clip, own_name
+from tasks.world.clip import Block, Camera, Clip, SensorFile, own_name
 
 # Masks of what a rig sees of the car that carries it: `<camera>.png` in a folder of the user's, white where it is.
 

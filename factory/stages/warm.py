@@ -34,10 +34,9 @@ from tasks.rollout.policy import SeenTraffic
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.sealed import Damaged, sealed, unsealed
 from tasks.settings import PdmSettings
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array
-from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, Clip, Scene, scene_of_clip
-from tasks.world.lanes import Lane, RoadMap, Route
+from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, AgentKind, AgentTracks, Clip, Scene, scene_of_clip
+from tasks.world.road_map import Lane, RoadMap, Route
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
 REPLAY = TrafficSettings(mode="replay")

@@ -334,7 +334,7 @@ def _world() -> tuple[Column, ...]:
     steps = "-1.5 .. 4.0 s at 10 Hz, index 15 is now"
     return (
         Column("agent_ids", "string", ("N",)),
-        Column("agent_kinds", "string", ("N",), about="tasks.world.agents.AgentKind"),
+        Column("agent_kinds", "string", ("N",), about="tasks.world.clip.AgentKind"),
         Column("agent_boxes", "float32", ("N", AGENT_STEPS, 5), box, EGO, steps, nan=True),
         Column("agent_velocities", "float32", ("N", AGENT_STEPS, 2), "m/s", EGO, "axes of the ego at now", nan=True),
         Column("agent_valid", "bool", ("N", AGENT_STEPS)),

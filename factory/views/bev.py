@@ -9,13 +9,11 @@ import numpy as np
 
 from tasks.attempt import Judged
 from tasks.perturb import Candidate, Considered
-from tasks.world.agents import AgentKind
 from tasks.world.arrays import Array, Bytes, Image, ShortInts
-from tasks.world.clip import NOW, Clip
-from tasks.world.frames import box_corners, points_to_local
+from tasks.world.clip import NOW, AgentKind, Clip
+from tasks.world.frames import HEADING, PACIFICA, box_corners, points_to_local
 from tasks.world.geometry import ego_boxes
-from tasks.world.lanes import LightState
-from tasks.world.vehicle import HEADING, PACIFICA
+from tasks.world.road_map import LightState
 
 Colour = tuple[int, int, int]  # RGB
 

@@ -29,8 +29,7 @@ from factory.views.bev import AGENT_COLOURS, EXPERT, LOGGED, OBJECT, PERTURBED, 
 from factory.views.sample_picture import ego_way
 from tasks.subscores import JUDGED, SUBSCORES
 from tasks.world.arrays import Array
-from tasks.world.frames import to_local
-from tasks.world.vehicle import PACIFICA
+from tasks.world.frames import PACIFICA, to_local
 
 Row = Mapping[str, Any]
 

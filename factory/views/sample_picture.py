@@ -23,7 +23,7 @@ from factory.views.bev import (
 )
 from tasks.world.arrays import Array, Image
 from tasks.world.frames import to_local
-from tasks.world.lanes import LightState
+from tasks.world.road_map import LightState
 
 Row = Mapping[str, Any]
 

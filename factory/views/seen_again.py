@@ -34,10 +34,8 @@ from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import render, vehicles_at
 from tasks.render.settings import ImageSource
 from tasks.render.views import VISIBLE_M, pose_on_ground
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array, Image
-from tasks.world.camera import Pinhole
-from tasks.world.clip import STEP_S
+from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Pinhole
 from tasks.world.frames import to_world
 
 Row = Mapping[str, Any]

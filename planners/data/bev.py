@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from factory.store.schema import AGENT_STEPS, NOW_INDEX
 from planners.data.batch import BevLayout
-from tasks.world.agents import AgentKind
 from tasks.world.arrays import F32, Bools, Bytes, ShortInts
+from tasks.world.clip import AgentKind
 from tasks.world.frames import box_corners
 
 

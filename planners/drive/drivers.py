@@ -15,10 +15,8 @@ from tasks.experts.pdm_closed.planner import PdmClosed
 from tasks.experts.protocol import Plan
 from tasks.settings import PdmSettings
 from tasks.world.arrays import Array
-from tasks.world.chance import stream
-from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene
-from tasks.world.frames import to_world
-from tasks.world.vehicle import HEADING, VX
+from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene, stream
+from tasks.world.frames import HEADING, VX, to_world
 
 
 class DriveEnd(StrEnum):

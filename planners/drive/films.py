@@ -27,7 +27,7 @@ from planners.drive.loop import PLAN_STEPS, ClosedLoop
 from planners.drive.measures import measures_of
 from tasks.world.arrays import Image
 from tasks.world.clip import STEP_S
-from tasks.world.vehicle import HEADING, VX
+from tasks.world.frames import HEADING, VX
 
 BEV_PX, CAMERA_PX = (560, 560), (720, 405)  # width, height
 HOLD = 10  # pictures that the end is shown for

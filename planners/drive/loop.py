@@ -17,13 +17,11 @@ from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bools, Ints
-from tasks.world.clip import HORIZON_STEPS, STEP_S, Rollout
+from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentTracks, Rollout
+from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y
 from tasks.world.geometry import ego_boxes, touching
-from tasks.world.polygons import arc_lengths
-from tasks.world.route import RouteFinder
-from tasks.world.vehicle import HEADING, PACIFICA, VX, VY, X, Y
+from tasks.world.road_map import RouteFinder, arc_lengths
 
 # The road ahead of a drive: how far along it a place lies, and where it ends.
 

@@ -8,7 +8,7 @@ from planners.drive.drivers import DriveEnd
 from planners.drive.loop import ClosedLoop
 from tasks.reward.rules.comfort import comfortable
 from tasks.world.clip import STEP_S
-from tasks.world.vehicle import X, Y
+from tasks.world.frames import X, Y
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,10 @@ from tasks.experts.protocol import Plan
 from tasks.perturb import Perturbation
 from tasks.rollout.roles import stands_always
 from tasks.settings import TrafficSettings
-from tasks.world.agents import MOVING_KINDS, PER_STEP, AgentTracks
 from tasks.world.arrays import Array
-from tasks.world.clip import STEP_S, Clip, Scene, scene_of_clip
-from tasks.world.lanes import LightState, TrafficLights
-from tasks.world.vehicle import X, Y
+from tasks.world.clip import MOVING_KINDS, PER_STEP, STEP_S, AgentTracks, Clip, Scene, scene_of_clip
+from tasks.world.frames import X, Y
+from tasks.world.road_map import LightState, TrafficLights
 
 LOGGED = -1
 ABSENT = {"boxes": np.nan, "velocities": np.nan, "valid": False, "center_z": np.nan}  # of AgentTracks

@@ -27,8 +27,7 @@ from tasks.perturb import Perturbation, perturb
 from tasks.render.settings import RenderSettings
 from tasks.rollout.policy import traffic_record
 from tasks.stages import stage_versions
-from tasks.world.chance import stream
-from tasks.world.clip import HORIZON_STEPS, NOW, Clip
+from tasks.world.clip import HORIZON_STEPS, NOW, Clip, stream
 from tasks.world.vocabulary import Vocabulary
 
 

@@ -28,8 +28,7 @@ from tasks.reward.one_stage import COLUMNS, FrameScores
 from tasks.rollout.simulate import TrafficSettings, roll_out
 from tasks.world.arrays import Array, Image
 from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS, STEP_S, Rollout
-from tasks.world.frames import to_world
-from tasks.world.vehicle import HEADING
+from tasks.world.frames import HEADING, to_world
 
 BEV_PX, CAMERA_PX = (560, 560), (720, 405)  # width, height
 PAPER, INK = (246, 246, 243), (30, 30, 30)

@@ -24,8 +24,7 @@ from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffi
 from tasks.trajectories import at_ten_hz
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, Scene
-from tasks.world.frames import to_local, to_world
-from tasks.world.vehicle import HEADING
+from tasks.world.frames import HEADING, to_local, to_world
 
 INTERVAL_S = 0.5  # between the two frames of a pair
 COARSE_STEP = 5  # planners answer at 2 Hz: the human is judged by as much of his drive

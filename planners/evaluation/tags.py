@@ -6,13 +6,10 @@ from typing import Any
 import numpy as np
 
 from factory.store.schema import AGENT_STEPS, NOW_INDEX
-from tasks.world.agents import AgentKind
 from tasks.world.arrays import Array
-from tasks.world.clip import STEP_S
-from tasks.world.frames import wrap_angle
-from tasks.world.lanes import LightState
-from tasks.world.polygons import Rings
-from tasks.world.vehicle import PACIFICA
+from tasks.world.clip import STEP_S, AgentKind
+from tasks.world.frames import PACIFICA, wrap_angle
+from tasks.world.road_map import LightState, Rings
 
 TURN_RAD = 0.5  # change of heading over the label's 4 s
 STANDING_MPS, MOVING_MPS, HIGH_SPEED_MPS = 0.5, 2.0, 10.0

@@ -17,8 +17,7 @@ from planners.navsim.agent import CAMERAS, HISTORY
 from tasks.render.views import undistorted
 from tasks.trajectories import at_ten_hz
 from tasks.world.arrays import Array, Bytes
-from tasks.world.camera import Camera
-from tasks.world.clip import HORIZON_STEPS
+from tasks.world.clip import HORIZON_STEPS, Camera
 
 FRONT = ("cam_l0", "cam_f0", "cam_r0")  # the front camera and its neighbours, left to right
 

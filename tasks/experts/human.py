@@ -7,7 +7,7 @@ import numpy as np
 
 from tasks.experts.protocol import Plan
 from tasks.world.clip import HORIZON_STEPS, Scene
-from tasks.world.vehicle import HEADING
+from tasks.world.frames import HEADING
 
 
 @dataclass(frozen=True)

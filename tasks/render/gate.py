@@ -24,10 +24,8 @@ from tasks.render.settings import GateSettings, RenderSettings
 from tasks.render.splatting.gaussians import Gaussians, rotations_of
 from tasks.render.splatting.raster import View
 from tasks.stages import Rejected
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array, Bools, Bytes, Ints
-from tasks.world.camera import Camera, Pinhole, SensorFile
-from tasks.world.clip import STEP_S
+from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Camera, Pinhole, SensorFile
 
 # How like its photos a vehicle near the camera looks, judged by the photo that was taken from nearest to here.
 #

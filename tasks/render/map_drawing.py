@@ -11,11 +11,10 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bytes
-from tasks.world.camera import Camera
+from tasks.world.clip import AgentKind, AgentTracks, Camera
 from tasks.world.frames import box_corners
-from tasks.world.lanes import RoadMap
+from tasks.world.road_map import RoadMap
 
 NEAR_M = 0.3
 VISIBLE_M = 90.0

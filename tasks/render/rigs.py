@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tasks.world.camera import Camera
+from tasks.world.clip import Camera
 
 HEIGHT_M = 1.6  # of every camera above the ground; all sit above the rear axle's x + 1.5 m
 

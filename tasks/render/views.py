@@ -7,11 +7,9 @@ import numpy as np
 
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Backend, render, vehicles_at
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bytes
-from tasks.world.camera import Camera, Fisheye, Pinhole
-from tasks.world.clip import STEP_S
-from tasks.world.vehicle import HEADING, X, Y
+from tasks.world.clip import STEP_S, AgentTracks, Camera, Fisheye, Pinhole
+from tasks.world.frames import HEADING, X, Y
 
 VISIBLE_M = 150.0  # agents further away are not drawn
 

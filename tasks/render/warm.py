@@ -10,8 +10,7 @@ from tasks.render.scene.sensed import Photo, Sweep
 from tasks.render.scene.stereo import partners, wide_depth
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.sh import turned
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import AgentKind, AgentTracks, Camera, SensorFile
 
 FRONT = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]])
 POINTS = ((8.0, 1.0, 1.0), (9.0, -1.0, 2.0))  # that the rig is adjusted to

@@ -14,13 +14,11 @@ from tasks.reward.verdicts import RuleContext, context_of
 from tasks.rollout.simulate import TrafficScene, roll_on
 from tasks.settings import ExpertGate
 from tasks.stages import Rejected
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bools
-from tasks.world.clip import HORIZON_STEPS, STEP_S
+from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentTracks
+from tasks.world.frames import AX, HEADING, PACIFICA, STEERING, VX, YAW_RATE, X, Y
 from tasks.world.geometry import ego_boxes, touching
-from tasks.world.lanes import RoadMap, Route
-from tasks.world.route import RouteFinder
-from tasks.world.vehicle import AX, HEADING, PACIFICA, STEERING, VX, YAW_RATE, X, Y
+from tasks.world.road_map import RoadMap, Route, RouteFinder
 
 # Whether the route goes on where a drive ends (docs/reward.md 2m).
 

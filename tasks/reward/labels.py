@@ -14,8 +14,8 @@ from tasks.rollout.lqr import track
 from tasks.rollout.simulate import Rollouts, TrafficSettings, prepare_traffic, roll_out_many
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import HORIZON_STEPS, Scene
+from tasks.world.frames import PACIFICA
 from tasks.world.geometry import ego_boxes, touching
-from tasks.world.vehicle import PACIFICA
 from tasks.world.vocabulary import Vocabulary
 
 TRAJECTORIES_AT_ONCE = 4096  # 15 MB of states

@@ -13,13 +13,11 @@ from tasks.reward.rules.comfort import comfort_history
 from tasks.reward.rules.lights import NEVER_RED, RedLanes, index_red_lanes
 from tasks.reward.rules.map_index import MapIndex, index_map
 from tasks.reward.rules.obstacles import N_TIMES, Obstacles, index_obstacles, lay_out
-from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools
-from tasks.world.clip import Clip, Scene
+from tasks.world.clip import MOVING_KINDS, AgentKind, AgentTracks, Clip, Scene
+from tasks.world.frames import EGO_STATE_SIZE, PACIFICA
 from tasks.world.geometry import LARGEST, all_within, ego_boxes
-from tasks.world.lanes import LightState, MapLayer, MapPolygon
-from tasks.world.polygons import polygons_near
-from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA
+from tasks.world.road_map import LightState, MapLayer, MapPolygon, polygons_near
 
 PAST_STEPS = (0, 5, 10, 15)  # of the 1.5 s history at 10 Hz: -1.5, -1.0, -0.5, 0 s
 _NOBODY = read_only(np.full(5, np.nan))

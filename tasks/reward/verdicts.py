@@ -18,7 +18,7 @@ from tasks.reward.rules.map_index import MapIndex
 from tasks.reward.rules.obstacles import Obstacles, within_reach
 from tasks.subscores import LABELLED, WHOLES
 from tasks.world.arrays import Array, Bools, Bytes
-from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA
+from tasks.world.frames import EGO_STATE_SIZE, PACIFICA
 
 INDEX_FROM_ROWS = 32  # an index of the objects costs about as much as it saves on that many trajectories
 

@@ -18,7 +18,7 @@ from tasks.rollout.polylines import chord_headings, extent, frenet, interpolated
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.frames import wrap_angle
 from tasks.world.geometry import to_line, wrapped
-from tasks.world.lanes import Lane, RoadMap
+from tasks.world.road_map import Lane, RoadMap
 
 # The lanes cars drive on, as flat arrays: which are near a pose, and what follows each.
 

@@ -21,8 +21,7 @@ from tasks.kernels.compiled import inlined, kernel, read_only
 from tasks.kernels.trig import sincos, wrap
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S
-from tasks.world.geometry import LARGEST
-from tasks.world.vehicle import (
+from tasks.world.frames import (
     AX,
     AY,
     EGO_STATE_SIZE,
@@ -38,6 +37,7 @@ from tasks.world.vehicle import (
     X,
     Y,
 )
+from tasks.world.geometry import LARGEST
 
 # Kinematic bicycle with first-order actuators: the ego's motion model (docs/reward.md 1b).
 #
@@ -259,7 +259,7 @@ def track(
 ) -> Array:
     """Simulated ego states (K, 41, 11), world frame, that follow each plan; row 0 is `ego_state0`.
 
-    ego_state0: (11,) columns tasks.world.vehicle; poses: (K, 40, 3) x, y, heading at 0.1 .. 4.0 s, in the world or, if
+    ego_state0: (11,) columns tasks.world.frames; poses: (K, 40, 3) x, y, heading at 0.1 .. 4.0 s, in the world or, if
     `local`, in the frame of `ego_state0`, as a vocabulary holds them.
     planned_pose0: (K, 3) where each plan says the ego is now, when that is not the ego's own pose: the proposals of
     PDM-Closed start on their path, beside the ego.

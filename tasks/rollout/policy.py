@@ -18,10 +18,10 @@ from tasks.rollout.idm import IdmDriver
 from tasks.rollout.traffic import begin_step, finish_step, first_row
 from tasks.rollout.traffic_state import AgentStates, Motion, Roles, RolloutRows
 from tasks.settings import TrafficSettings
-from tasks.world.agents import AgentKind
 from tasks.world.arrays import Array, Bools, Ints
+from tasks.world.clip import AgentKind
 from tasks.world.geometry import all_within
-from tasks.world.lanes import RoadMap
+from tasks.world.road_map import RoadMap
 
 SEEN_ROWS = 11  # of 0.1 s: the second before now, and now
 

@@ -5,10 +5,9 @@ import numpy as np
 from tasks.rollout.corridor import PATH_SPACING_M, Paths, stretches_of
 from tasks.rollout.idm import CLOSED, CLOSED_IF_STOPPABLE, OPEN
 from tasks.rollout.lane_following import LaneIndex, LanePath, lane_costs, on_a_lane
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bools, Bytes, Ints
-from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene
-from tasks.world.lanes import LightState
+from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentTracks, Scene
+from tasks.world.road_map import LightState
 
 NEVER = 1_000_000  # a step no clip has
 STANDS_WITHIN_M, STANDS_BELOW_MPS = 1.0, 0.3  # over a whole log: boxes of parked cars jitter by decimetres

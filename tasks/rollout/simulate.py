@@ -51,11 +51,10 @@ from tasks.rollout.traffic import drive, drive_many
 from tasks.rollout.traffic_state import AgentStates, Motion, Roles, RolloutRows, Yielding
 from tasks.rollout.yielding import yielding_in
 from tasks.settings import MOST, TrafficSettings
-from tasks.world.agents import MOVING_KINDS, PER_STEP, AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools
-from tasks.world.clip import HORIZON_STEPS, STEP_S, Rollout, Scene
+from tasks.world.clip import HORIZON_STEPS, MOVING_KINDS, PER_STEP, STEP_S, AgentKind, AgentTracks, Rollout, Scene
+from tasks.world.frames import EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY
 from tasks.world.geometry import LARGEST, all_within, ego_boxes
-from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY
 
 SHORTEST_HEADWAY_S = 0.5  # of who keeps its intent: logged drivers follow as near as that
 LOG_STRIDE = 3  # every third logged pose tells a way

@@ -10,7 +10,7 @@ import numpy as np
 
 from tasks.kernels.compiled import inlined, kernel
 from tasks.world.arrays import Array, Bools
-from tasks.world.vehicle import HEADING, Vehicle, X, Y
+from tasks.world.frames import HEADING, Vehicle, X, Y
 
 
 @inlined

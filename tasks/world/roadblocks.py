@@ -13,10 +13,8 @@ from typing import Any
 import numpy as np
 
 from tasks.world.arrays import Array
-from tasks.world.frames import wrap_angle
-from tasks.world.lanes import MapLayer, RoadMap, Route
-from tasks.world.route import NoRoute, RouteFinder
-from tasks.world.vehicle import PACIFICA
+from tasks.world.frames import PACIFICA, wrap_angle
+from tasks.world.road_map import MapLayer, NoRoute, RoadMap, Route, RouteFinder
 
 SEARCH_M = 1.0  # half side of the square in which roadblocks are candidates
 MAX_HEADING_ERROR_RAD, MAX_DISPLACEMENT_M = np.pi / 4, 3.0

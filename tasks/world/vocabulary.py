@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from tasks.world.arrays import Array, Indices
 from tasks.world.clip import HORIZON_STEPS, STEP_S
-from tasks.world.frames import to_local
-from tasks.world.vehicle import HEADING
+from tasks.world.frames import HEADING, to_local
 
 OF_LOG = -1  # stands for the log itself where a trajectory has its row in the vocabulary
 FIRST_START = -2  # for the first of a clip's own start states; -3 for the second ...

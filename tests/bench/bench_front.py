@@ -23,8 +23,7 @@ from tasks.render.rig.correct import Correction
 from tasks.render.scene.asset import rises_of
 from tasks.render.scene.movers import lifted
 from tasks.render.settings import FitSettings, RigSettings
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import Block
+from tasks.world.clip import Block, Camera, SensorFile
 
 SIZE = (400, 225)
 EVERY = 8  # of the photos one is held out, as `hold_out_every` has it

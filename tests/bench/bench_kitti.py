@@ -30,7 +30,7 @@ from tasks.render.scene.engine import render
 from tasks.render.scene.sensed import Photo, shifted
 from tasks.render.settings import Backend, FitSettings
 from tasks.render.splatting.tensors import by_kernels
-from tasks.world.camera import Pinhole
+from tasks.world.clip import Pinhole
 from tests.bench.stored_scene import Look, kept, storage_table
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]

@@ -27,9 +27,8 @@ from tasks.reward.ends import hit_after_s
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffic
 from tasks.settings import ExpertGate
 from tasks.stages import END_FAULTS, Rejected
-from tasks.world.polygons import Rings, arc_lengths
-from tasks.world.route import LOOKAHEAD_M, driving_command
-from tasks.world.vehicle import HEADING
+from tasks.world.frames import HEADING
+from tasks.world.road_map import LOOKAHEAD_M, Rings, arc_lengths, driving_command
 
 FAR_M = 2.0
 LANE_M = 3.5

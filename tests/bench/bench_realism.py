@@ -27,11 +27,10 @@ from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import ClipReader
 from tasks.rollout.roles import stands_always
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import HORIZON_STEPS, STEP_S, Clip, Rollout, scene_of_clip
+from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentKind, AgentTracks, Clip, Rollout, scene_of_clip
+from tasks.world.frames import PACIFICA
 from tasks.world.geometry import ego_boxes
-from tasks.world.lanes import RoadMap
-from tasks.world.vehicle import PACIFICA
+from tasks.world.road_map import RoadMap
 from tests.bench.realism import (
     FEATURES,
     GROUPS,

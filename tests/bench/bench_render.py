@@ -21,7 +21,7 @@ from tasks.render.scene.engine import render
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gradient import backward
 from tasks.render.splatting.raster import forward, splat
-from tasks.world.camera import Pinhole
+from tasks.world.clip import Pinhole
 from tests.bench.peer_splat import Draw, compiled, drawing, peer_checkout
 from tests.bench.timing import cpu_milliseconds, memory_mb, milliseconds
 

@@ -24,10 +24,9 @@ from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import N_TIMES, PAST_STEPS, PreparedScene, prepare
 from tasks.rollout.lqr import track
 from tasks.world.clip import NOW, scene_of_clip
-from tasks.world.frames import to_world
+from tasks.world.frames import PACIFICA, to_world
 from tasks.world.geometry import ego_boxes
-from tasks.world.polygons import polygons_near
-from tasks.world.vehicle import PACIFICA
+from tasks.world.road_map import polygons_near
 from tasks.world.vocabulary import kinematic_trajectories
 from tests.bench.peer import BenchScene, Beside, beside, peer_python
 from tests.bench.timing import cpu_milliseconds, least_and_median_cpu_ms, memory_mb

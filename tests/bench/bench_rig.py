@@ -27,10 +27,8 @@ from tasks.render.scene.asset import psnr
 from tasks.render.scene.driven_road import driven_road
 from tasks.render.scene.features import Known
 from tasks.render.settings import FitSettings, RigSettings
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import STEP_S
+from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Camera, SensorFile
 from tests.bench.stored_scene import kept
 
 SIZE = (480, 270)

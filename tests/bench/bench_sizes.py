@@ -20,7 +20,7 @@ from tasks.render.fit.start import prepare
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.engine import Vehicles, render
 from tasks.render.settings import FitSettings
-from tasks.world.camera import Pinhole
+from tasks.world.clip import Pinhole
 from tests.bench.bench_rig import HELD_OUT, read_block
 
 SIZES = ((480, 270), (960, 540), (1920, 1080))

@@ -33,7 +33,7 @@ from tasks.render.scene.build import held_out_rows
 from tasks.render.scene.engine import vehicles_at
 from tasks.render.scene.sensed import Photo
 from tasks.render.settings import FitSettings
-from tasks.world.camera import Camera, Pinhole
+from tasks.world.clip import Camera, Pinhole
 from tests.bench.stored_scene import Look, kept, storage_table
 from tests.bench.town_truth import MOVED_M, Compared, Painter, Truth, beside, sideways
 

@@ -34,10 +34,8 @@ from tasks.render.gate import (
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Vehicles, render, vehicles_at
 from tasks.render.views import VISIBLE_M, pose_on_ground
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array
-from tasks.world.camera import Camera, Pinhole
-from tasks.world.clip import HORIZON_STEPS, STEP_S, Clip
+from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentKind, AgentTracks, Camera, Clip, Pinhole
 
 NOTHING_LARGE = 1.0  # the likeness of a picture without any large vehicle
 MOST_LOGS = 10_000

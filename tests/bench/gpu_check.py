@@ -39,7 +39,7 @@ from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gsplat_backend import BackendMissing, rasterize_all, require
 from tasks.render.splatting.raster import View, forward
 from tasks.render.splatting.tensors import Draw, Eye, SceneTensors, by_gsplat, by_kernels, learned_arguments
-from tasks.world.camera import Pinhole
+from tasks.world.clip import Pinhole
 from tests.bench.bench_render import cloud
 from tests.bench.peer_gsplat import SCENES, answers, apart, of_kernels
 

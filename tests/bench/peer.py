@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from tasks.reward.epdms import Scores
 from tasks.subscores import RECORDS
-from tasks.world.agents import AgentTracks
-from tasks.world.lanes import MapPolygon
+from tasks.world.clip import AgentTracks
+from tasks.world.road_map import MapPolygon
 
 Array = NDArray[np.float64]
 

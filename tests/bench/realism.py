@@ -18,10 +18,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import STEP_S
+from tasks.world.clip import STEP_S, AgentKind, AgentTracks
 from tasks.world.frames import box_corners, wrap_angle
-from tasks.world.lanes import RoadMap
+from tasks.world.road_map import RoadMap
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

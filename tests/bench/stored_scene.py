@@ -15,7 +15,7 @@ from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import NOBODY, Vehicles, render
 from tasks.render.settings import RenderSettings, SceneDtype
 from tasks.world.arrays import F32, Bytes
-from tasks.world.camera import Pinhole
+from tasks.world.clip import Pinhole
 from tests.bench.timing import cpu_milliseconds
 
 READS = 5

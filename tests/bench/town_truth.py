@@ -15,9 +15,8 @@ from tasks.render.scene.movers import behind_boxes
 from tasks.render.scene.sensed import Photo, shifted
 from tasks.render.scene.sky import directions
 from tasks.render.scene.stereo import FAR_M
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array
-from tasks.world.camera import Pinhole
+from tasks.world.clip import AgentKind, AgentTracks, Pinhole
 
 Painter = Callable[[float, Photo], NDArray[np.uint8]]  # time, photo (its camera and pose): the truth there
 MOVED_M = (3.0, 0.8)  # ahead and to the left, of every vehicle

@@ -20,8 +20,7 @@ from tasks.experts.protocol import Plan
 from tasks.hard_scenes import BEFORE_STEPS, BenchmarkClip
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.world.clip import NOW, STEP_S, Clip, Scene, scene_of_clip
-from tasks.world.frames import to_world
-from tasks.world.vehicle import HEADING, VX, X
+from tasks.world.frames import HEADING, VX, X, to_world
 from tests.tasks.streets import street_clip
 
 HORIZON = np.arange(1, 41) * STEP_S

@@ -8,8 +8,8 @@ from types import ModuleType
 import numpy as np
 
 from tasks.reward.prepare import PreparedScene, prepare
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.lanes import MapLayer, MapPolygon
+from tasks.world.clip import AgentKind, AgentTracks
+from tasks.world.road_map import MapLayer, MapPolygon
 
 SCENES = ("7fab2350_20", "7fab2350_44", "adcf7d18_64", "adcf7d18_80", "7fab2350_104")
 RECORDED_K = {  # what was recorded besides K = 256

@@ -13,8 +13,7 @@ from tasks.render.scene.build import grey_of
 from tasks.render.scene.engine import render, vehicles_at
 from tasks.render.scene.sensed import Sweep, on_ego
 from tasks.render.settings import RenderSettings
-from tasks.world.camera import Camera, Pinhole
-from tasks.world.clip import Clip
+from tasks.world.clip import Camera, Clip, Pinhole
 
 LOG = "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
 SETTINGS = RenderSettings()

@@ -11,10 +11,9 @@ import pytest
 
 from factory.datasets.av2.log import agents_at, ego_states_at, step_times
 from factory.datasets.av2.reader import AV2Log, AV2Reader, log_folders, read_log
-from tasks.world.agents import MOVING_KINDS
+from tasks.world.clip import MOVING_KINDS
 from tasks.world.frames import wrap_angle
-from tasks.world.polygons import polygons_near
-from tasks.world.route import centerline_from
+from tasks.world.road_map import centerline_from, polygons_near
 
 SCENES = ("7fab2350_20", "7fab2350_44", "7fab2350_104", "adcf7d18_64", "adcf7d18_80")
 

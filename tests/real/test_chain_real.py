@@ -19,8 +19,7 @@ from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.stages import Rejected
 from tasks.subscores import SUBSCORES
-from tasks.world.chance import stream
-from tasks.world.clip import HORIZON_STEPS, NOW, Clip, scene_of_clip
+from tasks.world.clip import HORIZON_STEPS, NOW, Clip, scene_of_clip, stream
 from tasks.world.frames import to_local, to_world
 from tasks.world.vocabulary import Vocabulary
 

@@ -16,9 +16,8 @@ from tasks.experts.recovery.expert import Recovery, RecoveryTable
 from tasks.perturb import Perturbation, PerturbSettings, perturb
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic
 from tasks.stages import Rejected
-from tasks.world.chance import stream
-from tasks.world.clip import Clip, scene_of_clip
-from tasks.world.polygons import Rings
+from tasks.world.clip import Clip, scene_of_clip, stream
+from tasks.world.road_map import Rings
 from tasks.world.vocabulary import Vocabulary
 
 AV2 = ("data", "av2", "sensor", "val")

@@ -17,10 +17,8 @@ from factory.datasets.navsim.reader import NavsimReader
 from factory.readers.logs import WholeLog
 from factory.stages.sensors import load_photos
 from tasks.render.scene.sensed import Photo
-from tasks.world.agents import AgentTracks
-from tasks.world.camera import Camera
-from tasks.world.clip import CLIP_STEPS, NOW, Clip
-from tasks.world.lanes import TrafficLights
+from tasks.world.clip import CLIP_STEPS, NOW, AgentTracks, Camera, Clip
+from tasks.world.road_map import TrafficLights
 from tasks.world.roadblocks import route_of_roadblocks
 from tests.factory.datasets.navsim.geopackage_writer import CITIES, ORIGIN, stub_rows, write_geopackage
 from tests.factory.datasets.navsim.openscene_writer import FRAME_STEPS, Place, Sensed, write_openscene

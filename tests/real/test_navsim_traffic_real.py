@@ -12,9 +12,8 @@ from factory.datasets.av2.reader import AV2Reader, log_folders, read_log
 from factory.readers.base import ClipRef
 from tasks.rollout.navsim import bodies
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import HISTORY_STEPS, NOW, Clip, Scene, scene_of_clip
-from tasks.world.lanes import RoadMap, Route
+from tasks.world.clip import HISTORY_STEPS, NOW, AgentKind, AgentTracks, Clip, Scene, scene_of_clip
+from tasks.world.road_map import RoadMap, Route
 
 EGOS = 3
 WHOLE = SCENES[:3]  # the log holds a whole clip there

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tasks.experts.pdm_closed.planner import PdmPlan, PdmSettings, plan_pdm_closed
-from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.clip import AgentKind, AgentTracks
 from tasks.world.frames import wrap_angle
-from tasks.world.lanes import MapLayer, MapPolygon
+from tasks.world.road_map import MapLayer, MapPolygon
 
 SCENES = ("7fab2350_20", "7fab2350_44", "7fab2350_104", "adcf7d18_64", "adcf7d18_80")
 PUBLISHED = PdmSettings()

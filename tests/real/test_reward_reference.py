@@ -16,8 +16,7 @@ from tasks.rollout.lqr import track
 from tasks.subscores import JUDGED, RECORDS
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW
-from tasks.world.frames import wrap_angle
-from tasks.world.vehicle import HEADING
+from tasks.world.frames import HEADING, wrap_angle
 
 EXACT = {record.name: record.long_name for record in RECORDS if record.name in JUDGED}  # ours: recorded
 CLOSE = {"ep": "ego_progress", "ep_raw_m": "ego_progress_raw_m", "pdm_score": "pdm_score"}

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from factory.datasets.av2.reader import AV2Reader
 from tasks.rollout.corridor import boxes_overlap
 from tasks.rollout.simulate import TrafficSettings, next_scene, simulate
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, Rollout, Scene, scene_of_clip
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.frames import wrap_angle
 
 GRAZE_M = 0.1  # boxes are annotated by hand: smaller by this on each side before they count as touching

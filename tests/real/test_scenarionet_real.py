@@ -7,10 +7,9 @@ import pytest
 
 from factory.datasets.scenarionet.reader import ScenarioNetReader, read_log, read_scenario, scenario_files
 from factory.readers.base import ClipIndex
-from tasks.world.agents import AgentKind
-from tasks.world.clip import CLIP_STEPS, NOW, Clip
-from tasks.world.polygons import Rings
-from tasks.world.vehicle import AX, AY, HEADING, VX, VY, X, Y
+from tasks.world.clip import CLIP_STEPS, NOW, AgentKind, Clip
+from tasks.world.frames import AX, AY, HEADING, VX, VY, X, Y
+from tasks.world.road_map import Rings
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from tasks.experts.protocol import Plan
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene
-from tasks.world.frames import to_world
-from tasks.world.vehicle import PACIFICA, VX, X, Y
+from tasks.world.frames import PACIFICA, VX, X, Y, to_world
 
 
 def shift(speed: float, side_m: float) -> NDArray[np.float64]:

@@ -8,12 +8,9 @@ from numpy.typing import NDArray
 from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.perturb import Perturbation, PerturbSettings, perturb
 from tasks.rollout.simulate import TrafficSettings
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.chance import stream
-from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Clip
-from tasks.world.frames import to_world
-from tasks.world.lanes import Lane, LightState, MapLayer, MapPolygon, RoadMap, Route, TrafficLights
-from tasks.world.vehicle import EGO_STATE_SIZE, VX, X
+from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Clip, stream
+from tasks.world.frames import EGO_STATE_SIZE, VX, X, to_world
+from tasks.world.road_map import Lane, LightState, MapLayer, MapPolygon, RoadMap, Route, TrafficLights
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
 Array = NDArray[np.float64]

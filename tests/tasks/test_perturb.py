@@ -23,8 +23,7 @@ from tasks.reward.epdms import score
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.stages import STAGES, Rejected
-from tasks.world.chance import stream
-from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip, stream
 from tasks.world.frames import to_local, to_world
 from tasks.world.vocabulary import OF_LOG, Vocabulary, kinematic_trajectories
 from tests.tasks.streets import moved, street_clip

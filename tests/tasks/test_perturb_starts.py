@@ -10,7 +10,7 @@ from tasks.perturb import NO_STARTS, Candidate, Perturbation, PerturbSettings, p
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
-from tasks.world.chance import stream
+from tasks.world.clip import stream
 from tasks.world.vocabulary import FIRST_START, Vocabulary, kinematic_trajectories
 from tests.tasks.streets import street_clip
 

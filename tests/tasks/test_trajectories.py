@@ -7,11 +7,9 @@ import pytest
 
 from tasks.experts.pdm_closed.planner import plan_for
 from tasks.trajectories import at_ten_hz, score_trajectories
-from tasks.world.agents import AgentTracks
-from tasks.world.clip import CLIP_STEPS, HISTORY_STEPS, Clip, scene_of_clip
-from tasks.world.frames import to_local
-from tasks.world.lanes import NO_LIGHTS, Lane, LightState, MapPolygon, RoadMap, Route, TrafficLights
-from tasks.world.vehicle import VX, X
+from tasks.world.clip import CLIP_STEPS, HISTORY_STEPS, AgentTracks, Clip, scene_of_clip
+from tasks.world.frames import VX, X, to_local
+from tasks.world.road_map import NO_LIGHTS, Lane, LightState, MapPolygon, RoadMap, Route, TrafficLights
 from tests.tasks.reward.straight_street import STREET, Thing, drive, tracks
 
 

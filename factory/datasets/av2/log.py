@@ -17,11 +17,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from factory.datasets.av2.folders import ANNOTATIONS, POSES
 from factory.readers.base import BadClip
-from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools, Indices, Ints
-from tasks.world.clip import STEP_S
-from tasks.world.frames import wrap_angle
-from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, X, Y
+from tasks.world.clip import MOVING_KINDS, STEP_S, AgentKind, AgentTracks
+from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, X, Y, wrap_angle
 
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 SIZE_COLUMNS = ("length_m", "width_m", "height_m")

@@ -35,11 +35,19 @@ from factory.readers.base import BadClip, ClipRef, folder_split
 from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive
 from factory.readers.pickles import id_text
 from tasks.world.arrays import Array
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import STEP_S, Block
-from tasks.world.lanes import Lane, LightState, MapLayer, MapPolygon, RoadMap, TrafficLights
-from tasks.world.polygons import centerline_from_boundaries, ring_from_boundaries, valid_ring
-from tasks.world.route import roadblocks_of
+from tasks.world.clip import STEP_S, Block, Camera, SensorFile
+from tasks.world.road_map import (
+    Lane,
+    LightState,
+    MapLayer,
+    MapPolygon,
+    RoadMap,
+    TrafficLights,
+    centerline_from_boundaries,
+    ring_from_boundaries,
+    roadblocks_of,
+    valid_ring,
+)
 
 # An Argoverse 2 vector map (log_map_archive_*.json) as a RoadMap. Format: Wilson et al. 2021, argoverse/av2-api.
 

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from factory.readers.base import BadClip, bytes_of
 from factory.readers.pickles import id_text, load_plain
 from factory.wording import shown
-from tasks.world.agents import AgentKind
 from tasks.world.arrays import Array
+from tasks.world.clip import AgentKind
 
 # Values out of a pickled dict, checked one by one: what is wrong names file, frame and key.
 

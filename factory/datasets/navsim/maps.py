@@ -21,7 +21,7 @@ from factory.readers.base import BadClip
 from tasks.caches import user_cache
 from tasks.sealed import check, seal
 from tasks.world.arrays import Array, Ints
-from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap
+from tasks.world.road_map import Lane, MapLayer, MapPolygon, RoadMap
 from tasks.world.roadblocks import Roadblocks
 
 # One nuPlan GeoPackage as tables of arrays in the city's UTM zone. Layers and columns: nuplan-devkit,

@@ -43,7 +43,7 @@ from tasks.hard_scenes import GivenScenes
 from tasks.render.settings import ImageSource
 from tasks.stages import FOLLOW_UP, FOLLOW_UP_BEFORE, HUMAN, HUMAN_BEFORE
 from tasks.world.clip import Scene
-from tasks.world.vehicle import HEADING
+from tasks.world.frames import HEADING
 
 # A frame of NAVSIM's logs as a sample and as a world to drive in: 1.5 s before it, 4 s after it.
 

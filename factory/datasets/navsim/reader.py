@@ -60,8 +60,7 @@ from factory.readers.settings import NavsimClips
 from factory.readers.validate import validate_clip
 from factory.wording import time_text
 from tasks.caches import user_cache
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import NOW, Block, Clip
+from tasks.world.clip import NOW, Block, Camera, Clip, SensorFile
 
 LICENCE = "CC BY-NC-SA 4.0 (nuPlan via OpenScene)"
 BLOCK_FRAMES, BLOCK_STRIDE_FRAMES = 40, 20  # of the stretches that are reconstructed

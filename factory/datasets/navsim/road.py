@@ -9,10 +9,9 @@ from factory.datasets.navsim.maps import open_city
 from factory.readers.base import BadClip
 from factory.readers.pictures import BadPicture, Size, jpeg_size
 from tasks.world.arrays import Array
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.lanes import RoadMap, Route
+from tasks.world.clip import Camera, SensorFile
+from tasks.world.road_map import NoRoute, RoadMap, Route, RouteFinder
 from tasks.world.roadblocks import corrected_roadblocks, route_of_roadblocks
-from tasks.world.route import NoRoute, RouteFinder
 
 MAP_RADIUS_M = 150.0  # around the drive: the reward's 100 m, and room for one that strays
 

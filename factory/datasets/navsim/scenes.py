@@ -26,13 +26,21 @@ from factory.readers.base import BadClip
 from factory.readers.pictures import BadPicture, jpeg_size, refuse_size, without_exif
 from factory.stages.rows import scene_columns
 from tasks.render.settings import ImageSource
-from tasks.world.agents import PER_STEP, AgentTracks
 from tasks.world.arrays import Array
-from tasks.world.camera import Camera
-from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, STEP_S, Clip, Scene, scene_of_clip
-from tasks.world.frames import to_local
-from tasks.world.lanes import LightState, RoadMap, Route, TrafficLights
-from tasks.world.vehicle import EGO_STATE_SIZE, HEADING
+from tasks.world.clip import (
+    CLIP_STEPS,
+    HORIZON_STEPS,
+    NOW,
+    PER_STEP,
+    STEP_S,
+    AgentTracks,
+    Camera,
+    Clip,
+    Scene,
+    scene_of_clip,
+)
+from tasks.world.frames import EGO_STATE_SIZE, HEADING, to_local
+from tasks.world.road_map import LightState, RoadMap, Route, TrafficLights
 
 HISTORY_FRAMES = FRAMES_BEFORE + 1  # now among them
 SCENE_FRAMES = HISTORY_FRAMES + 8  # with the 4 s that are driven

@@ -24,7 +24,7 @@ from factory.datasets.navsim.log import (
 )
 from factory.readers.base import BadClip, bytes_of
 from factory.readers.pickles import Record, load_records
-from tasks.world.agents import AgentKind
+from tasks.world.clip import AgentKind
 from tasks.world.frames import to_local, wrap_angle
 
 HISTORY_FRAMES, FUTURE_FRAMES = 4, 8

@@ -19,13 +19,11 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from factory.datasets.navsim.log import Frame
 from factory.readers.settings import FRAME_STEPS
-from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools
-from tasks.world.clip import CLIP_STEPS, HISTORY_STEPS, HORIZON_STEPS
-from tasks.world.frames import wrap_angle
+from tasks.world.clip import CLIP_STEPS, HISTORY_STEPS, HORIZON_STEPS, MOVING_KINDS, AgentKind, AgentTracks
+from tasks.world.frames import AX, EGO_STATE_SIZE, HEADING, PACIFICA, VX, X, wrap_angle
 from tasks.world.geometry import ego_boxes, touching
-from tasks.world.lanes import LightState, TrafficLights
-from tasks.world.vehicle import AX, EGO_STATE_SIZE, HEADING, PACIFICA, VX, X
+from tasks.world.road_map import LightState, TrafficLights
 
 FRAMES_BEFORE = HISTORY_STEPS // FRAME_STEPS  # of T in a window
 HORIZON_FRAMES = HORIZON_STEPS // FRAME_STEPS

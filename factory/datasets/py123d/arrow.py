@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from factory.datasets.av2.log import KIND_OF_CATEGORY
 from factory.readers.base import BadClip
 from factory.wording import shown
-from tasks.world.agents import AgentKind
 from tasks.world.arrays import Array, Indices, Ints
+from tasks.world.clip import AgentKind
 
 VERSIONS = ("0.6", "0.7")  # of py123d, whose files are read
 US_NS = 1000

@@ -38,11 +38,10 @@ from factory.datasets.scenarionet.tracks import FIT_STEPS, MAX_GAP_S, smooth_dri
 from factory.readers.base import BadClip
 from factory.readers.logs import LoggedDrive
 from factory.readers.pickles import id_text
-from tasks.world.agents import AgentKind
 from tasks.world.arrays import Array, Indices
-from tasks.world.clip import STEP_S
-from tasks.world.lanes import LightState, RoadMap, TrafficLights
-from tasks.world.vehicle import EGO_STATE_SIZE
+from tasks.world.clip import STEP_S, AgentKind
+from tasks.world.frames import EGO_STATE_SIZE
+from tasks.world.road_map import LightState, RoadMap, TrafficLights
 
 EGO, BOXES, LIGHTS = "ego_state_se3.arrow", "box_detections_se3.arrow", "traffic_light_detections.arrow"
 DENSE_S = 0.15  # what comes at most this far apart are no keyframes

@@ -28,9 +28,16 @@ from factory.readers.base import BadClip
 from factory.readers.pickles import id_text
 from factory.wording import shown
 from tasks.world.arrays import Array, Indices
-from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap
-from tasks.world.polygons import centerline_from_boundaries, valid_ring, with_headings
-from tasks.world.route import roadblocks_of
+from tasks.world.road_map import (
+    Lane,
+    MapLayer,
+    MapPolygon,
+    RoadMap,
+    centerline_from_boundaries,
+    roadblocks_of,
+    valid_ring,
+    with_headings,
+)
 
 LANE, LANE_GROUP, INTERSECTION, CROSSWALK, CARPARK, GENERIC_DRIVABLE = 0, 1, 2, 3, 5, 6  # numbers of layers
 BIKE_LANE, BIKE = 3, "LANE_BIKE_LANE"  # of the lane types; as raw lanes name it

@@ -28,8 +28,7 @@ from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, Whol
 from factory.readers.settings import Py123dClips
 from factory.wording import shown
 from tasks.world.arrays import Array
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import STEP_S, Block
+from tasks.world.clip import STEP_S, Block, Camera, SensorFile
 
 # Cameras of a log of 123D, and where its photos and sweeps lie.
 #

@@ -16,9 +16,19 @@ from factory.readers.base import BadClip
 from factory.readers.pickles import id_text
 from factory.wording import shown
 from tasks.world.arrays import Array
-from tasks.world.lanes import Lane, LightState, MapLayer, MapPolygon, RoadMap, TrafficLights
-from tasks.world.polygons import arc_lengths, n_spaced, resample, with_headings
-from tasks.world.route import roadblocks_of
+from tasks.world.road_map import (
+    Lane,
+    LightState,
+    MapLayer,
+    MapPolygon,
+    RoadMap,
+    TrafficLights,
+    arc_lengths,
+    n_spaced,
+    resample,
+    roadblocks_of,
+    with_headings,
+)
 
 # ScenarioNet's map features as plain lanes, and which of them are connectors inside a junction.
 #

@@ -12,11 +12,9 @@ from factory.readers.base import BadClip
 from factory.readers.pictures import frame_uri
 from factory.wording import shown
 from tasks.world.arrays import Array
-from tasks.world.camera import ROTATION_SLACK, Camera, Fisheye, SensorFile
-from tasks.world.clip import STEP_S
-from tasks.world.frames import upright, wrap_angle
+from tasks.world.clip import ROTATION_SLACK, STEP_S, Camera, Fisheye, SensorFile
+from tasks.world.frames import HEADING, X, Y, upright, wrap_angle
 from tasks.world.geometry import all_within
-from tasks.world.vehicle import HEADING, X, Y
 
 MAX_ENTRIES = 500_000
 MAX_CAMERAS, MAX_PIXELS = 64, 1 << 14  # of a rig; a side of a photo

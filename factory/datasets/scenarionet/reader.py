@@ -38,7 +38,7 @@ from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, STEP_S, Block
 from tasks.world.frames import upright
-from tasks.world.lanes import TrafficLights
+from tasks.world.road_map import TrafficLights
 
 SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"
 # Of the stretches that are reconstructed: 20 s, as far apart as any clip still lies in one, so that a scene of

@@ -23,11 +23,9 @@ from scipy.signal import savgol_filter
 from factory.readers.base import BadClip
 from factory.readers.pickles import id_text
 from factory.wording import shown
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools, Ints
-from tasks.world.clip import STEP_S
-from tasks.world.frames import wrap_angle
-from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY, X, Y
+from tasks.world.clip import STEP_S, AgentKind, AgentTracks
+from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY, X, Y, wrap_angle
 
 # The clock of nuScenes' ego in ScenarioNet's files, put right.
 #

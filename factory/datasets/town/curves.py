@@ -3,7 +3,7 @@
 import numpy as np
 
 from tasks.world.arrays import Array
-from tasks.world.polygons import arc_lengths
+from tasks.world.road_map import arc_lengths
 
 RAMP_M = 12.0  # curvature is averaged over it, so that a car can follow without a jump of the steering wheel
 

@@ -17,7 +17,7 @@ from factory.datasets.town.scenery import Scenery, figure, lamps_lit
 from factory.datasets.town.textures import TREELINE
 from factory.readers.settings import MOUNTS, check_cameras
 from tasks.world.arrays import F32, Array, Bytes, ShortInts
-from tasks.world.camera import Camera
+from tasks.world.clip import Camera
 
 CELLS = 2  # shaded places per pixel and axis
 SAMPLES = 2  # per cell and axis, of what is visible

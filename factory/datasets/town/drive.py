@@ -14,10 +14,9 @@ from factory.datasets.town.streets import Streets, TownRoad
 from tasks.rollout.lqr import track
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS
-from tasks.world.frames import box_corners
+from tasks.world.frames import AX, AY, EGO_STATE_SIZE, PACIFICA, VX, box_corners
 from tasks.world.geometry import ego_boxes, touching
-from tasks.world.polygons import arc_lengths
-from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, PACIFICA, VX
+from tasks.world.road_map import arc_lengths
 
 # Agents that drive: lights with phases, lane paths, and a driver that follows its path, its leader and the lights.
 #

@@ -13,7 +13,7 @@ from factory.datasets.town.drive import GREEN, RED, YELLOW, TownTrack
 from factory.datasets.town.raster import WHITE, Builder, Mesh, lifted, shades
 from factory.datasets.town.streets import CROSSING_GAP_M, CROSSING_M, PAVEMENT_M, STOP_LINE_M, Streets, TownRoad
 from tasks.world.arrays import Array, Ints
-from tasks.world.polygons import arc_lengths
+from tasks.world.road_map import arc_lengths
 
 # Houses with their awnings and balconies, and trees of leaf cards.
 

@@ -11,7 +11,7 @@ import shapely
 
 from factory.datasets.town import curves
 from tasks.world.arrays import Array
-from tasks.world.polygons import arc_lengths
+from tasks.world.road_map import arc_lengths
 
 CROSSING_M = 3.0  # a crosswalk's width along the road
 CROSSING_GAP_M = 0.8  # from the junction's edge

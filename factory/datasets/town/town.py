@@ -32,7 +32,7 @@ from factory.readers.settings import LOG_STEPS, LOGS_PER_TOWN, STEPS_PER_SWEEP, 
 from factory.readers.whole_folder import finish_whole, make_whole, mend, unfinished_folder
 from factory.wording import time_text
 from tasks.world.arrays import Array, Ints
-from tasks.world.camera import Camera
+from tasks.world.clip import Camera
 
 WINDOWS_PER_LOG = 3  # of 9.5 s at stride 1 s
 

@@ -28,13 +28,11 @@ from tasks.reward.prepare import prepare
 from tasks.rollout.lqr import track
 from tasks.settings import PDM_DEFAULTS, PdmSettings
 from tasks.stages import Rejected
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array
-from tasks.world.clip import Scene
+from tasks.world.clip import AgentTracks, Scene
+from tasks.world.frames import EGO_STATE_SIZE, PACIFICA
 from tasks.world.geometry import ego_boxes
-from tasks.world.lanes import LightState, MapLayer, MapPolygon
-from tasks.world.polygons import polygons_near
-from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA
+from tasks.world.road_map import LightState, MapLayer, MapPolygon, polygons_near
 
 __all__ = ["PdmClosed", "PdmPlan", "PdmSettings", "plan_for", "plan_pdm_closed"]
 

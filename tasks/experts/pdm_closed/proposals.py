@@ -16,9 +16,9 @@ import shapely.ops
 from tasks.kernels.compiled import kernel
 from tasks.rollout.polylines import extent
 from tasks.settings import PDM_DEFAULTS, PdmSettings
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools, Indices, Ints
-from tasks.world.frames import box_corners
+from tasks.world.clip import AgentKind, AgentTracks
+from tasks.world.frames import PACIFICA, VX, X, Y, box_corners
 from tasks.world.geometry import (
     ego_boxes,
     ring_contains,
@@ -29,7 +29,6 @@ from tasks.world.geometry import (
     to_segment,
     wrapped,
 )
-from tasks.world.vehicle import PACIFICA, VX, X, Y
 
 # Parallel polylines that can be driven by arc length (docs/reward.md 4). Compiled.
 

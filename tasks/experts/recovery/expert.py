@@ -19,8 +19,7 @@ from tasks.settings import FEASIBLE_DEFAULTS, FeasibleSettings, RecoverySettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene
-from tasks.world.frames import to_local, to_world, wrap_angle
-from tasks.world.vehicle import AX, HEADING, PACIFICA, STEERING, VX, VY
+from tasks.world.frames import AX, HEADING, PACIFICA, STEERING, VX, VY, to_local, to_world, wrap_angle
 from tasks.world.vocabulary import checked_trajectories, trajectories_digest
 
 # A retrieved trajectory made drivable from the ego's true start: two small QPs and an exact integration.

@@ -20,8 +20,8 @@ from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import FitSettings
 from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import Gaussians, concatenate, rotations_of
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array, Bools
+from tasks.world.clip import AgentKind, AgentTracks
 
 ROAD_TOP_M = 0.08  # a Gaussian that starts no further from the road's surface belongs to it
 START_WIDTH = 640  # pixels of a photo across, more of which say no better where surfaces are

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from tasks.kernels.compiled import kernel
 from tasks.world.arrays import Array, Bools, Ints
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import DRIVES_APART_S
+from tasks.world.clip import DRIVES_APART_S, Camera, SensorFile
 
 # A rig under adjustment: what of it may change, and what its photos were given as.
 

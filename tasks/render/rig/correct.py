@@ -35,9 +35,8 @@ from tasks.render.scene.sensed import Photo, Tracks
 from tasks.render.scene.sky import directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import RigSettings
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import F32, Array, Bools, Bytes, Indices
-from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import AgentTracks, Camera, SensorFile
 
 # Corners of a photo, and which of them two photos share (SIFT, Lowe 2004).
 

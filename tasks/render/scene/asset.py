@@ -13,9 +13,8 @@ from tasks.render.scene.sky import SkyMap
 from tasks.render.scene.surfels import box_gaussians
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.render.splatting.project import FITTED, ScreenFilter
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array, Bools, Bytes
-from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import AgentKind, AgentTracks, Camera, SensorFile
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from tasks.render.scene.depth import SHALLOW, STREET, Seen
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.render.scene.sky import directions
 from tasks.render.splatting.gaussians import Gaussians
-from tasks.world.agents import AgentKind
 from tasks.world.arrays import Array, Bools
+from tasks.world.clip import AgentKind
 
 SPACING_M = 0.3
 SIGMA_M = 0.17  # of a Gaussian along its face

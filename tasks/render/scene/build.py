@@ -37,10 +37,8 @@ from tasks.render.settings import AssetSettings
 from tasks.render.splatting.gaussians import EMPTY, Gaussians, concatenate
 from tasks.render.splatting.project import OF_DISCS
 from tasks.render.splatting.raster import gather, shade, splat
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array, Bools, Bytes
-from tasks.world.camera import Pinhole
-from tasks.world.clip import of_other_log
+from tasks.world.clip import AgentKind, AgentTracks, Pinhole, of_other_log
 
 MIN_NODE_DISCS = 40  # a track seen less is drawn as a plain box
 RELAXATION = 0.6

@@ -20,9 +20,8 @@ from tasks.render.settings import Backend
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.project import ScreenFilter
 from tasks.render.splatting.raster import View, forward
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array
-from tasks.world.camera import Pinhole
+from tasks.world.clip import AgentKind, AgentTracks, Pinhole
 
 
 @dataclass(frozen=True)

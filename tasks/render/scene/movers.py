@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from tasks.kernels.compiled import kernel
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import F32, Array, Bools, FloatArray
-from tasks.world.clip import STEP_S
+from tasks.world.clip import STEP_S, AgentTracks
 from tasks.world.frames import upright, wrap_angle
 
 MARGIN_M = 0.15  # boxes are drawn tightly; mirrors and noise stick out

@@ -8,10 +8,9 @@ import numpy as np
 
 from tasks.render.scene.asset import OwnBody, developed
 from tasks.render.scene.movers import GROUND_CLEARANCE_M, KNOT_S, boxes_at, driving, owners, world_from_boxes
-from tasks.world.agents import MOVING_KINDS, AgentTracks
 from tasks.world.arrays import F32, Array, Bools, Bytes, Indices
-from tasks.world.clip import STEP_S
-from tasks.world.vehicle import PACIFICA
+from tasks.world.clip import MOVING_KINDS, STEP_S, AgentTracks
+from tasks.world.frames import PACIFICA
 
 EGO_MARGIN_M = 0.3
 FUSED_VOXEL_M = 0.07

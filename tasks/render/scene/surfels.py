@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 from tasks.kernels.compiled import kernel
 from tasks.render.scene.sky import camera_rays
 from tasks.render.splatting.gaussians import Gaussians, quats_of
-from tasks.world.agents import AgentKind
 from tasks.world.arrays import F32, Array, Bools, Indices, ShortInts
+from tasks.world.clip import AgentKind
 
 SIGMA_PER_PIXEL = 0.5  # standard deviation of a disc in units of its spacing on the surface (measured: .45 .. .55)
 FLATNESS = 0.1  # thickness as a share of the short side

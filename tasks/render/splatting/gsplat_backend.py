@@ -19,7 +19,7 @@ from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.project import FITTED, NEAR_M, ScreenFilter
 from tasks.render.splatting.raster import View
 from tasks.world.arrays import F32
-from tasks.world.camera import Pinhole
+from tasks.world.clip import Pinhole
 
 HOW_TO_FIX = 'install them (pip install -e ".[gpu]" in the checkout), or draw with render.backend=cpu'
 

@@ -15,7 +15,7 @@ from tasks.kernels.compiled import kernel
 from tasks.reward.rules.ego import checked
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import HORIZON_STEPS, STEP_S
-from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, STEERING, YAW_ACCEL, YAW_RATE
+from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, STEERING, YAW_ACCEL, YAW_RATE
 
 # Savitzky-Golay filters of the comfort rules (docs/reward.md 2i): a polynomial fitted to every window of samples.
 #

@@ -14,7 +14,7 @@ from tasks.reward.rules.ego import OFF_LANE, Body
 from tasks.reward.rules.map_index import MapIndex
 from tasks.reward.rules.obstacles import Box, Obstacles, apart, box_at, cell_of, centroid, out_of_reach, touching
 from tasks.world.arrays import Array, Bools
-from tasks.world.vehicle import HEADING, X, Y
+from tasks.world.frames import HEADING, X, Y
 
 STOPPED_EGO_MPS = 0.05
 STOPPED_EGO_TTC_MPS = 5e-3

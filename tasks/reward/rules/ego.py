@@ -10,8 +10,8 @@ from tasks.kernels.compiled import kernel
 from tasks.kernels.trig import sincos
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import HORIZON_STEPS
+from tasks.world.frames import EGO_STATE_SIZE, HEADING, VX, VY, X, Y
 from tasks.world.geometry import LARGEST, all_within
-from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, VX, VY, X, Y
 
 # Bits of an instant's flags (docs/reward.md 2a)
 MULTIPLE_LANES = 1  # corners in more than one lane, and no lane holds all four

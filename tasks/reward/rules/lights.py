@@ -10,7 +10,7 @@ from tasks.kernels.compiled import kernel
 from tasks.reward.rules.ego import Body
 from tasks.reward.rules.map_index import outlines
 from tasks.world.arrays import Array, Bools, Ints
-from tasks.world.lanes import MapPolygon
+from tasks.world.road_map import MapPolygon
 
 
 class RedLanes(NamedTuple):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tasks.kernels.compiled import kernel
 from tasks.world.arrays import Array, Bools, Bytes, Ints, ShortInts
 from tasks.world.geometry import LARGEST, all_within
-from tasks.world.lanes import MapLayer, MapPolygon
+from tasks.world.road_map import MapLayer, MapPolygon
 
 # Map polygons as edges, and what is refused of them.
 
@@ -58,7 +58,7 @@ def outlines(polygons: Sequence[MapPolygon]) -> Outlines:
 def refused(polygon: MapPolygon, problem: str) -> ValueError:
     """The error that names a polygon, what is wrong with it and how to fix it."""
     return ValueError(
-        f"polygons: {polygon.layer} {polygon.token!r}: {problem} (tasks.world.polygons.valid_ring repairs)"
+        f"polygons: {polygon.layer} {polygon.token!r}: {problem} (tasks.world.road_map.valid_ring repairs)"
     )
 
 

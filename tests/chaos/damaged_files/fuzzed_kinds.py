@@ -28,7 +28,7 @@ from factory.store.location import BadCacheFile, decode_tree, encode_tree
 from factory.views.scene_files import background_bytes, read_splats
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.render.splatting.project import CLASSIC
-from tasks.world.camera import SensorFile
+from tasks.world.clip import SensorFile
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.chaos.damaged_files.mutants_of_files import Rng, of_bytes, of_json, of_pickle, of_text
 from tests.factory.datasets.navsim import scene_pickles

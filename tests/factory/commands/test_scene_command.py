@@ -14,7 +14,7 @@ from tasks.render.scene.engine import render
 from tasks.render.splatting.formats import from_ply, to_ply
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
 from tasks.render.splatting.project import ANTIALIASED, CLASSIC, FITTED
-from tasks.world.camera import Pinhole
+from tasks.world.clip import Pinhole
 from tests.factory.stages.test_scene_file import scene
 
 main = COMMANDS["scene"].load()

@@ -8,10 +8,9 @@ import pytest
 
 from factory.readers.base import BadClip, ClipRef
 from factory.readers.logs import LoggedDrive, LogReader, Recorded, WholeLog, route_of_drive
-from tasks.world.agents import AgentTracks
-from tasks.world.clip import CLIP_STEPS, STEP_S
-from tasks.world.lanes import TrafficLights
-from tasks.world.vehicle import EGO_STATE_SIZE, VX, X
+from tasks.world.clip import CLIP_STEPS, STEP_S, AgentTracks
+from tasks.world.frames import EGO_STATE_SIZE, VX, X
+from tasks.world.road_map import TrafficLights
 from tests.tasks.streets import street_clip
 
 SPEED_MPS = 8.0

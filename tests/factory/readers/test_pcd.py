@@ -8,7 +8,7 @@ import pytest
 from factory.readers.base import BadClip
 from factory.readers.points import read_pcd
 from factory.stages.sensors import load_sweeps
-from tasks.world.camera import SensorFile
+from tasks.world.clip import SensorFile
 
 FIELDS = (("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<u1"), ("ring", "<u2"), ("lidar_info", "<i4"))
 

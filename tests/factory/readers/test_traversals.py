@@ -14,9 +14,17 @@ from factory.stages.assets import asset_for, block_id
 from factory.stages.sensors import block_cameras, block_of, chosen_cameras, load_photos
 from tasks.render.scene.build import held_out_rows
 from tasks.render.settings import PsnrGate, RenderSettings, SceneFrom
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import DRIVES_APART_S, STEP_S, Block, of_other_log, own_name
+from tasks.world.clip import (
+    DRIVES_APART_S,
+    STEP_S,
+    AgentKind,
+    AgentTracks,
+    Block,
+    Camera,
+    SensorFile,
+    of_other_log,
+    own_name,
+)
 
 LOG, OTHER, STRANGER = 2, 16, 0  # of the town: the first two share a street, the third drives elsewhere
 

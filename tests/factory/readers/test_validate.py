@@ -10,10 +10,8 @@ import pytest
 from factory.readers.base import BadClip, ClipIndex, ClipRef
 from factory.readers.logs import route_of_drive
 from factory.readers.validate import read_clip
-from tasks.world.camera import SensorFile
-from tasks.world.clip import Clip
-from tasks.world.lanes import RoadMap
-from tasks.world.route import NoRoute, RouteFinder, roadblocks_of
+from tasks.world.clip import Clip, SensorFile
+from tasks.world.road_map import NoRoute, RoadMap, RouteFinder, roadblocks_of
 from tests.tasks.streets import street_clip
 
 REF = ClipRef("street", "street", 2000)
@@ -104,7 +102,7 @@ FAULTS: dict[str, tuple[Callable[[Clip], Any], str]] = {
     ),
     "lights of another code": (
         lambda c: replace(c, lights=replace(c.lights, states=c.lights.states + 7)),
-        "lights.states: 8: expected tasks.world.lanes.LightState",
+        "lights.states: 8: expected tasks.world.road_map.LightState",
     ),
     "a line as the route ahead": (lambda c: replace(c, centerline=c.centerline[:1]), "centerline: 1 points"),
     "a photo of no camera": (

@@ -6,9 +6,7 @@ import cv2
 import numpy as np
 
 from tasks.render.rig.adjust import motions
-from tasks.world.agents import AgentTracks
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import Block
+from tasks.world.clip import AgentTracks, Block, Camera, SensorFile
 
 WIDTH, HEIGHT, FOCAL, WALL_M, ROAD_M, CELL_M = 400, 224, 260.0, 6.0, -0.3, 0.03
 NOBODY = AgentTracks(

@@ -19,8 +19,7 @@ from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky import SkyMap
 from tasks.render.settings import Adjust, RigSettings
 from tasks.render.splatting.gaussians import EMPTY
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import Block
+from tasks.world.clip import Block, Camera, SensorFile
 
 
 @pytest.fixture(scope="module")

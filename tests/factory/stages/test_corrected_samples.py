@@ -20,8 +20,7 @@ from tasks.render.rig.adjust import motions, twists_of
 from tasks.render.settings import Adjust, RenderSettings, RigSettings, SceneFrom
 from tasks.sealed import unsealed_json
 from tasks.settings import PdmSettings
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import NOW, STEP_S, Clip, scene_of_clip
+from tasks.world.clip import NOW, STEP_S, Camera, Clip, SensorFile, scene_of_clip
 from tests.tasks.streets import street_clip
 
 LATER_S = 0.5  # the clip begins so long after its block

@@ -22,7 +22,7 @@ from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.lqr import track
 from tasks.stages import HUMAN
-from tasks.world.agents import AgentTracks
+from tasks.world.clip import AgentTracks
 from tasks.world.frames import to_world
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 

@@ -13,7 +13,7 @@ from tasks.render.rig.correct import hidden_by
 from tasks.render.scene.asset import OwnBody, RenderAsset
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.gaussians import EMPTY
-from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import Camera, SensorFile
 from tests.factory.data_folders import add_companions
 
 K = np.array([[60.0, 0.0, 48.0], [0.0, 60.0, 32.0], [0.0, 0.0, 1.0]])

@@ -19,8 +19,7 @@ from factory.store.schema import COLUMNS, UNLISTED
 from tasks import stages
 from tasks.perturb import Perturbation, perturb
 from tasks.stages import HUMAN, HUMAN_BEFORE
-from tasks.world.chance import stream
-from tasks.world.clip import HORIZON_STEPS, NOW
+from tasks.world.clip import HORIZON_STEPS, NOW, stream
 from tasks.world.frames import to_local
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.tasks.streets import street_clip

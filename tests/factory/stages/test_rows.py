@@ -15,7 +15,7 @@ from tasks.perturb import Candidate
 from tasks.rollout.simulate import TrafficSettings
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, scene_of_clip
 from tasks.world.frames import to_world
-from tasks.world.lanes import LightState, MapLayer, MapPolygon, TrafficLights
+from tasks.world.road_map import LightState, MapLayer, MapPolygon, TrafficLights
 from tests.tasks.streets import EGO_HEIGHT_M, SPEED_MPS, moved, perturbed, rectangle, same_poses, street_clip
 
 RNG = np.random.default_rng(0)  # nothing here draws from it

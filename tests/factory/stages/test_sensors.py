@@ -22,11 +22,9 @@ from tasks.render.fit import reconstruct
 from tasks.render.scene.build import AssetSettings, psnr
 from tasks.render.settings import Backend, FitSettings, RenderSettings, SceneDtype, SceneFrom
 from tasks.render.splatting.gsplat_backend import BackendMissing
-from tasks.world.agents import AgentTracks
-from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import CLIP_STEPS, Clip
-from tasks.world.lanes import RoadMap, Route
-from tasks.world.vehicle import EGO_STATE_SIZE
+from tasks.world.clip import CLIP_STEPS, AgentTracks, Camera, Clip, SensorFile
+from tasks.world.frames import EGO_STATE_SIZE
+from tasks.world.road_map import RoadMap, Route
 
 SETTINGS = RenderSettings(width=48, height=32, scene=SceneFrom.DISCS, asset=AssetSettings(hold_out_every=0))
 FRONT = np.array([[0.0, 0.0, 1.0, 1.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]])

@@ -35,11 +35,8 @@ from tasks.reward.label_bytes import VocabularyLabels
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.stages import STAGES, stage_versions
-from tasks.world.camera import Camera, Pinhole
-from tasks.world.chance import stream
-from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
-from tasks.world.frames import to_world
-from tasks.world.vehicle import EGO_STATE_SIZE, VX, Y
+from tasks.world.clip import HORIZON_STEPS, NOW, Camera, Clip, Pinhole, Rollout, Scene, scene_of_clip, stream
+from tasks.world.frames import EGO_STATE_SIZE, VX, Y, to_world
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.factory.datasets.av2.test_av2 import write_log
 from tests.factory.datasets.scenarionet.scenarionet_scenarios import nuscenes, save

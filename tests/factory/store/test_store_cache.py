@@ -11,7 +11,7 @@ import pytest
 from factory.store.location import BadCacheFile, ClipCache, Location, decode_tree, encode_tree
 from factory.store.samples import CandidateRow
 from tasks.stages import Rejected
-from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.clip import AgentKind, AgentTracks
 
 
 def forged(tree: object) -> bytes:

@@ -18,8 +18,7 @@ from tasks.render.scene.engine import Vehicles, render, vehicles_at
 from tasks.render.scene.movers import boxes_at, world_from_boxes
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.project import ANTIALIASED
-from tasks.world.camera import Pinhole
-from tasks.world.clip import CLIP_STEPS, Clip
+from tasks.world.clip import CLIP_STEPS, Clip, Pinhole
 from tests.tasks.render.splatting.test_ply import some
 from tests.tasks.streets import street_clip
 

@@ -26,7 +26,7 @@ from factory.store.reader import SampleTable
 from factory.views.bev import EXPERT, LOGGED
 from tasks.stages import HUMAN
 from tasks.world.clip import NOW
-from tasks.world.vehicle import HEADING, X, Y
+from tasks.world.frames import HEADING, X, Y
 
 show_main = COMMANDS["show"].load()
 

@@ -9,7 +9,7 @@ import pytest
 from factory.store.schema import AGENT_STEPS, NOW_INDEX
 from planners.data.batch import BevLayout
 from planners.data.bev import BevClass, bev_raster, nearest_agents
-from tasks.world.agents import AgentKind
+from tasks.world.clip import AgentKind
 from tasks.world.frames import box_corners
 
 LAYOUT = BevLayout(ahead_m=32.0, behind_m=8.0, side_m=16.0, cell_m=0.5)

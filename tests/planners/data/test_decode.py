@@ -16,7 +16,7 @@ from planners.data.files import Footers, files_of, group_bytes, leaves
 from planners.data.images import stitched
 from planners.data.index import BEV_COLUMNS, PLAN_COLUMNS
 from tasks.reward.label_bytes import VocabularyLabels
-from tasks.world.agents import AgentKind
+from tasks.world.clip import AgentKind
 from tests.planners.samples import grey_pictures, labels, sample, write_table
 
 NUMERIC = [name for name, c in COLUMNS.items() if c.dtype not in ("struct", "string", "binary") and not c.nullable]

@@ -13,7 +13,7 @@ from planners.data.files import LocalCopy
 from planners.data.index import DataSettings, make_feed, open_data
 from planners.data.loader import Loader, copies_of
 from planners.data.mix import MixSettings
-from tasks.world.agents import AgentKind
+from tasks.world.clip import AgentKind
 from tests.factory.store.test_store_s3 import s3
 from tests.planners.data.test_loader import BATCH, NEEDS, assert_same, counted_reads, n_groups, out, rows, windows
 from tests.planners.samples import FRONT_YAWS, jpeg, labels, pictures, plain, sample, write_table

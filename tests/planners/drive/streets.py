@@ -9,10 +9,8 @@ from factory.store.reader import Sample
 from planners.drive.drivers import DriveEnd
 from planners.drive.loop import LoopSettings
 from planners.drive.starts import DriveStart, lengthened, logged_start
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, STEP_S, Clip, Scene
-from tasks.world.frames import to_world
-from tasks.world.vehicle import HEADING, VX
+from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Clip, Scene
+from tasks.world.frames import HEADING, VX, to_world
 from tests.tasks.streets import street_clip
 
 FAR = LoopSettings(seconds=60.0, bound_m=1000.0)

@@ -12,7 +12,7 @@ from planners.drive.starts import logged_start
 from planners.evaluation.planner_names import planner_of
 from tasks.settings import PdmSettings, TrafficSettings
 from tasks.world.clip import NOW
-from tasks.world.vehicle import PACIFICA, VX, X, Y
+from tasks.world.frames import PACIFICA, VX, X, Y
 from tests.planners.drive.streets import FAR, Steady, car, nobody, start_on, street_with
 from tests.tasks.streets import moved, street_clip
 

@@ -8,9 +8,8 @@ import pytest
 from planners.drive.loop import road_from
 from planners.drive.starts import known_places, lengthened, perturbed_starts
 from tasks.settings import PdmSettings, TrafficSettings
-from tasks.world.camera import SensorFile
-from tasks.world.clip import CLIP_STEPS, NOW, Block
-from tasks.world.lanes import LightState
+from tasks.world.clip import CLIP_STEPS, NOW, Block, SensorFile
+from tasks.world.road_map import LightState
 from tests.tasks.streets import perturbed, street_clip
 
 

@@ -26,9 +26,8 @@ from tasks.experts.protocol import Plan
 from tasks.reward.one_stage import COLUMNS
 from tasks.rollout.simulate import TrafficSettings
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip
-from tasks.world.frames import to_world
-from tasks.world.lanes import MapLayer, MapPolygon
-from tasks.world.vehicle import AX, HEADING, X
+from tasks.world.frames import AX, HEADING, X, to_world
+from tasks.world.road_map import MapLayer, MapPolygon
 from tests.planners.small_benchmark import clip_scenes, same_plan_everywhere, straight
 from tests.tasks.streets import rectangle, street_clip
 

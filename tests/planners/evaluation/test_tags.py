@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from planners.evaluation.tags import tags_of
-from tasks.world.lanes import LightState
+from tasks.world.road_map import LightState
 
 STEPS = 56
 TIMES = np.arange(1, 41) * 0.1

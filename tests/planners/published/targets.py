@@ -9,7 +9,7 @@ import numpy as np
 from factory.store.schema import AGENT_STEPS
 from planners.data.batch import BevLayout
 from planners.data.bev import BevClass, bev_raster, nearest_agents
-from tasks.world.agents import AgentKind
+from tasks.world.clip import AgentKind
 from tests.planners.published.formula import AGENTS, street
 from tests.planners.published.ours import Difference
 

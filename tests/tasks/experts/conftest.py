@@ -5,10 +5,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import CLIP_STEPS, HISTORY_STEPS, HORIZON_STEPS, NOW, Clip, Scene
-from tasks.world.lanes import Lane, LightState, MapLayer, MapPolygon, RoadMap, Route, TrafficLights
-from tasks.world.vehicle import EGO_STATE_SIZE, VX, X, Y
+from tasks.world.clip import CLIP_STEPS, HISTORY_STEPS, HORIZON_STEPS, NOW, AgentKind, AgentTracks, Clip, Scene
+from tasks.world.frames import EGO_STATE_SIZE, VX, X, Y
+from tasks.world.road_map import Lane, LightState, MapLayer, MapPolygon, RoadMap, Route, TrafficLights
 
 LANE_M, ROAD_M = 4.0, 400.0
 

@@ -11,10 +11,9 @@ import shapely.ops
 from numpy.typing import NDArray
 
 from tasks.settings import PDM_DEFAULTS, PdmSettings
-from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
-from tasks.world.frames import box_corners, wrap_angle
+from tasks.world.clip import MOVING_KINDS, AgentKind, AgentTracks
+from tasks.world.frames import PACIFICA, VX, Vehicle, X, Y, box_corners, wrap_angle
 from tasks.world.geometry import ego_boxes
-from tasks.world.vehicle import PACIFICA, VX, Vehicle, X, Y
 
 Array = NDArray[np.float64]
 STEP_S = 0.1

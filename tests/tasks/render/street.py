@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.render.scene.sensed import Photo, Sweep
-from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.clip import AgentKind, AgentTracks
 
 WIDTH, HEIGHT = 128, 72
 INTRINSICS = np.array([[100.0, 0.0, 64.0], [0.0, 100.0, 36.0], [0.0, 0.0, 1.0]])

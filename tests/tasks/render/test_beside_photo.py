@@ -24,8 +24,7 @@ from tasks.render.gate import (
 from tasks.render.scene.engine import Vehicles
 from tasks.render.scene.sensed import Photo
 from tasks.render.splatting.raster import View
-from tasks.world.agents import AgentKind
-from tasks.world.camera import Pinhole
+from tasks.world.clip import AgentKind, Pinhole
 
 Array = NDArray[np.float64]
 INTRINSICS = np.array([[110.0, 0.0, 80.0], [0.0, 110.0, 45.0], [0.0, 0.0, 1.0]])

@@ -24,7 +24,7 @@ from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import EMPTY, Gaussians, concatenate
 from tasks.render.splatting.raster import View
 from tasks.stages import PICTURE_FAULTS, STAGES
-from tasks.world.camera import Camera, Pinhole
+from tasks.world.clip import Camera, Pinhole
 
 SETTINGS = GateSettings(width=128)
 FRONT = Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), street.EGO_FROM_CAMERA)

@@ -30,8 +30,7 @@ from tasks.render.scene.movers import BEYOND_M
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.raster import View
 from tasks.stages import Rejected
-from tasks.world.agents import AgentKind
-from tasks.world.camera import Camera, Pinhole, SensorFile
+from tasks.world.clip import AgentKind, Camera, Pinhole, SensorFile
 
 FRONT = Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), street.EGO_FROM_CAMERA)
 SIZE = (street.WIDTH, street.HEIGHT)

@@ -10,9 +10,9 @@ import street
 from tasks.render.map_drawing import GROUND, ROAD, SKY, WHITE, clip_near, draw_map_views, ground_height
 from tasks.render.rigs import RIGS, pinhole
 from tasks.render.views import pose_on_ground, undistorted
-from tasks.world.camera import Camera
-from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap
-from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, X, Y
+from tasks.world.clip import Camera
+from tasks.world.frames import EGO_STATE_SIZE, HEADING, X, Y
+from tasks.world.road_map import Lane, MapLayer, MapPolygon, RoadMap
 
 
 def states(x: float, y: float, heading: float) -> np.ndarray:

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.lanes import MapLayer, MapPolygon
+from tasks.world.clip import AgentKind, AgentTracks
+from tasks.world.road_map import MapLayer, MapPolygon
 
 N_TIMES = 41
 KINDS = tuple(AgentKind)

@@ -4,7 +4,7 @@ import numpy as np
 import shapely
 from hypothesis import strategies as st
 
-from tasks.world.lanes import MapLayer, MapPolygon
+from tasks.world.road_map import MapLayer, MapPolygon
 
 LAYERS = tuple(MapLayer)
 

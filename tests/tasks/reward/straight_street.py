@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tasks.reward.prepare import PreparedScene, prepare
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.frames import to_world
-from tasks.world.lanes import MapLayer, MapPolygon
-from tasks.world.vehicle import HEADING, VX, X, Y
+from tasks.world.clip import AgentKind, AgentTracks
+from tasks.world.frames import HEADING, VX, X, Y, to_world
+from tasks.world.road_map import MapLayer, MapPolygon
 
 ORIGIN = np.zeros(3)
 

@@ -8,7 +8,7 @@ import pytest
 
 from tasks.reward.epdms import score
 from tasks.reward.prepare import prepare
-from tasks.world.lanes import MapLayer, MapPolygon
+from tasks.world.road_map import MapLayer, MapPolygon
 from tests.tasks.reward.random_worlds import random_drives, random_world
 
 SQUARE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.0]])

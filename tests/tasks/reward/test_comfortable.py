@@ -5,7 +5,7 @@ import pytest
 
 from tasks.kernels.compiled import read_only
 from tasks.reward.rules.comfort import N_FLAGS, comfort_along, comfort_scratch, comfortable
-from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, YAW_RATE
+from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, YAW_RATE
 
 
 def test_it_is_history_comfort_instant_by_instant() -> None:

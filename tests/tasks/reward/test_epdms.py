@@ -7,9 +7,9 @@ import numpy as np
 from tasks.reward.epdms import Scores, human_filtered, relative_progress, rows, score, score_with_ec
 from tasks.reward.rules.map_index import index_map
 from tasks.rollout.lqr import track
-from tasks.world.agents import AgentKind
+from tasks.world.clip import AgentKind
 from tasks.world.frames import to_world
-from tasks.world.lanes import MapLayer
+from tasks.world.road_map import MapLayer
 from tests.tasks.reward.straight_street import Thing, drive, past_of, rectangle, street
 
 TRAFFIC = (

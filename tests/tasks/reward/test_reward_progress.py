@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tasks.reward.epdms import score
-from tasks.world.lanes import MapLayer
-from tasks.world.vehicle import HEADING, X, Y
+from tasks.world.frames import HEADING, X, Y
+from tasks.world.road_map import MapLayer
 from tests.tasks.reward.straight_street import drive, rectangle, street
 
 

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from tasks.reward.ends import BRAKING_MPS2, hit_after_s, onward
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
-from tasks.world.agents import AgentKind
-from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Scene, scene_of_clip
-from tasks.world.frames import to_world
-from tasks.world.vehicle import HEADING, PACIFICA, STEERING, VX, YAW_RATE, X, Y
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentKind, Scene, scene_of_clip
+from tasks.world.frames import HEADING, PACIFICA, STEERING, VX, YAW_RATE, X, Y, to_world
 from tests.tasks.rollout import worlds
 from tests.tasks.rollout.worlds import Track
 from tests.tasks.streets import moved, street_clip

@@ -7,11 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.rollout.lqr import track
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import CLIP_STEPS, Scene, scene_of_clip
-from tasks.world.frames import to_world, wrap_angle
-from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap
-from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, VX, X
+from tasks.world.clip import CLIP_STEPS, AgentKind, AgentTracks, Scene, scene_of_clip
+from tasks.world.frames import EGO_STATE_SIZE, HEADING, VX, X, to_world, wrap_angle
+from tasks.world.road_map import Lane, MapLayer, MapPolygon, RoadMap
 from tests.tasks.rollout import worlds
 
 Array = NDArray[np.float64]

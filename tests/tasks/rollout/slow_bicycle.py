@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.world.clip import STEP_S
-from tasks.world.frames import wrap_angle
-from tasks.world.vehicle import (
+from tasks.world.frames import (
     AX,
     EGO_STATE_SIZE,
     HEADING,
@@ -25,6 +24,7 @@ from tasks.world.vehicle import (
     Vehicle,
     X,
     Y,
+    wrap_angle,
 )
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ STEERING_TIME_CONSTANT_S = 0.05
 def step(state: Array, accel_command: Array, steering_rate_command: Array, vehicle: Vehicle = PACIFICA) -> Array:
     """The states (K, 11) 0.1 s later.
 
-    state: (K, 11), columns tasks.world.vehicle; accel_command: (K,) [m/s^2]; steering_rate_command: (K,) [rad/s].
+    state: (K, 11), columns tasks.world.frames; accel_command: (K,) [m/s^2]; steering_rate_command: (K,) [rad/s].
     Lateral velocity and acceleration of the result are zero.
     """
     dt = STEP_S

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.world.clip import HORIZON_STEPS, STEP_S
-from tasks.world.frames import wrap_angle
-from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, PACIFICA, STEERING, VX, Vehicle, X, Y
+from tasks.world.frames import EGO_STATE_SIZE, HEADING, PACIFICA, STEERING, VX, Vehicle, X, Y, wrap_angle
 from tests.tasks.rollout import slow_bicycle as bicycle
 
 Array = NDArray[np.float64]
@@ -34,7 +33,7 @@ STOPPING_SPEED_MPS = 0.2
 def track(ego_state0: Array, poses: Array, vehicle: Vehicle = PACIFICA, *, planned_pose0: Array | None = None) -> Array:
     """Simulated ego states (K, 41, 11) that follow each plan; row 0 is `ego_state0`.
 
-    ego_state0: (11,) columns tasks.world.vehicle; poses: (K, 40, 3) world x, y, heading at 0.1 .. 4.0 s.
+    ego_state0: (11,) columns tasks.world.frames; poses: (K, 40, 3) world x, y, heading at 0.1 .. 4.0 s.
     planned_pose0: (K, 3) where each plan says the ego is now, when that is not the ego's own pose: the proposals of
     PDM-Closed start on their path, beside the ego.
     """

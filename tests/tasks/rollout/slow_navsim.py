@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tasks.rollout.navsim import IdmAgent, NavsimAgents, bodies
 from tasks.settings import TrafficSettings
-from tasks.world.vehicle import PACIFICA
+from tasks.world.frames import PACIFICA
 
 Array = NDArray[np.float64]
 

@@ -20,9 +20,8 @@ from tasks.rollout.simulate import (
     roll_out_many,
 )
 from tasks.rollout.traffic_state import AgentStates
-from tasks.world.agents import AgentTracks
-from tasks.world.clip import NOW, Rollout
-from tasks.world.vehicle import HEADING, PACIFICA, VX, X, Y
+from tasks.world.clip import NOW, AgentTracks, Rollout
+from tasks.world.frames import HEADING, PACIFICA, VX, X, Y
 from tests.tasks.rollout import slow_idm, worlds
 
 Array = NDArray[np.float64]

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from tasks.rollout.lqr import track
-from tasks.world.frames import to_world, wrap_angle
-from tasks.world.vehicle import AX, HEADING, STEERING, VX, YAW_RATE, X, Y
+from tasks.world.frames import AX, HEADING, STEERING, VX, YAW_RATE, X, Y, to_world, wrap_angle
 
 TIMES_S = 0.1 * np.arange(1, 41)
 

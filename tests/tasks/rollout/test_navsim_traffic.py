@@ -22,9 +22,8 @@ from tasks.experts.protocol import Plan
 from tasks.reward.labels import reactive_scores
 from tasks.rollout.navsim import idm_acceleration
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out, roll_out_many, simulate
-from tasks.world.agents import AgentKind
-from tasks.world.clip import NOW, STEP_S, Rollout, Scene
-from tasks.world.vehicle import PACIFICA
+from tasks.world.clip import NOW, STEP_S, AgentKind, Rollout, Scene
+from tasks.world.frames import PACIFICA
 from tests.tasks.rollout import slow_navsim, worlds
 from tests.tasks.rollout.crowds import Crowd, crowd, crowd_of
 from tests.tasks.rollout.worlds import CAR, Track

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from tasks.rollout.policy import SEEN_ROWS, BadPolicy, SeenTraffic, refuse_another_policy, traffic_record
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_on, roll_out, roll_out_many
-from tasks.world.agents import PER_STEP, AgentKind, AgentTracks
-from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Scene
-from tasks.world.vehicle import X
+from tasks.world.clip import CLIP_STEPS, NOW, PER_STEP, STEP_S, AgentKind, AgentTracks, Scene
+from tasks.world.frames import X
 from tests.tasks.rollout import worlds
 from tests.tasks.rollout.worlds import Track
 

@@ -7,10 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_on, roll_out
-from tasks.world.agents import PER_STEP, AgentKind
-from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, STEP_S, Scene
-from tasks.world.lanes import LightState, TrafficLights
-from tasks.world.vehicle import EGO_STATE_SIZE, VX, X
+from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, PER_STEP, STEP_S, AgentKind, Scene
+from tasks.world.frames import EGO_STATE_SIZE, VX, X
+from tasks.world.road_map import LightState, TrafficLights
 from tests.tasks.rollout import worlds
 from tests.tasks.rollout.worlds import Track
 

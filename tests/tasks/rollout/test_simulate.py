@@ -8,11 +8,9 @@ import shapely
 
 from tasks.rollout.lane_following import logged_path
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out, simulate
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Rollout, Scene, scene_of_clip
-from tasks.world.frames import box_corners
-from tasks.world.lanes import LightState, TrafficLights
-from tasks.world.vehicle import PACIFICA
+from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Rollout, Scene, scene_of_clip
+from tasks.world.frames import PACIFICA, box_corners
+from tasks.world.road_map import LightState, TrafficLights
 from tests.tasks.rollout import worlds
 from tests.tasks.rollout.worlds import Track
 from tests.tasks.streets import moved

@@ -5,8 +5,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from tasks.rollout.lqr import STOPPING_SPEED_MPS, track
-from tasks.world.frames import to_world, wrap_angle
-from tasks.world.vehicle import AX, AY, HEADING, STEERING, VX, VY, YAW_RATE, Vehicle, X, Y
+from tasks.world.frames import AX, AY, HEADING, STEERING, VX, VY, YAW_RATE, Vehicle, X, Y, to_world, wrap_angle
 from tests.tasks.rollout import slow_lqr
 
 DRIVEN, MOVED = settings(max_examples=60), settings(max_examples=25)

@@ -8,10 +8,9 @@ import shapely
 from numpy.typing import NDArray
 
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out, simulate
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Rollout, Scene
+from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Rollout, Scene
 from tasks.world.frames import box_corners
-from tasks.world.lanes import Lane, LightState, TrafficLights
+from tasks.world.road_map import Lane, LightState, TrafficLights
 from tests.tasks.rollout import worlds
 from tests.tasks.rollout.test_batched_traffic import stages
 from tests.tasks.rollout.worlds import Track, lane

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Clip, Scene, scene_of_clip
-from tasks.world.lanes import NO_LIGHTS, Lane, RoadMap, Route, TrafficLights
-from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, VX, X, Y
+from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Clip, Scene, scene_of_clip
+from tasks.world.frames import EGO_STATE_SIZE, HEADING, VX, X, Y
+from tasks.world.road_map import NO_LIGHTS, Lane, RoadMap, Route, TrafficLights
 
 CAR = (4.6, 1.9)  # length, width [m]
 FAR_EGO = (0.0, 500.0, 0.0)  # a standing ego out of everyone's way

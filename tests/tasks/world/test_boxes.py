@@ -3,9 +3,8 @@
 import numpy as np
 import shapely
 
-from tasks.world.frames import box_corners
+from tasks.world.frames import PACIFICA, box_corners
 from tasks.world.geometry import ego_boxes, touching
-from tasks.world.vehicle import PACIFICA
 
 
 def test_separating_axes_agree_with_polygon_intersection():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tasks.world.camera import Camera
+from tasks.world.clip import Camera
 
 CAMERA = Camera(
     "front",

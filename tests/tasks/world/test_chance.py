@@ -4,7 +4,7 @@ from itertools import combinations
 
 import numpy as np
 
-from tasks.world.chance import stream
+from tasks.world.clip import stream
 
 
 def draws(*words: object) -> np.ndarray:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tasks.world.frames import to_world
-from tasks.world.route import LATERAL_M, LOOKAHEAD_M, driving_command
+from tasks.world.road_map import LATERAL_M, LOOKAHEAD_M, driving_command
 
 ORIGIN = np.zeros(3)
 

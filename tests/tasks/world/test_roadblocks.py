@@ -8,8 +8,8 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tasks.world.road_map import NoRoute
 from tasks.world.roadblocks import Roadblocks, _search, corrected_roadblocks
-from tasks.world.route import NoRoute
 
 
 def street(n: int) -> Roadblocks:

@@ -7,15 +7,24 @@ import pytest
 import shapely
 
 from tasks.world.frames import to_world
-from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap, Route
-from tasks.world.polygons import (
+from tasks.world.road_map import (
+    Lane,
+    MapLayer,
+    MapPolygon,
+    NoRoute,
     Rings,
+    RoadMap,
+    Route,
+    RouteFinder,
+    centerline_from,
     centerline_from_boundaries,
+    driven_lanes,
     polygons_near,
     ring_from_boundaries,
+    roadblocks_of,
+    route_of_log,
     valid_ring,
 )
-from tasks.world.route import NoRoute, RouteFinder, centerline_from, driven_lanes, roadblocks_of, route_of_log
 
 WIDTH = 4.0
 

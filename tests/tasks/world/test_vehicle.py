@@ -4,7 +4,7 @@ from dataclasses import fields
 
 import pytest
 
-from tasks.world.vehicle import Vehicle
+from tasks.world.frames import Vehicle
 
 
 @pytest.mark.parametrize("length_m", [0.0, -1.0, float("nan"), float("inf")])

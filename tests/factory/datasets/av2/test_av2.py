@@ -12,10 +12,9 @@ import pytest
 from factory.datasets.av2.reader import AV2Reader, read_cameras
 from factory.readers.base import BadClip, ClipRef
 from factory.stages.sensors import encode_jpeg, load_photos
-from tasks.world.agents import AgentKind
-from tasks.world.clip import CLIP_STEPS, NOW
-from tasks.world.lanes import LightState
-from tasks.world.vehicle import AX, AY, HEADING, VX, X
+from tasks.world.clip import CLIP_STEPS, NOW, AgentKind
+from tasks.world.frames import AX, AY, HEADING, VX, X
+from tasks.world.road_map import LightState
 
 START_NS = 315_966_253_000_000_000
 YAW = 0.5  # the road's direction in the city frame

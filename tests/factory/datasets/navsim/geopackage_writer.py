@@ -17,7 +17,7 @@ import pyproj
 import shapely
 
 from tasks.world.arrays import Array
-from tasks.world.lanes import Lane, RoadMap
+from tasks.world.road_map import Lane, RoadMap
 
 CITIES = {  # location -> version folder, UTM zone
     "sg-one-north": ("9.17.1964", 32648),

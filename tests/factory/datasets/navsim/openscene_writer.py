@@ -21,12 +21,9 @@ from factory.datasets.av2.log import step_times, world_from_ego_at
 from factory.datasets.av2.reader import AV2Log
 from factory.datasets.navsim.log import CAMERA_NAMES
 from factory.readers.logs import WholeLog
-from tasks.world.agents import AgentKind
-from tasks.world.camera import Camera
-from tasks.world.clip import STEP_S
-from tasks.world.frames import points_to_local
-from tasks.world.lanes import LightState
-from tasks.world.vehicle import AX, HEADING, VX
+from tasks.world.clip import STEP_S, AgentKind, Camera
+from tasks.world.frames import AX, HEADING, VX, points_to_local
+from tasks.world.road_map import LightState
 
 FRAME_STEPS = 5
 FIRST_STAMP_US = 1_623_693_600_000_000

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from factory.datasets.navsim.log import CAMERA_NAMES, frame_of, frames_of, read_frames
 from factory.readers.base import BadClip
-from tasks.world.agents import AgentKind
+from tasks.world.clip import AgentKind
 from tests.factory.datasets.navsim.logs import NAME, SPEED_MPS, frame
 
 

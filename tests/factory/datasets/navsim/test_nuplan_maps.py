@@ -12,7 +12,7 @@ from factory.datasets.av2.reader import read_map
 from factory.datasets.navsim.maps import City, cache_file, kept_tables, open_city
 from factory.datasets.town.town import _vector_map, plan_log
 from factory.readers.base import BadClip
-from tasks.world.lanes import MapLayer, RoadMap
+from tasks.world.road_map import MapLayer, RoadMap
 from tests.factory.datasets.navsim.geopackage_writer import ORIGIN, Row, town_rows, write_geopackage, write_root
 
 pytestmark = pytest.mark.slow  # the first test builds a town

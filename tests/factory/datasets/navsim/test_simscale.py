@@ -19,7 +19,7 @@ from factory.views.board.watch import Watch
 from planners.data.batch import BevLayout
 from planners.data.bev import BevClass, bev_raster
 from tasks.world.frames import to_local, to_world
-from tasks.world.lanes import LightState
+from tasks.world.road_map import LightState
 from tests.factory.datasets.navsim import simscale_writer as simscale
 from tests.factory.datasets.navsim.geopackage_writer import CITIES, ORIGIN, stub_rows, write_geopackage
 

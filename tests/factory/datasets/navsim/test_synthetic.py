@@ -12,7 +12,7 @@ import pytest
 from factory.datasets.navsim.synthetic import read_scene_pickle
 from factory.readers.base import BadClip
 from factory.readers.pickles import Record, load_plain, load_records
-from tasks.world.agents import AgentKind
+from tasks.world.clip import AgentKind
 from tasks.world.frames import to_world
 from tests.factory.datasets.navsim import scene_pickles
 

@@ -16,8 +16,7 @@ from factory.datasets.town.town import write_logs
 from factory.readers.settings import TownSettings
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW, Clip
-from tasks.world.lanes import LightState, RoadMap
-from tasks.world.route import RouteFinder, driving_command
+from tasks.world.road_map import LightState, RoadMap, RouteFinder, driving_command
 from tasks.world.vocabulary import kinematic_trajectories
 from tests.factory.datasets.navsim.geopackage_writer import (
     CITIES,

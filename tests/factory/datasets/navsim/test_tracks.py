@@ -7,9 +7,8 @@ import pytest
 
 from factory.datasets.navsim.log import Frame, frame_of
 from factory.datasets.navsim.tracks import ego_states, lights, stretch_agents, window_agents, world_from_ego
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import NOW
-from tasks.world.lanes import LightState
+from tasks.world.clip import NOW, AgentKind, AgentTracks
+from tasks.world.road_map import LightState
 from tests.factory.datasets.navsim.logs import frame
 from tests.factory.datasets.navsim.twin import Shown, brought_to_10_hz
 

@@ -9,11 +9,9 @@ from math import atan2, cos, pi, sin
 import numpy as np
 import shapely
 
-from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
-from tasks.world.clip import Clip
-from tasks.world.frames import box_corners
-from tasks.world.lanes import LightState, TrafficLights
-from tasks.world.vehicle import PACIFICA
+from tasks.world.clip import MOVING_KINDS, AgentKind, AgentTracks, Clip
+from tasks.world.frames import PACIFICA, box_corners
+from tasks.world.road_map import LightState, TrafficLights
 
 FRAMES = 20
 NOW, LATER, LAST = 3, 11, 19  # frames T, T+H, T+2H

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factory.datasets.av2.reader import map_file, read_map
-from tasks.world.lanes import RoadMap
+from tasks.world.road_map import RoadMap
 
 LABELS = {  # of AV2SensorBoxDetectionLabel, those that appear in the tests' logs
     "BICYCLIST": 3,

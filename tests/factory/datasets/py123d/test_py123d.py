@@ -13,10 +13,8 @@ import shapely
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.py123d.arrow import KINDS_OF_LABELS
 from factory.datasets.py123d.reader import Py123dReader
-from tasks.world.agents import AgentKind
-from tasks.world.clip import NOW, Clip
-from tasks.world.lanes import LightState, MapLayer
-from tasks.world.polygons import polygons_near
+from tasks.world.clip import NOW, AgentKind, Clip
+from tasks.world.road_map import LightState, MapLayer, polygons_near
 from tests.factory.datasets.av2.test_av2 import SPEED, START_NS, road, write_log, write_table
 from tests.factory.datasets.py123d.py123d_logs import (
     CARPARK,

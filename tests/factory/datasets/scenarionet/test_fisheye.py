@@ -14,8 +14,7 @@ from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.gaussians import EMPTY
 from tasks.render.views import straightened
-from tasks.world.camera import Camera, Fisheye
-from tasks.world.clip import Clip
+from tasks.world.clip import Camera, Clip, Fisheye
 from tests.factory.datasets.scenarionet import scenarionet_scenarios as town
 
 SIZE = (160, 120)

@@ -9,10 +9,9 @@ from factory.datasets.scenarionet.map import pieces
 from factory.datasets.scenarionet.reader import ScenarioNetReader, read_log
 from factory.datasets.scenarionet.tracks import SLOPE_STEPS, LoggedTrack, resampled, slope_velocities
 from factory.readers.base import ClipRef
-from tasks.world.agents import AgentKind
-from tasks.world.clip import CLIP_STEPS, NOW
-from tasks.world.lanes import LightState
-from tasks.world.vehicle import AX, AY, HEADING, VX, VY, X, Y
+from tasks.world.clip import CLIP_STEPS, NOW, AgentKind
+from tasks.world.frames import AX, AY, HEADING, VX, VY, X, Y
+from tasks.world.road_map import LightState
 from tests.factory.datasets.scenarionet import scenarionet_scenarios as town
 
 DIALECTS = {

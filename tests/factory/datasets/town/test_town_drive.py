@@ -24,10 +24,9 @@ from factory.datasets.town.town import WINDOWS_PER_LOG, plan_log, write_town
 from factory.readers.settings import LOG_STEPS, TownSettings
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW
-from tasks.world.frames import box_corners, to_local
+from tasks.world.frames import PACIFICA, box_corners, to_local
 from tasks.world.geometry import ego_boxes
-from tasks.world.polygons import arc_lengths
-from tasks.world.vehicle import PACIFICA
+from tasks.world.road_map import arc_lengths
 
 BLIND = TownSettings(cameras=(), lidar_beams=0)
 

@@ -14,7 +14,7 @@ from factory.datasets.town.reader import SyntheticReader
 from factory.datasets.town.town import LICENCE, WINDOWS_PER_LOG, write_town
 from factory.readers.settings import LOG_STEPS, STEPS_PER_SWEEP, TownSettings
 from tasks.world.clip import Clip
-from tasks.world.lanes import LightState
+from tasks.world.road_map import LightState
 
 HISTORY_S = 1.5
 SMALL = TownSettings(("ring_front_center", "ring_rear_left"), width=64, height=36, lidar_beams=8, lidar_azimuths=90)

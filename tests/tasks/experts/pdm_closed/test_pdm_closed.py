@@ -11,9 +11,8 @@ from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings, plan_for
 from tasks.experts.pdm_closed.proposals import driver, forecast, idm_step, proposals
 from tasks.experts.protocol import Plan
 from tasks.stages import Rejected
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import Scene
-from tasks.world.vehicle import PACIFICA
+from tasks.world.clip import AgentKind, AgentTracks, Scene
+from tasks.world.frames import PACIFICA
 
 Road = Callable[..., Scene]
 Objects = Callable[..., AgentTracks]

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.pdm_closed.proposals import forecast, proposals
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.frames import box_corners
+from tasks.world.clip import AgentKind, AgentTracks
+from tasks.world.frames import HEADING, VX, X, Y, box_corners
 from tasks.world.geometry import rings_distance, rings_touch
-from tasks.world.vehicle import HEADING, VX, X, Y
 from tests.tasks.experts import slow_pdm
 
 Array = NDArray[np.float64]

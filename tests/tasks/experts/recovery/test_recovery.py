@@ -17,8 +17,7 @@ from tasks.experts.recovery.expert import (
 )
 from tasks.stages import Rejected
 from tasks.world.clip import NOW, Scene
-from tasks.world.frames import to_local, to_world
-from tasks.world.vehicle import AX, HEADING, PACIFICA, STEERING, VX, VY
+from tasks.world.frames import AX, HEADING, PACIFICA, STEERING, VX, VY, to_local, to_world
 from tasks.world.vocabulary import kinematic_trajectories
 
 Road = Callable[..., Scene]

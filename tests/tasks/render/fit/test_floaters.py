@@ -29,8 +29,8 @@ from tasks.render.scene.body import BEFORE_M, REACH_M, body_boxes
 from tasks.render.scene.movers import SHIFT_SIZE, at_knots, shifted_boxes
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.tensors import by_kernels
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array
+from tasks.world.clip import AgentTracks
 from tests.tasks.render.fit.test_reconstruct import fresh
 
 N = 5  # photos, every 0.25 s: the car 8 to 12 m before the camera, a little to the left

@@ -13,8 +13,8 @@ from tasks.render.fit.state import FitState
 from tasks.render.scene.movers import KNOT_S, SHIFT_SIZE, shifted_boxes, world_from_boxes
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import quats_of, turned_quats
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array
+from tasks.world.clip import AgentTracks
 from tests.tasks.render.fit.test_reconstruct import fresh
 
 SETTINGS = FitSettings(

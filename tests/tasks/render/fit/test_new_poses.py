@@ -17,9 +17,8 @@ from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.sensed import Photo
 from tasks.render.settings import FitSettings, GateSettings, RenderSettings
 from tasks.render.views import render_views
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Bools
-from tasks.world.camera import Camera
+from tasks.world.clip import AgentTracks, Camera
 
 pytestmark = pytest.mark.slow
 GAINS = {"left": (1.25, 1.2, 1.3), "right": (0.75, 0.8, 0.7)}

@@ -26,8 +26,7 @@ from tasks.render.scene.sensed import Photo, Sweep, Tracks, shifted
 from tasks.render.settings import FitSettings
 from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import moved, turned_quats
-from tasks.world.agents import AgentKind
-from tasks.world.camera import Pinhole
+from tasks.world.clip import AgentKind, Pinhole
 
 SETTINGS = FitSettings(
     iterations=24,

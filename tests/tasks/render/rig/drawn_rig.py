@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tasks.render.rig.adjust import Rig, given_rig, motions, residuals
 from tasks.render.rig.correct import UNIT, Corners
-from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import Camera, SensorFile
 
 Array = NDArray[np.float64]
 WIDTH, HEIGHT, FOCAL = 960, 540, 700.0

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from tasks.render.rig.adjust import motions, twists_of
 from tasks.render.rig.correct import Correction, corrected
 from tasks.render.settings import RigSettings
-from tasks.world.camera import Camera
+from tasks.world.clip import Camera
 
 pytestmark = pytest.mark.slow
 NAMES, BELIEVED = list(drawn_rig.YAWS_DEG), RigSettings()

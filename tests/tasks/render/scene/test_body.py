@@ -15,7 +15,7 @@ from tasks.render.scene.sensed import Tracks
 from tasks.render.scene.sky import directions
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians
-from tasks.world.agents import AgentTracks
+from tasks.world.clip import AgentTracks
 
 AT_S = 0.5
 

@@ -13,9 +13,8 @@ from tasks.render.scene.movers import lifted
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.gaussians import EMPTY
 from tasks.render.views import pose_on_ground
-from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.camera import SensorFile
-from tasks.world.vehicle import EGO_STATE_SIZE, X
+from tasks.world.clip import AgentKind, AgentTracks, SensorFile
+from tasks.world.frames import EGO_STATE_SIZE, X
 
 STEPS = 21
 PARKED = AgentTracks(

@@ -12,7 +12,7 @@ from tasks.render.scene.engine import NOBODY, render, vehicles_at
 from tasks.render.splatting.gaussians import EMPTY
 from tasks.render.splatting.raster import View
 from tasks.render.views import render_views
-from tasks.world.camera import Camera, Pinhole
+from tasks.world.clip import Camera, Pinhole
 
 POSE = street.ego_pose(3.0) @ street.EGO_FROM_CAMERA
 FRONT = Pinhole(street.INTRINSICS, POSE, street.WIDTH, street.HEIGHT)

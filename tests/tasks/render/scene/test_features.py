@@ -5,7 +5,7 @@ import numpy as np
 
 from tasks.render.scene.features import Known, known_without_lidar, triangulated
 from tasks.render.scene.sensed import Photo, Tracks
-from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.clip import AgentKind, AgentTracks
 
 WALL_M = 9.0
 K = np.array([[120.0, 0.0, 80.0], [0.0, 120.0, 60.0], [0.0, 0.0, 1.0]])

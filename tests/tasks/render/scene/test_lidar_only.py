@@ -8,8 +8,7 @@ import street
 
 from tasks.render.scene.build import BRIGHTEST, DARKEST, grey_of, lidar_asset
 from tasks.render.scene.engine import Vehicles, render
-from tasks.world.agents import AgentKind
-from tasks.world.camera import Pinhole
+from tasks.world.clip import AgentKind, Pinhole
 
 
 def seen(bright: int) -> np.ndarray:

@@ -11,8 +11,7 @@ from tasks.render.scene.build import build_asset
 from tasks.render.scene.sensed import Photo, own_bodies, reduced
 from tasks.render.settings import AssetSettings, FitSettings
 from tasks.render.views import render_views
-from tasks.world.agents import AgentTracks
-from tasks.world.camera import Camera
+from tasks.world.clip import AgentTracks, Camera
 
 BONNET = np.zeros((street.HEIGHT, street.WIDTH), bool)
 BONNET[58:, 24:104] = True

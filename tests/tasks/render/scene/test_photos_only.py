@@ -6,7 +6,7 @@ import pytest
 from tasks.render.scene.depth import see
 from tasks.render.scene.features import Points
 from tasks.render.scene.sensed import Photo, Tracks
-from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.clip import AgentKind, AgentTracks
 
 
 def test_a_road_that_is_known_lies_behind_a_car_and_not_on_it() -> None:

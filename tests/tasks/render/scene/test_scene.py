@@ -11,8 +11,7 @@ from tasks.render.scene.engine import NOBODY, Vehicles, render
 from tasks.render.scene.sensed import Photo
 from tasks.render.splatting import project, raster
 from tasks.render.warm import compile_kernels
-from tasks.world.agents import AgentKind
-from tasks.world.camera import Pinhole
+from tasks.world.clip import AgentKind, Pinhole
 
 
 def car_at(box: np.ndarray, name: str = "car") -> Vehicles:

@@ -12,7 +12,7 @@ from tasks.render.scene.asset import RenderAsset, psnr, scene_at
 from tasks.render.scene.engine import render, vehicles_at
 from tasks.render.settings import SceneDtype
 from tasks.render.splatting.gsplat_backend import arguments
-from tasks.world.camera import Pinhole
+from tasks.world.clip import Pinhole
 
 FRONT = Pinhole(street.INTRINSICS, street.ego_pose(3.0, 0.4) @ street.EGO_FROM_CAMERA, street.WIDTH, street.HEIGHT)
 

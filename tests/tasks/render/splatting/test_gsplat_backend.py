@@ -18,7 +18,7 @@ from tasks.render.splatting.gsplat_backend import BackendMissing, arguments, dra
 from tasks.render.splatting.project import CLASSIC, FITTED, NEAR_M
 from tasks.render.splatting.raster import View, forward
 from tasks.render.views import render_views
-from tasks.world.camera import Camera, Pinhole
+from tasks.world.clip import Camera, Pinhole
 
 POSE = street.ego_pose(3.0, 0.4) @ street.EGO_FROM_CAMERA
 FRONT = Pinhole(street.INTRINSICS, POSE, street.WIDTH, street.HEIGHT)

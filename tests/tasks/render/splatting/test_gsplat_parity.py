@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 
 from tasks.render.splatting.gsplat_backend import arguments
 from tasks.render.splatting.tensors import Eye, SceneTensors, learned_arguments
-from tasks.world.camera import Pinhole
+from tasks.world.clip import Pinhole
 from tests.bench.peer_gsplat import (
     CENTRED,
     HEIGHT,

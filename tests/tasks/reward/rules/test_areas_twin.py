@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from tasks.reward.rules.area_flags import areas_along, in_intersection
 from tasks.reward.rules.ego import CENTER_IN_INTERSECTION, MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, empty_body, place
 from tasks.reward.rules.map_index import index_map
+from tasks.world.frames import HEADING, PACIFICA, Vehicle, X, Y
 from tasks.world.geometry import ego_boxes
-from tasks.world.lanes import MapLayer, MapPolygon
-from tasks.world.vehicle import HEADING, PACIFICA, Vehicle, X, Y
+from tasks.world.road_map import MapLayer, MapPolygon
 from tests.tasks.reward.slow.areas import EgoAreas, ego_areas
 from tests.tasks.reward.slow.prepare import _regions
 from tests.tasks.reward.small_maps import small_maps

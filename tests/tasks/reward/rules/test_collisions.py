@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tasks.reward.epdms import score
-from tasks.world.agents import AgentKind
-from tasks.world.lanes import MapLayer
-from tasks.world.vehicle import VX, X
+from tasks.world.clip import AgentKind
+from tasks.world.frames import VX, X
+from tasks.world.road_map import MapLayer
 from tests.tasks.reward.straight_street import Thing, drive, rectangle, street, tracks
 
 FRONT, REAR = 4.049, 1.127  # rear axle to bumpers

@@ -5,7 +5,7 @@ import pytest
 
 from tasks.reward.epdms import score
 from tasks.reward.rules.comfort import comfort_history, extended_comfort
-from tasks.world.vehicle import AX, AY, HEADING, X
+from tasks.world.frames import AX, AY, HEADING, X
 from tests.tasks.reward.straight_street import drive, past_of, street
 
 

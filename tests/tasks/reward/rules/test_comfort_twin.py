@@ -8,7 +8,7 @@ from scipy.signal import savgol_coeffs, savgol_filter
 
 from tasks.reward.rules import comfort
 from tasks.reward.rules.comfort import LIMITS, comfort_along, comfort_history, comfort_scratch, extended_comfort
-from tasks.world.vehicle import AX, AY, HEADING, PACIFICA, VX, YAW_ACCEL, YAW_RATE
+from tasks.world.frames import AX, AY, HEADING, PACIFICA, VX, YAW_ACCEL, YAW_RATE
 from tests.tasks.reward.slow import comfort as slow
 
 FILTERS = {  # window, order, derivative

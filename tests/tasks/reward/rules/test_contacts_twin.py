@@ -13,10 +13,9 @@ from tasks.reward.rules.contacts import first_collision, first_time_to_collision
 from tasks.reward.rules.ego import MULTIPLE_LANES, NON_DRIVABLE, empty_body, place
 from tasks.reward.rules.map_index import index_map
 from tasks.reward.rules.obstacles import Obstacles, index_obstacles, unindexed
-from tasks.world.frames import box_corners, to_world
+from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y, box_corners, to_world
 from tasks.world.geometry import ego_boxes
-from tasks.world.lanes import MapLayer, MapPolygon
-from tasks.world.vehicle import HEADING, PACIFICA, VX, VY, X, Y
+from tasks.world.road_map import MapLayer, MapPolygon
 from tests.tasks.reward.slow import collisions as slow
 from tests.tasks.reward.slow.areas import EgoAreas
 from tests.tasks.reward.slow.prepare import Obstacles as SlowObstacles

@@ -8,9 +8,9 @@ from test_areas_twin import EXACT, drives, lattice_states
 
 from tasks.reward.rules.ego import empty_body, place
 from tasks.reward.rules.lights import first_red, index_red_lanes
+from tasks.world.frames import PACIFICA, Vehicle, X, Y
 from tasks.world.geometry import ego_boxes
-from tasks.world.lanes import MapLayer, MapPolygon
-from tasks.world.vehicle import PACIFICA, Vehicle, X, Y
+from tasks.world.road_map import MapLayer, MapPolygon
 from tests.tasks.reward.slow.collisions import traffic_light_compliance
 from tests.tasks.reward.slow.prepare import RedLanes, _shape
 from tests.tasks.reward.small_maps import small_maps

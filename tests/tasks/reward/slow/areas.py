@@ -6,8 +6,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tasks.world.frames import box_corners
-from tasks.world.vehicle import X, Y
+from tasks.world.frames import X, Y, box_corners
 from tests.tasks.reward.slow.prepare import Regions
 
 Array = NDArray[np.float64]

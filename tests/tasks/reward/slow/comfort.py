@@ -6,7 +6,7 @@ from scipy.signal import savgol_filter
 
 from tasks.reward.rules.comfort import ExtendedComfort
 from tasks.world.clip import STEP_S
-from tasks.world.vehicle import (
+from tasks.world.frames import (
     AX,
     AY,
     HEADING,

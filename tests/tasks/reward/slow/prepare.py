@@ -8,12 +8,10 @@ import shapely
 from numpy.typing import NDArray
 
 from tasks.reward.rules.comfort import comfort_history
-from tasks.world.agents import MOVING_KINDS, AgentTracks
-from tasks.world.clip import HORIZON_STEPS
-from tasks.world.frames import box_corners
+from tasks.world.clip import HORIZON_STEPS, MOVING_KINDS, AgentTracks
+from tasks.world.frames import PACIFICA, Vehicle, box_corners
 from tasks.world.geometry import ego_boxes, touching
-from tasks.world.lanes import MapLayer, MapPolygon
-from tasks.world.vehicle import PACIFICA, Vehicle
+from tasks.world.road_map import MapLayer, MapPolygon
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
