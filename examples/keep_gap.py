@@ -2,12 +2,12 @@
 
     python -m factory.run traffic=custom traffic.policy=examples.keep_gap:KeepGap
 
-It looks at boxes and ways only. What it is shown, and what it answers: tasks/rollout/policy.py.
+It looks at boxes and ways only. What it is shown, and what it answers: tasks/rollout/simulate.py.
 """
 
 import numpy as np
 
-from tasks.rollout.policy import SeenTraffic
+from tasks.rollout.simulate import SeenTraffic
 from tasks.world.arrays import Array
 from tasks.world.clip import STEP_S
 from tasks.world.frames import wrap_angle

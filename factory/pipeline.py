@@ -29,17 +29,15 @@ from factory.stages.rows import label_columns, sample_row
 from factory.store.samples import CandidateRow
 from factory.store.schema import UNLISTED, RunIdentity
 from tasks.attempt import ExpertGate, Judged, Timed, attempt, has_route, human_sample, perturbed_scene
-from tasks.experts.human import Human
-from tasks.experts.pdm_closed.planner import PdmSettings
-from tasks.experts.protocol import Expert, tried_once
+from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.protocol import Expert, Human, tried_once
 from tasks.hard_scenes import BEFORE_STEPS, BenchmarkClip, follow_up, frame_digest, half_a_second_before
 from tasks.perturb import NO_STARTS, Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
 from tasks.render.scene.engine import check
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling, vocabulary_labels
-from tasks.rollout.policy import refuse_another_policy
-from tasks.rollout.simulate import TrafficSettings
+from tasks.rollout.simulate import TrafficSettings, refuse_another_policy
 from tasks.stages import FOLLOW_UP_BEFORE, HUMAN_BEFORE, Rejected
 from tasks.subscores import OF_ONE_PLAN
 from tasks.world.arrays import Array

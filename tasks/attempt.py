@@ -9,12 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.experts.pdm_closed.planner import PdmClosed, PdmPlan, PdmSettings, plan_for
-from tasks.experts.pdm_closed.proposals import MIN_PROGRESS_M, path_length_m
+from tasks.experts.pdm_closed import MIN_PROGRESS_M, PdmClosed, PdmPlan, PdmSettings, path_length_m, plan_for
 from tasks.experts.protocol import Expert, Plan
-from tasks.reward.ends import end_fault
-from tasks.reward.epdms import Scores, score
-from tasks.reward.prepare import PreparedScene, prepare_scene
+from tasks.reward.epdms import PreparedScene, Scores, prepare_scene, score
+from tasks.reward.labels import end_fault
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.settings import ExpertGate

@@ -1,9 +1,99 @@
-"""Where this user's caches lie."""
+"""Where this user's caches lie, and cache files that carry a checksum: what was damaged on disk is found before use.
 
+    <content> <SEAL> <sha256 of the content and of the file's key, 32 bytes>
+
+The key is what a file is looked for by, such as its name: a whole file that stands under the key of another is damaged.
+Files that have none are found by whoever names them. Formats that are read from their front, or that find their end
+themselves, such as npz, stay readable with it. JSON carries its own in a member. A checksum finds damage; it does not
+keep out who writes into the folder.
+"""
+
+import hashlib
+import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 
 def user_cache() -> Path:
     """The project's folder in the user's cache (XDG base directories); everything in it can be made again."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "driving-data-factory"
+
+
+SEAL = b"\nsha256\n"
+SEAL_BYTES = len(SEAL) + 32
+MEMBER = "sha256"  # of JSON
+
+
+class Damaged(ValueError):
+    """A file is not as it was written: cut, or overwritten."""
+
+
+def sealed(content: bytes, key: str = "") -> bytes:
+    """What to write."""
+    return content + SEAL + _keyed(hashlib.sha256(content), key)
+
+
+def unsealed(data: bytes, key: str = "") -> bytes:
+    """The content of what was read under a key. Raises Damaged."""
+    content = data[:-SEAL_BYTES]
+    _compare(hashlib.sha256(content), data[-SEAL_BYTES:], key)
+    return content
+
+
+def seal(path: Path, key: str = "") -> None:
+    """Appends the seal to a file that is written."""
+    with path.open("rb") as file:
+        sha = hashlib.file_digest(file, "sha256")
+    with path.open("ab") as file:
+        file.write(SEAL + _keyed(sha, key))
+
+
+def check(path: Path, key: str = "") -> None:
+    """Holds a large file against its seal without having it in memory. Raises Damaged, OSError."""
+    left, sha = path.stat().st_size - SEAL_BYTES, hashlib.sha256()
+    with path.open("rb") as file:
+        while left > 0:
+            block = file.read(min(left, 2**20))
+            if not block:
+                break
+            sha.update(block)
+            left -= len(block)
+        _compare(sha, file.read(), key)
+
+
+def sealed_json(members: Mapping[str, Any]) -> str:
+    """As text for people too, the checksum last."""
+    return json.dumps({**members, MEMBER: _json_digest(members)}, indent=1)
+
+
+def unsealed_json(text: bytes) -> dict[str, Any]:
+    """The opposite. Raises Damaged."""
+    try:
+        members: dict[str, Any] = json.loads(text)
+        stated = members.pop(MEMBER)
+        if sealed_json(members) != text.decode():  # its own words alone: a changed space is damage too
+            raise Damaged(f"its checksum is not the stated {stated}")
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise error if isinstance(error, Damaged) else Damaged("no JSON with a checksum") from error
+    return members
+
+
+def _json_digest(members: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(members).encode()).hexdigest()
+
+
+def _keyed(sha: "hashlib._Hash", key: str) -> bytes:
+    if not key:
+        return sha.digest()
+    both = sha.copy()
+    both.update(b"\x1f" + key.encode())
+    return both.digest()
+
+
+def _compare(sha: "hashlib._Hash", stated: bytes, key: str) -> None:
+    if len(stated) < SEAL_BYTES or not stated.startswith(SEAL):
+        raise Damaged("it does not end with a checksum")
+    if stated != SEAL + _keyed(sha, key):
+        raise Damaged(f"its checksum is another than when it was written{' under this name' if key else ''}")

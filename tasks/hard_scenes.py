@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tasks.attempt import Judged, Timed, drive_and_judge, has_route, judge, perturbed_scene
-from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
+from tasks.experts.pdm_closed import PdmSettings, plan_for
 from tasks.experts.protocol import Plan
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import FOLLOW_UP_BEFORE, HUMAN_BEFORE, Rejected

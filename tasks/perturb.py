@@ -15,9 +15,8 @@ from itertools import islice
 
 import numpy as np
 
-from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
-from tasks.reward.epdms import Scores, score
-from tasks.reward.prepare import among, prepare_scene
+from tasks.experts.pdm_closed import PdmSettings, plan_for
+from tasks.reward.epdms import Scores, among, prepare_scene, score
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tasks.settings import PerturbSettings

@@ -1,9 +1,18 @@
-"""The sub-scores of EPDMS, a record each: what every other place that lists them is drawn from.
+"""The sub-scores of EPDMS, a record each, and what they weigh: what every other place that lists them is drawn from.
 
-A sub-score is its record here and its rule, which tasks/reward/verdicts.py calls; docs/extend.md says how to add one.
+A sub-score is its record here and its rule, which tasks/reward/epdms.py calls; docs/extend.md says how to add one.
+Light: no numpy.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
+from operator import add, mul
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
@@ -39,3 +48,23 @@ LABELLED = (*JUDGED, "ep")  # of every trajectory of a vocabulary
 HALVES = tuple(record.name for record in RECORDS if record.levels == THREE)
 WHOLES = tuple(name for name in JUDGED if name not in HALVES)
 INDEX = {record.name: record.index or f"{record.name}_index" for record in RECORDS if record.name in JUDGED}
+
+
+# What sub-scores weigh in a score, and what progress counts as (docs/reward.md 2k).
+
+_IN_ORDER = sorted(RECORDS, key=lambda record: record.section)
+MULTIPLIERS = tuple(record.name for record in _IN_ORDER if record.weight is None)
+WEIGHTS = {record.name: record.weight for record in _IN_ORDER if record.weight is not None}
+EC_WEIGHT = WEIGHTS.pop("ec")  # which takes two plans: a score has it or has it not
+TOTAL_WEIGHT = sum(WEIGHTS.values())
+PROGRESS_THRESHOLD_M = 5.0
+
+
+def multiplied(scores: Mapping[str, "NDArray[np.float64]"]) -> "NDArray[np.float64]":
+    """What the weighted mean is multiplied by (K,), of sub-scores (K,) by name."""
+    return reduce(mul, (scores[name] for name in MULTIPLIERS))
+
+
+def weighted(scores: Mapping[str, "NDArray[np.float64]"]) -> "NDArray[np.float64]":
+    """The weighted sum (K,) of sub-scores (K,) of one plan by name; its mean is over TOTAL_WEIGHT."""
+    return reduce(add, (weight * scores[name] for name, weight in WEIGHTS.items()))

@@ -4,9 +4,8 @@ from typing import Literal
 
 import numpy as np
 
-from tasks.experts.pdm_closed.planner import plan_for
-from tasks.reward.epdms import Scores, rows, score
-from tasks.reward.prepare import N_TIMES, prepare_scene
+from tasks.experts.pdm_closed import plan_for
+from tasks.reward.epdms import N_TIMES, Scores, prepare_scene, rows, score
 from tasks.rollout.lqr import track
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, Scene, scene_of_clip

@@ -25,8 +25,7 @@ from planners.training.checkpoint import load_planner
 from planners.training.train import main as train_main
 from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import cache_dir
-from tasks.rollout.policy import traffic_record
-from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
+from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out, traffic_record
 from tasks.stages import Rejected
 from tasks.world.clip import scene_of_clip
 from tests.tasks.rollout import worlds

@@ -22,18 +22,7 @@ FORBIDDEN = {
 # Of each package the rooms from the ground up: a module imports from its own room and those below it.
 ROOMS = {
     "tasks": (
-        *(
-            "caches",
-            "sealed",
-            "subscores",
-            "stages",
-            "settings",
-            "kernels",
-            "world",
-            "rollout",
-            "reward.rules",
-            "reward",
-        ),
+        *("caches", "subscores", "stages", "settings", "kernels", "world", "rollout", "reward"),
         *("experts", "perturb", "attempt", "hard_scenes", "trajectories"),
         *("render.settings", "render.splatting", "render.scene", "render.rig", "render.fit", "render"),
     ),

@@ -27,7 +27,7 @@ from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.verify import damaged_logs, restore_logs, verify
 from planners.training.checkpoint import load_planner, load_training, save_checkpoint
-from tasks.experts.recovery.expert import RecoveryTable
+from tasks.experts.recovery import RecoveryTable
 from tests.factory.stages.test_scene_file import scene
 from tests.factory.toy import ToyWork, refs
 from tests.planners.toy import Toy, ToySettings

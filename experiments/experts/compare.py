@@ -23,8 +23,8 @@ from factory.setup.settings import assemble
 from tasks.attempt import perturbed_scene, verdict
 from tasks.experts.protocol import Plan
 from tasks.hard_scenes import BEFORE_STEPS
+from tasks.reward.comfort import extended_comfort
 from tasks.reward.epdms import score_with_ec
-from tasks.reward.rules.comfort import extended_comfort
 from tasks.rollout.lqr import track
 from tasks.stages import Rejected
 from tasks.world.arrays import Array

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from factory.files import matching_below
-from tasks.sealed import Damaged, sealed_json, unsealed_json
+from tasks.caches import Damaged, sealed_json, unsealed_json
 
 log = logging.getLogger(__name__)
 

@@ -30,17 +30,16 @@ from factory.setup.vocabulary import (
 )
 from factory.stages.sensors import chosen_cameras, masks_digest, refuse_unknown_masks
 from factory.store.schema import UNLISTED, RunIdentity, canonical_json
-from tasks.caches import user_cache
+from tasks.caches import check, user_cache
 from tasks.experts.protocol import Expert, tried_once
-from tasks.experts.recovery.expert import Recovery, RecoverySettings, RecoveryTable
+from tasks.experts.recovery import Recovery, RecoverySettings, RecoveryTable
 from tasks.render.fit.losses import BadWeights, lpips_of
 from tasks.render.rigs import RIGS
 from tasks.render.scene import engine
 from tasks.render.settings import RenderMode
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling
-from tasks.rollout.policy import traffic_record
-from tasks.sealed import check
+from tasks.rollout.simulate import traffic_record
 from tasks.settings import PdmSettings
 from tasks.stages import FRAMES, stage_versions
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories

@@ -18,8 +18,8 @@ import pyarrow.parquet as pq
 from factory.files import atomic_file
 from factory.readers.base import BadClip, ClipReader
 from factory.readers.validate import read_clip
-from tasks.experts.recovery.expert import RecoveryTable
-from tasks.sealed import seal
+from tasks.caches import seal
+from tasks.experts.recovery import RecoveryTable
 from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, STEP_S
 from tasks.world.vocabulary import Vocabulary, checked_trajectories, cluster, human_windows, trajectories_digest

@@ -36,6 +36,7 @@ from factory.stages.sensors import (
 )
 from factory.store.location import Location
 from factory.wording import time_text
+from tasks.caches import Damaged, check, seal
 from tasks.render.fit.losses import Lpips, lpips_of
 from tasks.render.fit.reconstruct import advance, backend_of, finish
 from tasks.render.fit.start import prepare
@@ -46,7 +47,6 @@ from tasks.render.scene.movers import lifted
 from tasks.render.scene.sensed import own_bodies
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
 from tasks.render.settings import Backend, FitSettings, RenderSettings, SceneDtype, SceneFrom
-from tasks.sealed import Damaged, check, seal
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import AgentTracks, Block, Camera, Clip, SensorFile, of_other_log, own_name
 

@@ -16,13 +16,13 @@ import numpy as np
 from factory.files import atomic_file
 from factory.stages.scene_file import CALIBRATED
 from factory.stages.sensors import NO_MASKS, SensorData, opened_photos, poses_of, taken_by
+from tasks.caches import Damaged, sealed_json, unsealed_json
 from tasks.render.rig.correct import Correction, corners_of, corrected, ground_below, hidden_by
 from tasks.render.scene.asset import TakenFrom, rises_of
 from tasks.render.scene.driven_road import driven_roads
 from tasks.render.scene.features import Known
 from tasks.render.scene.movers import lifted
 from tasks.render.settings import Adjust, RigSettings
-from tasks.sealed import Damaged, sealed_json, unsealed_json
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import AgentTracks, Block, Camera, SensorFile
 

@@ -20,19 +20,15 @@ from factory.exits import become_worker, terminal_signals_blocked
 from factory.files import locked
 from factory.graph.steps import NotReady
 from tasks.attempt import drive_and_judge
-from tasks.experts.pdm_closed.proposals import forecast, proposals
+from tasks.caches import Damaged, sealed, unsealed
+from tasks.experts.pdm_closed import forecast, proposals
 from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole
 from tasks.render import warm as render_warm
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
-from tasks.reward.ends import hit_after_s
-from tasks.reward.epdms import score
-from tasks.reward.labels import Labelling, reactive_scores, vocabulary_labels
-from tasks.reward.prepare import prepare_scene
-from tasks.reward.verdicts import INDEX_FROM_ROWS
-from tasks.rollout.policy import SeenTraffic
-from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
-from tasks.sealed import Damaged, sealed, unsealed
+from tasks.reward.epdms import INDEX_FROM_ROWS, prepare_scene, score
+from tasks.reward.labels import Labelling, hit_after_s, reactive_scores, vocabulary_labels
+from tasks.rollout.simulate import SeenTraffic, TrafficSettings, prepare_traffic, simulate
 from tasks.settings import PdmSettings
 from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, AgentKind, AgentTracks, Clip, Scene, scene_of_clip

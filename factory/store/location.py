@@ -26,7 +26,7 @@ from pyarrow import fs
 from factory.files import atomic_file, in_submitted_job, is_data
 from factory.store.schema import TableSpec
 from factory.wording import one_line
-from tasks.sealed import Damaged, sealed, unsealed
+from tasks.caches import Damaged, sealed, unsealed
 
 if TYPE_CHECKING:
     from tasks.hard_scenes import BenchmarkClip, GivenScenes, OneStageClip
@@ -277,7 +277,7 @@ def raising_damaged_file(path: str) -> Iterator[None]:
 #
 # A file is a plain zip of arrays (npz, no pickle) plus one JSON tree that says how frozen dataclasses, tuples, dicts
 # and arrays nest. Reading it builds only dataclasses and enums of this distribution, by their fields, and nothing
-# else. A seal (tasks.sealed) stands behind the zip; a damaged or foreign file counts as missing, with the reason.
+# else. A seal (tasks.caches) stands behind the zip; a damaged or foreign file counts as missing, with the reason.
 
 FORMAT = 1
 PACKAGES = ("tasks.", "factory.")  # whose dataclasses and enums a file may name

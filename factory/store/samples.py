@@ -31,7 +31,7 @@ from factory.store.schema import (
     why_other_schema,
 )
 from factory.store.table import Bytes, Codes, Ints, KeyedTable, distinct_rows, fixed_bytes, text_codes
-from tasks.sealed import MEMBER, sealed_json, unsealed_json
+from tasks.caches import MEMBER, sealed_json, unsealed_json
 
 # What became of attempts: the tables `outcomes`, `candidates` and `plans`, and the history that a run goes on from.
 

@@ -44,7 +44,7 @@ from factory.store.location import (
 )
 from factory.store.schema import TableSpec
 from factory.wording import one_line
-from tasks.sealed import Damaged, sealed, unsealed
+from tasks.caches import Damaged, sealed, unsealed
 
 # Texts of millions of rows as integers: a number for each different text.
 

@@ -37,7 +37,7 @@ from pyarrow import fs
 from factory.files import locked
 from factory.store.location import raising_damaged_file
 from factory.store.reader import TIME_TOLERANCE_S, group_rows, sample_table
-from tasks.sealed import Damaged, sealed, unsealed
+from tasks.caches import Damaged, sealed, unsealed
 from tasks.world.arrays import Ints
 
 FOOTER_BYTES = 2**25  # as they are stored; parsed they take eight times that

@@ -11,7 +11,7 @@ from factory.store.reader import Sample
 from planners.evaluation.planner_names import EvaluatedPlanner, needs_of
 from planners.evaluation.planning import plans_of
 from planners.evaluation.scoring import human_plans, pdm_plans
-from tasks.experts.pdm_closed.planner import PdmClosed
+from tasks.experts.pdm_closed import PdmClosed
 from tasks.experts.protocol import Plan
 from tasks.settings import PdmSettings
 from tasks.world.arrays import Array

@@ -13,8 +13,7 @@ import numpy as np
 from planners.drive.drivers import DriveEnd, Driver
 from planners.drive.eyes import Eyes, Images, NoEyes, Sight
 from planners.drive.starts import DriveStart
-from tasks.reward.epdms import Scores, score
-from tasks.reward.prepare import prepare_scene
+from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.world.arrays import Array, Bools, Ints

@@ -6,7 +6,7 @@ import numpy as np
 
 from planners.drive.drivers import DriveEnd
 from planners.drive.loop import ClosedLoop
-from tasks.reward.rules.comfort import comfortable
+from tasks.reward.comfort import comfortable
 from tasks.world.clip import STEP_S
 from tasks.world.frames import X, Y
 

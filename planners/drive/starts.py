@@ -13,10 +13,10 @@ import numpy as np
 
 from planners.evaluation.frames import NO_CANDIDATE
 from tasks.attempt import drive_and_judge, has_route, perturbed_scene
-from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
+from tasks.experts.pdm_closed import PdmSettings, plan_for
 from tasks.experts.protocol import Plan
 from tasks.perturb import Perturbation
-from tasks.rollout.roles import stands_always
+from tasks.rollout.lane_following import stands_always
 from tasks.settings import TrafficSettings
 from tasks.world.arrays import Array
 from tasks.world.clip import MOVING_KINDS, PER_STEP, STEP_S, AgentTracks, Clip, Scene, scene_of_clip

@@ -25,7 +25,7 @@ from planners.drive.table import DriveKey, DriveRow
 from planners.evaluation.planner_names import planner_of
 from tasks.perturb import Perturbation, perturb
 from tasks.render.settings import RenderSettings
-from tasks.rollout.policy import traffic_record
+from tasks.rollout.simulate import traffic_record
 from tasks.stages import stage_versions
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, stream
 from tasks.world.vocabulary import Vocabulary

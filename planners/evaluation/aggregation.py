@@ -11,8 +11,7 @@ import numpy as np
 
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow
-from tasks.reward.one_stage import COLUMNS, FrameScores, means_of
-from tasks.reward.two_stage import Group, TwoStageScores, aggregate, is_uniform
+from tasks.reward.aggregate import COLUMNS, FrameScores, Group, TwoStageScores, aggregate, is_uniform, means_of
 from tasks.world.arrays import Array
 
 HumanFilter = Literal["unfiltered", "filtered"]
@@ -51,7 +50,7 @@ class ClipResult:
 
 @dataclass(frozen=True)
 class Summary:
-    """Means over clips; columns tasks.reward.one_stage.COLUMNS."""
+    """Means over clips; columns tasks.reward.aggregate.COLUMNS."""
 
     n_clips: int
     n_two_stage: int  # clips with follow-ups

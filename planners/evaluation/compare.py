@@ -26,7 +26,7 @@ from planners.evaluation.aggregation import ClipResult, Measured, by_clip, check
 from planners.evaluation.bootstrap import LEVELS, Interval, clusters_of, paired_interval
 from planners.evaluation.score_rows import read_record, read_rows
 from planners.evaluation.score_table import FILTERS_NOTE
-from tasks.reward.one_stage import COLUMNS
+from tasks.reward.aggregate import COLUMNS
 
 
 @dataclass(frozen=True)

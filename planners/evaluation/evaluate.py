@@ -57,9 +57,8 @@ from planners.evaluation.scoring import (
     score_lone,
 )
 from planners.evaluation.tags import TAG_COLUMNS, tags_of
-from tasks.experts.pdm_closed.planner import PdmSettings
-from tasks.rollout.policy import traffic_record
-from tasks.rollout.simulate import TrafficSettings
+from tasks.experts.pdm_closed import PdmSettings
+from tasks.rollout.simulate import TrafficSettings, traffic_record
 from tasks.stages import stage_versions
 from tasks.world.arrays import Array
 

@@ -39,9 +39,8 @@ from planners.evaluation.aggregation import HumanFilter, Measured, Summary, by_c
 from planners.evaluation.bootstrap import Interval
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow
-from tasks.reward.formula import EC_WEIGHT, TOTAL_WEIGHT, multiplied, weighted
-from tasks.reward.one_stage import COLUMNS, FrameScores, means_over
-from tasks.subscores import RECORDS
+from tasks.reward.aggregate import COLUMNS, FrameScores, means_over
+from tasks.subscores import EC_WEIGHT, RECORDS, TOTAL_WEIGHT, multiplied, weighted
 from tasks.world.arrays import Array
 
 SPLITS: Mapping[str, str] = {"navhard": "navhard_two_stage", "navtest": "navtest"}  # name -> its split's file

@@ -23,8 +23,8 @@ from planners.evaluation.frames import Benchmark, FrameKey, Pair
 from planners.evaluation.planner_names import EvaluatedPlanner, composed, planner_of
 from planners.evaluation.planning import plans_of
 from planners.evaluation.scoring import ClipFrames, PreparedPair, Rules, prepare_clip, score_pair
-from tasks.experts.pdm_closed.planner import PdmSettings
-from tasks.reward.one_stage import COLUMNS, FrameScores
+from tasks.experts.pdm_closed import PdmSettings
+from tasks.reward.aggregate import COLUMNS, FrameScores
 from tasks.rollout.simulate import TrafficSettings, roll_out
 from tasks.world.arrays import Array, Image
 from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS, STEP_S, Rollout

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from factory.config.compose import ConfigError
 from planners.evaluation.frames import FrameKey
-from tasks.reward.one_stage import COLUMNS, FrameScores
+from tasks.reward.aggregate import COLUMNS, FrameScores
 from tasks.world.arrays import Array
 
 ScoreStage = Literal["one_stage", "stage_one", "stage_two"]
@@ -32,7 +32,7 @@ class FrameRow:
 
     stage: ScoreStage
     key: FrameKey
-    scores: FrameScores  # tasks.reward.one_stage.COLUMNS; NaN: not defined
+    scores: FrameScores  # tasks.reward.aggregate.COLUMNS; NaN: not defined
     progress_m: float  # along the route, of the drive
     start: Array  # (3,) rear axle of the frame, world
     end: Array  # (3,) last pose of the plan as predicted, world; NaN: no plan

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from planners.evaluation.aggregation import SummaryLine
-from tasks.reward.one_stage import COLUMNS
+from tasks.reward.aggregate import COLUMNS
 from tasks.world.arrays import Image
 
 HEAD = ("planner", "stage", "human_filter", *COLUMNS, "clips", "frames", "uniform_share", "uniform_share_before")

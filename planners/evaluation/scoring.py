@@ -13,12 +13,10 @@ import numpy as np
 
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair, Pair
 from planners.evaluation.score_rows import FrameRow, ScoreStage
-from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
-from tasks.reward.epdms import Scores, rows, score
-from tasks.reward.one_stage import COLUMNS, FrameScores, frame_scores
-from tasks.reward.prepare import N_TIMES, PreparedScene, among, prepare_scene
-from tasks.reward.rules.comfort import extended_comfort
-from tasks.reward.two_stage import follow_up_weights
+from tasks.experts.pdm_closed import PdmSettings, plan_for
+from tasks.reward.aggregate import COLUMNS, FrameScores, follow_up_weights, frame_scores
+from tasks.reward.comfort import extended_comfort
+from tasks.reward.epdms import N_TIMES, PreparedScene, Scores, among, prepare_scene, rows, score
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffic, roll_out
 from tasks.trajectories import at_ten_hz

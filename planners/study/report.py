@@ -40,7 +40,7 @@ from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow, read_rows
 from planners.evaluation.score_table import FILTERS_NOTE
 from planners.study.setups import Comparison, Setup, words_of
-from tasks.reward.one_stage import COLUMNS, FrameScores
+from tasks.reward.aggregate import COLUMNS, FrameScores
 
 FRAMES = "frames.parquet"
 META = b"study"

@@ -31,7 +31,7 @@ from factory.config.shapes import plain
 from factory.readers.pickles import load_tensors
 from factory.wording import one_line
 from planners.models.planner import Planner, PlannerChoice, build_planner, planner_class
-from tasks.sealed import sealed_json, unsealed_json
+from tasks.caches import sealed_json, unsealed_json
 from tasks.world.arrays import FloatArray
 
 FOLDER = "checkpoints"

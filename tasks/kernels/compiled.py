@@ -33,8 +33,7 @@ from numba.core.registry import cpu_target
 from numba.core.serialize import dumps
 from numpy.typing import NDArray
 
-from tasks.caches import user_cache
-from tasks.sealed import Damaged, sealed, unsealed
+from tasks.caches import Damaged, sealed, unsealed, user_cache
 
 F = TypeVar("F", bound=Callable[..., Any])
 log = logging.getLogger(__name__)

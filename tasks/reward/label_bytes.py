@@ -14,8 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tasks.reward.formula import PROGRESS_THRESHOLD_M, TOTAL_WEIGHT, multiplied, weighted
-from tasks.subscores import HALVES, JUDGED, WHOLES
+from tasks.subscores import HALVES, JUDGED, PROGRESS_THRESHOLD_M, TOTAL_WEIGHT, WHOLES, multiplied, weighted
 from tasks.world.arrays import Array, Bools, Bytes
 
 Normalise = Literal["pairs", "batch", "masked"]

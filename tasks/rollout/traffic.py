@@ -18,20 +18,7 @@ import numpy as np
 
 from tasks.kernels.compiled import hidden_kernel, kernel
 from tasks.rollout.corridor import Paths, pose_on_path, project_on_path
-from tasks.rollout.idm import IdmDriver, advance
-from tasks.rollout.rules import (
-    braked_for,
-    cell_of,
-    due_path,
-    far_from_ego,
-    hardest_acceleration,
-    is_clear,
-    road_acceleration,
-    start_on,
-    touches_driven,
-    way_of,
-)
-from tasks.rollout.traffic_state import (
+from tasks.rollout.idm import (
     ABSENT,
     DRIVEN,
     EGO,
@@ -40,13 +27,25 @@ from tasks.rollout.traffic_state import (
     STANDING,
     AgentStates,
     Diverged,
+    IdmDriver,
     Motion,
     Roles,
     RolloutRows,
     Yielding,
+    advance,
+    braked_for,
+    cell_of,
+    due_path,
     empty_motion,
     empty_rows,
+    far_from_ego,
+    hardest_acceleration,
+    is_clear,
     nobody_diverged,
+    road_acceleration,
+    start_on,
+    touches_driven,
+    way_of,
 )
 from tasks.rollout.yielding import has_way, intended_acceleration, turned_at, yields_for
 from tasks.world.arrays import Array, Bools

@@ -6,10 +6,22 @@ from typing import NamedTuple
 import numpy as np
 
 from tasks.kernels.compiled import inner_kernel, kernel
-from tasks.rollout.corridor import CELLS, PATH_SPACING_M, Paths, boxes_overlap, project_on_path
-from tasks.rollout.idm import CLOSED, IdmDriver, following_acceleration, free_acceleration, stop_line_gap
-from tasks.rollout.roles import NEVER, STANDS_BELOW_MPS
-from tasks.rollout.traffic_state import DRIVEN, REPLAYED, AgentStates, Diverged, Motion, Roles, RolloutRows, Yielding
+from tasks.rollout.corridor import CELLS, CLOSED, PATH_SPACING_M, Paths, boxes_overlap, project_on_path
+from tasks.rollout.idm import (
+    DRIVEN,
+    REPLAYED,
+    AgentStates,
+    Diverged,
+    IdmDriver,
+    Motion,
+    Roles,
+    RolloutRows,
+    Yielding,
+    following_acceleration,
+    free_acceleration,
+    stop_line_gap,
+)
+from tasks.rollout.lane_following import NEVER, STANDS_BELOW_MPS
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene
 from tasks.world.geometry import wrapped

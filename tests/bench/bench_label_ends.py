@@ -23,7 +23,7 @@ from factory.pipeline import FactoryWork
 from factory.readers.base import ClipRef
 from factory.setup.settings import assemble
 from tasks.attempt import Judged, end_verdict, verdict
-from tasks.reward.ends import hit_after_s
+from tasks.reward.labels import hit_after_s
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffic
 from tasks.settings import ExpertGate
 from tasks.stages import END_FAULTS, Rejected

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import ClipReader
-from tasks.rollout.roles import stands_always
+from tasks.rollout.lane_following import stands_always
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentKind, AgentTracks, Clip, Rollout, scene_of_clip
 from tasks.world.frames import PACIFICA

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.datasets.town.reader import SyntheticReader
-from tasks.reward.epdms import Scores, score
-from tasks.reward.prepare import N_TIMES, PAST_STEPS, PreparedScene, prepare
+from tasks.reward.epdms import N_TIMES, PAST_STEPS, PreparedScene, Scores, prepare, score
 from tasks.rollout.lqr import track
 from tasks.world.clip import NOW, scene_of_clip
 from tasks.world.frames import PACIFICA, to_world

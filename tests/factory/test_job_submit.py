@@ -18,8 +18,8 @@ import pytest
 
 from factory.stages.warm import compile_kernels, marker
 from factory.store.reader import SampleTable
+from tasks.caches import unsealed
 from tasks.kernels.compiled import cache_dir
-from tasks.sealed import unsealed
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 

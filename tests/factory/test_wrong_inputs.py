@@ -116,7 +116,7 @@ WRONG = [
         "clips=custom", "clips._target_=factory.datasets.av3.Reader", says=["factory.datasets has no av3", "mean av2?"]
     ),
     run("clips=custom", "clips._target_=a_module.Reader", says=["a_module cannot be imported: KeyError: 'x'"]),
-    run("+expert.x._target_=tasks.experts.human.Humann", "experts=[x]", says=["has no Humann; did you mean Human?"]),
+    run("+expert.x._target_=tasks.experts.protocol.Humann", "experts=[x]", says=["has no Humann; did you mean Human?"]),
     run(
         "clips=av2", "clips.root=a_log", "render=auto", "render.cameras=[nope]", says=["this rig has ring_front_center"]
     ),

@@ -6,7 +6,7 @@ import numpy as np
 
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow, ScoreStage
-from tasks.reward.one_stage import COLUMNS, FrameScores
+from tasks.reward.aggregate import COLUMNS, FrameScores
 
 
 def row(

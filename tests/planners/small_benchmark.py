@@ -15,7 +15,7 @@ from factory.store.samples import Store
 from factory.store.schema import COLUMNS, SAMPLES, sample_row_to_table
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair
 from tasks.attempt import drive_and_judge
-from tasks.experts.pdm_closed.planner import PdmSettings
+from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.hard_scenes import BEFORE_STEPS, BenchmarkClip
 from tasks.rollout.simulate import TrafficSettings, simulate

@@ -7,7 +7,7 @@ from types import ModuleType
 
 import numpy as np
 
-from tasks.reward.prepare import PreparedScene, prepare
+from tasks.reward.epdms import PreparedScene, prepare
 from tasks.world.clip import AgentKind, AgentTracks
 from tasks.world.road_map import MapLayer, MapPolygon
 

@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from factory.datasets.av2.reader import AV2Reader
 from tasks.attempt import ExpertGate, Judged, attempt, perturbed_scene
-from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings, plan_for
+from tasks.experts.pdm_closed import PdmClosed, PdmSettings, plan_for
 from tasks.experts.protocol import Expert
-from tasks.experts.recovery.expert import Recovery, RecoveryTable
+from tasks.experts.recovery import Recovery, RecoveryTable
 from tasks.perturb import Perturbation, PerturbSettings, gate_failures, grid_cells, perturb
-from tasks.reward.epdms import score
-from tasks.reward.prepare import prepare_scene
+from tasks.reward.epdms import prepare_scene, score
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.stages import Rejected

@@ -10,9 +10,9 @@ from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import ClipReader
 from tasks.attempt import ExpertGate, Judged, attempt, end_verdict, human_sample, perturbed_scene
-from tasks.experts.human import Human
-from tasks.experts.pdm_closed.planner import PdmSettings
-from tasks.experts.recovery.expert import Recovery, RecoveryTable
+from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.protocol import Human
+from tasks.experts.recovery import Recovery, RecoveryTable
 from tasks.perturb import Perturbation, PerturbSettings, perturb
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic
 from tasks.stages import Rejected

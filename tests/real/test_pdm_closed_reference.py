@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tasks.experts.pdm_closed.planner import PdmPlan, PdmSettings, plan_pdm_closed
+from tasks.experts.pdm_closed import PdmPlan, PdmSettings, plan_pdm_closed
 from tasks.world.clip import AgentKind, AgentTracks
 from tasks.world.frames import wrap_angle
 from tasks.world.road_map import MapLayer, MapPolygon

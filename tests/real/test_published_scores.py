@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from planners.evaluation.compare import main
 from planners.evaluation.navsim import read_table
+from tasks.reward.aggregate import COLUMNS, FrameScores, columns_of, means_over
 from tasks.reward.epdms import Scores
-from tasks.reward.one_stage import COLUMNS, FrameScores, columns_of, means_over
 from tasks.subscores import RECORDS
 
 Array = NDArray[np.float64]

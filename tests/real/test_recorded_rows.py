@@ -24,7 +24,7 @@ from planners.evaluation.evaluate import main
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.navsim import LONG, read_table
 from tasks.hard_scenes import OneStageClip
-from tasks.reward.one_stage import COLUMNS
+from tasks.reward.aggregate import COLUMNS
 from tasks.world.clip import scene_of_clip
 from tests.planners.small_benchmark import sample
 

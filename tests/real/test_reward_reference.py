@@ -10,8 +10,8 @@ from reference_scenes import RECORDED_K, SCENES, loader, prepared_scene, tracks,
 
 from factory.datasets.av2.reader import AV2Reader, log_folders
 from factory.readers.base import ClipRef
+from tasks.reward.comfort import extended_comfort
 from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_ec
-from tasks.reward.rules.comfort import extended_comfort
 from tasks.rollout.lqr import track
 from tasks.subscores import JUDGED, RECORDS
 from tasks.trajectories import score_trajectories

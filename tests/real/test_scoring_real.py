@@ -15,7 +15,7 @@ from factory.datasets.av2.reader import AV2Reader, log_folders
 from factory.readers.base import ClipRef
 from planners.evaluation.frames import Pair
 from planners.evaluation.scoring import PreparedFrame, Rules, prepare_frame, score_pair
-from tasks.reward.one_stage import COLUMNS
+from tasks.reward.aggregate import COLUMNS
 from tasks.rollout.simulate import TrafficSettings
 from tasks.world.clip import NOW, STEP_S, scene_of_clip
 from tasks.world.frames import to_local

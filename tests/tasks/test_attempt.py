@@ -7,12 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from tasks.attempt import ExpertGate, Judged, attempt, human_sample, perturbed_scene, verdict
-from tasks.experts.human import Human
-from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
-from tasks.experts.protocol import Expert, Plan
-from tasks.experts.recovery.expert import Recovery, RecoveryTable
-from tasks.reward.ends import BRAKING_MPS2, hit_after_s
+from tasks.experts.pdm_closed import PdmClosed, PdmSettings
+from tasks.experts.protocol import Expert, Human, Plan
+from tasks.experts.recovery import Recovery, RecoveryTable
 from tasks.reward.epdms import Scores
+from tasks.reward.labels import BRAKING_MPS2, hit_after_s
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.stages import END_FAULTS, STAGES, Rejected
 from tasks.subscores import JUDGED

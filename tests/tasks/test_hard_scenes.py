@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tasks.attempt import Judged, perturbed_scene
-from tasks.experts.human import Human
-from tasks.experts.pdm_closed.planner import PdmSettings
+from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.protocol import Human
 from tasks.hard_scenes import BenchmarkClip, follow_up, frame_digest, half_a_second_before
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import FRAMES, Rejected

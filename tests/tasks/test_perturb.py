@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
+from tasks.experts.pdm_closed import PdmSettings, plan_for
 from tasks.perturb import (
     Perturbation,
     PerturbSettings,
@@ -19,8 +19,7 @@ from tasks.perturb import (
     perturb,
     spread_out,
 )
-from tasks.reward.epdms import score
-from tasks.reward.prepare import prepare_scene
+from tasks.reward.epdms import prepare_scene, score
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.stages import STAGES, Rejected
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip, stream

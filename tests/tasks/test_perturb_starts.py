@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from tasks.experts.pdm_closed.planner import PdmSettings
+from tasks.experts.pdm_closed import PdmSettings
 from tasks.perturb import NO_STARTS, Candidate, Perturbation, PerturbSettings, perturb
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import Rejected

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tasks.sealed import Damaged, check, seal, sealed, sealed_json, unsealed, unsealed_json
+from tasks.caches import Damaged, check, seal, sealed, sealed_json, unsealed, unsealed_json
 
 CONTENT = bytes(range(90))
 

@@ -12,8 +12,7 @@ import pytest
 
 from tasks.reward import epdms
 from tasks.reward.epdms import N_ROWS, score
-from tasks.reward.formula import MULTIPLIERS, WEIGHTS
-from tasks.subscores import HALVES, LABELLED, RECORDS, SUBSCORES, WHOLES
+from tasks.subscores import HALVES, LABELLED, MULTIPLIERS, RECORDS, SUBSCORES, WEIGHTS, WHOLES
 from tests.tasks.reward.straight_street import drive, street
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -21,7 +20,7 @@ ADDED = {  # file -> where, and what is put before it: a record; its rule, a row
     "tasks/subscores.py": {
         '    SubScore("ec"': '    SubScore("sl", "speed_limit_compliance", "2m", "drove too fast", 3.0),\n',
     },
-    "tasks/reward/verdicts.py": {
+    "tasks/reward/epdms.py": {
         "_WHOLES = ": 'SL = LABELLED.index("sl")\n',
         "    for row in _WHOLES:": "    out.fails[SL, k] = _first_above(states, 15.0)\n",
         "@kernel\ndef _first_with(": """@kernel

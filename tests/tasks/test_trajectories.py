@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tasks.experts.pdm_closed.planner import plan_for
+from tasks.experts.pdm_closed import plan_for
 from tasks.trajectories import at_ten_hz, score_trajectories
 from tasks.world.clip import CLIP_STEPS, HISTORY_STEPS, AgentTracks, Clip, scene_of_clip
 from tasks.world.frames import VX, X, to_local

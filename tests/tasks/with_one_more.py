@@ -19,9 +19,9 @@ from planners.data.decode import BatchBuffer
 from planners.models.gtrs_dense import GtrsDenseSettings, TrajectoryScorer
 from tasks import subscores
 from tasks.attempt import ExpertGate, verdict
+from tasks.reward.aggregate import COLUMNS, columns_of
 from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_ec
 from tasks.reward.label_bytes import ARRAYS, N_PLANES, VocabularyLabels
-from tasks.reward.one_stage import COLUMNS, columns_of
 from tasks.stages import STAGES
 from tests.factory.store.formats import formats_table
 from tests.tasks.reward.straight_street import drive, street

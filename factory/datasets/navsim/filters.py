@@ -25,8 +25,8 @@ from factory.readers.apart import Apart
 from factory.readers.base import BadClip
 from factory.readers.pickles import check_values
 from factory.wording import shown
+from tasks.caches import sealed, unsealed
 from tasks.kernels.compiled import write_whole
-from tasks.sealed import sealed, unsealed
 from tasks.world.arrays import Array, Bools, Ints
 
 MAX_YAML_BYTES = 64 << 20

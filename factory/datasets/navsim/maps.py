@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from factory.files import matching
 from factory.readers.base import BadClip
-from tasks.caches import user_cache
-from tasks.sealed import check, seal
+from tasks.caches import check, seal, user_cache
 from tasks.world.arrays import Array, Ints
 from tasks.world.road_map import Lane, MapLayer, MapPolygon, RoadMap
 from tasks.world.roadblocks import Roadblocks

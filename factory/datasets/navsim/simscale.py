@@ -40,9 +40,9 @@ from factory.stages.imaging import NO_IMAGES
 from factory.stages.rows import label_columns
 from factory.wording import shown
 from tasks.render.settings import ImageSource
-from tasks.reward.formula import multiplied
 from tasks.reward.label_bytes import VocabularyLabels
 from tasks.stages import HUMAN
+from tasks.subscores import multiplied
 from tasks.world.arrays import Array
 from tasks.world.vocabulary import Vocabulary
 

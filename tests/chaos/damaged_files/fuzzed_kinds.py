@@ -26,7 +26,7 @@ from factory.stages.warm import tiny_clip
 from factory.store.episodes import Message, check_episode, episode_bytes
 from factory.store.location import BadCacheFile, decode_tree, encode_tree
 from factory.views.scene_files import background_bytes, read_splats
-from tasks.experts.recovery.expert import RecoveryTable
+from tasks.experts.recovery import RecoveryTable
 from tasks.render.splatting.project import CLASSIC
 from tasks.world.clip import SensorFile
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories

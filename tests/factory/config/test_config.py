@@ -26,7 +26,7 @@ from factory.setup.settings import (
     simulates,
 )
 from tasks.caches import user_cache
-from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
+from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.render.settings import RenderMode, RenderSettings, SceneDtype
 from tasks.rollout.simulate import TrafficSettings
 from tests.factory.data_folders import add_companions
@@ -185,7 +185,7 @@ def test_a_value_of_the_wrong_kind_is_an_error_that_names_it(override: str, mess
         load_config([override])
 
 
-PDM = "+expert.mine._target_=tasks.experts.pdm_closed.planner.PdmClosed.of_run"
+PDM = "+expert.mine._target_=tasks.experts.pdm_closed.PdmClosed.of_run"
 RECOVERY = "+expert.mine._target_=factory.setup.settings.recovery"
 
 
@@ -196,7 +196,7 @@ def built(*overrides: str) -> object:
 
 
 def test_an_expert_is_added_by_its_target_with_all_its_arguments() -> None:
-    expert = built("+expert.mine._target_=tasks.experts.human.Human", "+expert.mine.name=me")
+    expert = built("+expert.mine._target_=tasks.experts.protocol.Human", "+expert.mine.name=me")
     assert (type(expert).__name__, expert.name) == ("Human", "me")  # type: ignore[attr-defined]
 
 
@@ -204,8 +204,8 @@ def test_an_expert_is_added_by_its_target_with_all_its_arguments() -> None:
     ("overrides", "message"),
     [
         (["+expert.mine._target_=nowhere.Expert"], r"expert\.mine: .*nowhere"),
-        (["+expert.mine._target_=tasks.experts.human.Nobody"], r"expert\.mine: .*Nobody"),
-        (["+expert.mine._target_=tasks.experts.human.Human", "+expert.mine.speed=3"], r"(?s)expert\.mine: .*speed"),
+        (["+expert.mine._target_=tasks.experts.protocol.Nobody"], r"expert\.mine: .*Nobody"),
+        (["+expert.mine._target_=tasks.experts.protocol.Human", "+expert.mine.speed=3"], r"(?s)expert\.mine: .*speed"),
         (["+expert.mine._target_=collections.Counter"], r"Counter is not an expert .* no name, digest, plan"),
         (["+expert.mine.speed=3"], r"expert\.mine\._target_ is missing"),
         ([PDM, "+expert.mine.speed=3"], r"(?s)expert\.mine: .*speed"),
@@ -226,7 +226,7 @@ def test_an_expert_that_asks_for_the_run_is_told_of_it() -> None:
 
 
 def test_experts_that_are_tried_once_say_so_themselves() -> None:
-    mine = "+expert.mine._target_=tasks.experts.human."
+    mine = "+expert.mine._target_=tasks.experts.protocol."
     for target, experts, simulated in (
         ("Human", "[mine,human]", False),
         ("Logged", "[mine,human]", True),

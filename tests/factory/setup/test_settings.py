@@ -11,8 +11,8 @@ from factory.files import machine_fault_of
 from factory.setup.settings import assemble
 from factory.setup.vocabulary import save_recovery_table
 from factory.store.schema import RunIdentity
-from tasks.experts.recovery.expert import RecoveryTable
-from tasks.rollout.policy import SeenTraffic
+from tasks.experts.recovery import RecoveryTable
+from tasks.rollout.simulate import SeenTraffic
 from tasks.world.arrays import Array
 from tasks.world.vocabulary import kinematic_trajectories
 

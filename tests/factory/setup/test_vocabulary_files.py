@@ -22,7 +22,7 @@ from factory.setup.vocabulary import (
     save_recovery_table,
     train_windows,
 )
-from tasks.experts.recovery.expert import RecoveryTable
+from tasks.experts.recovery import RecoveryTable
 from tasks.world.clip import CLIP_STEPS, Clip
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.tasks.streets import street_clip

@@ -14,11 +14,11 @@ from factory.stages.rig import SAID, UsedRig, taken_from, used_rig
 from factory.stages.sensors import load_photos
 from factory.store.reader import decode_stored_image
 from tasks.attempt import Judged, human_sample
-from tasks.experts.human import Human
+from tasks.caches import unsealed_json
+from tasks.experts.protocol import Human
 from tasks.perturb import Candidate
 from tasks.render.rig.adjust import motions, twists_of
 from tasks.render.settings import Adjust, RenderSettings, RigSettings, SceneFrom
-from tasks.sealed import unsealed_json
 from tasks.settings import PdmSettings
 from tasks.world.clip import NOW, STEP_S, Camera, Clip, SensorFile, scene_of_clip
 from tests.tasks.streets import street_clip

@@ -21,10 +21,10 @@ from factory.stages.rig import SAID, _say, told_of
 from factory.stages.scene_file import BadScene, read_scene, write_scene
 from factory.stages.warm import _is_compiled, marker, tiny_clip
 from factory.store.location import BadCacheFile, Location, SceneFiles, encode_tree
-from tasks.experts.recovery.expert import RecoveryTable
+from tasks.caches import SEAL_BYTES, Damaged, seal, sealed, sealed_json, unsealed_json
+from tasks.experts.recovery import RecoveryTable
 from tasks.hard_scenes import OneStageClip
 from tasks.kernels.compiled import kernel
-from tasks.sealed import SEAL_BYTES, Damaged, seal, sealed, sealed_json, unsealed_json
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.factory.damage import damaged
 from tests.factory.datasets.navsim.geopackage_writer import stub_rows, write_root

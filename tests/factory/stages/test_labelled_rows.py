@@ -18,8 +18,7 @@ from factory.store.reader import SampleTable, labels_of
 from factory.store.schema import LABEL_COLUMNS
 from factory.views.sample_picture import SCORE_COLOURS, sample_bev
 from tasks.attempt import Judged
-from tasks.reward.epdms import Scores, score
-from tasks.reward.prepare import prepare_scene
+from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.rollout.lqr import track
 from tasks.stages import HUMAN
 from tasks.world.clip import AgentTracks

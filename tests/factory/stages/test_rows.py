@@ -9,8 +9,8 @@ from factory.stages.rows import sample_row
 from factory.store.schema import BOOKKEEPING, COLUMNS, MAP_RADIUS_M, sample_row_to_table
 from tasks.attempt import Judged, human_sample, perturbed_scene
 from tasks.attempt import drive_and_judge as judge
-from tasks.experts.human import Human
-from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
+from tasks.experts.pdm_closed import PdmClosed, PdmSettings
+from tasks.experts.protocol import Human
 from tasks.perturb import Candidate
 from tasks.rollout.simulate import TrafficSettings
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, scene_of_clip

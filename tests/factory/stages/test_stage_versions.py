@@ -18,10 +18,9 @@ from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.stages.rows import label_columns, sample_row
 from factory.store.schema import SCHEMA
 from tasks.attempt import Judged, perturbed_scene
-from tasks.experts.human import Human
-from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
-from tasks.experts.protocol import Plan
-from tasks.experts.recovery.expert import Recovery, RecoveryTable
+from tasks.experts.pdm_closed import PdmClosed, PdmSettings
+from tasks.experts.protocol import Human, Plan
+from tasks.experts.recovery import Recovery, RecoveryTable
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
 from tasks.render.gate import composed, likeness_to_photo, measures
 from tasks.render.map_drawing import draw_map_views
@@ -29,10 +28,9 @@ from tasks.render.rigs import RIGS
 from tasks.render.scene.build import AssetSettings, build_asset
 from tasks.render.scene.engine import NOBODY, render
 from tasks.render.views import render_views
-from tasks.reward.ends import BRAKING_MPS2, hit_after_s, way_on_m
-from tasks.reward.epdms import Scores, score
+from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.reward.label_bytes import VocabularyLabels
-from tasks.reward.prepare import prepare_scene
+from tasks.reward.labels import BRAKING_MPS2, hit_after_s, way_on_m
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.stages import STAGES, stage_versions
 from tasks.world.clip import HORIZON_STEPS, NOW, Camera, Clip, Pinhole, Rollout, Scene, scene_of_clip, stream

@@ -10,9 +10,9 @@ import pytest
 
 from factory.config.run import load_config, photos_alone
 from factory.stages.warm import compile_kernels, marker, parts_of
+from tasks.caches import unsealed
 from tasks.kernels.compiled import cache_dir
 from tasks.render.settings import Adjust, RenderMode, RenderSettings, RigSettings
-from tasks.sealed import unsealed
 
 pytestmark = pytest.mark.slow
 

@@ -19,8 +19,8 @@ from factory.exits import BAD_CONFIG
 from factory.store.reader import SampleTable, image_of, labels_of, to_torch
 from factory.store.samples import Store
 from factory.store.schema import LABEL_COLUMNS
+from tasks.caches import sealed_json
 from tasks.reward.label_bytes import VocabularyLabels
-from tasks.sealed import sealed_json
 from tests.factory.toy import ToyWork, executed, refs, row_of, stream
 
 

@@ -10,7 +10,7 @@ import pytest
 from planners.evaluation.aggregation import by_clip, lines_of, score_of, summarise
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow, read_rows, write_rows
-from tasks.reward.one_stage import COLUMNS, FrameScores
+from tasks.reward.aggregate import COLUMNS, FrameScores
 from tests.planners.made_rows import clip_rows, row
 
 SCORE = COLUMNS.index("score")

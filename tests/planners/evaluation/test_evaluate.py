@@ -22,7 +22,7 @@ from planners.evaluation.planning import all_plans, plans_of
 from planners.evaluation.score_rows import read_record, read_rows
 from planners.evaluation.shown import as_shown
 from planners.training.checkpoint import save_checkpoint
-from tasks.reward.one_stage import COLUMNS
+from tasks.reward.aggregate import COLUMNS
 from tests.planners.small_benchmark import StreetBenchmark, straight
 from tests.planners.toy import Toy, ToySettings
 

@@ -15,7 +15,7 @@ from planners.evaluation.frames import FrameKey
 from planners.evaluation.navsim import file_name, read_table, score_of_columns, write_tables
 from planners.evaluation.planner_names import planners_of
 from planners.evaluation.score_rows import FrameRow, read_rows
-from tasks.reward.one_stage import COLUMNS, FrameScores
+from tasks.reward.aggregate import COLUMNS, FrameScores
 from tests.planners.small_benchmark import StreetBenchmark
 
 SCORE, EC, DAC = (COLUMNS.index(name) for name in ("score", "ec", "dac"))

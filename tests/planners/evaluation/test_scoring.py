@@ -21,9 +21,9 @@ from planners.evaluation.scoring import (
     score_pair,
 )
 from tasks.attempt import drive_and_judge
-from tasks.experts.pdm_closed.planner import PdmSettings
+from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Plan
-from tasks.reward.one_stage import COLUMNS
+from tasks.reward.aggregate import COLUMNS
 from tasks.rollout.simulate import TrafficSettings
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip
 from tasks.world.frames import AX, HEADING, X, to_world

@@ -31,7 +31,7 @@ from planners.training.curves import LOSSES, VALIDATION
 from planners.training.fit import Loop, fit, total_steps
 from planners.training.optim import TrainingSettings
 from planners.training.processes import TrainingProcess
-from tasks.sealed import sealed_json
+from tasks.caches import sealed_json
 from tests.planners.toy import Toy, ToyBatches, ToySettings, toy_batch
 
 ALONE = TrainingProcess(0, 1, torch.device("cpu"))

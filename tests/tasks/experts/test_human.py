@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tasks.experts.human import Human
+from tasks.experts.protocol import Human
 from tasks.world.clip import NOW, Scene
 
 

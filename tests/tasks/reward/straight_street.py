@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.reward.prepare import PreparedScene, prepare
+from tasks.reward.epdms import PreparedScene, prepare
 from tasks.world.clip import AgentKind, AgentTracks
 from tasks.world.frames import HEADING, VX, X, Y, to_world
 from tasks.world.road_map import MapLayer, MapPolygon

@@ -6,10 +6,19 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
+from tasks.reward.aggregate import (
+    COLUMNS,
+    Group,
+    aggregate,
+    columns_of,
+    final_score,
+    follow_up_weights,
+    frame_scores,
+    group_scores,
+    means_of,
+)
 from tasks.reward.epdms import Scores, human_filtered, score, score_with_ec
-from tasks.reward.formula import MULTIPLIERS, WEIGHTS
-from tasks.reward.one_stage import COLUMNS, columns_of, final_score, frame_scores, means_of
-from tasks.reward.two_stage import Group, aggregate, follow_up_weights, group_scores
+from tasks.subscores import MULTIPLIERS, WEIGHTS
 from tests.tasks.reward.straight_street import drive, street
 
 NONE = np.nan  # no frame at most 0.55 s before

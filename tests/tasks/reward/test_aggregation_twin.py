@@ -7,9 +7,17 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tasks.reward.aggregate import (
+    COLUMNS,
+    FrameScores,
+    Group,
+    aggregate,
+    columns_of,
+    follow_up_weights,
+    frame_scores,
+    means_of,
+)
 from tasks.reward.epdms import Normalise, Scores, human_filtered, relative_progress
-from tasks.reward.one_stage import COLUMNS, FrameScores, columns_of, frame_scores, means_of
-from tasks.reward.two_stage import Group, aggregate, follow_up_weights
 from tests.tasks.reward.slow import aggregation as slow
 
 BRIEF = settings(max_examples=50)

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tasks.reward.epdms import score
-from tasks.reward.prepare import prepare
+from tasks.reward.epdms import prepare, score
 from tasks.world.road_map import MapLayer, MapPolygon
 from tests.tasks.reward.random_worlds import random_drives, random_world
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tasks.kernels.compiled import read_only
-from tasks.reward.rules.comfort import N_FLAGS, comfort_along, comfort_scratch, comfortable
+from tasks.reward.comfort import N_FLAGS, comfort_along, comfort_scratch, comfortable
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, YAW_RATE
 
 

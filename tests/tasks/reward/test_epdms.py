@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from tasks.reward.areas import index_map
 from tasks.reward.epdms import Scores, human_filtered, relative_progress, rows, score, score_with_ec
-from tasks.reward.rules.map_index import index_map
 from tasks.rollout.lqr import track
 from tasks.world.clip import AgentKind
 from tasks.world.frames import to_world

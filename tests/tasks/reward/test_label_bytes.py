@@ -12,7 +12,6 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from tasks.reward.epdms import relative_progress
-from tasks.reward.formula import MULTIPLIERS
 from tasks.reward.label_bytes import (
     CRC_BYTES,
     HALVES,
@@ -24,6 +23,7 @@ from tasks.reward.label_bytes import (
     decode,
     encode,
 )
+from tasks.subscores import MULTIPLIERS
 
 
 def labels_from(rng: np.random.Generator, k: int, reference_m: float = 20.0) -> VocabularyLabels:

@@ -7,13 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from tasks.attempt import Judged, drive_and_judge, human_sample, perturbed_scene
-from tasks.experts.human import Human
-from tasks.experts.pdm_closed.planner import PdmSettings
-from tasks.experts.protocol import Plan
-from tasks.reward.epdms import Scores, score
+from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.protocol import Human, Plan
+from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
 from tasks.reward.labels import Labelling, vocabulary_labels
-from tasks.reward.prepare import prepare_scene
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.world.clip import NOW, Scene, scene_of_clip

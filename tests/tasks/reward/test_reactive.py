@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from tasks.reward import labels
-from tasks.reward.epdms import Scores, score
+from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.reward.labels import reactive_scores
-from tasks.reward.prepare import prepare_scene
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tests.tasks.rollout.worlds import random_egos, random_scene
 

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.reward.epdms import Scores, score
-from tasks.reward.prepare import among, prepare
+from tasks.reward.epdms import Scores, among, prepare, score
 from tests.tasks.reward.random_worlds import random_drives, random_world
 from tests.tasks.reward.slow import epdms as slow
 from tests.tasks.reward.slow.prepare import prepare as slow_prepare

@@ -13,16 +13,24 @@ from numpy.typing import NDArray
 from tasks.kernels.compiled import kernel
 from tasks.rollout.corridor import PATH_SPACING_M, Paths, Way, boxes_overlap, corridor_gap, pose_on_path
 from tasks.rollout.idm import (
+    ABSENT,
+    CORRIDOR_MARGIN_M,
+    DRIVEN,
+    ENTER_CLEARANCE_M,
+    LARGEST_OFFSET_M,
+    REPLAYED,
     SMALLEST_GAP_M,
+    STANDING,
+    AgentStates,
     IdmDriver,
+    Roles,
+    Yielding,
     advance,
     following_acceleration,
     free_acceleration,
     needed_deceleration,
     stop_line_gap,
 )
-from tasks.rollout.rules import CORRIDOR_MARGIN_M, ENTER_CLEARANCE_M, LARGEST_OFFSET_M
-from tasks.rollout.traffic_state import ABSENT, DRIVEN, REPLAYED, STANDING, AgentStates, Roles, Yielding
 from tests.tasks.rollout.slow_yielding import has_way, intended, turned_on, waits_before
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
-from tasks.rollout.traffic_state import DRIVEN, Yielding
+from tasks.rollout.idm import DRIVEN, Yielding
 from tasks.world.clip import STEP_S
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tasks.rollout.idm import IdmDriver
+from tasks.rollout.idm import AgentStates, IdmDriver
 from tasks.rollout.simulate import (
     SHORTEST_HEADWAY_S,
     Rollouts,
@@ -19,7 +19,6 @@ from tasks.rollout.simulate import (
     roll_out,
     roll_out_many,
 )
-from tasks.rollout.traffic_state import AgentStates
 from tasks.world.clip import NOW, AgentTracks, Rollout
 from tasks.world.frames import HEADING, PACIFICA, VX, X, Y
 from tests.tasks.rollout import slow_idm, worlds

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tasks.attempt import drive_and_judge
-from tasks.experts.pdm_closed.planner import PdmSettings
+from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.reward.labels import reactive_scores
 from tasks.rollout.navsim import idm_acceleration

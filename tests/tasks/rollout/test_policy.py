@@ -6,8 +6,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.rollout.policy import SEEN_ROWS, BadPolicy, SeenTraffic, refuse_another_policy, traffic_record
-from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_on, roll_out, roll_out_many
+from tasks.rollout.simulate import (
+    SEEN_ROWS,
+    BadPolicy,
+    SeenTraffic,
+    TrafficSettings,
+    next_scene,
+    prepare_traffic,
+    refuse_another_policy,
+    roll_on,
+    roll_out,
+    roll_out_many,
+    traffic_record,
+)
 from tasks.world.clip import CLIP_STEPS, NOW, PER_STEP, STEP_S, AgentKind, AgentTracks, Scene
 from tasks.world.frames import X
 from tests.tasks.rollout import worlds

@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tasks.rollout.corridor import extent
 from tasks.rollout.lane_following import _order_along
-from tasks.rollout.polylines import extent
 
 NUMBERS = st.lists(st.integers(-3, 3), min_size=1, max_size=12)
 

@@ -15,8 +15,8 @@ from factory.readers.settings import MOUNTS
 from factory.stages.rows import sample_row
 from factory.store.samples import Store
 from tasks.attempt import drive_and_judge, human_sample, perturbed_scene
-from tasks.experts.human import Human
-from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
+from tasks.experts.pdm_closed import PdmClosed, PdmSettings
+from tasks.experts.protocol import Human
 from tasks.rollout.simulate import TrafficSettings
 from tasks.world.clip import Clip, scene_of_clip
 from tests.planners.samples import camera, jpeg, labels, plain, sample

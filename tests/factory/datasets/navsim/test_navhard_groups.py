@@ -18,7 +18,7 @@ from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.evaluate import EvaluateSettings, evaluate
 from planners.evaluation.planner_names import planner_of
 from planners.evaluation.score_rows import read_rows
-from tasks.reward.one_stage import COLUMNS
+from tasks.reward.aggregate import COLUMNS
 from tests.factory.datasets.navsim.geopackage_writer import CITIES, stub_rows, write_geopackage
 from tests.factory.datasets.navsim.several_follow_ups import (
     CITY,

@@ -14,7 +14,7 @@ from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.evaluate import main as evaluate
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import read_rows
-from tasks.reward.one_stage import COLUMNS
+from tasks.reward.aggregate import COLUMNS
 from tests.factory.datasets.navsim.navsim_town import NOW, frames_of, write_installation
 
 pytestmark = pytest.mark.slow  # a town, a city's map, PDM-Closed

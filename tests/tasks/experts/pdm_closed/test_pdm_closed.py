@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings, plan_for
-from tasks.experts.pdm_closed.proposals import driver, forecast, idm_step, proposals
+from tasks.experts.pdm_closed import PdmClosed, PdmSettings, driver, forecast, idm_step, plan_for, proposals
 from tasks.experts.protocol import Plan
 from tasks.stages import Rejected
 from tasks.world.clip import AgentKind, AgentTracks, Scene

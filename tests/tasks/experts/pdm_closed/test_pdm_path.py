@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed.proposals import DrivePaths, drive_paths, pose_at, project
+from tasks.experts.pdm_closed import DrivePaths, drive_paths, pose_at, project
 from tests.tasks.experts import slow_pdm
 
 Array = NDArray[np.float64]

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed.planner import PdmSettings
-from tasks.experts.pdm_closed.proposals import forecast, proposals
+from tasks.experts.pdm_closed import PdmSettings, forecast, proposals
 from tasks.world.clip import AgentKind, AgentTracks
 from tasks.world.frames import HEADING, VX, X, Y, box_corners
 from tasks.world.geometry import rings_distance, rings_touch

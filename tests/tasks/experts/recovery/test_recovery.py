@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tasks.experts.protocol import Plan
-from tasks.experts.recovery.expert import (
+from tasks.experts.recovery import (
     FeasibleSettings,
     Recovery,
     RecoverySettings,

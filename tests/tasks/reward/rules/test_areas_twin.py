@@ -6,9 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.reward.rules.area_flags import areas_along, in_intersection
-from tasks.reward.rules.ego import CENTER_IN_INTERSECTION, MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, empty_body, place
-from tasks.reward.rules.map_index import index_map
+from tasks.reward.areas import areas_along, in_intersection, index_map
+from tasks.reward.centerline import CENTER_IN_INTERSECTION, MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, empty_body, place
 from tasks.world.frames import HEADING, PACIFICA, Vehicle, X, Y
 from tasks.world.geometry import ego_boxes
 from tasks.world.road_map import MapLayer, MapPolygon

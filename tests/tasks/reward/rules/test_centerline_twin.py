@@ -8,8 +8,12 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.reward.rules.centerline import (
+from tasks.reward.centerline import (
+    CENTER_IN_INTERSECTION,
     MAX_CELLS,
+    NON_DRIVABLE,
+    ONCOMING,
+    Body,
     driving_direction,
     index_centerline,
     is_off,
@@ -17,7 +21,6 @@ from tasks.reward.rules.centerline import (
     locate_m,
     progress_m,
 )
-from tasks.reward.rules.ego import CENTER_IN_INTERSECTION, NON_DRIVABLE, ONCOMING, Body
 from tests.tasks.reward.slow import progress as slow
 
 ALONG_X = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 0.0], [25.0, 0.0], [60.0, 0.0]])  # with a joint of lanes

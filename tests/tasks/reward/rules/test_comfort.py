@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from tasks.reward.comfort import comfort_history, extended_comfort
 from tasks.reward.epdms import score
-from tasks.reward.rules.comfort import comfort_history, extended_comfort
 from tasks.world.frames import AX, AY, HEADING, X
 from tests.tasks.reward.straight_street import drive, past_of, street
 

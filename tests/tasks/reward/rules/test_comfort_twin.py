@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import savgol_coeffs, savgol_filter
 
-from tasks.reward.rules import comfort
-from tasks.reward.rules.comfort import LIMITS, comfort_along, comfort_history, comfort_scratch, extended_comfort
+from tasks.reward import comfort
+from tasks.reward.comfort import LIMITS, comfort_along, comfort_history, comfort_scratch, extended_comfort
 from tasks.world.frames import AX, AY, HEADING, PACIFICA, VX, YAW_ACCEL, YAW_RATE
 from tests.tasks.reward.slow import comfort as slow
 

@@ -9,10 +9,9 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.reward.rules.contacts import first_collision, first_time_to_collision
-from tasks.reward.rules.ego import MULTIPLE_LANES, NON_DRIVABLE, empty_body, place
-from tasks.reward.rules.map_index import index_map
-from tasks.reward.rules.obstacles import Obstacles, index_obstacles, unindexed
+from tasks.reward.areas import index_map
+from tasks.reward.centerline import MULTIPLE_LANES, NON_DRIVABLE, empty_body, place
+from tasks.reward.collisions import Obstacles, first_collision, first_time_to_collision, index_obstacles, unindexed
 from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y, box_corners, to_world
 from tasks.world.geometry import ego_boxes
 from tasks.world.road_map import MapLayer, MapPolygon
@@ -28,7 +27,7 @@ class World:
     """K drives among N objects."""
 
     states: np.ndarray  # (K, 41, 11)
-    flags: np.ndarray  # (K, 41) bits of tasks.reward.rules.ego
+    flags: np.ndarray  # (K, 41) bits of tasks.reward.centerline
     crossing: np.ndarray  # (P, 2) ring of an intersection
     boxes: np.ndarray  # (41, N, 5)
     is_stopped: np.ndarray  # (N,)

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_areas_twin import EXACT, drives, lattice_states
 
-from tasks.reward.rules.ego import empty_body, place
-from tasks.reward.rules.lights import first_red, index_red_lanes
+from tasks.reward.areas import first_red, index_red_lanes
+from tasks.reward.centerline import empty_body, place
 from tasks.world.frames import PACIFICA, Vehicle, X, Y
 from tasks.world.geometry import ego_boxes
 from tasks.world.road_map import MapLayer, MapPolygon

@@ -6,8 +6,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.reward.rules.area_flags import regions_at
-from tasks.reward.rules.map_index import DRIVABLE, INTERSECTION, LANE, ON_ROUTE, MapIndex, index_map
+from tasks.reward.areas import DRIVABLE, INTERSECTION, LANE, ON_ROUTE, MapIndex, index_map, regions_at
 from tasks.world.road_map import MapLayer, MapPolygon
 from tests.tasks.reward.small_maps import small_maps
 

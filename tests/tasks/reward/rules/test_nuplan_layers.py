@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tasks.reward.rules.ego import CENTER_IN_INTERSECTION, MULTIPLE_LANES, NON_DRIVABLE, ONCOMING
+from tasks.reward.centerline import CENTER_IN_INTERSECTION, MULTIPLE_LANES, NON_DRIVABLE, ONCOMING
 from tasks.world.frames import PACIFICA, X, Y
 from tasks.world.road_map import MapLayer
 from tests.tasks.reward.rules.test_areas_twin import flags_along

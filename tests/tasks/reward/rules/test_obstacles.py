@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.reward.rules.obstacles import (
+from tasks.reward.collisions import (
     CELLS_PER_SIDE,
     ENTRIES_PER_BOX,
     SMALLEST_CELL_M,

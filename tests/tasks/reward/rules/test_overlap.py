@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import shapely
 
-from tasks.reward.rules.obstacles import Box, apart, centroid, touching
+from tasks.reward.collisions import Box, apart, centroid, touching
 from tasks.world import geometry
 from tasks.world.frames import box_corners
 

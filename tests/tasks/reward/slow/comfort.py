@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from tasks.reward.rules.comfort import ExtendedComfort
+from tasks.reward.comfort import ExtendedComfort
 from tasks.world.clip import STEP_S
 from tasks.world.frames import (
     AX,

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tasks.reward.rules.comfort import comfort_history
+from tasks.reward.comfort import comfort_history
 from tasks.world.clip import HORIZON_STEPS, MOVING_KINDS, AgentTracks
 from tasks.world.frames import PACIFICA, Vehicle, box_corners
 from tasks.world.geometry import ego_boxes, touching
@@ -78,7 +78,7 @@ def prepare(
     ego_state0: Array | None = None,
     drop_touching: bool = True,
 ) -> PreparedScene:
-    """As tasks.reward.prepare.prepare, of arguments that make sense."""
+    """As tasks.reward.epdms.prepare, of arguments that make sense."""
     if ego_state0 is None and past_states is not None:
         ego_state0 = past_states[-1]
     return PreparedScene(

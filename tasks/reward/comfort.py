@@ -12,7 +12,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from tasks.kernels.compiled import kernel
-from tasks.reward.rules.ego import checked
+from tasks.reward.centerline import checked
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import HORIZON_STEPS, STEP_S
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, STEERING, YAW_ACCEL, YAW_RATE

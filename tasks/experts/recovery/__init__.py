@@ -1,1 +1,0 @@
-"""The recovery expert: back to the log along human trajectories."""
