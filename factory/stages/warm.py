@@ -26,7 +26,7 @@ from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole
 from tasks.render import warm as render_warm
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
-from tasks.reward.epdms import INDEX_FROM_ROWS, prepare_scene, score
+from tasks.reward.epdms import prepare_scene, score
 from tasks.reward.labels import Labelling, hit_after_s, reactive_scores, vocabulary_labels
 from tasks.rollout.simulate import SeenTraffic, TrafficSettings, prepare_traffic, simulate
 from tasks.settings import PdmSettings
@@ -177,17 +177,16 @@ def _warm(name: str) -> int:
 
 
 def _judge() -> None:
-    """Scores, of a few trajectories and of many, and all that an attempt among the log's traffic enters.
+    """Scores, and all that an attempt among the log's traffic enters.
 
     `plan` is compiled meanwhile and takes half as long: it is there when the attempt asks for it.
     """
     scene, ahead = _tiny_scene()
     prepared = prepare_scene(scene, scene.agents.window(scene.step, scene.step + HORIZON_STEPS + 1))
-    standing = np.tile(scene.ego_state, (INDEX_FROM_ROWS, HORIZON_STEPS + 1, 1))
-    score(prepared, standing[:2], normalise="pairs")
-    score(prepared, standing)
+    standing = np.tile(scene.ego_state, (2, HORIZON_STEPS + 1, 1))
+    score(prepared, standing, normalise="pairs")
     judged = drive_and_judge(scene, Plan(ahead), REPLAY, PdmSettings())
-    labelling = Labelling(Vocabulary(kinematic_trajectories(INDEX_FROM_ROWS, 0)), REPLAY)
+    labelling = Labelling(Vocabulary(kinematic_trajectories(2, 0)), REPLAY)
     vocabulary_labels(labelling, scene, judged.prepared, judged.reference)
     hit_after_s(prepare_traffic(scene, REPLAY), judged.prepared, judged.rollout.ego_states)
 

@@ -25,7 +25,17 @@ from tasks.settings import PDM_DEFAULTS, PdmSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bools, Indices, Ints
 from tasks.world.clip import AgentKind, AgentTracks, Scene
-from tasks.world.frames import EGO_STATE_SIZE, PACIFICA, VX, X, Y, box_corners
+from tasks.world.frames import (
+    EGO_STATE_SIZE,
+    HALF_LENGTH,
+    HALF_WIDTH,
+    PACIFICA,
+    REAR_AXLE_TO_CENTER,
+    VX,
+    X,
+    Y,
+    box_corners,
+)
 from tasks.world.geometry import (
     ego_boxes,
     ring_contains,
@@ -443,7 +453,6 @@ def _edges_around(swept: Corridors, path: int, x: float, y: float, squares: Arra
 SCORED_STEPS = 40
 PROPOSAL_STEPS = 50  # the chosen one is driven on to 5 s
 SAMPLES = PROPOSAL_STEPS // SAMPLE_STEPS + 1
-REAR_AXLE_TO_CENTER, HALF_LENGTH, HALF_WIDTH = PACIFICA.rear_axle_to_center, PACIFICA.half_length, PACIFICA.half_width
 
 
 @dataclass(frozen=True)

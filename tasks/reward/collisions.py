@@ -14,15 +14,8 @@ from tasks.reward.areas import MapIndex, in_intersection
 from tasks.reward.centerline import OFF_LANE, Body
 from tasks.world.arrays import Array, Bools, ShortInts
 from tasks.world.clip import HORIZON_STEPS
-from tasks.world.frames import HEADING, X, Y
+from tasks.world.frames import HALF_LENGTH, HALF_WIDTH, HEADING, X, Y
 from tasks.world.geometry import LARGEST
-
-# Everything the ego may run into, and a map from a place and a time to what can be touched there.
-#
-# Indexed objects are registered, per time, in every square cell whose centre points an ego body could touch them
-# from, whatever its heading; an ego position then reads one cell. The cells repeat after CELLS_PER_SIDE in x and y,
-# so the grid has no edges and a fixed size; what stands a whole period away is told apart by the boxes themselves.
-# Unindexed objects are the same structure with one cell for everywhere and all times.
 
 # Oriented boxes in the plane, one pair at a time: whether they touch, and where their centroid is.
 
@@ -103,54 +96,29 @@ def centroid(box: Box) -> tuple[float, float]:
 
 N_TIMES = HORIZON_STEPS + 1
 STOPPED_SPEED_MPS = 0.05
-CELLS_PER_SIDE = 64  # a power of two
-SMALLEST_CELL_M = 2.0
-ENTRIES_PER_BOX = 128  # bounds the index: cells grow until no more are expected on average
+LENGTH, WIDTH = 2.0 * HALF_LENGTH, 2.0 * HALF_WIDTH  # of the ego [m]
 
 
 class Obstacles(NamedTuple):
-    """N objects over T = 41 steps of 0.1 s, world frame, and where they can be touched."""
+    """N objects over T = 41 steps of 0.1 s, world frame."""
 
     boxes: Array  # (T, N, 5) centre x, y [m], heading [rad], length, width [m]; NaN when absent
     is_stopped: Bools  # (N,) no road user, or at most 0.05 m/s when first seen
     collision_score: Array  # (N,) what an at-fault collision leaves of NC: 0 for road users, else 0.5
-    spans: Array  # (N, 5) of unindexed objects, see spans_of; (0, 5) of indexed ones
-    axes: Array  # (T, N, 2) cos, sin of the headings; (0, N, 2): worked out where needed
-    starts: ShortInts  # (T x cells + 1,) items[starts[c]:starts[c + 1]] are the objects of cell c, times outermost
-    items: ShortInts  # (E,)
-    cells_per_side: int  # 1: one cell for everywhere and all times
-    cells_per_m: float
-
-
-def index_obstacles(boxes: Array, is_stopped: Bools, collision_score: Array, ego_circumradius_m: float) -> Obstacles:
-    """Objects that are the same for all trajectories, ready for egos whose corners are this far from their centre.
-
-    boxes: (T, N, 5); is_stopped, collision_score: (N,), as in Obstacles.
-    """
-    plain = unindexed(boxes, is_stopped, collision_score)
-    obstacles = plain._replace(spans=plain.spans[:0], axes=_axes(plain.boxes), cells_per_side=CELLS_PER_SIDE)
-    obstacles = obstacles._replace(cells_per_m=_cells_per_m(obstacles, ego_circumradius_m))
-    starts, items = _index(obstacles, ego_circumradius_m)
-    return obstacles._replace(starts=starts, items=items)
+    spans: Array  # (N, 5) see spans_of
 
 
 @kernel
-def unindexed(boxes: Array, is_stopped: Bools, collision_score: Array) -> Obstacles:
-    """Objects to be looked at one by one: for traffic that few trajectories meet (`with_objects`).
-
-    boxes: (T, N, 5); is_stopped, collision_score: (N,), as in Obstacles.
-    """
-    starts = np.zeros(2, np.int32)
-    starts[1] = len(is_stopped)
-    axes, items = np.empty((0, len(is_stopped), 2)), np.arange(len(is_stopped)).astype(np.int32)
-    return Obstacles(boxes, is_stopped, collision_score, spans_of(boxes), axes, starts, items, 1, 0.0)
+def obstacles_of(boxes: Array, is_stopped: Bools, collision_score: Array) -> Obstacles:
+    """Obstacles from boxes (T, N, 5), is_stopped (N,) and collision_score (N,)."""
+    return Obstacles(boxes, is_stopped, collision_score, spans_of(boxes))
 
 
 @kernel
 def lay_out(
     boxes: Array, velocities: Array, valid: Bools, collision_score: Array, ego_box: Array
 ) -> tuple[bool, Obstacles]:
-    """The unindexed obstacles that tracks of N objects are over their first 41 steps; False where one is not well.
+    """The obstacles that tracks of N objects are over their first 41 steps; False where one is not well.
 
     boxes (S >= 41, N, 5), velocities (S, N, 2) and valid (S, N) as in AgentTracks; collision_score: (N,). Left out for
     good is who is never there, and who touches the ego's box (5,) at first (one of NaN: nobody). Not well is who is
@@ -179,7 +147,7 @@ def lay_out(
     for k in range(n_kept):
         vx, vy = velocities[first_seen[kept[k]], kept[k]]
         is_stopped[k] = score[k] > 0.0 or np.hypot(vx, vy) <= STOPPED_SPEED_MPS
-    return n_wrong == 0, unindexed(met, is_stopped, score)
+    return n_wrong == 0, obstacles_of(met, is_stopped, score)
 
 
 @inlined
@@ -203,22 +171,6 @@ def _is_well(boxes: Array, velocities: Array, t: int, i: int) -> bool:
 def _box(box: Array) -> Box:
     x, y, heading, length, width = box
     return Box(x, y, heading, math.cos(heading), math.sin(heading), length, width)
-
-
-@kernel
-def with_objects(obstacles: Obstacles, boxes: Array, is_stopped: Bools) -> Obstacles:
-    """The same unindexed objects, elsewhere: boxes (T, N, 5) that one trajectory meets, is_stopped (N,) of them."""
-    return Obstacles(
-        boxes,
-        is_stopped,
-        obstacles.collision_score,
-        spans_of(boxes),
-        obstacles.axes,
-        obstacles.starts,
-        obstacles.items,
-        obstacles.cells_per_side,
-        obstacles.cells_per_m,
-    )
 
 
 @kernel
@@ -246,53 +198,24 @@ def spans_of(boxes: Array) -> Array:
 
 
 @kernel
-def within_reach(
-    obstacles: Obstacles, path: tuple[float, float, float, float], length: float, width: float
-) -> Obstacles:
-    """Unindexed objects without those that are out of reach all along a path; indexed ones as they are.
-
-    path: least x, y, most x, y of the centres [m] of an ego body of that length and width [m].
-    """
-    if obstacles.cells_per_side > 1:
-        return obstacles
+def within_reach(obstacles: Obstacles, body: Body) -> ShortInts:
+    """The objects that are not out of reach of a placed body all along its way and as far ahead as it looks."""
+    least_x, least_y, most_x, most_y = _looked_at(body)
     spans = obstacles.spans
     items = np.empty(len(spans), np.int32)
     n = 0
     for item in range(len(spans)):
         # as far as out_of_reach ever looks
-        reach = math.sqrt(0.5 * (spans[item, 4] + length * length + width * width) + ROUNDING_M) + ROUNDING_M
+        reach = math.sqrt(0.5 * (spans[item, 4] + LENGTH * LENGTH + WIDTH * WIDTH) + ROUNDING_M) + ROUNDING_M
         if (
-            spans[item, 0] - reach <= path[2]
-            and spans[item, 2] + reach >= path[0]
-            and spans[item, 1] - reach <= path[3]
-            and spans[item, 3] + reach >= path[1]
+            spans[item, 0] - reach <= most_x
+            and spans[item, 2] + reach >= least_x
+            and spans[item, 1] - reach <= most_y
+            and spans[item, 3] + reach >= least_y
         ):
             items[n] = item
             n += 1
-    starts = np.zeros(2, np.int32)
-    starts[1] = n
-    return Obstacles(
-        obstacles.boxes,
-        obstacles.is_stopped,
-        obstacles.collision_score,
-        spans,
-        obstacles.axes,
-        starts,
-        items[:n],
-        obstacles.cells_per_side,
-        obstacles.cells_per_m,
-    )
-
-
-@kernel
-def cell_of(obstacles: Obstacles, t: int, x: float, y: float) -> int:
-    """The cell whose items are all the objects that an ego body centred on (x, y) [m] at step t may touch."""
-    n = obstacles.cells_per_side
-    if n == 1:
-        return 0
-    column = math.floor(x * obstacles.cells_per_m) & (n - 1)
-    row = math.floor(y * obstacles.cells_per_m) & (n - 1)
-    return (t * n + row) * n + column
+    return items[:n]
 
 
 @kernel
@@ -300,16 +223,12 @@ def box_at(obstacles: Obstacles, t: int, item: int) -> Box:
     """Where an object is at step t; NaN when absent."""
     x, y, heading = obstacles.boxes[t, item, 0], obstacles.boxes[t, item, 1], obstacles.boxes[t, item, 2]
     length, width = obstacles.boxes[t, item, 3], obstacles.boxes[t, item, 4]
-    if obstacles.cells_per_side > 1:
-        return Box(x, y, heading, obstacles.axes[t, item, 0], obstacles.axes[t, item, 1], length, width)
     return Box(x, y, heading, math.cos(heading), math.sin(heading), length, width)
 
 
 @kernel
 def out_of_reach(obstacles: Obstacles, t: int, item: int, ego: Box) -> bool:
-    """Whether an unindexed object is too far away, or absent, to touch the ego at step t: nothing dearer is needed."""
-    if obstacles.cells_per_side > 1:
-        return False
+    """Whether an object is too far away, or absent, to touch the ego at step t: nothing dearer is needed."""
     boxes = obstacles.boxes
     dx, dy, length, width = boxes[t, item, 0] - ego.x, boxes[t, item, 1] - ego.y, boxes[t, item, 3], boxes[t, item, 4]
     # squared sum of the circumradii <= twice the sum of their squares
@@ -317,88 +236,7 @@ def out_of_reach(obstacles: Obstacles, t: int, item: int, ego: Box) -> bool:
     return not dx * dx + dy * dy <= reach_sq + ROUNDING_M
 
 
-@kernel
-def _axes(boxes: Array) -> Array:
-    """Cos and sin (T, N, 2) of the headings, by the same library as in `box_at`."""
-    axes = np.empty((boxes.shape[0], boxes.shape[1], 2))
-    for t in range(boxes.shape[0]):
-        for i in range(boxes.shape[1]):
-            axes[t, i, 0], axes[t, i, 1] = math.cos(boxes[t, i, 2]), math.sin(boxes[t, i, 2])
-    return axes
-
-
-@kernel
-def _reach(box: Box, ego_radius: float) -> tuple[float, float]:
-    """How far from a box's centre the centre of an ego that touches it can be, along x and y [m]; NaN when absent."""
-    c, s, margin = abs(box.cos), abs(box.sin), ego_radius + ROUNDING_M
-    return 0.5 * (box.length * c + box.width * s) + margin, 0.5 * (box.length * s + box.width * c) + margin
-
-
-@kernel
-def _cells_per_m(obstacles: Obstacles, ego_radius: float) -> float:
-    """The finest grid that keeps the index small."""
-    n_times, n_items = obstacles.boxes.shape[:2]
-    cell = SMALLEST_CELL_M
-    while True:
-        entries = 0.0
-        for t in range(n_times):
-            for item in range(n_items):
-                reach_x, reach_y = _reach(box_at(obstacles, t, item), ego_radius)
-                area = min(2.0 * reach_x / cell + 1.0, CELLS_PER_SIDE) * min(2.0 * reach_y / cell + 1.0, CELLS_PER_SIDE)
-                if math.isfinite(area):
-                    entries += area
-        if entries <= ENTRIES_PER_BOX * n_times * n_items:
-            return 1.0 / cell
-        cell *= 2.0
-
-
-@kernel
-def _index(obstacles: Obstacles, ego_radius: float) -> tuple[ShortInts, ShortInts]:
-    """Starts and items of the cells: counted, summed to the cells' ends, filled from there."""
-    n_times, n_items = obstacles.boxes.shape[:2]
-    starts = np.zeros(n_times * CELLS_PER_SIDE * CELLS_PER_SIDE + 1, dtype=np.int32)
-    items = np.empty(0, dtype=np.int32)
-    for fill in (False, True):
-        for t in range(n_times):
-            for item in range(n_items):
-                _register(obstacles, t, item, ego_radius, fill, starts, items)
-        if not fill:
-            end = 0
-            for cell in range(starts.size):
-                end += starts[cell]
-                starts[cell] = end
-            items = np.empty(end, dtype=np.int32)
-    return starts, items
-
-
-@kernel
-def _register(
-    obstacles: Obstacles, t: int, item: int, ego_radius: float, fill: bool, starts: ShortInts, items: ShortInts
-) -> None:
-    """Count an object in, or write it into, the cells that come within the ego's radius of its box at step t."""
-    box, per_m = box_at(obstacles, t, item), obstacles.cells_per_m
-    reach_x, reach_y = _reach(box, ego_radius)
-    if not math.isfinite(box.x + box.y + reach_x + reach_y):
-        return
-    left, right = math.floor((box.x - reach_x) * per_m), math.floor((box.x + reach_x) * per_m)
-    low, high = math.floor((box.y - reach_y) * per_m), math.floor((box.y + reach_y) * per_m)
-    everywhere = right - left >= CELLS_PER_SIDE or high - low >= CELLS_PER_SIDE
-    center_reach = ego_radius + ROUNDING_M + math.sqrt(0.5) / per_m  # from the box to a cell's centre
-    for row in range(low, min(high + 1, low + CELLS_PER_SIDE)):
-        dy = (row + 0.5) / per_m - box.y
-        first = (t * CELLS_PER_SIDE + (row & (CELLS_PER_SIDE - 1))) * CELLS_PER_SIDE
-        for column in range(left, min(right + 1, left + CELLS_PER_SIDE)):
-            dx = (column + 0.5) / per_m - box.x
-            along = max(abs(box.cos * dx + box.sin * dy) - 0.5 * box.length, 0.0)
-            across = max(abs(box.cos * dy - box.sin * dx) - 0.5 * box.width, 0.0)
-            if everywhere or along * along + across * across <= center_reach * center_reach:
-                cell = first + (column & (CELLS_PER_SIDE - 1))
-                if fill:
-                    starts[cell] -= 1
-                    items[starts[cell]] = item
-                else:
-                    starts[cell] += 1
-
+# The rules.
 
 STOPPED_EGO_MPS = 0.05
 STOPPED_EGO_TTC_MPS = 5e-3
@@ -409,22 +247,18 @@ TTC_STEPS = (0, 3, 6, 9)  # projections 0, 0.3, 0.6, 0.9 s ahead
 
 @kernel
 def first_collision(
-    obstacles: Obstacles, states: Array, body: Body, half_length: float, half_width: float, ignored: Bools
+    obstacles: Obstacles, items: ShortInts, states: Array, body: Body, ignored: Bools
 ) -> tuple[float, float]:
     """NC in {0, 0.5, 1} and the time index of the first collision at fault, inf where there is none.
 
-    states: (41, 11) of one trajectory; body: placed there, with its flags; half_length, half_width: of the body [m];
-    ignored: (N,) scratch.
+    items: the obstacles in reach; states: (41, 11) of one trajectory; body: placed there, with its flags; ignored: (N,)
+    scratch.
     """
     ignored[:] = False
     nc, first = 1.0, math.inf
     for t in range(states.shape[0]):
-        ego = Box(
-            body.x[t], body.y[t], states[t, HEADING], body.cos[t], body.sin[t], 2.0 * half_length, 2.0 * half_width
-        )
-        cell = cell_of(obstacles, t, ego.x, ego.y)
-        for entry in range(obstacles.starts[cell], obstacles.starts[cell + 1]):
-            item = obstacles.items[entry]
+        ego = Box(body.x[t], body.y[t], states[t, HEADING], body.cos[t], body.sin[t], LENGTH, WIDTH)
+        for item in items:
             if ignored[item] or out_of_reach(obstacles, t, item, ego):
                 continue
             other = box_at(obstacles, t, item)
@@ -442,13 +276,7 @@ def first_collision(
 
 @kernel
 def first_time_to_collision(
-    obstacles: Obstacles,
-    states: Array,
-    body: Body,
-    map_index: MapIndex,
-    half_length: float,
-    half_width: float,
-    ignored: Bools,
+    obstacles: Obstacles, items: ShortInts, states: Array, body: Body, map_index: MapIndex, ignored: Bools
 ) -> float:
     """First time index at which the ego, going straight on for up to 0.9 s, runs into something; inf: none.
 
@@ -462,10 +290,8 @@ def first_time_to_collision(
         for step in TTC_STEPS:
             gone = body.speed[t] * (step * 0.1)
             x, y = body.x[t] + c * gone, body.y[t] + s * gone
-            ego = Box(x, y, states[t, HEADING], c, s, 2.0 * half_length, 2.0 * half_width)
-            cell = cell_of(obstacles, t + step, x, y)
-            for entry in range(obstacles.starts[cell], obstacles.starts[cell + 1]):
-                item = obstacles.items[entry]
+            ego = Box(x, y, states[t, HEADING], c, s, LENGTH, WIDTH)
+            for item in items:
                 if ignored[item] or out_of_reach(obstacles, t + step, item, ego):
                     continue
                 other = box_at(obstacles, t + step, item)
@@ -479,7 +305,7 @@ def first_time_to_collision(
 
 
 @kernel
-def reach_of(body: Body) -> tuple[float, float, float, float]:
+def _looked_at(body: Body) -> tuple[float, float, float, float]:
     """Least x, y, most x, y [m] of the places of a placed body that both rules look at."""
     ahead = max(TTC_STEPS) * 0.1
     least_x, least_y, most_x, most_y = math.inf, math.inf, -math.inf, -math.inf

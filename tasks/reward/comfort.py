@@ -15,7 +15,7 @@ from tasks.kernels.compiled import kernel
 from tasks.reward.centerline import checked
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import HORIZON_STEPS, STEP_S
-from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, STEERING, YAW_ACCEL, YAW_RATE
+from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, REAR_AXLE_TO_CENTER, STEERING, YAW_ACCEL, YAW_RATE
 
 # Savitzky-Golay filters of the comfort rules (docs/reward.md 2i): a polynomial fitted to every window of samples.
 #
@@ -190,7 +190,6 @@ def comfort_scratch() -> Array:
 def comfort_along(
     history: Array,  # (14, 11) ego states, see comfort_history
     states: Array,  # (41, 11) of one trajectory
-    rear_axle_to_center: float,  # [m]
     scratch: Array,  # (10, 55), see comfort_scratch
     flags: Bools,  # (6,) out, as in LIMITS
 ) -> float:
@@ -200,8 +199,8 @@ def comfort_along(
     """
     judged, lon, lat, magnitude, heading = scratch[:N_FLAGS], scratch[6], scratch[7], scratch[8], scratch[9]
     before = len(history)
-    _load(history, rear_axle_to_center, lon[:before], lat[:before], magnitude[:before], heading[:before])
-    _load(states, rear_axle_to_center, lon[before:], lat[before:], magnitude[before:], heading[before:])
+    _load(history, lon[:before], lat[:before], magnitude[:before], heading[:before])
+    _load(states, lon[before:], lat[before:], magnitude[before:], heading[before:])
     _limited_quantities(lon, lat, magnitude, heading, judged)
     comfortable = True
     for f in range(N_FLAGS):
@@ -227,11 +226,11 @@ def _limited_quantities(lon: Array, lat: Array, magnitude: Array, heading: Array
 
 
 @kernel
-def _load(states: Array, rear_axle_to_center: float, lon: Array, lat: Array, magnitude: Array, heading: Array) -> None:
+def _load(states: Array, lon: Array, lat: Array, magnitude: Array, heading: Array) -> None:
     for t in range(len(states)):
         ax, ay, omega = states[t, AX], states[t, AY], states[t, YAW_RATE]
         # At the centre, with the public signs: + d omega^2 where geometry says minus, and no lateral term
-        lon[t] = ax + rear_axle_to_center * (omega * omega) + rear_axle_to_center * states[t, YAW_ACCEL]
+        lon[t] = ax + REAR_AXLE_TO_CENTER * (omega * omega) + REAR_AXLE_TO_CENTER * states[t, YAW_ACCEL]
         lat[t] = ay
         magnitude[t] = math.sqrt(ax * ax + ay * ay)
         heading[t] = states[t, HEADING]
@@ -264,16 +263,16 @@ def comfortable(states: Array) -> Bools:
     if states.ndim != 2 or states.shape[1] != EGO_STATE_SIZE or len(states) < LONGEST_FILTER:
         raise ValueError(f"states must be (T >= {LONGEST_FILTER}, {EGO_STATE_SIZE}), got {states.shape}")
     within = np.ones(len(states), dtype=np.bool_)
-    _within_limits(np.ascontiguousarray(states, np.float64), PACIFICA.rear_axle_to_center, within)
+    _within_limits(np.ascontiguousarray(states, np.float64), within)
     return within
 
 
 @kernel
-def _within_limits(states: Array, rear_axle_to_center: float, within: Bools) -> None:
+def _within_limits(states: Array, within: Bools) -> None:
     n = len(states)
     scratch = np.empty((_SCRATCH_ROWS, n))
     judged, lon, lat, magnitude, heading = scratch[:N_FLAGS], scratch[6], scratch[7], scratch[8], scratch[9]
-    _load(states, rear_axle_to_center, lon, lat, magnitude, heading)
+    _load(states, lon, lat, magnitude, heading)
     _limited_quantities(lon, lat, magnitude, heading, judged)
     for t in range(n):
         for f in range(N_FLAGS):

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, make_dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -32,11 +32,8 @@ from tasks.reward.collisions import (
     Obstacles,
     first_collision,
     first_time_to_collision,
-    index_obstacles,
     lay_out,
-    reach_of,
-    unindexed,
-    with_objects,
+    obstacles_of,
     within_reach,
 )
 from tasks.reward.comfort import N_FLAGS, comfort_along, comfort_history, comfort_scratch
@@ -54,7 +51,7 @@ from tasks.subscores import (
 )
 from tasks.world.arrays import Array, Bools, Bytes
 from tasks.world.clip import MOVING_KINDS, AgentKind, AgentTracks, Clip, Scene
-from tasks.world.frames import EGO_STATE_SIZE, PACIFICA
+from tasks.world.frames import EGO_STATE_SIZE, HALF_LENGTH, HALF_WIDTH, PACIFICA, REAR_AXLE_TO_CENTER
 from tasks.world.geometry import LARGEST, all_within, ego_boxes
 from tasks.world.road_map import LightState, MapLayer, MapPolygon, polygons_near
 
@@ -81,15 +78,8 @@ class PreparedScene:
     history: Array | None  # (14, 11) ego states at -1.5 .. -0.2 s; None: history comfort is not judged
     centerline: Centerline
     map_index: MapIndex
-    obstacles: Obstacles  # to be looked at one by one
+    obstacles: Obstacles
     red_lanes: RedLanes
-
-    @cached_property
-    def indexed_obstacles(self) -> Obstacles:
-        """The same objects, quicker to look up; made when first asked for, since only many trajectories repay it."""
-        radius_m = float(np.hypot(PACIFICA.half_length, PACIFICA.half_width))
-        plain = self.obstacles
-        return index_obstacles(plain.boxes, plain.is_stopped, plain.collision_score, radius_m)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Arrays that a shared object store hands out read-only are copied: the kernels are compiled for others."""
@@ -251,7 +241,6 @@ def _red(red_lanes: tuple[str, ...] | tuple[tuple[str, ...], Bools], polygons: S
 
 # Every rule applied to every trajectory, one after the other (docs/reward.md 2); no row depends on another.
 
-INDEX_FROM_ROWS = 32  # an index of the objects costs about as much as it saves on that many trajectories
 
 NC, DAC, DDC, TLC = (LABELLED.index(name) for name in ("nc", "dac", "ddc", "tlc"))
 TTC, LK, HC = (LABELLED.index(name) for name in ("ttc", "lk", "hc"))
@@ -268,18 +257,9 @@ class Verdicts(NamedTuple):
     comfort: Bools  # (K, 6)
 
 
-class Ego(NamedTuple):
-    """The ego's body [m]."""
-
-    half_length: float
-    half_width: float
-    rear_axle_to_center: float
-
-
 class RuleContext(NamedTuple):
     """What a trajectory is judged against, but for the objects."""
 
-    ego: Ego
     centerline: Centerline
     map_index: MapIndex
     red_lanes: RedLanes
@@ -298,7 +278,6 @@ def context_of(prepared: PreparedScene, with_history: bool) -> RuleContext:
     """A prepared scene as the kernels take it."""
     history = prepared.history if with_history and prepared.history is not None else np.empty((0, EGO_STATE_SIZE))
     return RuleContext(
-        Ego(PACIFICA.half_length, PACIFICA.half_width, PACIFICA.rear_axle_to_center),
         prepared.centerline,
         prepared.map_index,
         prepared.red_lanes,
@@ -314,30 +293,24 @@ def scratch_for(n_objects: int) -> Scratch:
 
 @kernel
 def judge_one(
-    context: RuleContext, everything: Obstacles, states: Array, scratch: Scratch, k: int, out: Verdicts
+    context: RuleContext, obstacles: Obstacles, states: Array, scratch: Scratch, k: int, out: Verdicts
 ) -> None:
     """All rules on one trajectory (41, 11), written to row k."""
-    body, half_length, half_width = scratch.body, context.ego.half_length, context.ego.half_width
-    place(states, context.ego.rear_axle_to_center, body)
-    areas_along(context.map_index, body, half_length, half_width)
+    body = scratch.body
+    place(states, REAR_AXLE_TO_CENTER, body)
+    areas_along(context.map_index, body, HALF_LENGTH, HALF_WIDTH)
     _spread_flags(body.flags, out.ego_areas[k])
-    obstacles = within_reach(everything, reach_of(body), 2.0 * half_length, 2.0 * half_width)
-    out.scores[NC, k], out.fails[NC, k] = first_collision(
-        obstacles, states, body, half_length, half_width, scratch.ignored
-    )
+    items = within_reach(obstacles, body)
+    out.scores[NC, k], out.fails[NC, k] = first_collision(obstacles, items, states, body, scratch.ignored)
     out.fails[DAC, k] = _first_with(body.flags, NON_DRIVABLE)
     out.scores[DDC, k], out.fails[DDC, k] = driving_direction(body)
-    out.fails[TLC, k] = first_red(context.red_lanes, body, half_length, half_width)
-    out.fails[TTC, k] = first_time_to_collision(
-        obstacles, states, body, context.map_index, half_length, half_width, scratch.ignored
-    )
+    out.fails[TLC, k] = first_red(context.red_lanes, body, HALF_LENGTH, HALF_WIDTH)
+    out.fails[TTC, k] = first_time_to_collision(obstacles, items, states, body, context.map_index, scratch.ignored)
     out.fails[LK, k] = lane_keeping(context.centerline, body)
     last = states.shape[0] - 1
     out.ep_raw_m[k] = progress_m(context.centerline, body.x[0], body.y[0], body.x[last], body.y[last])
     if len(context.history) > 0:
-        out.fails[HC, k] = comfort_along(
-            context.history, states, context.ego.rear_axle_to_center, scratch.comfort, out.comfort[k]
-        )
+        out.fails[HC, k] = comfort_along(context.history, states, scratch.comfort, out.comfort[k])
     else:
         out.fails[HC, k] = math.inf
         out.comfort[k] = True
@@ -409,8 +382,8 @@ def score(
     as if alone. with_history=False leaves history comfort at 1, as the public passes over the human and PDM-Closed do.
     Raises ValueError for other shapes or non-finite states.
     """
-    obstacles = prepared.indexed_obstacles if len(states) >= INDEX_FROM_ROWS else prepared.obstacles
-    return _scored(context_of(prepared, with_history), obstacles, _NO_BOXES, _NO_FLAGS, states, _in_pairs(normalise))
+    context = context_of(prepared, with_history)
+    return _scored(context, prepared.obstacles, _NO_BOXES, _NO_FLAGS, states, _in_pairs(normalise))
 
 
 def score_among(
@@ -427,7 +400,7 @@ def score_among(
             f"boxes must be ({len(states)}, {N_TIMES}, {n_objects}, 5) and is_stopped ({len(states)}, {n_objects}), "
             f"got {boxes.shape} and {is_stopped.shape}"
         )
-    nobody = unindexed(np.full((N_TIMES, n_objects, 5), np.nan), np.zeros(n_objects, np.bool_), collision_score)
+    nobody = obstacles_of(np.full((N_TIMES, n_objects, 5), np.nan), np.zeros(n_objects, np.bool_), collision_score)
     boxes, is_stopped = np.require(boxes, None, ["C", "W"]), np.require(is_stopped, None, ["C", "W"])
     return _scored(context_of(prepared, with_history=True), nobody, boxes, is_stopped, states, True)
 
@@ -512,7 +485,7 @@ def _score_all(
     for k in range(states.shape[0]):
         met = obstacles
         if boxes.shape[0] > 0:
-            met = with_objects(obstacles, boxes[k], is_stopped[k])
+            met = obstacles_of(boxes[k], is_stopped[k], obstacles.collision_score)
         judge_one(context, met, states[k], scratch, k, out)
     _add_up(table, in_pairs)
     return True

@@ -9,7 +9,7 @@ import numpy as np
 from tasks.kernels.compiled import kernel
 from tasks.reward.areas import areas_along
 from tasks.reward.centerline import checked, empty_body, place
-from tasks.reward.collisions import STOPPED_SPEED_MPS, first_collision, unindexed
+from tasks.reward.collisions import STOPPED_SPEED_MPS, first_collision, obstacles_of, within_reach
 from tasks.reward.epdms import (
     PreparedScene,
     RuleContext,
@@ -29,7 +29,19 @@ from tasks.settings import ExpertGate
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentTracks, Scene
-from tasks.world.frames import AX, HEADING, PACIFICA, STEERING, VX, YAW_RATE, X, Y
+from tasks.world.frames import (
+    AX,
+    HALF_LENGTH,
+    HALF_WIDTH,
+    HEADING,
+    PACIFICA,
+    REAR_AXLE_TO_CENTER,
+    STEERING,
+    VX,
+    YAW_RATE,
+    X,
+    Y,
+)
 from tasks.world.geometry import ego_boxes, touching
 from tasks.world.road_map import RoadMap, Route, RouteFinder
 from tasks.world.vocabulary import Vocabulary
@@ -182,11 +194,11 @@ def _stands_when_first_seen(tracks: AgentTracks) -> Bools:
 @kernel
 def _first_hit(context: RuleContext, boxes: Array, is_stopped: Bools, collision_score: Array, states: Array) -> float:
     """Index of the first collision at fault of states (T, 11) with boxes (T, N, 5), inf: none."""
-    ego, body = context.ego, empty_body(states.shape[0])
-    place(states, ego.rear_axle_to_center, body)
-    areas_along(context.map_index, body, ego.half_length, ego.half_width)
-    obstacles, ignored = unindexed(boxes, is_stopped, collision_score), np.empty(len(is_stopped), np.bool_)
-    return first_collision(obstacles, states, body, ego.half_length, ego.half_width, ignored)[1]
+    body = empty_body(states.shape[0])
+    place(states, REAR_AXLE_TO_CENTER, body)
+    areas_along(context.map_index, body, HALF_LENGTH, HALF_WIDTH)
+    obstacles, ignored = obstacles_of(boxes, is_stopped, collision_score), np.empty(len(is_stopped), np.bool_)
+    return first_collision(obstacles, within_reach(obstacles, body), states, body, ignored)[1]
 
 
 # What the gate asks of an end.

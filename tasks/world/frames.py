@@ -101,3 +101,4 @@ class Vehicle:
 
 
 PACIFICA = Vehicle()
+REAR_AXLE_TO_CENTER, HALF_LENGTH, HALF_WIDTH = PACIFICA.rear_axle_to_center, PACIFICA.half_length, PACIFICA.half_width

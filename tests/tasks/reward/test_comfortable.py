@@ -5,7 +5,7 @@ import pytest
 
 from tasks.kernels.compiled import read_only
 from tasks.reward.comfort import N_FLAGS, comfort_along, comfort_scratch, comfortable
-from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, YAW_RATE
+from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, YAW_RATE
 
 
 def test_it_is_history_comfort_instant_by_instant() -> None:
@@ -18,7 +18,7 @@ def test_it_is_history_comfort_instant_by_instant() -> None:
         states[:, [AX, AY, HEADING, YAW_RATE]] = smooth
         flags = np.empty(N_FLAGS, np.bool_)
         history, drive = states[:14].copy(), states[14:].copy()
-        first = comfort_along(history, drive, PACIFICA.rear_axle_to_center, comfort_scratch(), flags)
+        first = comfort_along(history, drive, comfort_scratch(), flags)
         within = comfortable(read_only(states))
         assert within.all() == flags.all() == np.isinf(first)
         judged.add(bool(flags.all()))

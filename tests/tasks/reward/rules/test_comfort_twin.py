@@ -22,7 +22,7 @@ FILTERS = {  # window, order, derivative
 
 def judged(history: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, float]:
     flags = np.empty(6, dtype=bool)
-    first = comfort_along(history, states, PACIFICA.rear_axle_to_center, comfort_scratch(), flags)
+    first = comfort_along(history, states, comfort_scratch(), flags)
     return flags, first
 
 

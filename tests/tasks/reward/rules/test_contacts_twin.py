@@ -1,6 +1,5 @@
 """Collisions and time to collision: the kernels equal the numpy version in random small worlds, and invariances."""
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,15 +10,13 @@ from hypothesis import strategies as st
 
 from tasks.reward.areas import index_map
 from tasks.reward.centerline import MULTIPLE_LANES, NON_DRIVABLE, empty_body, place
-from tasks.reward.collisions import Obstacles, first_collision, first_time_to_collision, index_obstacles, unindexed
+from tasks.reward.collisions import first_collision, first_time_to_collision, obstacles_of, within_reach
 from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y, box_corners, to_world
-from tasks.world.geometry import ego_boxes
+from tasks.world.geometry import ego_boxes, touching
 from tasks.world.road_map import MapLayer, MapPolygon
 from tests.tasks.reward.slow import collisions as slow
 from tests.tasks.reward.slow.areas import EgoAreas
 from tests.tasks.reward.slow.prepare import Obstacles as SlowObstacles
-
-HALF_LENGTH_M, HALF_WIDTH_M = PACIFICA.half_length, PACIFICA.half_width
 
 
 @dataclass(frozen=True)
@@ -34,25 +31,20 @@ class World:
     collision_score: np.ndarray  # (N,)
 
 
-def contacts(world: World, obstacles: Obstacles) -> np.ndarray:
+def contacts(world: World) -> np.ndarray:
     """NC, its index, TTC's index (K, 3) by the kernels."""
     found = np.empty((len(world.states), 3))
+    obstacles = obstacles_of(world.boxes, world.is_stopped, world.collision_score)
     ignored = np.ones(obstacles.boxes.shape[1], dtype=bool)
     map_index = index_map([MapPolygon("crossing", MapLayer.INTERSECTION, world.crossing)], frozenset())
-    half = HALF_LENGTH_M, HALF_WIDTH_M
     for k, states in enumerate(world.states):
         body = empty_body(len(states))
         place(states, PACIFICA.rear_axle_to_center, body)
         body.flags[:] = world.flags[k]
-        found[k, :2] = first_collision(obstacles, states, body, *half, ignored)
-        found[k, 2] = first_time_to_collision(obstacles, states, body, map_index, *half, ignored)
+        items = within_reach(obstacles, body)
+        found[k, :2] = first_collision(obstacles, items, states, body, ignored)
+        found[k, 2] = first_time_to_collision(obstacles, items, states, body, map_index, ignored)
     return found
-
-
-def indexed(world: World) -> Obstacles:
-    return index_obstacles(
-        world.boxes, world.is_stopped, world.collision_score, math.hypot(HALF_LENGTH_M, HALF_WIDTH_M)
-    )
 
 
 def slow_contacts(world: World) -> np.ndarray:
@@ -160,14 +152,7 @@ def worlds(draw: st.DrawFn) -> World:
 @settings(max_examples=150)
 @given(worlds())
 def test_both_rules_equal_the_numpy_version(world: World) -> None:
-    np.testing.assert_array_equal(contacts(world, indexed(world)), slow_contacts(world))
-
-
-@settings(max_examples=25)
-@given(worlds())
-def test_objects_without_an_index_give_the_same(world: World) -> None:
-    plain = unindexed(world.boxes, world.is_stopped, world.collision_score)
-    np.testing.assert_array_equal(contacts(world, plain), contacts(world, indexed(world)))
+    np.testing.assert_array_equal(contacts(world), slow_contacts(world))
 
 
 def test_what_is_exactly_ahead_may_count_as_not_ahead_where_rounding_lifts_the_cosine() -> None:
@@ -184,7 +169,24 @@ def test_what_is_exactly_ahead_may_count_as_not_ahead_where_rounding_lifts_the_c
             is_stopped=np.ones(1, dtype=bool),
             collision_score=np.zeros(1),
         )
-        found = contacts(world, indexed(world))
+        found = contacts(world)
         np.testing.assert_array_equal(found, slow_contacts(world))
         verdicts.add(float(found[0, 2]))
     assert verdicts == {0.0, np.inf}
+
+
+def test_objects_left_out_along_a_path_are_those_that_nothing_on_it_touches() -> None:
+    x = np.array([0.0, 0.0, 43.5, 44.5, 20.0, np.nan, 43.0])  # the path ends at 40 m
+    boxes = np.zeros((41, 7, 5))
+    boxes[..., 0], boxes[..., 3], boxes[..., 4] = x, 2.0, 1.0
+    boxes[:40, 1, 0], boxes[40, 1, 0] = 500.0, 3.0  # gone at all times but the last
+    boxes[:, 4, 1] = 30.0  # aside
+    boxes[:40, 6] = np.nan  # there at the last step alone
+    states = np.zeros((41, 11))
+    states[:, X] = np.arange(41.0) - PACIFICA.rear_axle_to_center
+    body = empty_body(41)
+    place(states, PACIFICA.rear_axle_to_center, body)
+    kept = within_reach(obstacles_of(boxes, np.zeros(7, dtype=bool), np.zeros(7)), body)
+    assert kept.tolist() == [0, 1, 2, 6]
+    ego = np.array([40.0, 0.0, 0.0, PACIFICA.length, PACIFICA.width])
+    assert [i for i in range(7) if touching(ego, boxes[:, i]).any()] == [2, 6]  # from the path's end
