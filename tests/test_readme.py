@@ -205,7 +205,6 @@ def test_every_command_is_one_its_program_takes(
                 "height",
                 "out",
                 "threads",
-                "lpips",
             }
             assert set(pairs(given(arguments))) <= known
         case ["python", "-m", "examples.csv_logs", folder]:

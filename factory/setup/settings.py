@@ -17,7 +17,6 @@ from factory.config.run import RecoverySources, RunConfig, VocabularyChoice, pho
 from factory.files import machine_fault_of
 from factory.pipeline import BenchmarkWork, FactoryWork
 from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef
-from factory.readers.pickles import check_checkpoint
 from factory.readers.validate import read_clip
 from factory.setup.vocabulary import (
     Starts,
@@ -33,7 +32,6 @@ from factory.store.schema import UNLISTED, RunIdentity, canonical_json
 from tasks.caches import check, user_cache
 from tasks.experts.protocol import Expert, tried_once
 from tasks.experts.recovery import Recovery, RecoverySettings, RecoveryTable
-from tasks.render.fit.losses import BadWeights, lpips_of
 from tasks.render.rigs import RIGS
 from tasks.render.scene import engine
 from tasks.render.settings import RenderMode
@@ -102,11 +100,7 @@ def refuse_missing_backend(config: RunConfig) -> None:
         return
     try:
         engine.check(config.render.backend)
-        if config.render.lpips:
-            for file in filter(Path.is_file, map(Path, config.render.lpips)):
-                check_checkpoint(file)
-            lpips_of(config.render.lpips)
-    except (BackendMissing, BadWeights, ValueError) as error:
+    except BackendMissing as error:
         raise ConfigError(str(error)) from error
 
 
@@ -252,7 +246,7 @@ def identity_of(
     for group, value in science.items():
         settings |= {f"{group}.{key}": plain for key, plain in dataclasses.asdict(value).items()}
     settings |= {f"traffic.{key}": plain for key, plain in traffic_record(config.traffic).items()}
-    del settings["render.lpips"], settings["perturb.starts"]  # measures alone; a path
+    del settings["perturb.starts"]  # a path
     digest = vocabulary.digest
     if starts is not None:
         settings["perturb.starts"] = starts.digest

@@ -37,7 +37,6 @@ from factory.stages.sensors import (
 from factory.store.location import Location
 from factory.wording import time_text
 from tasks.caches import Damaged, check, seal
-from tasks.render.fit.losses import Lpips, lpips_of
 from tasks.render.fit.reconstruct import advance, backend_of, finish
 from tasks.render.fit.start import prepare
 from tasks.render.fit.state import FitState
@@ -66,7 +65,6 @@ def fitted(
     threads: int,
     stopped: StopCheck = never_stop,
     backend: Backend = Backend.CPU,
-    lpips: Lpips | None = None,
 ) -> RenderAsset:
     """The scene of a block's sensors; what is half done lies beside `path`, where the scene will be stored.
 
@@ -96,7 +94,7 @@ def fitted(
         if state.iteration < settings.iterations and stopped():
             said.unlink(missing_ok=True)
             raise TaskStopped(f"{path.stem}: {state.iteration} of {settings.iterations} iterations are done")
-    asset = finish(problem, state, threads, lpips)
+    asset = finish(problem, state, threads)
     begun.unlink(missing_ok=True)
     said.unlink(missing_ok=True)
     return asset
@@ -199,8 +197,7 @@ def asset_for(
             if found is not None:
                 data = replace(data, known=known_of(data, block, found))
             if settings.scene is SceneFrom.FIT:
-                lpips = lpips_of(settings.lpips) if settings.lpips else None
-                asset = fitted(path, data, agents, settings.fit, threads, stopped, settings.backend, lpips)
+                asset = fitted(path, data, agents, settings.fit, threads, stopped, settings.backend)
             else:
                 asset = build_asset(data.photos, data.sweeps, agents, settings.asset, data.known)
             asset = replace(asset, rig=cameras if taken else (), taken=taken, bodies=own_bodies(data.photos))
@@ -279,8 +276,6 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
     if settings.scene is SceneFrom.FIT and settings.backend.on_gpu:
         made["backend"] = Backend.GSPLAT  # another fit to the last bits, so that a run on CPUs never meets it
     how: list[object] = [settings.width, settings.height, sorted(settings.cameras), made]
-    if settings.lpips and part == "fit":  # a scene without the measure is made again
-        how.append([[Path(name).name, Path(name).stat().st_size] for name in settings.lpips])
     if wanted(block, settings.rig):
         how.append(asdict(settings.rig))
     if settings.own_body:

@@ -124,7 +124,7 @@ def _tokens(names: Sequence[str]) -> list[str]:
 
 # How well scenes show photos they were not made of, camera by camera: for `factory scene` and the report.
 
-MEANS = ("psnr_db", "ssim", "lpips", "away_m")  # of views
+MEANS = ("psnr_db", "ssim", "away_m")  # of views
 
 
 @dataclass(frozen=True)
@@ -135,16 +135,14 @@ class CameraRow:
     photos: int
     psnr_db: float
     ssim: float
-    lpips: float
     away_m: float  # from the nearest photo that the scene was made of
     psnr_db_of: Mapping[str, float]  # by class: road, vehicles, rest
 
     @property
     def text(self) -> str:
         """In one line; what was not measured is left out."""
-        said = [f"{self.psnr_db:.2f} dB", f"SSIM {self.ssim:.3f}", f"LPIPS {self.lpips:.3f}"]
-        numbers = (self.psnr_db, self.ssim, self.lpips)
-        found = ", ".join(text for text, number in zip(said, numbers, strict=True) if not math.isnan(number))
+        said = [(self.psnr_db, f"{self.psnr_db:.2f} dB"), (self.ssim, f"SSIM {self.ssim:.3f}")]
+        found = ", ".join(text for number, text in said if not math.isnan(number))
         away = "" if math.isnan(self.away_m) else f", {self.away_m:.1f} m from the nearest photo used"
         classes = ", ".join(f"{name} {value:.2f} dB" for name, value in self.psnr_db_of.items())
         return f"{found} over {self.photos} held-out photos{away}" + (f" ({classes})" if classes else "")

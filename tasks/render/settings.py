@@ -249,9 +249,6 @@ class RenderSettings:
     psnr_min: float = 27.0  # [dB] what a block's held-out photos must come out with; 0: anything
     camera_psnr_min: float = 20.0  # [dB] and those of each of its cameras; 0: anything
     psnr_gate: PsnrGate = PsnrGate.REJECT  # what becomes of a block below psnr_min
-    lpips: tuple[
-        str, ...
-    ] = ()  # files of weights: held-out photos are measured by LPIPS as well, which decides nothing
     gate: GateSettings = field(default_factory=GateSettings)  # what every rendered picture of a drive must come up to
     # Without photos: images only this close to where a sweep was taken; 0: none.
     lidar_only_reach_m: float = fixed(15.0)

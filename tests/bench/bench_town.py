@@ -3,7 +3,7 @@
 The painter of the town knows what is to be seen from everywhere: from held-out photos' poses, from 1 and 2 m to either
 side, turned by 20 degrees (road, vehicles and the rest apart), and with every vehicle put 3 m ahead and 0.8 m to the
 left. Only photos, lidar, poses and boxes go into the scene. Options: log=0 width=320 height=180 out=out/bench_town
-threads=2 lpips=<weights,...> and the settings of `FitSettings`.
+threads=2 and the settings of `FitSettings`.
 A camera that would be within 0.6 m of somebody's box is left out. With moved vehicles all pixels count whose sight line
 meets the box of one of them within 40 m, whatever else is in front.
 """
@@ -25,7 +25,6 @@ from factory.datasets.town.town import log_name, plan_log, write_log
 from factory.readers.settings import TownSettings
 from factory.stages.sensors import block_of, load_sensors
 from factory.views.scene_files import camera_rows
-from tasks.render.fit.losses import Lpips, lpips_of
 from tasks.render.fit.reconstruct import LEAST_PIXELS as LEAST_OF_CLASS
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.start import prepare
@@ -85,11 +84,10 @@ def with_moved_vehicles(drive: TownDrive) -> TownDrive:
     return replace(drive, tracks=tuple(tracks))
 
 
-def row(name: str, views: Sequence[Compared], lpips: Lpips | None) -> str:
+def row(name: str, views: Sequence[Compared]) -> str:
     """A line of the table: means over the views, the worst PSNR, mean PSNR by class."""
     scores = np.array([(view.psnr_db, view.ssim) for view in views])
     told = [f"{scores[:, 0].mean():.2f}", f"{scores[:, 1].mean():.3f}"]
-    told.append("" if lpips is None else f"{np.mean([lpips(view.picture, view.truth) for view in views]):.3f}")
     told += [f"{scores[:, 0].min():.1f}", *(by_class(views, of) for of in CLASSES), str(len(views))]
     return f"| {name} | " + " | ".join(told) + " |"
 
@@ -115,8 +113,6 @@ def main() -> None:
     """Writes the log, trains, prints a table, writes pictures."""
     options = dict(option.split("=", 1) for option in sys.argv[1:])
     log, threads = int(options.pop("log", "0")), int(options.pop("threads", "2"))
-    weights = options.pop("lpips", "")
-    lpips = lpips_of(weights.split(",")) if weights else None
     width, height = int(options.pop("width", "320")), int(options.pop("height", "180"))
     out = Path(options.pop("out", "out/bench_town"))
     kinds = {field.name: type(getattr(SETTINGS, field.name)) for field in fields(FitSettings)}
@@ -145,7 +141,7 @@ def main() -> None:
             print(f"{iteration}: loss {loss:.4f}, training photos {score:.2f} dB, {seconds:.0f} s", flush=True)
 
     advance(problem, state, settings, settings.iterations, told, threads)
-    asset = finish(problem, state, threads, lpips)
+    asset = finish(problem, state, threads)
     seconds, cpu_s = time.perf_counter() - began, time.process_time() - cpu
 
     photos = [data.photos[i] for i in sorted(held_out_rows(data.photos, settings.hold_out_every))]
@@ -167,12 +163,10 @@ def main() -> None:
         "turned 20 degrees right": views.compared([beside(p, left_rad=-np.deg2rad(20.0)) for p in photos]),
         "moved vehicles, inside their boxes": views.compared_moved(photos),
     }
-    print(
-        f"\n| log {log} at {width}x{height} | PSNR [dB] | SSIM | LPIPS | worst [dB] | road | vehicles | rest | views |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|")
+    print(f"\n| log {log} at {width}x{height} | PSNR [dB] | SSIM | worst [dB] | road | vehicles | rest | views |")
+    print("|---|---|---|---|---|---|---|---|")
     for name, compared in kinds_of_view.items():
-        print(row(name, compared, lpips))
+        print(row(name, compared))
         path = out / f"log{log}-{name.replace(' ', '-').replace(',', '')}.png"
         cv2.imwrite(str(path), cv2.cvtColor(picture(compared), cv2.COLOR_RGB2BGR))
     print()

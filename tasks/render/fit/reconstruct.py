@@ -9,7 +9,7 @@ import numpy as np
 from tasks.kernels.compiled import kernel
 from tasks.render.fit.backend import Derivatives, FitBackend, Held
 from tasks.render.fit.corrections import after, between, corrected, exposed, inverse, matrix_of, reference
-from tasks.render.fit.losses import Lpips, Target, ssim
+from tasks.render.fit.losses import Target, ssim
 from tasks.render.fit.on_cpu import OnCpu, compose, forward_pass
 from tasks.render.fit.start import Problem, Shot, prepare
 from tasks.render.fit.state import BACKGROUND, FitState, Road, above_road, opacities_of, refine
@@ -46,17 +46,12 @@ SAME_WAY = 0.87  # cosine: photos that look within 30 degrees of each other
 
 
 def measured(
-    asset: RenderAsset,
-    problem: Problem,
-    shot: Shot,
-    scene_from_camera: Array,
-    threads: int = 1,
-    lpips: Lpips | None = None,
+    asset: RenderAsset, problem: Problem, shot: Shot, scene_from_camera: Array, threads: int = 1
 ) -> ViewQuality:
     """Of a photo that was held out, as `asset` shows it from a pose (4, 4) in the problem's frame.
 
     The camera has the colours that it has at any new pose then, and tracks are where photos say that they were. Pixels
-    without weight say nothing; LPIPS, whose layers see far around, is of the whole picture.
+    without weight say nothing.
     """
     photo, target = shot.photo, shot.compared.target
     picture = drawn(asset, problem, photo, scene_from_camera, threads)
@@ -71,7 +66,6 @@ def measured(
         psnr(picture[counted], target.rgb[counted]) if counted.any() else float("nan"),
         ssim(picture, target)[0],
         held_out=True,
-        lpips=float("nan") if lpips is None else lpips(picture, target.rgb),
         away_m=away(photo, [other.photo for other in problem.train]),
         classes=tuple(of for of in found if of is not None),
     )
@@ -448,8 +442,8 @@ def box_shifts(problem: Problem, state: FitState) -> tuple[Array, BoxShifts]:
     return moved_by, BoxShifts(tuple(problem.tracks.ids[j] for j in known), rows[known].astype(np.float32))
 
 
-def finish(problem: Problem, state: FitState, threads: int = 2, lpips: Lpips | None = None) -> RenderAsset:
-    """The scene as it is rendered, with what it makes of the photos held out; `lpips` measures them as well.
+def finish(problem: Problem, state: FitState, threads: int = 2) -> RenderAsset:
+    """The scene as it is rendered, with what it makes of the photos held out.
 
     What all cameras make of the scene's light on average is folded into it: its own colours are those of photos.
     """
@@ -483,5 +477,5 @@ def finish(problem: Problem, state: FitState, threads: int = 2, lpips: Lpips | N
     )
     views = []
     for shot in problem.held_out:
-        views.append(measured(asset, problem, shot, pose_of(problem, state, shot.photo), threads, lpips))
+        views.append(measured(asset, problem, shot, pose_of(problem, state, shot.photo), threads))
     return replace(asset, views=tuple(views), psnr_db=mean_psnr_db(views), n_held_out=len(views))

@@ -48,7 +48,6 @@ class ViewQuality:
     psnr_db: float
     ssim: float
     held_out: bool  # the scene was built without this photo
-    lpips: float = float("nan")  # 0: alike
     away_m: float = float("nan")  # from the nearest photo that the scene was built from and that looks the same way
     classes: tuple[ClassQuality, ...] = ()  # those that the photo shows
 

@@ -44,7 +44,7 @@ def test_info_says_what_is_in_a_scene(stored: Path, capsys: pytest.CaptureFixtur
         "background  30 Gaussians, SH degree 1",
         "node        b/7 ü: 5 Gaussians, SH degree 3",
         "psnr        27.12 dB over 3 held-out photos",
-        "camera      front: 28.50 dB, SSIM 0.910, LPIPS 0.250 over 1 held-out photos, "
+        "camera      front: 28.50 dB, SSIM 0.910 over 1 held-out photos, "
         "3.5 m from the nearest photo used (road 30.50 dB)",
         "view        front at 0.50 s: 28.50 dB, SSIM 0.910, held out",
         "exposures   1",

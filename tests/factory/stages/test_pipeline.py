@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.config.compose import ConfigError
 from factory.config.run import load_config
 from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, RejectedAttempt, run_attempt
 from factory.pipeline import FactoryWork, WholeClip
 from factory.readers.base import BadClip
-from factory.setup.settings import assemble, identity_of, refuse_missing_backend
-from factory.stages.assets import block_id
+from factory.setup.settings import assemble, identity_of
 from factory.store.schema import COLUMNS, UNLISTED
 from tasks import stages
 from tasks.perturb import Perturbation, perturb
@@ -22,7 +20,6 @@ from tasks.stages import HUMAN, HUMAN_BEFORE
 from tasks.world.clip import HORIZON_STEPS, NOW, stream
 from tasks.world.frames import to_local
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
-from tests.tasks.streets import street_clip
 
 VOCABULARY = Vocabulary(kinematic_trajectories(3, 0))
 SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "vocabulary.k=300"]
@@ -224,25 +221,6 @@ def test_gates_that_are_off_are_no_part_of_what_rows_are_made_under_and_gates_th
     on = identity_of(load_config([]), VOCABULARY, None)
     assert dict(on.settings) == dict(off.settings) | {"reward.off_route": True, "reward.after": True}
     assert on.settings_hash != off.settings_hash and on.prepare_digest == off.prepare_digest
-
-
-def test_weights_that_only_measure_are_no_part_of_what_rows_are_made_under(tmp_path: Path) -> None:
-    """The scene is made again, so that it is measured; a table goes on."""
-    (tmp_path / "alex.pth").write_bytes(b"heads")
-    weights = f"render.lpips=[{tmp_path}/alex.pth]"
-    plain, measured = load_config([]), load_config([weights])
-    assert identity_of(plain, VOCABULARY, None) == identity_of(measured, VOCABULARY, None)
-    clip = street_clip()
-    ids = {block_id(clip, config.render) for config in (plain, measured)}
-    assert len(ids) == 2
-
-
-def test_weights_that_are_none_are_refused_before_a_run(tmp_path: Path) -> None:
-    pytest.importorskip("torch")
-    (tmp_path / "note.pth").write_text("no weights")
-    for name, said in (("note.pth", "cannot be read as a checkpoint"), ("absent.pth", "No such file")):
-        with pytest.raises(ConfigError, match=said):
-            refuse_missing_backend(load_config([f"render.lpips=[{tmp_path / name}]"]))
 
 
 def test_without_a_gate_the_block_s_settings_are_no_part_of_what_is_prepared() -> None:

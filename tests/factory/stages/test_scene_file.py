@@ -44,7 +44,7 @@ def scene() -> RenderAsset:
         psnr_db=27.123456789,
         n_held_out=3,
         views=(
-            ViewQuality("front", 0.5, 28.5, 0.91, True, 0.25, 3.5, (ClassQuality("road", 0.3, 30.5, 0.9),)),
+            ViewQuality("front", 0.5, 28.5, 0.91, True, 3.5, (ClassQuality("road", 0.3, 30.5, 0.9),)),
             ViewQuality("front", 1.0, float("inf"), float("nan"), False),
         ),
         exposures=(Exposure("front", 0.5, np.eye(3, 4, dtype=np.float32) * 1.1),),

@@ -83,7 +83,7 @@ def test_each_class_is_measured_on_its_own_pixels(fitted: tuple[Problem, FitStat
     assert of(other, "vehicles").psnr_db < of(same, "vehicles").psnr_db - 1.0
     assert of(other, "vehicles").ssim < of(same, "vehicles").ssim
     assert of(other, "road").psnr_db == pytest.approx(of(same, "road").psnr_db, abs=0.3)
-    assert same.psnr_db > other.psnr_db and np.isnan(same.lpips)
+    assert same.psnr_db > other.psnr_db
 
 
 def test_pixels_without_weight_are_not_measured(fitted: tuple[Problem, FitState]) -> None:
@@ -100,15 +100,3 @@ def test_pixels_without_weight_are_not_measured(fitted: tuple[Problem, FitState]
     assert masked.psnr_db == clean.psnr_db and of(masked, "rest").psnr_db == of(clean, "rest").psnr_db
     seen = measured(asset, problem, Shot(bad, None), pose)
     assert seen.psnr_db < masked.psnr_db - 3.0
-
-
-def test_lpips_is_of_the_picture_and_the_photo(fitted: tuple[Problem, FitState]) -> None:
-    problem, state = fitted
-
-    def distance(picture: np.ndarray, photo: np.ndarray) -> float:
-        assert picture.shape == photo.shape == (72, 128, 3)
-        np.testing.assert_array_equal(photo, problem.held_out[0].compared.target.rgb)
-        return float(np.abs(picture - photo).mean())
-
-    (view,) = finish(problem, state, lpips=distance).views
-    assert 0.0 < view.lpips < 0.2
