@@ -50,9 +50,9 @@ def refuse_cameras_of_no_rig(config: RunConfig) -> None:
     if not wanted or config.render.mode is RenderMode.NONE:
         return
     if not rig and config.render.mode is RenderMode.MAP:
-        from tasks.render.rigs import RIGS
+        from tasks.render.rigs import MAP_RIG
 
-        rig = tuple(camera.name for camera in RIGS[config.render.map_rig])
+        rig = tuple(camera.name for camera in MAP_RIG)
     if missing := [name for name in wanted if name not in rig]:
         none = f"no log under {root} has calibrated cameras"
         if target == SCENARIONET:

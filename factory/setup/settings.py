@@ -32,7 +32,7 @@ from factory.store.schema import UNLISTED, RunIdentity, canonical_json
 from tasks.caches import check, user_cache
 from tasks.experts.protocol import Expert, tried_once
 from tasks.experts.recovery import Recovery, RecoverySettings, RecoveryTable
-from tasks.render.rigs import RIGS
+from tasks.render.rigs import MAP_RIG
 from tasks.render.scene import engine
 from tasks.render.settings import RenderMode
 from tasks.render.splatting.gsplat_backend import BackendMissing
@@ -164,7 +164,7 @@ def refuse_unknown_cameras(config: RunConfig, reader: ClipReader, index: ClipInd
         except BadClip:
             continue
         if not rig and config.render.mode is RenderMode.MAP:
-            rig = RIGS[config.render.map_rig]
+            rig = MAP_RIG
         if rig:
             chosen_cameras(rig, wanted)
             refuse_unknown_masks(masks, rig)

@@ -184,13 +184,13 @@ def asset_for(
                 log.warning("%s; it is built again", error)
             else:
                 if made_of is not Sensing.LIDAR_ONLY and wanted(block, settings.rig):
-                    said_again(path, block, cameras, settings.rig, masks)
+                    said_again(path, block, cameras, masks)
                 return kept
         if made_of is not Sensing.LIDAR_ONLY:
             agents, taken, found = block.agents, tuple[TakenFrom, ...](), None
             if wanted(block, settings.rig):
                 given = block.images
-                block, cameras, found = corrected_rig(path, block, cameras, settings.rig, masks)
+                block, cameras, found = corrected_rig(path, block, cameras, masks)
                 taken = taken_from(given, block.images) if found is not None else ()
                 agents = lifted(agents, *rises_of(taken))
             data = load_sensors(block, cameras, settings.width, settings.height, masks)
@@ -218,7 +218,7 @@ def corrected_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -
     cameras = block_cameras(block, rig)
     path, masks = scene_path(clip, settings, cache_dir), masks_of(cameras, read_masks(settings.own_body, rig))
     with only_builder(path):
-        return used_rig(path, block, cameras, settings.rig, masks)
+        return used_rig(path, block, cameras, masks)
 
 
 def own_part(asset: RenderAsset) -> RenderAsset:

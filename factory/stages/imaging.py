@@ -33,7 +33,7 @@ from tasks.render.gate import (
     unfit,
 )
 from tasks.render.map_drawing import draw_map_views
-from tasks.render.rigs import RIGS
+from tasks.render.rigs import MAP_RIG
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import vehicles_at
 from tasks.render.scene.sensed import Photo
@@ -105,7 +105,7 @@ class Imaging:
         that lacks some of its photos.
         """
         if self.settings.mode is RenderMode.MAP:
-            rig = clip.cameras or RIGS[self.settings.map_rig]
+            rig = clip.cameras or MAP_RIG
             return self._drawn(clip, judged, None, chosen_cameras(rig, self.settings.cameras))
         if self.settings.mode is RenderMode.PAINTER:
             return self._painted(clip, judged)
@@ -233,7 +233,7 @@ class Imaging:
             "camera": camera,
             "time_s": float(time_s),
             "ego_pose": pose.ravel(),
-            "jpeg": encode_jpeg(rgb, self.settings.jpeg_quality, self.settings.jpeg_chroma),
+            "jpeg": encode_jpeg(rgb, self.settings.jpeg_quality),
         }
 
     def rig(self, cameras: Sequence[Camera]) -> list[dict[str, object]]:

@@ -74,7 +74,6 @@ def corrected_rig(
     path: Path,
     block: Block,
     cameras: Sequence[Camera],
-    settings: RigSettings,
     own_body: Mapping[str, Bools] = NO_MASKS,
 ) -> tuple[Block, tuple[Camera, ...], Correction | None]:
     """Block and cameras as the photos say they are, and what was found, which is written beside `path`.
@@ -87,8 +86,8 @@ def corrected_rig(
     for row, image in opened_photos(files, cameras):
         (camera,) = (camera for camera in cameras if camera.name == files[row].sensor)
         hidden = hidden_by(block.agents, camera, files[row], own_body.get(camera.name))
-        corners[row] = corners_of(image, settings.width, settings.corners, hidden)
-    found = corrected(cameras, files, [corners[row] for row in range(len(files))], settings)
+        corners[row] = corners_of(image, hidden)
+    found = corrected(cameras, files, [corners[row] for row in range(len(files))])
     if found is None:
         log.warning("%s: too few corners are shared by the photos: calibration and poses are used as given", path.stem)
         _say(path, {"cameras": [], "used": [], "taken": []})
@@ -118,7 +117,7 @@ def told_of(said: Path) -> dict[str, Any]:
 
 
 def used_rig(
-    path: Path, block: Block, cameras: Sequence[Camera], settings: RigSettings, own_body: Mapping[str, Bools] = NO_MASKS
+    path: Path, block: Block, cameras: Sequence[Camera], own_body: Mapping[str, Bools] = NO_MASKS
 ) -> UsedRig | None:
     """The rig as it is told beside `path`, found first where nothing is told there; None where nothing can be found.
 
@@ -130,7 +129,7 @@ def used_rig(
     except (FileNotFoundError, Damaged) as error:
         if isinstance(error, Damaged):
             log.warning("%s: %s; it is written again", said, error)
-        corrected_rig(path, block, cameras, settings, own_body)
+        corrected_rig(path, block, cameras, own_body)
         told = told_of(said)
     used: dict[str, dict[str, Any]] = {
         row["name"]: {key: np.array(row[key], np.float64) for key in CALIBRATED} for row in told["used"]
@@ -144,9 +143,7 @@ def used_rig(
     return UsedRig(tuple(replace(camera, **used[camera.name]) for camera in cameras), tuple(taken))
 
 
-def said_again(
-    path: Path, block: Block, cameras: Sequence[Camera], settings: RigSettings, own_body: Mapping[str, Bools] = NO_MASKS
-) -> None:
+def said_again(path: Path, block: Block, cameras: Sequence[Camera], own_body: Mapping[str, Bools] = NO_MASKS) -> None:
     """Writes what was found anew where the file beside `path` is damaged; the scene there stays. Raises BadClip."""
     said = path.with_suffix(SAID)
     try:
@@ -155,7 +152,7 @@ def said_again(
         return
     except Damaged as error:
         log.warning("%s: %s; it is written again", said, error)
-        corrected_rig(path, block, cameras, settings, own_body)
+        corrected_rig(path, block, cameras, own_body)
 
 
 def known_of(data: SensorData, block: Block, found: Correction) -> Known:

@@ -17,7 +17,6 @@ from factory.readers.points import read_pcd, read_points
 from tasks.render.scene.driven_road import driven_roads
 from tasks.render.scene.features import NOTHING_KNOWN, Known
 from tasks.render.scene.sensed import Photo, Sweep, on_ego
-from tasks.render.settings import Chroma
 from tasks.render.views import straightened, undistorted
 from tasks.world.arrays import Array, Bools, Bytes
 from tasks.world.clip import Block, Camera, Clip, SensorFile, own_name
@@ -88,10 +87,6 @@ def _files(folder: str) -> dict[str, Path]:
 
 
 XYZ, INTENSITY = ("x", "y", "z"), "intensity"
-SAMPLING: Mapping[Chroma, int] = {
-    "420": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
-    "444": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
-}
 NO_PICTURE = 1.0  # standard deviation [grey levels] that a photo has at least, at night too
 
 
@@ -162,9 +157,9 @@ def chosen_cameras(rig: Sequence[Camera], names: Sequence[str] | None) -> tuple[
     return tuple(by_name[name] for name in names)
 
 
-def encode_jpeg(image: Bytes, quality: int, chroma: Chroma = "420") -> bytes:
-    """An rgb image (H, W, 3) as JPEG bytes; quality 1..100, colour at half the size each way (420) or whole (444)."""
-    how = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, SAMPLING[chroma]]
+def encode_jpeg(image: Bytes, quality: int) -> bytes:
+    """An rgb image (H, W, 3) as JPEG bytes; quality 1..100, colour at half the size each way."""
+    how = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
     done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), how)
     if not done:
         raise ValueError(f"no JPEG of an image of shape {image.shape}")

@@ -20,12 +20,4 @@ def pinhole(name: str, yaw_deg: float, field_of_view_deg: float, width: int = 64
     return Camera(name, width, height, intrinsics, np.zeros(5), ego_from_camera)
 
 
-_SIX = {"front": 0.0, "front_left": 60.0, "rear_left": 120.0, "rear": 180.0, "rear_right": -120.0, "front_right": -60.0}
-_YAWS_DEG = {
-    "front": {"front": 0.0},
-    "three_front": {"front_left": 55.0, "front": 0.0, "front_right": -55.0},
-    "ring_six": _SIX,
-}
-RIGS: dict[str, tuple[Camera, ...]] = {
-    rig: tuple(pinhole(name, yaw, 70.0) for name, yaw in yaws.items()) for rig, yaws in _YAWS_DEG.items()
-}
+MAP_RIG = (pinhole("front_left", 55.0, 70.0), pinhole("front", 0.0, 70.0), pinhole("front_right", -55.0, 70.0))

@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Literal
 
 from tasks.settings import fixed
 
@@ -42,7 +41,7 @@ class AssetSettings:
 DISCS = AssetSettings()  # every block's: a user chooses between discs and fit, not how discs are built
 
 
-# Whether a rig's calibration is corrected before its photos are used, and how far it and the poses are believed.
+# Whether a rig's calibration is corrected before its photos are used.
 
 
 class Adjust(StrEnum):
@@ -53,32 +52,9 @@ class Adjust(StrEnum):
 
 @dataclass(frozen=True)
 class RigSettings:
-    """Sigmas are what calibration and poses are expected to be off by; 0 holds a quantity fixed.
-
-    One set for all rigs: a camera that photos say little of stays as given (docs/reconstruction.md, real rigs).
-    """
+    """The priors are one set for all rigs, in tasks/render/rig/correct.py."""
 
     adjust: Adjust = Adjust.AUTO
-    width: int = fixed(960)  # pixels of the photos that corners are looked for in, where they are larger
-    corners: int = fixed(4000)  # a photo, at most
-    partners: int = fixed(3)  # photos of each camera that a photo is matched with
-    turn_deg: float = fixed(1.0)  # of a camera on the ego
-    shift_m: float = fixed(0.1)
-    focal: float = fixed(0.01)  # share of the focal lengths
-    centre: float = fixed(0.01)  # of the principal point, as a share of the width
-    lens: float = fixed(0.02)  # of k1, k2, k3; of p1, p2 a tenth
-    stamp_s: float = fixed(0.05)  # of a camera's stamps against the ego's, where photos can tell
-    pose_turn_deg: float = fixed(0.5)  # of the ego, root mean square over the drive
-    pose_shift_m: float = fixed(0.2)
-
-    def __post_init__(self) -> None:
-        for name, least in (("width", 64), ("corners", 100), ("partners", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"rig {name} must be {least} or more, not {getattr(self, name)}")
-        sigmas = ("turn_deg", "shift_m", "focal", "centre", "lens", "stamp_s", "pose_turn_deg", "pose_shift_m")
-        for name in sigmas:
-            if not 0.0 <= getattr(self, name) < float("inf"):
-                raise ValueError(f"rig {name} must be 0 or more, not {getattr(self, name)}")
 
     def may_correct(self, photos_alone: bool) -> bool:
         """Whether a run may have a rig to correct; photos_alone: its clips may have photos and no lidar."""
@@ -107,7 +83,6 @@ class FitSettings:
     most_gaussians: int = 250_000  # of a scene
     start_opacity: float = 0.5  # of every Gaussian
     stereo_photos: int = 4  # neighbours compared where lidar does not reach
-    sh_degree: int = fixed(0)  # 0 to 3
     # Loss.
     ssim_weight: float = 0.1  # loss = (1 - w) L1 + w (1 - SSIM)
     opaque_weight: float = fixed(0.1)  # of the mean light that passes where a photo looks at the ground
@@ -149,17 +124,12 @@ class FitSettings:
                 raise ValueError(f"fit {name} must be 1 or more, not {getattr(self, name)}")
         if self.road_share <= 0.0:
             raise ValueError(f"fit road_share must be above 0, not {self.road_share}")
-        if self.sh_degree not in range(4):
-            raise ValueError(f"fit sh_degree must be 0 to 3, not {self.sh_degree}")
         for name in ("ssim_weight", "rate_end", "mean_rate_end"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"fit {name} must be from 0 to 1, not {getattr(self, name)}")
         for name in ("stretch", "box_stretch"):
             if getattr(self, name) != 0.0 and not getattr(self, name) >= 1.0:
                 raise ValueError(f"fit {name} must be 0 (any) or 1 and more, not {getattr(self, name)}")
-
-
-Chroma = Literal["420", "444"]
 
 
 class RenderMode(StrEnum):
@@ -245,14 +215,12 @@ class RenderSettings:
     width: int = 320  # pixels
     height: int = 180  # pixels
     jpeg_quality: int = 90  # 1 to 100
-    jpeg_chroma: Chroma = "420"  # colours at half the size each way; 444: whole
     psnr_min: float = 27.0  # [dB] what a block's held-out photos must come out with; 0: anything
     camera_psnr_min: float = 20.0  # [dB] and those of each of its cameras; 0: anything
     psnr_gate: PsnrGate = PsnrGate.REJECT  # what becomes of a block below psnr_min
     gate: GateSettings = field(default_factory=GateSettings)  # what every rendered picture of a drive must come up to
     # Without photos: images only this close to where a sweep was taken; 0: none.
     lidar_only_reach_m: float = fixed(15.0)
-    map_rig: Literal["front", "three_front", "ring_six"] = "three_front"  # for mode=map without a rig
     scene: SceneFrom = SceneFrom.FIT  # discs: built in one go, seconds a block; fit: then fitted to its photos, minutes
     scene_dtype: SceneDtype = fixed(SceneDtype.FLOAT16)  # of scenes' files; float16: all but the places of Gaussians
     own_body: str = ""  # folder of masks, <camera>.png, of what the rig sees of the ego itself

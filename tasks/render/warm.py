@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from tasks.render.fit.reconstruct import reconstruct
+from tasks.render.fit.reconstruct import advance, finish
+from tasks.render.fit.start import prepare
 from tasks.render.rig.adjust import N_CAMERA, Bundle, Matched, adjusted, given_rig
 from tasks.render.scene.build import AssetSettings, RenderAsset, build_asset
 from tasks.render.scene.depth import confirmed
@@ -27,7 +28,9 @@ def compile_fit_kernels() -> RenderAsset:
     settings = FitSettings(
         iterations=4, start_gaussians=200, most_gaussians=300, refine_every=2, refine_from=2, pose_from=0
     )
-    return reconstruct(*_seen(), settings, held_out=[1])
+    problem, state = prepare(*_seen(), settings, held_out=[1])
+    advance(problem, state, settings, settings.iterations)
+    return finish(problem, state)
 
 
 def compile_rig_kernels() -> Bundle:

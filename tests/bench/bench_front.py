@@ -22,7 +22,7 @@ from tasks.render.fit.start import prepare
 from tasks.render.rig.correct import Correction
 from tasks.render.scene.asset import rises_of
 from tasks.render.scene.movers import lifted
-from tasks.render.settings import FitSettings, RigSettings
+from tasks.render.settings import FitSettings
 from tasks.world.clip import Block, Camera, SensorFile
 
 SIZE = (400, 225)
@@ -51,7 +51,7 @@ def unmatched(
     kept = [k for k in range(len(block.images)) if k % EVERY != EVERY // 2]
     given = {k: block.images[k] for k in kept}
     fewer = replace(block, images=tuple(given.values()))
-    corrected, rig, found = corrected_rig(path, fewer, cameras, RigSettings())
+    corrected, rig, found = corrected_rig(path, fewer, cameras)
     known = dict(zip(kept, corrected.images, strict=True))
     files = [
         known[k] if k in known else beside(file, (given[k - 1], known[k - 1]), (given[k + 1], known[k + 1]))
@@ -75,7 +75,7 @@ def main() -> None:
     if adjust:
         path = out / "front.safetensors"
         if matched:
-            block, cameras, found = corrected_rig(path, block, cameras, RigSettings())
+            block, cameras, found = corrected_rig(path, block, cameras)
         else:
             block, cameras, found = unmatched(path, block, cameras)
     data = load_sensors(block, cameras, *SIZE)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from factory.datasets.kitti.reader import read_drive, steadied
 from factory.stages.scene_file import write_scene
-from tasks.render.fit.corrections import affine_between, corrected, exposed
+from tasks.render.fit.corrections import corrected, exposed
 from tasks.render.fit.losses import ssim, target_of
 from tasks.render.fit.on_torch import OnTorch
 from tasks.render.fit.reconstruct import advance, backend_of, corrections_at, drawn, finish, pose_of
@@ -29,9 +29,9 @@ from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import render
 from tasks.render.scene.sensed import Photo, shifted
 from tasks.render.settings import Backend, FitSettings
-from tasks.render.splatting.tensors import by_kernels
 from tasks.world.clip import Pinhole
-from tests.bench.stored_scene import Look, kept, storage_table
+from tests.bench.by_kernels import by_kernels
+from tests.bench.stored_scene import Look, affine_between, kept, storage_table
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 FITTED_FRAMES = 12  # of image_03's training frames, for its affine colour and rigid correction

@@ -18,7 +18,7 @@ import numpy as np
 
 from factory.stages.rig import lines_of
 from factory.stages.sensors import load_photos, opened_photos
-from tasks.render.fit.corrections import affine_between, exposed
+from tasks.render.fit.corrections import exposed
 from tasks.render.fit.losses import ssim
 from tasks.render.fit.reconstruct import advance, classes_of, drawn, finish, pose_of
 from tasks.render.fit.start import Problem, Shot, prepare
@@ -26,10 +26,10 @@ from tasks.render.rig.correct import Correction, corners_of, corrected, ground_b
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.driven_road import driven_road
 from tasks.render.scene.features import Known
-from tasks.render.settings import FitSettings, RigSettings
+from tasks.render.settings import FitSettings
 from tasks.world.arrays import Array
 from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Camera, SensorFile
-from tests.bench.stored_scene import kept
+from tests.bench.stored_scene import affine_between, kept
 
 SIZE = (480, 270)
 HELD_OUT, VALIDATED = (20, 27), (18, 24)
@@ -87,12 +87,12 @@ def movers(files: list[SensorFile], instants: list[int], ground_m: float) -> Age
     return AgentTracks(tuple(MOVERS), kinds, boxes, np.zeros((n_steps, n, 2)), valid, centre_z, heights)
 
 
-def correct(cameras: list[Camera], files: list[SensorFile], settings: RigSettings) -> Correction:
+def correct(cameras: list[Camera], files: list[SensorFile]) -> Correction:
     """As a run does it, and what it says of each camera."""
     opened = {}
     for row, image in opened_photos(files, cameras):
-        opened[row] = corners_of(image, settings.width, settings.corners)
-    found = corrected(cameras, files, [opened[row] for row in range(len(files))], settings)
+        opened[row] = corners_of(image)
+    found = corrected(cameras, files, [opened[row] for row in range(len(files))])
     assert found is not None, "too few corners were matched"
     print("\n".join(lines_of(found)), f"{len(found.points)} points", sep="\n", flush=True)
     return found
@@ -110,14 +110,13 @@ def main() -> None:
     validate, threads = options.pop("validate", "0") == "1", int(options.pop("threads", "2"))
     adjust, ground = options.pop("adjust", "1") == "1", options.pop("ground", "")
     masked = options.pop("movers", "1") == "1"
-    rig = RigSettings(**{k.removeprefix("rig."): float(options.pop(k)) for k in list(options) if k.startswith("rig.")})
     kinds = {field.name: type(getattr(FitSettings(), field.name)) for field in fields(FitSettings)}
     settings = replace(SETTINGS, **{k: kinds[k](float(v)) for k, v in options.items()})
 
     cameras, files, instants = read_block(root, HELD_OUT if validate else ())
     known, started = Known(), time.process_time()
     if adjust:
-        found = correct(cameras, files, rig)
+        found = correct(cameras, files)
         cameras, files, known = list(found.cameras), list(found.files), Known(corners=found.points)
     if ground:
         poses = np.stack([file.world_from_ego for file in files])

@@ -38,10 +38,11 @@ from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gsplat_backend import BackendMissing, rasterize_all, require
 from tasks.render.splatting.raster import View, forward
-from tasks.render.splatting.tensors import Draw, Eye, SceneTensors, by_gsplat, by_kernels, learned_arguments
+from tasks.render.splatting.tensors import Draw, Eye, SceneTensors, by_gsplat, learned_arguments
 from tasks.world.clip import Pinhole
 from tests.bench.bench_render import cloud
-from tests.bench.peer_gsplat import SCENES, answers, apart, of_kernels
+from tests.bench.by_kernels import by_kernels
+from tests.bench.peer_gsplat import HEIGHT, SCENES, WIDTH, answers, apart, of_kernels, pictures_of, pose
 
 CLOSE = 1e-3  # of an array's length: CUDA's exponential is good to 2e-6, and sums come in any order
 BEHIND_A_WALL = 5e-3  # light that a tile drops and gsplat does not
@@ -133,8 +134,15 @@ def parity(place: Place) -> bool:
     well = True
     for name, (scene, intrinsics) in SCENES.items():
         ours = of_kernels(scene, intrinsics)
-        found = apart(ours, answers(place.draw, scene, intrinsics, torch.float32, place.device))
-        most = [max(v for what, v in found.items() if what.startswith("d ") is by) for by in (False, True)]
+        if "d means" in ours:
+            theirs = answers(place.draw, scene, intrinsics, torch.float32, place.device)
+        else:  # light that depends on the side: drawn, not learned
+            eye, behind = Pinhole(np.array(intrinsics), pose(), WIDTH, HEIGHT), np.zeros((HEIGHT, WIDTH, 3), np.float32)
+            theirs = pictures_of(place.engine(scene, [eye], [behind], True)[0], ours["index"])
+        found = apart(ours, theirs)
+        most = [
+            max((v for what, v in found.items() if what.startswith("d ") is by), default=0.0) for by in (False, True)
+        ]
         close = max(most) < (BEHIND_A_WALL if "wall" in name else CLOSE)
         well &= close
         print(f"| {name} | {most[0]:.1e} | {most[1]:.1e} | {'well' if close else 'NOT WELL'} |", flush=True)
@@ -168,7 +176,6 @@ def shaken(truth: Gaussians, n_photos: int) -> FitState:
         "log_scales": truth.log_scales + rng.normal(0.0, 0.2, (n, 3)),
         "logits": logits_of(np.full((n, 1), 0.5)),
         "colours": np.full((n, 3), 0.5),
-        "sh_rest": np.zeros((n, 0)),
         "sky": np.full((ROWS * COLUMNS, 3), 0.5),
         "exposure": np.zeros((n_photos, EXPOSURE_SIZE)),
         "poses": np.zeros((n_photos, POSE_SIZE)),
@@ -209,7 +216,6 @@ def plain(place: Place, problem: Problem, start: FitState, settings: FitSettings
     names = ("means", "quats", "log_scales", "logits", "colours")
     leaves = [torch.tensor(start.learned[name].values, device=place.device, requires_grad=True) for name in names]
     adam = torch.optim.Adam([{"params": [leaf], "lr": 1e-3} for leaf in leaves])
-    nothing = torch.zeros(len(start), 0, 3, device=place.device)
     motion = torch.zeros(6, device=place.device)
     photos = [torch.tensor(shot.compared.target.rgb, device=place.device) for shot in problem.train]
     everywhere = torch.ones(problem.train[0].photo.rgb.shape[:2], device=place.device)
@@ -218,7 +224,7 @@ def plain(place: Place, problem: Problem, start: FitState, settings: FitSettings
     def iterate() -> None:
         i = next(turn) % len(photos)
         shot, (means, quats, log_scales, logits, colours) = problem.train[i].photo, leaves
-        scene = SceneTensors(means, quats, log_scales, logits[:, 0], colours, nothing)
+        scene = SceneTensors(means, quats, log_scales, logits[:, 0], colours)
         height, width = shot.rgb.shape[:2]
         eye = Eye(shot.intrinsics, shot.world_from_camera, width, height, motion)
         (rgb,) = place.plain(scene, [eye], False)
@@ -242,8 +248,8 @@ def views(place: Place, n: int, sizes: Sequence[tuple[int, int]], threads: int) 
     scene, well = cloud(n), True
     leaves = [torch.tensor(a, device=place.device) for a in (scene.means, scene.quats, scene.log_scales)]
     logits = torch.logit(torch.tensor(scene.opacities, device=place.device))
-    others = (torch.tensor(scene.colours, device=place.device), torch.zeros(n, 0, 3, device=place.device))
-    on_device, still = SceneTensors(*leaves, logits, *others), torch.zeros(6, device=place.device)
+    colours, still = torch.tensor(scene.colours, device=place.device), torch.zeros(6, device=place.device)
+    on_device = SceneTensors(*leaves, logits, colours)
     for width, height in sizes:
         k = np.array([[0.6 * width, 0.0, width / 2], [0.0, 0.6 * width, height / 2], [0.0, 0.0, 1.0]])
         behind = np.full((height, width, 3), SKY, np.float32)

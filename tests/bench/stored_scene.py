@@ -40,6 +40,17 @@ def kept(asset: RenderAsset) -> RenderAsset:
         return read_scene(path)
 
 
+def affine_between(source: F32, target: F32) -> F32:
+    """An exposure's row (12,) that takes colours `source` (M, 3) closest to `target` (M, 3).
+
+    Least squares with a small pull towards the identity.
+    """
+    padded = np.column_stack([source, np.ones(len(source))]).astype(np.float64)
+    keep = 1e-3 * len(source) * np.eye(4)
+    off = np.linalg.solve(padded.T @ padded + keep, padded.T @ (np.asarray(target, np.float64) - source))
+    return np.concatenate([off[:3].T.ravel(), off[3]]).astype(np.float32)
+
+
 def storage_table(asset: RenderAsset, looks: Sequence[Look], threads: int) -> str:
     """A row for each dtype of a scene's file: MB, CPU ms to read it, pictures against those of the scene in memory (of
     floats, the mean and the worst, and of 8 bits), and against the photos [dB]."""

@@ -13,9 +13,7 @@ import pytest
 from pyarrow.feather import write_feather
 
 from factory.__main__ import main
-from factory.commands.completion import settings_of
 from factory.datasets.av2.folders import INTRINSICS, POSES
-from tasks.render.rigs import RIGS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "numba", "scipy", "shapely", "pyarrow", "deltalake", "ray", "torch", "cv2")
@@ -78,7 +76,7 @@ MISTYPED = [  # told before anything heavy is imported
     run("traffic.headway_s=-1", says=["headway_s must be positive"]),
     run("render.width=0", says=["render width must be finite and at least 16, not 0"]),
     run("render.gate.vehicle_min=2", says=["render gate vehicle_min must be from 0 to 1"]),
-    run("render.map_rig=five_front", says=["render.map_rig: must be front, three_front or ring_six; did you mean"]),
+    run("render.psnr_gate=rejct", says=["render.psnr_gate: must be reject or mark; did you mean"]),
     run("expert.recovery.smooth=maybe", says=["expert.recovery.smooth: must be true or false"]),
     run("expert.recovery.smoth=true", says=["did you mean expert.recovery.smooth=?"]),
     run("expert.recovery.weights=[1]", says=["expert.recovery.weights: there is no such setting"]),
@@ -218,10 +216,6 @@ def test_a_mistyped_word_imports_nothing_heavy(folder: Path) -> None:
     )
     done = python(folder, "-c", code)
     assert done.stdout.splitlines()[-1:] == ["loaded []"], done.stderr
-
-
-def test_the_rigs_that_a_map_may_be_drawn_for_are_those_there_are() -> None:
-    assert settings_of([])["render.map_rig"] == list(RIGS)
 
 
 def test_a_plus_before_a_setting_may_stand_or_not(capsys: pytest.CaptureFixture[str]) -> None:

@@ -199,17 +199,6 @@ def exposed_gradient(rgb: F32, row: F32, d_exposed: F32) -> tuple[F32, F32]:
     return np.asarray(d_exposed @ matrix, np.float32), d_row.astype(np.float32)
 
 
-def affine_between(source: FloatArray, target: FloatArray, ridge: float = 1e-3) -> F32:
-    """The row (12,) that takes colours `source` (M, 3) closest to `target` (M, 3); identity where they say nothing.
-
-    Least squares with a pull of `ridge` per sample towards identity.
-    """
-    padded = np.column_stack([source, np.ones(len(source))]).astype(np.float64)
-    keep = ridge * max(len(source), 1) * np.eye(4)
-    off = np.linalg.solve(padded.T @ padded + keep, padded.T @ (np.asarray(target, np.float64) - source))
-    return np.concatenate([off[:3].T.ravel(), off[3]]).astype(np.float32)
-
-
 def exposures_of(photos: Sequence[Photo], seen: Sequence[Seen], points: Array) -> F32:
     """Rows (N, 12) of the photos: photo colour = row applied to what all cameras agree on.
 

@@ -22,7 +22,7 @@ from tasks.render.splatting.project import DEPTH
 from tasks.render.splatting.raster import ForwardPass, forward
 from tasks.world.arrays import F32, Array, Ints
 
-_PER_GAUSSIAN = ("index", "means", "quats", "log_scales", "logits", "colours", "sh_rest", "screen")
+_PER_GAUSSIAN = ("index", "means", "quats", "log_scales", "logits", "colours", "screen")
 
 
 @dataclass(frozen=True)

@@ -280,13 +280,13 @@ class OnTorch:
 
         asked = [*leaves, exposure, eye.motion, seen.screen]
         by = torch.autograd.grad(loss, asked, materialize_grads=True)
-        means, quats, log_scales, logits, colours, sh_rest, sky, d_exposure, d_camera, screen = by
+        means, quats, log_scales, logits, colours, sky, d_exposure, d_camera, screen = by
         spans = [torch.arange(span.start, span.stop, device=self.device) for span in map(_span, parts)]
         rows = torch.cat(spans)[seen.index]
         tracks, boxes = _of_boxes(parts, leaves[0].detach(), leaves[1].detach(), means, quats)
         shapes = {"means": means, "quats": quats, "log_scales": log_scales, "logits": logits[:, 0], "colours": colours}
         back: dict[str, Any] = {name: tensor[rows] for name, tensor in shapes.items()}
-        back |= {"index": rows, "sh_rest": sh_rest[rows].view(len(rows), -1, 3), "screen": screen}
+        back |= {"index": rows, "screen": screen}
         back["camera"] = d_camera.double().cpu().numpy()
         error = torch.mean((picture.detach().clamp(0.0, 1.0) - photo).double() ** 2)
         score = float(-10.0 * torch.log10(error))
@@ -299,8 +299,8 @@ class OnTorch:
 
 def _composed(leaves: Sequence[Tensor], parts: Sequence[OwnedGaussians]) -> SceneTensors:
     """The scene of `parts`, of which a photo shows some; `leaves` as of SHAPES."""
-    means, quats, log_scales, logits, colours, sh_rest = leaves
-    every = SceneTensors(means, quats, log_scales, logits[:, 0], colours, sh_rest.view(len(means), -1, 3))
+    means, quats, log_scales, logits, colours = leaves
+    every = SceneTensors(means, quats, log_scales, logits[:, 0], colours)
     scenes = []
     for part in parts:
         mine = SceneTensors(*(tensor[_span(part)] for tensor in every.parts()))

@@ -1,6 +1,6 @@
 """A block's scene fitted to its photos: one photo an iteration, all of it a function of the inputs and the seed."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,8 +10,8 @@ from tasks.kernels.compiled import kernel
 from tasks.render.fit.backend import Derivatives, FitBackend, Held
 from tasks.render.fit.corrections import after, between, corrected, exposed, inverse, matrix_of, reference
 from tasks.render.fit.losses import Target, ssim
-from tasks.render.fit.on_cpu import OnCpu, compose, forward_pass
-from tasks.render.fit.start import Problem, Shot, prepare
+from tasks.render.fit.on_cpu import OnCpu
+from tasks.render.fit.start import Problem, Shot
 from tasks.render.fit.state import BACKGROUND, FitState, Road, above_road, opacities_of, refine
 from tasks.render.scene.asset import ClassQuality, Exposure, RenderAsset, ViewQuality, mean_psnr_db, psnr
 from tasks.render.scene.body import BEFORE_M, bodies_near, nearest_box
@@ -25,12 +25,13 @@ from tasks.render.scene.movers import (
     shifted_boxes,
     world_from_boxes,
 )
-from tasks.render.scene.sensed import Photo, Sweep, shifted
+from tasks.render.scene.sensed import Photo, shifted
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap, directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import Backend, FitSettings
 from tasks.render.splatting.gaussians import moved
 from tasks.render.splatting.gsplat_backend import require
+from tasks.world.agents import AgentKind
 from tasks.world.arrays import F32, Array, Bools, Ints
 from tasks.world.clip import AgentKind, AgentTracks, Pinhole
 
@@ -231,31 +232,10 @@ def project(means: Any, camera_from_scene: Any, k: Any, height: int, width: int)
 
 
 REPORT_EVERY = 100
-SH_RATE = 6e-4  # step size of what depends on the direction
 REFINE_UNTIL = 0.8  # share of the iterations after which nothing is relocated, and what is learned is averaged
 NOTED_EVERY = 0.01  # share of the iterations between two instants of that average
 LEAST_SHARE = 1e-3  # of a photo in a knot, for it to say anything there
 Progress = Callable[[int, float, float], None]  # iteration, mean loss and mean PSNR [dB] of the last REPORT_EVERY
-
-
-def reconstruct(
-    photos: Sequence[Photo],
-    sweeps: Sequence[Sweep],
-    agents: AgentTracks | None,
-    settings: FitSettings,
-    progress: Progress | None = None,
-    held_out: Collection[int] | None = None,
-    threads: int = 2,
-    backend: FitBackend | None = None,
-) -> RenderAsset:
-    """The scene of one block. `agents`: 10 Hz tracks whose first step is time 0 of photos and sweeps.
-
-    Whoever wants to stop and go on calls `prepare`, `advance` and `finish`, which this is made of.
-    Raises ValueError without photos to train on.
-    """
-    problem, state = prepare(photos, sweeps, agents, settings, held_out, threads)
-    advance(problem, state, settings, settings.iterations, progress, threads, backend=backend)
-    return finish(problem, state, threads)
 
 
 def advance(
@@ -377,22 +357,6 @@ def _step_gaussians(held: Held, settings: FitSettings, found: Derivatives) -> No
     learned["log_scales"].step(rows, mine.log_scales, fall * settings.scale_rate)
     learned["logits"].step(rows, mine.logits[:, None], fall * settings.opacity_rate)
     learned["colours"].step(rows, mine.colours, fall * settings.colour_rate)
-    if mine.sh_rest.shape[1]:
-        learned["sh_rest"].step(rows, mine.sh_rest.reshape(len(rows), -1), fall * SH_RATE)
-
-
-def picture_of(problem: Problem, state: FitState, photo: Photo, threads: int = 1) -> F32:
-    """What the fit makes of a photo of the block that it need not have seen (H, W, 3); samples are drawn of what
-    `finish` keeps of it.
-
-    Pose correction and exposure are those learned from the same camera, between the photos before and after.
-    `photo.world_from_camera` is local (minus `problem.origin`).
-    """
-    row_pose, row_colour = corrections_at(problem, state, photo.camera, photo.time_s)
-    camera = corrected(photo.world_from_camera, row_pose)
-    scene, _ = compose(problem, state, boxes_off(problem, state), photo)
-    seen, _ = forward_pass(state, scene, photo, camera, threads)
-    return np.clip(exposed(seen.view.rgb, row_colour), 0.0, 1.0)
 
 
 def pose_of(problem: Problem, state: FitState, photo: Photo) -> Array:
@@ -449,14 +413,12 @@ def finish(problem: Problem, state: FitState, threads: int = 2) -> RenderAsset:
     """
     rows, cameras = state.learned["exposure"].values, [shot.photo.camera for shot in problem.train]
     common = reference(cameras, rows)
-    matrix, _ = matrix_of(common)
     moved_by, shifts = box_shifts(problem, state)
     every = state.gaussians()
     every = replace(
         every,
         quats=every.quats / np.linalg.norm(every.quats, axis=1, keepdims=True),
         colours=exposed(every.colours, common),
-        sh_rest=every.sh_rest @ matrix.T,
     )
     sky = exposed(state.learned["sky"].values, common)
     nodes = {

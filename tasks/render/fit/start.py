@@ -18,7 +18,6 @@ from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, reduced, shift
 from tasks.render.scene.sky import directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import FitSettings
-from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import Gaussians, concatenate, rotations_of
 from tasks.world.arrays import F32, Array, Bools
 from tasks.world.clip import AgentKind, AgentTracks
@@ -204,7 +203,6 @@ def _first_state(
         "log_scales": Learned.of(start.log_scales),
         "logits": Learned.of(logits_of(opacities)),
         "colours": Learned.of(start.colours),
-        "sh_rest": Learned.of(np.zeros((len(start), 3 * sh.COUNTS[settings.sh_degree]))),
         "sky": Learned.of(sky.reshape(-1, 3)),
         "exposure": Learned.of(exposures),
         "poses": Learned.of(np.zeros((len(exposures), POSE_SIZE))),

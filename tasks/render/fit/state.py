@@ -238,7 +238,7 @@ def lay_flat(means: F32, quats: F32, log_scales: F32, rows: Ints, road: Road) ->
 
 
 BACKGROUND = -1
-SHAPES = ("means", "quats", "log_scales", "logits", "colours", "sh_rest")  # learned, one row per Gaussian
+SHAPES = ("means", "quats", "log_scales", "logits", "colours")  # learned, one row per Gaussian
 WORLD = ("sky", "exposure", "poses", "boxes")
 PER_GAUSSIAN = ("owner", "road", "nearest", "wanted")  # fields of FitState
 COUNTS = ("iteration", "noted")
@@ -265,9 +265,8 @@ class FitState:
 
     def gaussians(self) -> Gaussians:
         """All of them, in the frames of their owners."""
-        means, quats, log_scales, logits, colours, rest = (self.learned[name].values for name in SHAPES)
-        rest = rest.reshape(len(self), -1, 3)
-        return Gaussians(means, quats, log_scales, opacities_of(logits[:, 0]), colours, rest)
+        means, quats, log_scales, logits, colours = (self.learned[name].values for name in SHAPES)
+        return Gaussians(means, quats, log_scales, opacities_of(logits[:, 0]), colours)
 
     def seen(self, rows: Ints, depths: F32, screen: F32) -> F32:
         """Notes what a photo says of `rows` (M,): their depths (M,) in it, their derivatives (M, 2) by the place on it.

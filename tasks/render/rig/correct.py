@@ -34,12 +34,12 @@ from tasks.render.scene.movers import behind_boxes
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.render.scene.sky import directions
 from tasks.render.scene.stereo import FAR_M
-from tasks.render.settings import RigSettings
 from tasks.world.arrays import F32, Array, Bools, Bytes, Indices
 from tasks.world.clip import AgentTracks, Camera, SensorFile
 
 # Corners of a photo, and which of them two photos share (SIFT, Lowe 2004).
 
+CORNERS_WIDTH_PX, MOST_CORNERS = 960, 4000  # of the photos that corners are looked for in, and how many a photo
 CONTRAST = 0.02  # OpenCV's threshold, half its default: asphalt and facades have faint corners
 RATIO = 0.85  # the second best match must be this much worse
 UNIT = 512.0  # length of a descriptor: whole numbers whose products are exact in float32, in any order of the sum
@@ -56,17 +56,17 @@ class Corners:
     pixel: float  # pixels of the photo per pixel of the picture that was looked at
 
 
-def corners_of(rgb: Bytes, width: int, most: int, hidden: Bools | None = None) -> Corners:
-    """The corners of a photo (H, W, 3) shrunk to `width`, none where it is `hidden` (h, w), a mask of any size."""
+def corners_of(rgb: Bytes, hidden: Bools | None = None) -> Corners:
+    """The corners of a photo (H, W, 3), none where it is `hidden` (h, w), a mask of any size."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    scale = max(1.0, rgb.shape[1] / width)
+    scale = max(1.0, rgb.shape[1] / CORNERS_WIDTH_PX)
     size = round(rgb.shape[1] / scale), round(rgb.shape[0] / scale)
     if scale > 1.0:
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     mask = None
     if hidden is not None:
         mask = 255 - 255 * cv2.resize(hidden.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    sift = cv2.SIFT_create(nfeatures=most, contrastThreshold=CONTRAST)  # type: ignore[attr-defined]
+    sift = cv2.SIFT_create(nfeatures=MOST_CORNERS, contrastThreshold=CONTRAST)  # type: ignore[attr-defined]
     found, descriptors = sift.detectAndCompute(grey, mask)
     if descriptors is None:
         return Corners(np.zeros((0, 2)), np.zeros((0, 128), np.float32), scale)
@@ -107,6 +107,7 @@ def matches(a: Corners, b: Corners) -> tuple[Indices, Indices]:
 
 # Which photos are compared, and the corners that show one point in several of them.
 
+PARTNERS = 3  # photos of each camera that a photo is matched with
 DEPTHS_M = (5.0, 12.0, 40.0)  # at which it is asked what two photos share
 LIKELY, LIKELY_SHARE = 0.09, 0.5  # 5 degrees that a match may be off as given; share of a pair's that must not be
 GRID = (6, 4)  # pixels of a photo that are asked for, across and down
@@ -115,8 +116,8 @@ BASELINES_M = (0.3, 20.0)  # less: no parallax; more: nothing looks the same
 BEST_M = (1.0, 3.0, 8.0)  # baselines that partners of the same camera are chosen near; a gap in one is filled by others
 
 
-def pairs(rig: Rig, shots: Shots, cameras: Sequence[Camera], partners: int) -> list[tuple[int, int]]:
-    """Rows of the photos that are compared: of each camera up to `partners` of those that show the same place."""
+def pairs(rig: Rig, shots: Shots, cameras: Sequence[Camera]) -> list[tuple[int, int]]:
+    """Rows of the photos that are compared: of each camera up to PARTNERS of those that show the same place."""
     poses = shots.world_from_ego @ rig.ego_from_camera[shots.camera_of]
     found = set()
     for i in range(len(poses)):
@@ -130,10 +131,10 @@ def pairs(rig: Rig, shots: Shots, cameras: Sequence[Camera], partners: int) -> l
             if mine:
                 rows = rows[rows > i]
                 best = [rows[np.argmin(np.abs(np.log(away[rows] / m)))] for m in BEST_M if len(rows)]
-                nearest = rows[np.argsort(away[rows], kind="stable")[:partners]]
+                nearest = rows[np.argsort(away[rows], kind="stable")[:PARTNERS]]
                 chosen = {int(j) for j in (*best, *nearest)}
             else:
-                chosen = {int(j) for j in rows[np.argsort(-share[rows], kind="stable")[:partners]]}
+                chosen = {int(j) for j in rows[np.argsort(-share[rows], kind="stable")[:PARTNERS]]}
             found |= {(min(i, j), max(i, j)) for j in chosen}
     return sorted(found)
 
@@ -205,6 +206,7 @@ def matched_corners(rig: Rig, shots: Shots, corners: Sequence[Corners], compared
 # wrong explains the same photos, and nothing is gained by a delay. So one is believed where corners that were not
 # fitted agree clearly better with it. They can where speeds change or the ego turns.
 
+STAMP_S = 0.05  # sigma of a camera's stamps against the ego's
 STAMP_OF_CAMERA = STAMP - 6  # of a camera's parameters
 EVERY = 4  # of so many points one is fitted and another measured: they decide as all do, in a fraction of the time
 LEAST_LATE_S = 0.01  # less is a decimetre at 10 m/s, which mounts have as well
@@ -223,11 +225,11 @@ class Delays:
     believed: Bools  # (C,)
 
 
-def delays(given: Rig, shots: Shots, matched: Matched, held: Bundle, sigmas: Array, stamp_s: float) -> Delays:
+def delays(given: Rig, shots: Shots, matched: Matched, held: Bundle, sigmas: Array) -> Delays:
     """Whose delay explains what nothing else does; `held` is what `sigmas` (n,), no delays, came to."""
     every = np.ones(len(given.stamps), np.bool_)
     fitted, measured = (part_of(matched, matched.point_of % EVERY == k) for k in (0, 1))
-    late = adjusted(given, shots, fitted, with_stamps(sigmas, every, stamp_s), held.rig, WIDTHS_PX).rig
+    late = adjusted(given, shots, fitted, with_stamps(sigmas, every), held.rig, WIDTHS_PX).rig
     found = np.abs(late.stamps) >= LEAST_LATE_S
     if not found.any():
         return Delays(late.stamps, 0.0, 0.0, found)
@@ -239,11 +241,11 @@ def delays(given: Rig, shots: Shots, matched: Matched, held: Bundle, sigmas: Arr
     return Delays(late.stamps, float(gain), float(sure), found & bool(gain > LEAST_GAIN and sure > SURE))
 
 
-def with_stamps(sigmas: Array, cameras: Bools, stamp_s: float) -> Array:
+def with_stamps(sigmas: Array, cameras: Bools) -> Array:
     """(n,) the same, the stamps of some cameras (C,) free."""
     out = sigmas.copy()
     of_camera = out[len(out) - N_CAMERA * len(cameras) :].reshape(-1, N_CAMERA)
-    of_camera[cameras, STAMP_OF_CAMERA] = stamp_s
+    of_camera[cameras, STAMP_OF_CAMERA] = STAMP_S
     return out
 
 
@@ -258,6 +260,11 @@ def _gained(one: Rig, other: Rig, shots: Shots, matched: Matched) -> tuple[Array
     return (costs[0] - costs[1])[there], float(costs[0][there].mean()) if there.any() else 0.0
 
 
+# Sigmas: what calibration and poses are expected to be off by (docs/reconstruction.md, real rigs).
+TURN_DEG, SHIFT_M = 1.0, 0.1  # of a camera on the ego
+FOCAL, CENTRE = 0.01, 0.01  # of focal lengths and principal point, as shares of the focal length and of the width
+LENS_TERM = 0.02  # of k1, k2, k3; of p1, p2 a tenth
+POSE_TURN_DEG, POSE_SHIFT_M = 0.5, 0.2  # of the ego, root mean square over the drive
 LEAST_CORNERS = 50  # of an instant: with fewer its correction is that between the instants before and after
 TOO_FAR = 10.0  # times what poses are expected to be off by: no pose is
 STRANGE = 0.15  # of the share of corners that agree in half of a camera's photos
@@ -292,9 +299,7 @@ class Correction:
     strangers: tuple[int, ...] = ()  # rows of files that do not show what those before and after and beside them do
 
 
-def corrected(
-    cameras: Sequence[Camera], files: Sequence[SensorFile], corners: Sequence[Corners], settings: RigSettings
-) -> Correction | None:
+def corrected(cameras: Sequence[Camera], files: Sequence[SensorFile], corners: Sequence[Corners]) -> Correction | None:
     """Cameras and poses that make the photos' corners meet; None where too few do to say anything.
 
     `corners` of the files' photos, in their order; a file without any takes the correction of the times around it.
@@ -304,23 +309,22 @@ def corrected(
     local = shots.world_from_ego.copy()
     local[:, :3, 3] -= shift
     shots = replace(shots, world_from_ego=local)
-    matched = matched_corners(rig, shots, corners, pairs(rig, shots, cameras, settings.partners))
+    matched = matched_corners(rig, shots, corners, pairs(rig, shots, cameras))
     if len(matched.starts) <= LEAST_POINTS:
         return None
     readouts_s, heights = (np.array([getattr(c, name) for c in cameras]) for name in ("readout_s", "height"))
     matched = replace(matched, after_s=read_after_s(matched, shots, readouts_s, heights))
-    sigmas = sigmas_of(cameras, len(rig.corrections), settings)
+    sigmas = sigmas_of(cameras, len(rig.corrections))
     bundle = adjusted(rig, shots, matched, sigmas)
-    strangers = _strangers(bundle, shots, matched, corners, settings)
+    strangers = _strangers(bundle, shots, matched, corners)
     if strangers:
         matched = without(matched, np.array(strangers))
         if len(matched.starts) <= LEAST_POINTS:
             return None
         bundle = adjusted(rig, shots, matched, sigmas)
-    if settings.stamp_s > 0.0:
-        believed = delays(rig, shots, matched, bundle, sigmas, settings.stamp_s).believed
-        if believed.any():
-            bundle = adjusted(rig, shots, matched, with_stamps(sigmas, believed, settings.stamp_s))
+    believed = delays(rig, shots, matched, bundle, sigmas).believed
+    if believed.any():
+        bundle = adjusted(rig, shots, matched, with_stamps(sigmas, believed))
     points = bundle.points[np.bincount(matched.point_of, bundle.used, len(bundle.points)) > 0]
     if len(points) < LEAST_POINTS:
         return None
@@ -376,15 +380,15 @@ def _scale(places: Array, given: Array) -> float:
     return float((off * wanted).sum()) / spread if spread > 1.0 else 1.0
 
 
-def sigmas_of(cameras: Sequence[Camera], n_instants: int, settings: RigSettings) -> Array:
+def sigmas_of(cameras: Sequence[Camera], n_instants: int) -> Array:
     """(n,) what each parameter of a rig may be off by, in the order of `Rig.away_from`; stamps: nothing."""
-    of_instant = np.repeat([settings.pose_shift_m, np.radians(settings.pose_turn_deg)], 3)
+    of_instant = np.repeat([POSE_SHIFT_M, np.radians(POSE_TURN_DEG)], 3)
     # Poses are off together, bit by bit along the drive: all of them weigh as much as one camera does.
     rows = [np.tile(of_instant * np.sqrt(n_instants), n_instants)]
     for camera in cameras:
-        mount = [settings.shift_m] * 3 + [np.radians(settings.turn_deg)] * 3
-        pinhole = [settings.focal * camera.intrinsics[0, 0]] * 2 + [settings.centre * camera.width] * 2
-        lens = settings.lens * np.array([1.0, 1.0, 0.1, 0.1, 1.0])
+        mount = [SHIFT_M] * 3 + [np.radians(TURN_DEG)] * 3
+        pinhole = [FOCAL * camera.intrinsics[0, 0]] * 2 + [CENTRE * camera.width] * 2
+        lens = LENS_TERM * np.array([1.0, 1.0, 0.1, 0.1, 1.0])
         rows += [np.array(mount), np.array(pinhole), lens, np.zeros(1)]
     return np.concatenate(rows)
 
@@ -409,13 +413,11 @@ def _between(bundle: Bundle, shots: Shots, matched: Matched, times: Array) -> Ar
     return out
 
 
-def _strangers(
-    bundle: Bundle, shots: Shots, matched: Matched, corners: Sequence[Corners], settings: RigSettings
-) -> tuple[int, ...]:
+def _strangers(bundle: Bundle, shots: Shots, matched: Matched, corners: Sequence[Corners]) -> tuple[int, ...]:
     """Photos of whose corners far fewer agree than is usual for their camera, or but where the ego cannot have been."""
     away = twists_of(bundle.rig.corrections)[shots.instant_of]
-    elsewhere = np.linalg.norm(away[:, :3], axis=1) > TOO_FAR * settings.pose_shift_m
-    elsewhere |= np.degrees(np.linalg.norm(away[:, 3:], axis=1)) > TOO_FAR * settings.pose_turn_deg
+    elsewhere = np.linalg.norm(away[:, :3], axis=1) > TOO_FAR * POSE_SHIFT_M
+    elsewhere |= np.degrees(np.linalg.norm(away[:, 3:], axis=1)) > TOO_FAR * POSE_TURN_DEG
     agree = np.bincount(matched.view_of, bundle.used, len(corners)) / np.maximum([len(c.at) for c in corners], 1)
     looked_at = np.array([len(c.at) for c in corners]) >= LEAST_CORNERS
     out = []

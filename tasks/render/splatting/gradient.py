@@ -13,7 +13,6 @@ import numpy as np
 from tasks.kernels.compiled import inlined, kernel
 from tasks.kernels.simd import LANES, fill, fused, larger, load, smaller, store, sums, where_below
 from tasks.kernels.threads import in_chunks
-from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import Gaussians, quats_of, turned_quats
 from tasks.render.splatting.project import (
     BLOCK_SIZE,
@@ -388,7 +387,6 @@ class Gradients:
     log_scales: F32  # (M, 3)
     logits: F32  # (M,) by log(opacity / (1 - opacity))
     colours: F32  # (M, 3)
-    sh_rest: F32  # (M, count, 3)
     screen: F32  # (M, 2) [1/px] by the centre on the picture, u and v: how much density control wants it elsewhere
     camera: Array  # (6,) by v [1/m], w [1/rad] of a camera motion x' = x + v + w cross x, x in camera coordinates
 
@@ -403,18 +401,18 @@ def backward(
 ) -> Gradients:
     """Derivatives of a loss, from its derivatives by the view's rgb (H, W, 3), depth and alpha (H, W).
 
-    `gaussians` as traced. By the background it is d_rgb * (1 - alpha). Where the cut-off at 1/255, the cap on alpha or
-    the order in depth changes the picture jumps, and its jumps have no derivative: alpha beyond the cap counts as flat.
+    `gaussians` as traced, of SH degree 0. By the background it is d_rgb * (1 - alpha). Where the cut-off at 1/255, the
+    cap on alpha or the order in depth changes the picture jumps, and its jumps have no derivative: alpha beyond the cap
+    counts as flat.
     Raises ValueError where shapes are not the view's.
     """
-    splats, n, count = forward.splats, len(forward.splats.index), gaussians.sh_rest.shape[1]
+    splats, n = forward.splats, len(forward.splats.index)
     pair_start = pair_starts(splats.tiles)
     pairs = _pairs(forward, pair_start, d_rgb, d_depth, d_alpha, threads)
-    center = np.ascontiguousarray(np.linalg.inv(splats.camera_from_scene)[:3, 3])
     sums = np.empty((n, SUMS_SIZE), np.float32)
-    sizes = ((n, 3), (n, 4), (n, 3), (n,), (n, 2), (n, 3), (n, count, 3))
-    means, quats, log_scales, logits, screen, colours, sh_rest = (np.empty(size, np.float32) for size in sizes)
-    shapes, light = (means, quats, log_scales, logits, screen), (gaussians.means, gaussians.colours, gaussians.sh_rest)
+    sizes = ((n, 3), (n, 4), (n, 3), (n,), (n, 2))
+    means, quats, log_scales, logits, screen = (np.empty(size, np.float32) for size in sizes)
+    shapes = (means, quats, log_scales, logits, screen)
     camera_from_scene, view = splats.camera_from_scene, (splats.width, splats.height, splats.screen.keeps_light)
     scene = (gaussians.means, gaussians.quats, gaussians.log_scales, camera_from_scene, splats.intrinsics, *view)
 
@@ -422,14 +420,11 @@ def backward(
         camera = np.zeros(6)
         add_pairs(pair_start, pairs, first, last, sums)
         project_gradient(*scene, splats.index, splats.projected, sums, first, last, *shapes, camera)
-        upstream = sums[:, W_RED : W_BLUE + 1]
-        by_direction = sh.seen_gradient(*light, center, splats.index, upstream, first, last, means, colours, sh_rest)
-        # To the directions, a camera moved by v is as a scene moved by v; turning it changes none of them.
-        camera[:3] += splats.camera_from_scene[:3, :3] @ by_direction
         return camera
 
     camera = np.sum([np.zeros(6), *in_chunks(run, n, GAUSSIANS_CHUNK, threads)], axis=0)
-    return Gradients(splats.index, means, quats, log_scales, logits, colours, sh_rest, screen, camera)
+    colours = np.where(gaussians.colours[splats.index] >= 0.0, sums[:, W_RED : W_BLUE + 1], np.float32(0.0))
+    return Gradients(splats.index, means, quats, log_scales, logits, colours, screen, camera)
 
 
 def _pairs(
@@ -457,10 +452,4 @@ def unmoved(gradients: Gradients, target_from_source: Array) -> Gradients:
     """
     rotation = target_from_source[:3, :3]
     quats = turned_quats(quats_of(rotation.T[None])[0], gradients.quats)
-    turn = sh.turning(rotation, gradients.sh_rest.shape[1])
-    return replace(
-        gradients,
-        means=(gradients.means @ rotation).astype(np.float32),
-        quats=quats.astype(np.float32),
-        sh_rest=np.einsum("ba,nbc->nac", turn, gradients.sh_rest).astype(np.float32),
-    )
+    return replace(gradients, means=(gradients.means @ rotation).astype(np.float32), quats=quats.astype(np.float32))

@@ -1,6 +1,6 @@
-"""A scene as tensors, drawn so that torch knows the derivatives: by gsplat on CUDA, or by this package's kernels.
+"""A scene as tensors, drawn by gsplat on CUDA so that torch knows the derivatives.
 
-Both take what is learned (log-scales, logits), keep to one camera, and leave the background to whoever calls. torch is
+It takes what is learned (log-scales, logits), keeps to one camera, and leaves the background to whoever calls. torch is
 imported here and in `tasks.render.fit.on_torch` alone; nothing but render.backend=gsplat loads either.
 """
 
@@ -12,12 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tasks.render.splatting import sh
-from tasks.render.splatting.gaussians import Gaussians, quats_of
-from tasks.render.splatting.gradient import backward
+from tasks.render.splatting.gaussians import quats_of
 from tasks.render.splatting.gsplat_backend import plain_arguments
-from tasks.render.splatting.project import DEPTH
-from tasks.render.splatting.raster import ForwardPass, forward
 from tasks.world.arrays import Array
 
 
@@ -30,7 +26,6 @@ class SceneTensors:
     log_scales: Tensor  # (N, 3)
     logits: Tensor  # (N,)
     colours: Tensor  # (N, 3)
-    sh_rest: Tensor  # (N, count, 3)
 
     def parts(self) -> list[Tensor]:
         """The tensors, in this order."""
@@ -69,9 +64,7 @@ def moved(scene: SceneTensors, target_from_source: Array) -> SceneTensors:
     w, x, y, z = quats_of(rotation[None])[0]
     product = _tensor(np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]), like)
     means = scene.means @ _tensor(rotation.T, like) + _tensor(target_from_source[:3, 3], like)
-    turn = _tensor(sh.turning(rotation, scene.sh_rest.shape[1]), like)
-    sh_rest = torch.einsum("ab,nbc->nac", turn, scene.sh_rest)
-    return SceneTensors(means, scene.quats @ product.T, scene.log_scales, scene.logits, scene.colours, sh_rest)
+    return SceneTensors(means, scene.quats @ product.T, scene.log_scales, scene.logits, scene.colours)
 
 
 def _tensor(array: Any, like: Tensor) -> Tensor:
@@ -96,10 +89,7 @@ def splatted(rasterization: Callable[..., Any], scene: SceneTensors, eye: Eye) -
 
 def learned_arguments(scene: SceneTensors, eye: Eye) -> dict[str, Any]:
     """What `gsplat.rasterization` is called with for one eye: as `gsplat_backend.arguments`, but to be derived by."""
-    count, like = scene.sh_rest.shape[1], scene.means
-    colours = scene.colours.clamp(min=0.0)  # as the kernels do; gsplat does it for higher degrees alone
-    if count:
-        colours = torch.cat([((scene.colours - 0.5) / sh.C0)[:, None], scene.sh_rest], dim=1)
+    like = scene.means
     still = _tensor(np.linalg.inv(eye.scene_from_camera), like)
     zero = torch.zeros((), dtype=like.dtype, device=like.device)
     shift, (a, b, c) = eye.motion[:3], eye.motion[3:]
@@ -110,40 +100,7 @@ def learned_arguments(scene: SceneTensors, eye: Eye) -> dict[str, Any]:
         "quats": scene.quats,
         "scales": scene.log_scales.exp(),
         "opacities": scene.logits.sigmoid(),
-        "colors": colours,
+        "colors": scene.colours.clamp(min=0.0),  # as the kernels do
         "viewmats": (still + change @ still)[None],
         "Ks": _tensor(eye.intrinsics, like)[None],
-    } | plain_arguments(eye.width, eye.height, count)
-
-
-def by_kernels(scene: SceneTensors, eye: Eye, threads: int = 1) -> Splatted:
-    """On the CPU, by `raster.forward` and `gradient.backward`: the loop over tensors without a GPU."""
-    arrays = [part.detach().numpy() for part in scene.parts()]
-    arrays[3] = scene.logits.detach().sigmoid().numpy()
-    gaussians = Gaussians(*arrays)
-    nothing = np.zeros(3, np.float32)
-    seen = forward(gaussians, eye.intrinsics, eye.scene_from_camera, eye.width, eye.height, nothing, threads)
-    index = torch.from_numpy(seen.splats.index)
-    screen = torch.zeros(len(index), 2, requires_grad=True)
-    rgb, depth, alpha = _Blended.apply(seen, gaussians, threads, *scene.parts(), eye.motion, screen)
-    return Splatted(rgb, depth, alpha, index, torch.from_numpy(seen.splats.projected[:, DEPTH].copy()), screen)
-
-
-class _Blended(torch.autograd.Function):
-    """A traced view, whose derivatives are those of the kernels."""
-
-    @staticmethod
-    def forward(ctx: Any, seen: ForwardPass, gaussians: Gaussians, threads: int, *inputs: Tensor) -> Any:
-        ctx.seen, ctx.gaussians, ctx.threads = seen, gaussians, threads
-        return tuple(torch.from_numpy(picture) for picture in (seen.view.rgb, seen.view.depth, seen.view.alpha))
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> Any:
-        d_rgb, d_depth, d_alpha = (up.numpy() for up in upstream)
-        by = backward(ctx.seen, ctx.gaussians, d_rgb, d_depth, d_alpha, ctx.threads)
-        n, rows = len(ctx.gaussians), (by.means, by.quats, by.log_scales, by.logits, by.colours, by.sh_rest)
-        whole = [np.zeros((n, *part.shape[1:]), np.float32) for part in rows]
-        for everyone, part in zip(whole, rows):
-            everyone[by.index] = part
-        tensors = [torch.from_numpy(part) for part in (*whole, by.camera.astype(np.float32), by.screen)]
-        return None, None, None, *tensors
+    } | plain_arguments(eye.width, eye.height, 0)

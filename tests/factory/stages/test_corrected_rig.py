@@ -38,7 +38,7 @@ def test_a_turned_camera_is_put_right_told_and_drawn_with(
 ) -> None:
     said = (CAMERAS[0], turned(CAMERAS[1], (1.0, -1.5, 0.8)))
     with caplog.at_level(logging.INFO):
-        same, found, correction = corrected_rig(tmp_path / "block-1.safetensors", block, said, RigSettings())
+        same, found, correction = corrected_rig(tmp_path / "block-1.safetensors", block, said)
     assert correction is not None and len(same.images) == len(block.images)
     # What both cameras are turned by is the ego's frame as well, which photos do not know.
     true, now = (np.linalg.inv(rig[0].ego_from_camera) @ rig[1].ego_from_camera for rig in (CAMERAS, found))
@@ -52,7 +52,7 @@ def test_a_turned_camera_is_put_right_told_and_drawn_with(
     path = tmp_path / f"block-1{SAID}"
     whole = path.read_bytes()
     path.write_bytes(whole.replace(b"after_px", b"aftfr_px", 1))
-    said_again(tmp_path / "block-1.safetensors", block, said, RigSettings())
+    said_again(tmp_path / "block-1.safetensors", block, said)
     assert path.read_bytes() == whole and f"{path}: its checksum" in caplog.text and "written again" in caplog.text
     asset = RenderAsset(np.zeros(3), EMPTY, {}, SkyMap(np.zeros((2, 2, 3), np.float32)), 30.0, rig=found)
     assert asset.as_corrected([said[1]]) == (found[1],)
@@ -79,7 +79,7 @@ def test_swapped_files_are_left_out_and_named(block: Block, tmp_path: Path, capl
     a, b = 6, 7  # both cameras at one instant
     images[a], images[b] = replace(images[a], uri=images[b].uri), replace(images[b], uri=images[a].uri)
     swapped = replace(block, images=tuple(images))
-    kept, _, correction = corrected_rig(tmp_path / "block-2.safetensors", swapped, CAMERAS, RigSettings())
+    kept, _, correction = corrected_rig(tmp_path / "block-2.safetensors", swapped, CAMERAS)
     assert correction is not None and correction.strangers == (a, b)
     assert len(kept.images) == len(images) - 2 and images[a].uri in caplog.text
 
@@ -87,7 +87,7 @@ def test_swapped_files_are_left_out_and_named(block: Block, tmp_path: Path, capl
 def test_a_photo_of_another_size_than_its_camera_s_is_named(block: Block, tmp_path: Path) -> None:
     said = (replace(CAMERAS[0], width=WIDTH + 8), CAMERAS[1])
     with pytest.raises(BadClip, match=r"front_0\.png"):
-        corrected_rig(tmp_path / "block-3.safetensors", block, said, RigSettings())
+        corrected_rig(tmp_path / "block-3.safetensors", block, said)
 
 
 def test_by_default_blocks_without_lidar_are_corrected(block: Block) -> None:

@@ -24,7 +24,7 @@ from tasks.world.clip import NOW, STEP_S, Camera, Clip, SensorFile, scene_of_cli
 from tests.tasks.streets import street_clip
 
 LATER_S = 0.5  # the clip begins so long after its block
-SETTINGS = RenderSettings(width=200, height=112, scene=SceneFrom.DISCS, jpeg_quality=100, jpeg_chroma="444")
+SETTINGS = RenderSettings(width=200, height=112, scene=SceneFrom.DISCS, jpeg_quality=100)
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +136,6 @@ def test_what_photos_say_of_a_rig_is_found_once_also_where_it_is_nothing(clip: C
     assert block is not None
     alone = replace(block, images=block.images[:1])  # nothing to compare it with
     path = tmp_path / "block-1.safetensors"
-    assert used_rig(path, alone, clip.cameras, RigSettings()) is None
+    assert used_rig(path, alone, clip.cameras) is None
     gone = replace(block, images=(replace(block.images[0], uri=str(tmp_path / "gone.png")),))
-    assert used_rig(path, gone, clip.cameras, RigSettings()) is None, "the photo is not opened again"
+    assert used_rig(path, gone, clip.cameras) is None, "the photo is not opened again"

@@ -17,7 +17,7 @@ from factory.readers.base import BadClip
 from factory.stages import assets
 from factory.stages.assets import Sensing, asset_for, block_id, sensing
 from factory.stages.scene_file import stored_dtype
-from factory.stages.sensors import SAMPLING, block_of, chosen_cameras, decode_image, encode_jpeg, load_sensors
+from factory.stages.sensors import block_of, chosen_cameras, decode_image, encode_jpeg, load_sensors
 from tasks.render.fit import reconstruct
 from tasks.render.scene.build import AssetSettings, psnr
 from tasks.render.settings import Backend, FitSettings, RenderSettings, SceneDtype, SceneFrom
@@ -315,14 +315,3 @@ def test_only_the_settings_that_make_the_scene_are_in_its_name(clip: Clip) -> No
     longer = replace(FITTED, fit=replace(FIT, iterations=30))
     assert len({block_id(clip, each) for each in (discs, FITTED, longer)}) == 3
     assert block_id(clip, replace(longer, scene=SceneFrom.DISCS)) == block_id(clip, discs)
-
-
-def test_whole_chroma_keeps_what_half_of_it_smears() -> None:
-    """Red and blue columns of one pixel."""
-    stripes = np.zeros((32, 32, 3), np.uint8)
-    stripes[:, ::2, 0], stripes[:, 1::2, 2] = 220, 220
-    off = {
-        chroma: np.abs(decode_image(encode_jpeg(stripes, 95, chroma), "x").astype(int) - stripes).mean()
-        for chroma in SAMPLING
-    }
-    assert off["444"] < 5.0 < 50.0 < off["420"]

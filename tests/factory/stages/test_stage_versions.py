@@ -24,7 +24,7 @@ from tasks.experts.recovery import Recovery, RecoveryTable
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
 from tasks.render.gate import composed, likeness_to_photo, measures
 from tasks.render.map_drawing import draw_map_views
-from tasks.render.rigs import RIGS
+from tasks.render.rigs import pinhole
 from tasks.render.scene.build import AssetSettings, build_asset
 from tasks.render.scene.engine import NOBODY, render
 from tasks.render.views import render_views
@@ -180,7 +180,7 @@ def pictures() -> dict[str, object]:
     clip = street_clip()
     pose = clip.world_from_ego[NOW : NOW + 1] * 1.0
     pose[:, 2, 3] = 0.0
-    drawn = draw_map_views(clip.road_map, RIGS["front"], pose, clip.agents, [NOW], 128, 72)
+    drawn = draw_map_views(clip.road_map, [pinhole("front", 0.0, 70.0)], pose, clip.agents, [NOW], 128, 72)
     eye = Pinhole(front.intrinsics, aside[0] @ front.ego_from_camera, street.WIDTH, street.HEIGHT)
     near = composed(asset, NOBODY, aside[0, :3, 3], 30.0)
     (found,) = measures(near, [eye], render(near, [eye]), aside[0])

@@ -25,7 +25,7 @@ class SlowGaussians:
     sides: Tensor
 
     def leaves(self) -> list[Tensor]:
-        return [self.means, self.quats, self.log_scales, self.logits, self.colours, self.sh_rest]
+        return [self.means, self.quats, self.log_scales, self.logits, self.colours]
 
 
 def slow(gaussians: Gaussians, dtype: torch.dtype = torch.float64, grad: bool = True) -> SlowGaussians:

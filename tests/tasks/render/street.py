@@ -3,8 +3,14 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.render.fit.corrections import corrected, exposed
+from tasks.render.fit.on_cpu import compose, forward_pass
+from tasks.render.fit.reconstruct import boxes_off, corrections_at
+from tasks.render.fit.start import Problem
+from tasks.render.fit.state import FitState
 from tasks.render.scene.sensed import Photo, Sweep
 from tasks.world.clip import AgentKind, AgentTracks
+from tasks.world.arrays import F32
 
 WIDTH, HEIGHT = 128, 72
 INTRINSICS = np.array([[100.0, 0.0, 64.0], [0.0, 100.0, 36.0], [0.0, 0.0, 1.0]])
@@ -91,3 +97,11 @@ def drive(n: int = 8, with_car: bool = True) -> tuple[list[Photo], list[Sweep]]:
     photos = [photo(1.0 * k, 0.0, 0.25 * k, with_car) for k in range(n)]
     sweeps = [sweep(0.5 * k, 0.125 * k, with_car) for k in range(2 * n)]
     return photos, sweeps
+
+
+def picture_of(problem: Problem, state: FitState, photo: Photo) -> F32:
+    """What the fit itself makes of a photo of the block (pose local), by the corrections of its camera's neighbours."""
+    row_pose, row_colour = corrections_at(problem, state, photo.camera, photo.time_s)
+    scene, _ = compose(problem, state, boxes_off(problem, state), photo)
+    seen, _ = forward_pass(state, scene, photo, corrected(photo.world_from_camera, row_pose), 1)
+    return np.clip(exposed(seen.view.rgb, row_colour), 0.0, 1.0)

@@ -43,7 +43,6 @@ def state(n: int, owners: int) -> FitState:
         "log_scales": Learned.of(np.full((n, 3), -3.0)),
         "logits": Learned.of(logits_of(opacities)),
         "colours": Learned.of(rng.uniform(0, 1, (n, 3))),
-        "sh_rest": Learned.of(np.zeros((n, 0))),
     }
     owner = np.sort(rng.integers(-1, owners, n)).astype(np.int32)
     return FitState(100, learned, owner, np.zeros(n, bool), np.ones(n, np.float32), np.ones(n, np.float32))

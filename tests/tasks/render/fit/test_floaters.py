@@ -28,13 +28,13 @@ from tasks.render.gate import on_box
 from tasks.render.scene.body import BEFORE_M, REACH_M, body_boxes
 from tasks.render.scene.movers import SHIFT_SIZE, at_knots, shifted_boxes
 from tasks.render.settings import FitSettings
-from tasks.render.splatting.tensors import by_kernels
 from tasks.world.arrays import Array
 from tasks.world.clip import AgentTracks
+from tests.bench.by_kernels import by_kernels
 from tests.tasks.render.fit.test_reconstruct import fresh
 
 N = 5  # photos, every 0.25 s: the car 8 to 12 m before the camera, a little to the left
-SETTINGS = FitSettings(iterations=60, start_gaussians=800, most_gaussians=800, refine_every=10, refine_from=10)
+SETTINGS = FitSettings(iterations=30, start_gaussians=800, most_gaussians=800, refine_every=5, refine_from=5)
 RAG = np.array([0.9, 0.1, 0.9])  # a colour that nothing in the street has
 POST, GREEN = np.array([4.9, 0.9, 1.2]), np.array([0.1, 0.8, 0.1])  # before the car in the first photo alone
 Prepared = tuple[Problem, FitState]
@@ -221,14 +221,17 @@ def test_floaters_become_transparent_and_forget_how_they_were_moved(prepared: Pr
     np.testing.assert_array_equal(logits.values[1:], before.learned["logits"].values[1:])
 
 
-@pytest.mark.parametrize("backend", [lambda: None, lambda: OnTorch(by_kernels, "cpu")], ids=["kernels", "torch"])
-@pytest.mark.parametrize("at", [10, 50])
+@pytest.mark.parametrize(
+    ("at", "backend"),
+    [(5, lambda: None), (25, lambda: None), (5, lambda: OnTorch(by_kernels, "cpu"))],
+    ids=["early", "late", "early on torch"],
+)
 def test_the_fit_clears_them_as_long_as_it_goes_on(
-    prepared: Prepared, backend: Callable[[], FitBackend | None], at: int
+    prepared: Prepared, at: int, backend: Callable[[], FitBackend | None]
 ) -> None:
     """Also when Gaussians are no longer put elsewhere: a rag from just before `at` is not there at its end."""
     problem, state = prepared[0], fresh(prepared[1])
-    assert 10 < REFINE_UNTIL * SETTINGS.iterations < 50
+    assert 5 < REFINE_UNTIL * SETTINGS.iterations < 25
     advance(problem, state, SETTINGS, at - 1, backend=backend())
     put(problem, state, before_the_car(0), RAG)
     advance(problem, state, SETTINGS, at, backend=backend())

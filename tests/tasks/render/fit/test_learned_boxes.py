@@ -7,7 +7,7 @@ import pytest
 import street
 
 from tasks.render.fit.backend import OwnedGaussians, by_box
-from tasks.render.fit.reconstruct import advance, box_shifts, boxes_off, finish, picture_of
+from tasks.render.fit.reconstruct import advance, box_shifts, boxes_off, finish
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import FitState
 from tasks.render.scene.movers import KNOT_S, SHIFT_SIZE, shifted_boxes, world_from_boxes
@@ -95,7 +95,7 @@ def test_a_scene_looks_the_same_whatever_a_box_is_off_by_on_average(beside: tupl
     assert shifts.track_ids == ("car",)
     np.testing.assert_allclose(shifts.rows[0, : N // 2].mean(axis=0), 0.0, atol=1e-6)
     view, photo = finish(problem, state).views[0], problem.held_out[0]
-    seen = picture_of(problem, state, photo.photo)
+    seen = street.picture_of(problem, state, photo.photo)
     rgb = photo.compared.target.rgb
     assert view.psnr_db == pytest.approx(-10.0 * np.log10(np.mean((seen - rgb) ** 2)), abs=1e-3)
 

@@ -19,8 +19,9 @@ from tasks.render.fit.state import FitState, Learned, find_road
 from tasks.render.fit.state import lay_flat as lay_flat_by_hand
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gradient import Gradients
-from tasks.render.splatting.tensors import by_kernels, splatted
+from tasks.render.splatting.tensors import splatted
 from tests.bench import peer_gsplat
+from tests.bench.by_kernels import by_kernels
 from tests.tasks.render.fit.test_reconstruct import few, fresh
 
 SETTINGS = FitSettings(
@@ -31,7 +32,6 @@ SETTINGS = FitSettings(
     refine_from=6,
     pose_from=4,
     stereo_photos=1,
-    sh_degree=2,
 )
 TENSORS = OnTorch(by_kernels, "cpu")
 
@@ -66,7 +66,7 @@ def numbers(found: Derivatives) -> dict[str, np.ndarray]:
 def test_one_photo_says_the_same_of_all_that_is_learned(prepared: tuple[Problem, FitState], weights: dict) -> None:
     problem, state, settings = prepared[0], fresh(prepared[1]), replace(SETTINGS, **weights)
     rng = np.random.default_rng(0)
-    for name, size in (("exposure", 0.05), ("poses", 0.005), ("sh_rest", 0.05), ("quats", 0.2), ("boxes", 0.05)):
+    for name, size in (("exposure", 0.05), ("poses", 0.005), ("quats", 0.2), ("boxes", 0.05)):
         values = state.learned[name].values
         values += rng.normal(0.0, size, values.shape)
     for row in range(len(problem.train)):
@@ -90,7 +90,7 @@ def test_one_photo_through_gsplat_s_reference_says_the_same(prepared: tuple[Prob
     for name in ("exposure", "camera"):
         expected = getattr(by_hand, name)
         assert np.linalg.norm(getattr(by_gsplat, name) - expected) <= 1e-3 * np.linalg.norm(expected), name
-    for name in ("means", "quats", "log_scales", "logits", "colours", "sh_rest", "screen"):
+    for name in ("means", "quats", "log_scales", "logits", "colours", "screen"):
         whole = [np.zeros((len(state), *getattr(by_hand.gaussians, name).shape[1:])) for _ in range(2)]
         for found, dense in zip((by_hand, by_gsplat), whole):
             dense[np.asarray(found.rows)] = getattr(found.gaussians, name)

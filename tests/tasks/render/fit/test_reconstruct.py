@@ -13,18 +13,16 @@ from tasks.render.fit.reconstruct import (
     REFINE_UNTIL,
     advance,
     corrections_at,
+    drawn,
     finish,
     photo_at,
-    picture_of,
-    reconstruct,
 )
 from tasks.render.fit.start import Problem, prepare
-from tasks.render.fit.state import BETA1, SHAPES, SLACK_M, FitState, Learned, above_road
+from tasks.render.fit.state import BETA1, SHAPES, SLACK_M, FitState, above_road
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.engine import Vehicles, render
-from tasks.render.scene.sensed import Photo, Sweep, Tracks, shifted
+from tasks.render.scene.sensed import Photo, Sweep, Tracks
 from tasks.render.settings import FitSettings
-from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import moved, turned_quats
 from tasks.world.clip import AgentKind, Pinhole
 
@@ -84,7 +82,7 @@ def test_a_held_out_photo_comes_out_better_with_every_round(prepared: tuple[Prob
     scores = []
     for until in (0, 8, 24):
         advance(problem, state, SETTINGS, until)
-        scores.append(psnr(picture_of(problem, state, shot.photo), shot.compared.target.rgb))
+        scores.append(psnr(street.picture_of(problem, state, shot.photo), shot.compared.target.rgb))
     assert scores[1] > scores[0] + 1.0
     assert scores[2] > scores[1]
     assert len(state) > len(prepared[1])
@@ -153,12 +151,12 @@ def test_a_picture_is_shown_with_the_exposure_that_was_learned_for_its_camera(
     """Twice as bright, and a little blue added."""
     problem, state = prepared[0], fresh(prepared[1])
     photo = problem.held_out[0].photo
-    plain = picture_of(problem, state, photo)
+    plain = street.picture_of(problem, state, photo)
     row = np.zeros(12, np.float32)
     row[[0, 4, 8]], row[11] = 1.0, 0.05
     state.learned["exposure"].values[:] = row
     expected = np.clip(2.0 * plain + np.array([0.0, 0.0, 0.05], np.float32), 0.0, 1.0)
-    np.testing.assert_allclose(picture_of(problem, state, photo), expected, atol=1e-5)
+    np.testing.assert_allclose(street.picture_of(problem, state, photo), expected, atol=1e-5)
     asset = finish(problem, state)
     exposures = asset.exposures
     assert len(exposures) == len(problem.train)
@@ -189,12 +187,8 @@ def test_the_scene_s_own_colours_are_those_of_photos_and_each_camera_keeps_its_m
     assert asset.affine_of("a", first)[0, 0] == pytest.approx(1.1, abs=1e-3)
     for shot in problem.train:
         photo = shot.photo
-        eye = Pinhole(photo.intrinsics, shifted(photo.world_from_camera, problem.origin), 64, 36)
-        boxes, valid = problem.tracks.at(photo.time_s)
-        there = Vehicles(problem.tracks.ids, problem.tracks.kinds, boxes + np.append(problem.origin, np.zeros(4)))
-        assert valid.all()
-        shown = render(asset, [eye], there, affines=[asset.affine_of(photo.camera, photo.time_s)])[0].rgb
-        np.testing.assert_allclose(shown, picture_of(problem, state, photo), atol=2e-3)
+        shown = drawn(asset, problem, photo, photo.world_from_camera)
+        np.testing.assert_allclose(shown, street.picture_of(problem, state, photo), atol=2e-3)
 
 
 def test_a_photo_takes_the_corrections_of_its_own_camera(prepared: tuple[Problem, FitState]) -> None:
@@ -279,8 +273,6 @@ def test_a_vehicle_s_gradients_are_turned_into_its_own_frame(prepared: tuple[Pro
     tells the gradient that the fit went by.
     """
     problem, state = prepared[0], fresh(prepared[1])
-    shine = np.random.default_rng(0).normal(0.0, 0.1, (len(state), 9))
-    state.learned["sh_rest"] = Learned.of(shine)
     angle, mine = np.radians(110.0), np.flatnonzero(state.owner == 0)
     back = np.eye(4)
     back[:2, :2] = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
@@ -290,7 +282,7 @@ def test_a_vehicle_s_gradients_are_turned_into_its_own_frame(prepared: tuple[Pro
     turned_box = replace(problem, tracks=Tracks(replace(agents, boxes=boxes), problem.origin))
     turned_car = fresh(state)
     in_box = moved(state.gaussians().take(mine), back)
-    for name, values in (("means", in_box.means), ("quats", in_box.quats), ("sh_rest", in_box.sh_rest)):
+    for name, values in (("means", in_box.means), ("quats", in_box.quats)):
         turned_car.learned[name].values[mine] = values.reshape(len(mine), -1)
 
     def gradients(problem: Problem, state: FitState) -> dict[str, NDArray[np.float64]]:
@@ -304,7 +296,6 @@ def test_a_vehicle_s_gradients_are_turned_into_its_own_frame(prepared: tuple[Pro
     expected = {
         "means": own["means"][mine] @ back[:3, :3].T,
         "quats": turned_quats(np.array([np.cos(angle / 2), 0.0, 0.0, -np.sin(angle / 2)]), own["quats"][mine]),
-        "sh_rest": sh.turned(own["sh_rest"][mine].reshape(len(mine), -1, 3), back[:3, :3]).reshape(len(mine), -1),
     }
     for name in SHAPES:
         wanted = expected.get(name, own[name][mine])
@@ -317,7 +308,7 @@ def test_a_vehicle_s_gradients_are_turned_into_its_own_frame(prepared: tuple[Pro
 
 def test_progress_is_told_and_photos_are_needed() -> None:
     with pytest.raises(ValueError, match="none to learn from"):
-        reconstruct([], [], None, SETTINGS)
+        prepare([], [], None, SETTINGS)
     with pytest.raises(ValueError, match="iterations"):
         FitSettings(iterations=0)
 
@@ -338,9 +329,10 @@ def test_a_plain_road_can_start_with_fewer_and_larger_gaussians() -> None:
 
 def test_without_lidar_the_street_is_fitted_from_parallax_alone() -> None:
     photos, _ = few()
-    started, fitted = (
-        reconstruct(photos, [], street.tracks(), replace(SETTINGS, iterations=n), held_out=[2]).psnr_db for n in (1, 24)
-    )
+    problem, state = prepare(photos, [], street.tracks(), SETTINGS, held_out=[2])
+    started = finish(problem, state).psnr_db
+    advance(problem, state, SETTINGS, SETTINGS.iterations)
+    fitted = finish(problem, state).psnr_db
     assert fitted > started + 0.5 and fitted > 18.0
 
 

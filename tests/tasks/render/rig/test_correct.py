@@ -11,11 +11,10 @@ from scipy.spatial import KDTree
 
 from tasks.render.rig.adjust import motions, twists_of
 from tasks.render.rig.correct import Correction, corrected
-from tasks.render.settings import RigSettings
 from tasks.world.clip import Camera
 
 pytestmark = pytest.mark.slow
-NAMES, BELIEVED = list(drawn_rig.YAWS_DEG), RigSettings()
+NAMES = list(drawn_rig.YAWS_DEG)
 
 
 def apart(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
@@ -38,9 +37,9 @@ def turned(camera: Camera, turn_deg: tuple[float, ...], shift_m: tuple[float, ..
     return replace(camera, ego_from_camera=camera.ego_from_camera @ motion)
 
 
-def correct(said: list[Camera], settings: RigSettings = BELIEVED, **late: float) -> Correction:
+def correct(said: list[Camera], **late: float) -> Correction:
     true, taken = cameras(), files(NAMES)
-    found = corrected(said, taken, corners_seen(true, taken, lambda name: late.get(name, 0.0)), settings)
+    found = corrected(said, taken, corners_seen(true, taken, lambda name: late.get(name, 0.0)))
     assert found is not None
     return found
 
@@ -56,7 +55,7 @@ def test_a_rig_that_is_right_stays(as_said: Correction) -> None:
         assert metres < 0.01 and degrees < 0.05, (found.name, metres, degrees)
     assert as_said.ego_shift_m < 0.02 and not as_said.strangers
     for change in as_said.changes:
-        assert change.corners > 1000 and change.after_px < 0.4
+        assert change.corners > 500 and change.after_px < 0.4
 
 
 def test_a_camera_turned_by_2_degrees_and_moved_by_10_cm_is_put_right() -> None:
@@ -87,15 +86,13 @@ def test_a_camera_stamped_100_ms_early_is_found_where_the_ego_turns_and_accelera
     assert late["right"] == pytest.approx(0.1, abs=0.02), late
     assert all(abs(late[name]) < 0.02 for name in NAMES if name != "right"), late
     assert found.changes[3].after_px < 0.5 < found.changes[3].before_px
-    held = correct(cameras(), RigSettings(stamp_s=0.0), right=0.1)
-    assert held.changes[3].late_s == 0.0 and held.changes[3].after_px > found.changes[3].after_px
 
 
 def test_no_delay_is_made_up_where_there_is_none_or_a_shifted_mount_says_the_same(as_said: Correction) -> None:
     assert [change.late_s for change in as_said.changes] == [0.0] * 4
     true, steady = cameras(), files(NAMES, straight_on)
     said = [turned(c, (0.0, 0.0, 0.0), (-0.08, 0.0, 0.0)) if c.name == "right" else c for c in true]
-    found = corrected(said, steady, corners_seen(true, steady, drive=straight_on), RigSettings())
+    found = corrected(said, steady, corners_seen(true, steady, drive=straight_on))
     assert found is not None and [change.late_s for change in found.changes] == [0.0] * 4
     assert apart(true[3].ego_from_camera, found.cameras[3].ego_from_camera)[0] < 0.05
 
@@ -108,7 +105,7 @@ def test_rows_that_are_read_one_after_the_other_are_put_where_the_ego_was() -> N
     tree = KDTree(drawn_rig.street_points(np.random.Generator(np.random.Philox(key=[0, 7]))))
     off_m = []
     for readout_s in (0.03, 0.0):
-        found = corrected([replace(c, readout_s=readout_s) for c in true], taken, corners, BELIEVED)
+        found = corrected([replace(c, readout_s=readout_s) for c in true], taken, corners)
         assert found is not None and all(change.after_px < 0.35 for change in found.changes)
         near = np.linalg.norm(found.points[:, :2] - taken[6].world_from_ego[:2, 3], axis=1) < 15.0
         off_m.append(float(np.median(tree.query(found.points[near])[0])))
@@ -125,7 +122,7 @@ def test_swapped_files_are_named() -> None:
     corners = corners_seen(true, taken)
     a, b = (i for i, file in enumerate(taken) if file.time_s == 2.5 and file.sensor in ("front", "back"))
     corners[a], corners[b] = corners[b], corners[a]
-    found = corrected(true, taken, corners, RigSettings())
+    found = corrected(true, taken, corners)
     assert found is not None and found.strangers == (a, b)
 
 
@@ -138,4 +135,4 @@ def test_the_same_corners_give_the_same_bytes(as_said: Correction) -> None:
 def test_photos_that_share_nothing_correct_nothing() -> None:
     taken = files(NAMES)[:12]
     corners = [corners_seen(cameras(), [file], seed=i)[0] for i, file in enumerate(taken)]
-    assert corrected(cameras(), taken, corners, RigSettings()) is None
+    assert corrected(cameras(), taken, corners) is None

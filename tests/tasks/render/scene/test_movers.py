@@ -6,7 +6,7 @@ import street
 
 from tasks.render.scene.movers import BEYOND_M, KNOT_S, BoxShifts, behind_boxes, boxes_at, shifted_boxes
 
-SAMPLES = 4000  # along a line
+SAMPLES = 2000  # along a line
 
 
 def meets(points: np.ndarray, eye: np.ndarray, boxes: np.ndarray, slack_m: float) -> np.ndarray:
@@ -27,7 +27,7 @@ def meets(points: np.ndarray, eye: np.ndarray, boxes: np.ndarray, slack_m: float
 def test_a_line_meets_a_box_where_one_of_its_points_lies_in_it() -> None:
     rng = np.random.default_rng(0)
     eye = np.array([1.0, -2.0, 1.5])
-    points = eye + rng.normal(size=(600, 3)) * [20.0, 20.0, 4.0]
+    points = eye + rng.normal(size=(250, 3)) * [20.0, 20.0, 4.0]
     place, heading, size = (
         rng.normal(size=(12, 3)) * [15.0, 15.0, 2.0],
         rng.uniform(-np.pi, np.pi, (12, 1)),
@@ -36,10 +36,10 @@ def test_a_line_meets_a_box_where_one_of_its_points_lies_in_it() -> None:
     boxes = np.hstack([place, heading, size])
     found = np.asarray(behind_boxes(points, eye, boxes))
     surely, perhaps = meets(points, eye, boxes, -0.03), meets(points, eye, boxes, 0.03)
-    assert 100 < surely.sum() < 500
+    assert 40 < surely.sum() < 210
     assert found[surely].all()
     assert not found[~perhaps].any()
-    assert (perhaps & ~surely).sum() < 60, "nearly every line is decided"
+    assert (perhaps & ~surely).sum() < 25, "nearly every line is decided"
 
 
 def test_an_eye_inside_a_box_sees_nothing_else() -> None:

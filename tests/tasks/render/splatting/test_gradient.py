@@ -15,7 +15,7 @@ from tasks.render.splatting.raster import ForwardPass, forward
 WIDTH, HEIGHT = 37, 29  # no multiple of a tile
 INTRINSICS = np.array([[30.0, 0.0, 18.0], [0.0, 31.0, 15.0], [0.0, 0.0, 1.0]])
 BACKGROUND = np.random.default_rng(1).uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
-KINDS = ("means", "quats", "log_scales", "logits", "colours", "sh_rest")
+KINDS = ("means", "quats", "log_scales", "logits", "colours")
 
 
 def pose(angles: tuple[float, float, float], position: tuple[float, float, float]) -> NDArray[np.float64]:
@@ -32,7 +32,7 @@ def pose(angles: tuple[float, float, float], position: tuple[float, float, float
 CAMERA = pose((0.05, -0.1, 0.2), (0.2, -0.1, -0.4))
 
 
-def cloud(n: int, seed: int, near: float, far: float, sigma: float, most_opaque: float, count: int = 0) -> Gaussians:
+def cloud(n: int, seed: int, near: float, far: float, sigma: float, most_opaque: float) -> Gaussians:
     rng = np.random.default_rng(seed)
     depth = rng.uniform(near, far, n)
     means = np.stack([rng.uniform(-0.7, 0.7, n) * depth, rng.uniform(-0.5, 0.5, n) * depth, depth], 1)
@@ -42,17 +42,16 @@ def cloud(n: int, seed: int, near: float, far: float, sigma: float, most_opaque:
         np.log(sigma * rng.uniform(0.3, 2.0, (n, 3))).astype(np.float32),
         rng.uniform(0.05, most_opaque, n).astype(np.float32),
         rng.uniform(0.1, 1.0, (n, 3)).astype(np.float32),
-        rng.normal(0.0, 0.1, (n, count, 3)).astype(np.float32),
     )
 
 
 SCENES = {
     "small ones": cloud(60, 0, 1.0, 12.0, 0.3, 0.9),
-    "some behind the camera": cloud(60, 1, -4.0, 6.0, 0.3, 0.9, 3),
-    "big and near": cloud(12, 2, 0.3, 2.0, 0.8, 0.8, 8),
-    "nearly opaque": cloud(40, 3, 2.0, 9.0, 0.4, 1.0, 15),
+    "some behind the camera": cloud(60, 1, -4.0, 6.0, 0.3, 0.9),
+    "big and near": cloud(12, 2, 0.3, 2.0, 0.8, 0.8),
+    "nearly opaque": cloud(40, 3, 2.0, 9.0, 0.4, 1.0),
     "opaque": replace(cloud(25, 4, 2.0, 9.0, 0.3, 1.0), opacities=np.full(25, 0.9996, np.float32)),
-    "hardly there": cloud(60, 5, 1.0, 9.0, 0.2, 0.06, 3),
+    "hardly there": cloud(60, 5, 1.0, 9.0, 0.2, 0.06),
 }
 
 
@@ -112,15 +111,13 @@ def test_gradients_are_those_of_the_slow_twin(name: str, terms: str) -> None:
 
 
 def test_a_vehicle_gets_its_gradients_in_its_own_frame() -> None:
-    street, car = cloud(30, 8, 3.0, 9.0, 0.4, 0.8, 3), cloud(40, 9, -0.5, 0.5, 0.15, 0.9, 15)
+    street, car = cloud(30, 8, 3.0, 9.0, 0.4, 0.8), cloud(40, 9, -0.5, 0.5, 0.15, 0.9)
     drive = pose((0.3, 0.8, -0.4), (0.4, 0.2, 3.0))
     scene, ups = concatenate([street, moved(car, drive)]), upstream(10)
     fast = backward(traced(scene), scene, *ups[:1])
     own = unmoved(fast, drive)
     leaves = slow_raster.slow(car)
-    wider = concatenate([street, replace(car, sh_rest=car.sh_rest)])  # the street's coefficients, filled up to 15
-    still = slow_raster.slow(wider.take(np.arange(len(street))))
-    whole = slow_raster.slow_concatenate([still, slow_raster.slow_moved(leaves, drive)])
+    whole = slow_raster.slow_concatenate([slow_raster.slow(street), slow_raster.slow_moved(leaves, drive)])
     nothing = np.zeros((HEIGHT, WIDTH), np.float32)
     slow, by_motion = slow_gradients(leaves, whole, (ups[0], nothing, nothing))
     wrong = [kind for kind, g in zip(KINDS, slow) if not same(dense(own, kind, len(scene))[len(street) :], g)]
@@ -137,7 +134,7 @@ def test_the_screen_gradient_moves_a_far_gaussian_across_the_view() -> None:
 
 
 def test_the_number_of_threads_changes_no_byte() -> None:
-    scene, ups = cloud(9000, 12, 1.0, 12.0, 0.05, 0.9, 3), upstream(13)
+    scene, ups = cloud(9000, 12, 1.0, 12.0, 0.05, 0.9), upstream(13)
     one, three = (backward(traced(scene, n), scene, *ups, threads=n) for n in (1, 3))
     for name in Gradients.__dataclass_fields__:
         assert getattr(one, name).tobytes() == getattr(three, name).tobytes()

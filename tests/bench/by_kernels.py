@@ -1,0 +1,46 @@
+"""The loop over tensors without a GPU: this package's kernels as a function that torch can derive."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.gradient import backward
+from tasks.render.splatting.project import DEPTH
+from tasks.render.splatting.raster import ForwardPass, forward
+from tasks.render.splatting.tensors import Eye, SceneTensors, Splatted
+
+
+def by_kernels(scene: SceneTensors, eye: Eye, threads: int = 1) -> Splatted:
+    """On the CPU, by `raster.forward` and `gradient.backward`: the loop over tensors without a GPU."""
+    arrays = [part.detach().numpy() for part in scene.parts()]
+    arrays[3] = scene.logits.detach().sigmoid().numpy()
+    gaussians = Gaussians(*arrays)
+    nothing = np.zeros(3, np.float32)
+    seen = forward(gaussians, eye.intrinsics, eye.scene_from_camera, eye.width, eye.height, nothing, threads)
+    index = torch.from_numpy(seen.splats.index)
+    screen = torch.zeros(len(index), 2, requires_grad=True)
+    rgb, depth, alpha = _Blended.apply(seen, gaussians, threads, *scene.parts(), eye.motion, screen)
+    return Splatted(rgb, depth, alpha, index, torch.from_numpy(seen.splats.projected[:, DEPTH].copy()), screen)
+
+
+class _Blended(torch.autograd.Function):
+    """A traced view, whose derivatives are those of the kernels."""
+
+    @staticmethod
+    def forward(ctx: Any, seen: ForwardPass, gaussians: Gaussians, threads: int, *inputs: Tensor) -> Any:
+        ctx.seen, ctx.gaussians, ctx.threads = seen, gaussians, threads
+        return tuple(torch.from_numpy(picture) for picture in (seen.view.rgb, seen.view.depth, seen.view.alpha))
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> Any:
+        d_rgb, d_depth, d_alpha = (up.numpy() for up in upstream)
+        by = backward(ctx.seen, ctx.gaussians, d_rgb, d_depth, d_alpha, ctx.threads)
+        n, rows = len(ctx.gaussians), (by.means, by.quats, by.log_scales, by.logits, by.colours)
+        whole = [np.zeros((n, *part.shape[1:]), np.float32) for part in rows]
+        for everyone, part in zip(whole, rows):
+            everyone[by.index] = part
+        tensors = [torch.from_numpy(part) for part in (*whole, by.camera.astype(np.float32), by.screen)]
+        return None, None, None, *tensors
