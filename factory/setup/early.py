@@ -50,7 +50,7 @@ def refuse_cameras_of_no_rig(config: RunConfig) -> None:
     if not wanted or config.render.mode is RenderMode.NONE:
         return
     if not rig and config.render.mode is RenderMode.MAP:
-        from tasks.render.rigs import MAP_RIG
+        from tasks.render.views import MAP_RIG
 
         rig = tuple(camera.name for camera in MAP_RIG)
     if missing := [name for name in wanted if name not in rig]:

@@ -32,10 +32,10 @@ from factory.store.schema import UNLISTED, RunIdentity, canonical_json
 from tasks.caches import check, user_cache
 from tasks.experts.protocol import Expert, tried_once
 from tasks.experts.recovery import Recovery, RecoverySettings, RecoveryTable
-from tasks.render.rigs import MAP_RIG
 from tasks.render.scene import engine
 from tasks.render.settings import RenderMode
 from tasks.render.splatting.gsplat_backend import BackendMissing
+from tasks.render.views import MAP_RIG
 from tasks.reward.labels import Labelling
 from tasks.rollout.simulate import traffic_record
 from tasks.settings import PdmSettings

@@ -15,9 +15,8 @@ import numpy as np
 
 from factory.graph.steps import StopCheck, never_stop
 from factory.readers.base import BadClip
-from factory.stages.assets import Sensing, asset_for, corrected_for, scene_path, sensing
+from factory.stages.assets import SAID, Sensing, UsedRig, asset_for, corrected_for, scene_path, sensing
 from factory.stages.painted import town_cameras, town_pictures
-from factory.stages.rig import SAID, UsedRig
 from factory.stages.rows import agent_columns
 from factory.stages.sensors import block_of, chosen_cameras, encode_jpeg, load_photos, taken_by
 from tasks.attempt import Judged
@@ -32,17 +31,16 @@ from tasks.render.gate import (
     sightings,
     unfit,
 )
-from tasks.render.map_drawing import draw_map_views
-from tasks.render.rigs import MAP_RIG
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import vehicles_at
 from tasks.render.scene.sensed import Photo
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
-from tasks.render.views import pose_on_ground, render_views
+from tasks.render.views import MAP_RIG, draw_map_views, render_views
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentTracks, Camera, Clip, Scene, SensorFile
 from tasks.world.frames import HEADING, X, Y
+from tasks.world.frames import pose_on_ground
 
 NO_IMAGES: dict[str, object] = {"cameras": None, "images": None, "image_source": str(ImageSource.NONE)}
 TAG_OF = {

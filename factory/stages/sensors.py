@@ -14,8 +14,7 @@ from factory.files import matching
 from factory.readers.base import BadClip
 from factory.readers.pictures import BadPicture, decode_grey, decode_rgb, file_and_frame, video_frames
 from factory.readers.points import read_pcd, read_points
-from tasks.render.scene.driven_road import driven_roads
-from tasks.render.scene.features import NOTHING_KNOWN, Known
+from tasks.render.scene.features import NOTHING_KNOWN, Known, driven_roads
 from tasks.render.scene.sensed import Photo, Sweep, on_ego
 from tasks.render.views import straightened, undistorted
 from tasks.world.arrays import Array, Bools, Bytes

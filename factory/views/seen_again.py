@@ -33,10 +33,10 @@ from tasks.caches import user_cache
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import render, vehicles_at
 from tasks.render.settings import ImageSource
-from tasks.render.views import VISIBLE_M, pose_on_ground
+from tasks.render.views import VISIBLE_M
 from tasks.world.arrays import Array, Image
 from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Pinhole
-from tasks.world.frames import to_world
+from tasks.world.frames import pose_on_ground, to_world
 
 Row = Mapping[str, Any]
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from tasks.world.arrays import Array
+from tasks.world.vehicle import HEADING, X, Y
 
 
 def wrap_angle(angle: Array) -> Array:
@@ -102,3 +103,24 @@ class Vehicle:
 
 PACIFICA = Vehicle()
 REAR_AXLE_TO_CENTER, HALF_LENGTH, HALF_WIDTH = PACIFICA.rear_axle_to_center, PACIFICA.half_length, PACIFICA.half_width
+
+
+def pose_on_ground(logged: Array, ego_states: Array) -> Array:
+    """3-D poses (F, 4, 4) of planar ego states (F, 11), standing on the road as the log knows it.
+
+    `logged` (S, 4, 4) world_from_ego: each state takes height, roll and pitch from the plane under the nearest logged
+    pose.
+    """
+    xy = ego_states[:, [X, Y]]
+    distance = np.linalg.norm(logged[None, :, :2, 3] - xy[:, None, :], axis=-1)
+    base = logged[np.argmin(distance, axis=1)]
+    up = base[:, :3, 2]
+    out = np.tile(np.eye(4), (len(xy), 1, 1))
+    out[:, :2, 3] = xy
+    offset = xy - base[:, :2, 3]
+    out[:, 2, 3] = base[:, 2, 3] - (offset * up[:, :2]).sum(axis=1) / up[:, 2]
+    flat = np.stack([np.cos(ego_states[:, HEADING]), np.sin(ego_states[:, HEADING])], axis=-1)
+    forward = np.column_stack([flat, -(flat * up[:, :2]).sum(axis=1) / up[:, 2]])
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    out[:, :3, 0], out[:, :3, 1], out[:, :3, 2] = forward, np.cross(up, forward), up
+    return out

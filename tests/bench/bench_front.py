@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from factory.datasets.scenarionet.reader import ScenarioNetReader
-from factory.stages.rig import corrected_rig, known_of, lines_of, taken_from
+from factory.stages.assets import corrected_rig, known_of, lines_of, taken_from
 from factory.stages.sensors import block_of, load_sensors
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.start import prepare

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.stages.rig import lines_of
+from factory.stages.assets import lines_of
 from factory.stages.sensors import load_photos, opened_photos
 from tasks.render.fit.corrections import exposed
 from tasks.render.fit.losses import ssim
@@ -24,8 +24,7 @@ from tasks.render.fit.reconstruct import advance, classes_of, drawn, finish, pos
 from tasks.render.fit.start import Problem, Shot, prepare
 from tasks.render.rig.correct import Correction, corners_of, corrected, ground_below
 from tasks.render.scene.asset import psnr
-from tasks.render.scene.driven_road import driven_road
-from tasks.render.scene.features import Known
+from tasks.render.scene.features import Known, driven_road
 from tasks.render.settings import FitSettings
 from tasks.world.arrays import Array
 from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Camera, SensorFile

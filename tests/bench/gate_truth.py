@@ -33,9 +33,10 @@ from tasks.render.gate import (
 )
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Vehicles, render, vehicles_at
-from tasks.render.views import VISIBLE_M, pose_on_ground
+from tasks.render.views import VISIBLE_M
 from tasks.world.arrays import F32, Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentKind, AgentTracks, Camera, Clip, Pinhole
+from tasks.world.frames import pose_on_ground
 
 NOTHING_LARGE = 1.0  # the likeness of a picture without any large vehicle
 MOST_LOGS = 10_000

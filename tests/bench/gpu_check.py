@@ -22,10 +22,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tasks.render.fit.backend import FitBackend
+from tasks.render.fit.backend import FitBackend, OnCpu
 from tasks.render.fit.corrections import EXPOSURE_SIZE, POSE_SIZE
 from tasks.render.fit.losses import target_of
-from tasks.render.fit.on_cpu import OnCpu
 from tasks.render.fit.on_torch import OnTorch, photo_loss
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.start import PhotoTarget, Problem, Shot

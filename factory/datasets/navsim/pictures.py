@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from factory.datasets.navsim.frames import FRAME_S, N_FRAMES, N_HISTORY, NOW_FRAME, SampleNames, hex16
 from factory.datasets.navsim.settings import PUBLIC_SIZE, CannotExport, ExportSettings
 from factory.store.reader import decode_stored_image
-from tasks.render.rigs import pinhole
+from tasks.render.views import pinhole
 from tasks.world.clip import Camera
 
 # Which camera of a rig stands for which of the eight that NAVSIM knows.

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from tasks.kernels.compiled import kernel
-from tasks.render.fit.backend import Derivatives, FitBackend, Held
+from tasks.render.fit.backend import Derivatives, FitBackend, Held, OnCpu
 from tasks.render.fit.corrections import after, between, corrected, exposed, inverse, matrix_of, reference
 from tasks.render.fit.losses import Target, ssim
-from tasks.render.fit.on_cpu import OnCpu
 from tasks.render.fit.start import Problem, Shot
 from tasks.render.fit.state import BACKGROUND, FitState, Road, above_road, opacities_of, refine
 from tasks.render.scene.asset import ClassQuality, Exposure, RenderAsset, ViewQuality, mean_psnr_db, psnr

@@ -29,7 +29,7 @@ from tasks.render.rig.adjust import (
     twists_of,
     without,
 )
-from tasks.render.scene.driven_road import WIDE_M, driven_roads
+from tasks.render.scene.features import WIDE_M, driven_roads
 from tasks.render.scene.movers import behind_boxes
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.render.scene.sky import directions

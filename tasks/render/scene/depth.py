@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from tasks.kernels.compiled import kernel
-from tasks.render.scene.driven_road import road_depth
-from tasks.render.scene.features import Points
+from tasks.render.scene.features import Points, road_depth
 from tasks.render.scene.movers import behind_boxes, world_from_boxes
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.render.scene.sky import directions, may_be_sky, no_worse

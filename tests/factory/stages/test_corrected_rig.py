@@ -11,7 +11,7 @@ import pytest
 from printed_street import CAMERAS, ROAD_M, WIDTH, photographed
 
 from factory.readers.base import BadClip
-from factory.stages.rig import SAID, corrected_rig, said_again, wanted
+from factory.stages.assets import SAID, corrected_rig, said_again, wanted
 from tasks.render.rig.adjust import motions, twists_of
 from tasks.render.rig.correct import ground_below
 from tasks.render.scene.asset import RenderAsset, TakenFrom

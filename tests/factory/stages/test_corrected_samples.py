@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from printed_street import CAMERAS, photographed
 
+from factory.stages.assets import SAID, UsedRig, taken_from, used_rig
 from factory.stages.imaging import Imaging, heights
-from factory.stages.rig import SAID, UsedRig, taken_from, used_rig
 from factory.stages.sensors import load_photos
 from factory.store.reader import decode_stored_image
 from tasks.attempt import Judged, human_sample

@@ -16,8 +16,7 @@ from factory.readers.settings import TownSettings
 from factory.readers.whole_folder import SUMS
 from factory.setup.settings import _table_of
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table, save_vocabulary
-from factory.stages.assets import _resumed, damaged_blocks
-from factory.stages.rig import SAID, _say, told_of
+from factory.stages.assets import SAID, _resumed, _say, damaged_blocks, told_of
 from factory.stages.scene_file import BadScene, read_scene, write_scene
 from factory.stages.warm import _is_compiled, marker, tiny_clip
 from factory.store.location import BadCacheFile, Location, SceneFiles, encode_tree

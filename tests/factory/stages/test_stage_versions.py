@@ -23,11 +23,9 @@ from tasks.experts.protocol import Human, Plan
 from tasks.experts.recovery import Recovery, RecoveryTable
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
 from tasks.render.gate import composed, likeness_to_photo, measures
-from tasks.render.map_drawing import draw_map_views
-from tasks.render.rigs import pinhole
 from tasks.render.scene.build import AssetSettings, build_asset
 from tasks.render.scene.engine import NOBODY, render
-from tasks.render.views import render_views
+from tasks.render.views import draw_map_views, pinhole, render_views
 from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.reward.label_bytes import VocabularyLabels
 from tasks.reward.labels import BRAKING_MPS2, hit_after_s, way_on_m

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.render.fit.backend import compose, forward_pass
 from tasks.render.fit.corrections import corrected, exposed
-from tasks.render.fit.on_cpu import compose, forward_pass
 from tasks.render.fit.reconstruct import boxes_off, corrections_at
 from tasks.render.fit.start import Problem
 from tasks.render.fit.state import FitState

@@ -7,12 +7,21 @@ import numpy as np
 import pytest
 import street
 
-from tasks.render.map_drawing import GROUND, ROAD, SKY, WHITE, clip_near, draw_map_views, ground_height
-from tasks.render.rigs import pinhole
-from tasks.render.views import pose_on_ground, undistorted
+from tasks.render.views import (
+    GROUND,
+    ROAD,
+    SKY,
+    WHITE,
+    clip_near,
+    draw_map_views,
+    ground_height,
+    pinhole,
+    undistorted,
+)
 from tasks.world.clip import Camera
 from tasks.world.frames import EGO_STATE_SIZE, HEADING, X, Y
 from tasks.world.road_map import Lane, MapLayer, MapPolygon, RoadMap
+from tasks.world.frames import pose_on_ground
 
 
 def states(x: float, y: float, heading: float) -> np.ndarray:

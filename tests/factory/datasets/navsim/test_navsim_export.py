@@ -20,7 +20,7 @@ from factory.datasets.navsim.pickles import METRICS
 from factory.datasets.navsim.pictures import CAMERAS, slots
 from factory.datasets.navsim.settings import CannotExport, ExportSettings
 from factory.store.reader import labels_of
-from tasks.render.rigs import pinhole
+from tasks.render.views import pinhole
 from tests.factory.datasets.navsim.navsim_samples import SIZE, TOKENS, K, exported, pictures, quiet, tree
 from tests.planners.samples import write_table
 

@@ -8,10 +8,9 @@ import pytest
 import street
 import torch
 
-from tasks.render.fit.backend import Derivatives
+from tasks.render.fit.backend import Derivatives, OnCpu
 from tasks.render.fit.losses import photo_loss as photo_loss_by_hand
 from tasks.render.fit.losses import target_of
-from tasks.render.fit.on_cpu import OnCpu
 from tasks.render.fit.on_torch import LearnedTensor, OnTorch, lay_flat, photo_loss
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.start import Problem, prepare

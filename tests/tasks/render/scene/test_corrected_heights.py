@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.stages.rig import taken_from
+from factory.stages.assets import taken_from
 from factory.stages.scene_file import read_scene, write_scene
 from tasks.render.scene.asset import RenderAsset, rises_of
 from tasks.render.scene.movers import lifted
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.gaussians import EMPTY
-from tasks.render.views import pose_on_ground
 from tasks.world.clip import AgentKind, AgentTracks, SensorFile
 from tasks.world.frames import EGO_STATE_SIZE, X
+from tasks.world.frames import pose_on_ground
 
 STEPS = 21
 PARKED = AgentTracks(

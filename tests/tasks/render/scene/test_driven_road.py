@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from tasks.render.fit.state import above_road, find_road
-from tasks.render.scene.driven_road import AHEAD_M, SPACING_M, WIDE_M, beside_road, driven_road
-from tasks.render.scene.features import Points
+from tasks.render.scene.features import AHEAD_M, SPACING_M, WIDE_M, Points, beside_road, driven_road
 from tasks.world.arrays import Array
 
 

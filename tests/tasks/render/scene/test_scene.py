@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import street
 
+from factory.stages.warm import compile_render_kernels
 from tasks.render.scene import depth, movers, stereo, surfels
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.build import AssetSettings, build_asset
 from tasks.render.scene.engine import NOBODY, Vehicles, render
 from tasks.render.scene.sensed import Photo
 from tasks.render.splatting import project, raster
-from tasks.render.warm import compile_kernels
 from tasks.world.clip import AgentKind, Pinhole
 
 
@@ -110,11 +110,11 @@ def test_no_photos_no_scene() -> None:
 
 
 def test_the_smallest_scene_reaches_every_kernel_of_the_room() -> None:
-    compile_kernels()
+    compile_render_kernels()
     modules = (depth, movers, project, raster, stereo, surfels)
     kernels = [value for module in modules for value in vars(module).values() if hasattr(value, "signatures")]
     assert len(kernels) > 10
     parts = {"_nearer", "aligned"}  # of their callers, like all that is inlined; no entry points
-    parts |= {"_anchor", "_chosen", "_confirm", "_stand_on"}  # which fits alone call: tasks.render.warm has theirs
+    parts |= {"_anchor", "_chosen", "_confirm", "_stand_on"}  # which fits alone call: factory.stages.warm has theirs
     entries = [kernel for kernel in kernels if not kernel.targetoptions.get("forceinline")]
     assert {kernel.__name__ for kernel in entries if not kernel.signatures} <= parts
