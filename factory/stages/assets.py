@@ -30,7 +30,6 @@ from factory.stages.sensors import (
     block_of,
     chosen_cameras,
     load_sensors,
-    load_sweeps,
     masks_digest,
     opened_photos,
     poses_of,
@@ -45,7 +44,7 @@ from tasks.render.fit.start import prepare
 from tasks.render.fit.state import FitState
 from tasks.render.rig.correct import Correction, corners_of, corrected, ground_below, hidden_by
 from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom, rises_of
-from tasks.render.scene.build import build_asset, lidar_asset
+from tasks.render.scene.build import build_asset
 from tasks.render.scene.features import Known, driven_roads
 from tasks.render.scene.movers import lifted
 from tasks.render.scene.sensed import own_bodies
@@ -329,19 +328,18 @@ class Sensing(Enum):
 
     PHOTOS = "photos"  # and lidar
     PHOTOS_ONLY = "photos_only"  # depth from parallax alone
-    LIDAR_ONLY = "lidar_only"
     NOTHING = "nothing"
 
 
 def sensing(clip: Clip, settings: RenderSettings) -> Sensing:
-    """What the block can be made of; nothing without a rig to look through, or without lidar and parallax.
+    """What the block can be made of; nothing without photos, or without lidar and parallax.
 
     Raises ValueError for a camera the rig does not have.
     """
     block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
     photos = taken_by(cameras, block.images)
-    if block.sweeps and cameras:
-        return Sensing.PHOTOS if photos else Sensing.LIDAR_ONLY
+    if block.sweeps and photos:
+        return Sensing.PHOTOS
     return Sensing.PHOTOS_ONLY if photos and _with_parallax(photos) >= PARALLAX_SHARE else Sensing.NOTHING
 
 
@@ -362,14 +360,13 @@ def asset_for(
 ) -> RenderAsset | None:
     """The scene of the clip's block with its digest; None where the clip has nothing to make one from.
 
-    Made of photos and lidar, or of either alone (`sensing`); the same on any number of threads.
+    Made of photos, with or without lidar (`sensing`); the same on any number of threads.
     Raises BadClip where a sensor file is broken, ValueError for a camera the rig does not have, and TaskStopped where a
     fit is `stopped`.
     """
     block, rig = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
     cameras = block_cameras(block, rig)
-    made_of = sensing(clip, settings)
-    if made_of is Sensing.NOTHING:
+    if sensing(clip, settings) is Sensing.NOTHING:
         return None
     path, masks = scene_path(clip, settings, cache_dir), masks_of(cameras, read_masks(settings.own_body, rig))
     with only_builder(path):
@@ -379,26 +376,23 @@ def asset_for(
             except BadScene as error:
                 log.warning("%s; it is built again", error)
             else:
-                if made_of is not Sensing.LIDAR_ONLY and wanted(block, settings.rig):
+                if wanted(block, settings.rig):
                     said_again(path, block, cameras, masks)
                 return kept
-        if made_of is not Sensing.LIDAR_ONLY:
-            agents, taken, found = block.agents, tuple[TakenFrom, ...](), None
-            if wanted(block, settings.rig):
-                given = block.images
-                block, cameras, found = corrected_rig(path, block, cameras, masks)
-                taken = taken_from(given, block.images) if found is not None else ()
-                agents = lifted(agents, *rises_of(taken))
-            data = load_sensors(block, cameras, settings.width, settings.height, masks)
-            if found is not None:
-                data = replace(data, known=known_of(data, block, found))
-            if settings.scene is SceneFrom.FIT:
-                asset = fitted(path, data, agents, settings.fit, threads, stopped, settings.backend)
-            else:
-                asset = build_asset(data.photos, data.sweeps, agents, settings.asset, data.known)
-            asset = replace(asset, rig=cameras if taken else (), taken=taken, bodies=own_bodies(data.photos))
+        agents, taken, found = block.agents, tuple[TakenFrom, ...](), None
+        if wanted(block, settings.rig):
+            given = block.images
+            block, cameras, found = corrected_rig(path, block, cameras, masks)
+            taken = taken_from(given, block.images) if found is not None else ()
+            agents = lifted(agents, *rises_of(taken))
+        data = load_sensors(block, cameras, settings.width, settings.height, masks)
+        if found is not None:
+            data = replace(data, known=known_of(data, block, found))
+        if settings.scene is SceneFrom.FIT:
+            asset = fitted(path, data, agents, settings.fit, threads, stopped, settings.backend)
         else:
-            asset = lidar_asset(load_sweeps(block.sweeps, with_intensity=True), block.agents)
+            asset = build_asset(data.photos, data.sweeps, agents, settings.asset, data.known)
+        asset = replace(asset, rig=cameras if taken else (), taken=taken, bodies=own_bodies(data.photos))
         return write_scene(path, replace(own_part(asset), block=range_of(clip, block)), settings.scene_dtype)
 
 
@@ -408,8 +402,7 @@ def corrected_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -
     Raises BadClip and ValueError as `asset_for` does.
     """
     block, rig = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
-    seen = sensing(clip, settings) in (Sensing.PHOTOS, Sensing.PHOTOS_ONLY)
-    if not (seen and wanted(block, settings.rig)):
+    if sensing(clip, settings) is Sensing.NOTHING or not wanted(block, settings.rig):
         return None
     cameras = block_cameras(block, rig)
     path, masks = scene_path(clip, settings, cache_dir), masks_of(cameras, read_masks(settings.own_body, rig))

@@ -1,9 +1,8 @@
 """The render stage: a sample's images, from the block's scene, the log's own photos, the map or the town's painter.
 
 A human sample of a clip with photos keeps them, whatever its block. Every other sample is drawn from the block where
-`factory.stages.assets.sensing` finds something to make it of, else written with image_source=none and no images. Lidar
-without photos gives grey pictures near its sweeps, tagged `lidar_only`; photos without lidar coarse ones, tagged
-`photos_only`.
+`factory.stages.assets.sensing` finds something to make it of, else written with image_source=none and no images. Photos
+without lidar give coarse pictures, tagged `photos_only`.
 """
 
 from collections.abc import Sequence
@@ -41,10 +40,10 @@ from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentTracks, Camera, Clip, Scene, SensorFile
 from tasks.world.frames import HEADING, X, Y
 from tasks.world.frames import pose_on_ground
+from tasks.world.vehicle import HEADING
 
 NO_IMAGES: dict[str, object] = {"cameras": None, "images": None, "image_source": str(ImageSource.NONE)}
 TAG_OF = {
-    Sensing.LIDAR_ONLY: "lidar_only",  # images show lidar returns in grey, not what a camera would have seen
     Sensing.PHOTOS_ONLY: "photos_only",  # no lidar: depth is guessed from parallax, markings shear off the photos' path
 }
 LOW_PSNR = "low_psnr"  # tag: held-out photos of the block come out worse than psnr_min
@@ -87,7 +86,7 @@ class Imaging:
         """
         if self.settings.mode is not RenderMode.AUTO:
             return None
-        if sensing(clip, self.settings) not in (Sensing.PHOTOS, Sensing.PHOTOS_ONLY):
+        if sensing(clip, self.settings) is Sensing.NOTHING:
             return None
         asset = _block(clip, self.settings, self.cache_dir)
         found = poor_block(asset, self.settings)
@@ -113,7 +112,7 @@ class Imaging:
         if candidate is None and taken_by(cameras, (*clip.images, *block_of(clip).images)):
             return self._photos(clip, judged, cameras)
         made_of = sensing(clip, self.settings)
-        if made_of is Sensing.NOTHING or (made_of is Sensing.LIDAR_ONLY and not self._near_sweeps(clip, judged)):
+        if made_of is Sensing.NOTHING:
             return NO_IMAGES
         asset = in_time_of(clip, _block(clip, self.settings, self.cache_dir))
         tags = [TAG_OF[made_of]] if made_of in TAG_OF else []
@@ -125,12 +124,12 @@ class Imaging:
         """Why a simulated drive cannot be shown: what `tasks.render.gate` finds on its pictures from T to T+2H.
 
         Vehicles are held against photos on the pictures that are stored, all else too where there are `shared` steps
-        of several samples of the drive, which fall together. None where nothing is rendered from photos: lidar's grey
-        pictures have gaps between its beams, and a reach instead. Raises BadClip for a broken sensor file.
+        of several samples of the drive, which fall together. None where nothing is rendered from photos. Raises BadClip
+        for a broken sensor file.
         """
         if self.settings.mode is not RenderMode.AUTO or not self.settings.gate.enabled:
             return None
-        if sensing(clip, self.settings) not in (Sensing.PHOTOS, Sensing.PHOTOS_ONLY):
+        if sensing(clip, self.settings) is Sensing.NOTHING:
             return None
         start, now = candidate.rollout.start_step, judged.scene.step
         steps: Sequence[int] = range(start, now + HORIZON_STEPS + 1, GATE_STRIDE)
@@ -154,12 +153,6 @@ class Imaging:
             album,
             stored,
         )
-
-    def _near_sweeps(self, clip: Clip, judged: Judged) -> bool:
-        """Whether every pose to be drawn is within reach of a place that a sweep was taken from."""
-        places = np.stack([file.world_from_ego[:2, 3] for file in block_of(clip).sweeps])
-        offsets = self._ego_states(judged)[:, None, [X, Y]] - places
-        return bool((np.linalg.norm(offsets, axis=-1).min(axis=1) < self.settings.lidar_only_reach_m).all())
 
     def _ego_states(self, judged: Judged) -> Array:
         """(F, 11) at the instants that are drawn."""

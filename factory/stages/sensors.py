@@ -85,7 +85,7 @@ def _files(folder: str) -> dict[str, Path]:
     return files
 
 
-XYZ, INTENSITY = ("x", "y", "z"), "intensity"
+XYZ = ("x", "y", "z")
 NO_PICTURE = 1.0  # standard deviation [grey levels] that a photo has at least, at night too
 
 
@@ -225,22 +225,21 @@ def _photo(file: SensorFile, image: Bytes, camera: Camera, width: int, height: i
     )
 
 
-def load_sweeps(files: Sequence[SensorFile], with_intensity: bool = False) -> tuple[Sweep, ...]:
+def load_sweeps(files: Sequence[SensorFile]) -> tuple[Sweep, ...]:
     """Sweeps of Argoverse 2 (.feather), OpenScene (.pcd), nuScenes (.bin): points in the ego frame. Raises BadClip."""
-    return tuple(_sweep(file, with_intensity) for file in files)
+    return tuple(_sweep(file) for file in files)
 
 
-def _sweep(file: SensorFile, with_intensity: bool) -> Sweep:
-    path, columns = Path(file.uri), (*XYZ, INTENSITY) if with_intensity else XYZ
-    table = _READ_SWEEP.get(path.suffix, read_feather)(path, columns)
+def _sweep(file: SensorFile) -> Sweep:
+    path = Path(file.uri)
+    table = _READ_SWEEP.get(path.suffix, read_feather)(path, XYZ)
     points = np.stack([table[name] for name in XYZ], axis=1).astype(np.float32)
     if file.ego_from_sensor is not None:
         turn = file.ego_from_sensor
         points = (points @ turn[:3, :3].T + turn[:3, 3]).astype(np.float32)
     if on_ego(points).all():
         raise BadClip(file.uri, "x y z", f"none of the {len(points)} returns lies outside of the ego's own body")
-    intensity = np.clip(table[INTENSITY], 0, 255).astype(np.uint8) if with_intensity else None
-    return Sweep(file.time_s, points, file.world_from_ego, intensity)
+    return Sweep(file.time_s, points, file.world_from_ego)
 
 
 _READ_SWEEP = {".pcd": read_pcd, ".bin": read_points}

@@ -437,13 +437,9 @@ def funnel_of_tables(
 
 
 def image_sources_text(store: Store, clip_ids: Collection[str]) -> str:
-    """One line: how many samples of these clips have images from where, those from lidar alone apart."""
-    rows = _of_clips(store.samples.read(["clip_id", "image_source", "tags"]), clip_ids).combine_chunks()
-    tags = rows["tags"].combine_chunks()
-    lidar = pc.list_parent_indices(tags).filter(pc.equal(pc.list_flatten(tags), "lidar_only"))
-    alone = pc.is_in(pa.array(range(rows.num_rows), pa.int64()), value_set=lidar.cast(pa.int64()))
-    sources = pc.if_else(alone, "render (lidar only)", rows["image_source"])
-    counts = {row["values"]: row["counts"] for row in pc.value_counts(sources).to_pylist()}
+    """One line: how many samples of these clips have images from where."""
+    rows = _of_clips(store.samples.read(["clip_id", "image_source"]), clip_ids)
+    counts = {row["values"]: row["counts"] for row in pc.value_counts(rows["image_source"]).to_pylist()}
     return "images: " + (", ".join(f"{source} {n}" for source, n in sorted(counts.items())) or "no samples")
 
 

@@ -159,12 +159,8 @@ def _limits(store: Store, samples: pa.Table, outcomes: pa.Table, orphans: int) -
             "surfaces that no sensor saw are filled in."
         )
     tags = pc.value_counts(pc.list_flatten(samples["tags"])).to_pylist()
-    for tag, what in (
-        ("lidar_only", "from lidar alone, in grey"),
-        ("photos_only", "from photos without lidar, coarse"),
-    ):
-        for found in (count["counts"] for count in tags if count["values"] == tag):
-            yield f"- The pictures of {found:,} samples are drawn {what} (tag `{tag}`)."
+    for found in (count["counts"] for count in tags if count["values"] == "photos_only"):
+        yield f"- The pictures of {found:,} samples are drawn from photos without lidar, coarse (tag `photos_only`)."
     if drawn := sources.get("map", 0):
         yield f"- The pictures of {drawn:,} samples are drawn from the map, no photos."
     blind = pc.sum(pc.equal(samples["image_source"], "none")).as_py()

@@ -20,8 +20,8 @@ from factory.stages.scene_file import SUFFIX, BadScene, described_by, read_scene
 from factory.store.location import BadCacheFile
 from factory.wording import one_line
 from tasks.render.scene.asset import BlockRange, RenderAsset, ViewQuality
-from tasks.render.scene.build import plain_sky
 from tasks.render.scene.movers import world_from_boxes
+from tasks.render.scene.sky import plain_sky
 from tasks.render.splatting import sh
 from tasks.render.splatting.formats import (
     LoggedVehicle,

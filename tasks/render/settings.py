@@ -219,8 +219,6 @@ class RenderSettings:
     camera_psnr_min: float = 20.0  # [dB] and those of each of its cameras; 0: anything
     psnr_gate: PsnrGate = PsnrGate.REJECT  # what becomes of a block below psnr_min
     gate: GateSettings = field(default_factory=GateSettings)  # what every rendered picture of a drive must come up to
-    # Without photos: images only this close to where a sweep was taken; 0: none.
-    lidar_only_reach_m: float = fixed(15.0)
     scene: SceneFrom = SceneFrom.FIT  # discs: built in one go, seconds a block; fit: then fitted to its photos, minutes
     scene_dtype: SceneDtype = fixed(SceneDtype.FLOAT16)  # of scenes' files; float16: all but the places of Gaussians
     own_body: str = ""  # folder of masks, <camera>.png, of what the rig sees of the ego itself
@@ -235,7 +233,6 @@ class RenderSettings:
             "jpeg_quality": (1, 100),
             "psnr_min": (0.0, math.inf),
             "camera_psnr_min": (0.0, math.inf),
-            "lidar_only_reach_m": (0.0, math.inf),
         }
         _check("render", self, bounds)
 

@@ -75,7 +75,6 @@ class Sweep:
     time_s: float
     points: F32  # (M, 3) ego frame [m]
     world_from_ego: Array  # (4, 4)
-    intensity: Bytes | None = None  # (M,) strength of the return
 
 
 def shifted(pose: Array, by: Array) -> Array:

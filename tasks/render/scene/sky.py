@@ -93,6 +93,16 @@ class SkyMap:
         return backdrop(cells.reshape(-1, 3), where, threads)
 
 
+SKY_RGB, HAZE_RGB = (0.72, 0.78, 0.85), (0.30, 0.30, 0.31)  # above and below the horizon
+
+
+def plain_sky() -> SkyMap:
+    """One colour above the horizon, one below: of a scene from elsewhere that brings no sky."""
+    rgb = np.empty((ROWS, COLUMNS, 3), np.float32)
+    rgb[: ROWS // 2], rgb[ROWS // 2 :] = SKY_RGB, HAZE_RGB
+    return SkyMap(rgb)
+
+
 def may_be_sky(rgb: F32) -> Bools:
     """Pixels (H, W) of a picture in [0, 1] that are as bright or as blue as the sky."""
     grey = rgb.mean(axis=-1)

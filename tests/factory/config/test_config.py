@@ -164,7 +164,7 @@ def test_render_settings_out_of_range_are_refused(name: str, values: tuple[float
 
 def test_render_settings_at_their_bounds_are_taken() -> None:
     for quality in (1, 100):
-        RenderSettings(width=16, height=16, jpeg_quality=quality, psnr_min=0.0, lidar_only_reach_m=0.0)
+        RenderSettings(width=16, height=16, jpeg_quality=quality, psnr_min=0.0)
 
 
 @pytest.mark.parametrize(

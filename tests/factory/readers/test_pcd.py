@@ -56,9 +56,8 @@ def test_every_field_comes_back_in_its_own_type_whatever_the_order(tmp_path: Pat
 def test_a_sweep_of_a_clip_may_be_a_pcd(tmp_path: Path) -> None:
     path = tmp_path / "a.pcd"
     path.write_bytes(pcd(records()))
-    (sweep,) = load_sweeps([SensorFile("lidar", str(path), 0.5, np.eye(4))], with_intensity=True)
+    (sweep,) = load_sweeps([SensorFile("lidar", str(path), 0.5, np.eye(4))])
     assert sweep.points.dtype == np.float32 and sweep.points.tolist()[1] == [11.5, -1.0, 0.25]
-    assert sweep.intensity is not None and sweep.intensity.tolist() == [0, 40, 80, 120, 160]
 
 
 @pytest.mark.parametrize(

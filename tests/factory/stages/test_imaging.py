@@ -3,7 +3,6 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -73,36 +72,7 @@ def test_photos_too_far_apart_for_parallax_give_a_simulated_drive_no_pictures(to
 
 
 @pytest.mark.slow
-def test_lidar_s_grey_pictures_are_drawn_only_where_every_one_is_near_a_sweep(tmp_path: Path) -> None:
-    """A reach between a drive's nearest and farthest picture gives it none: not a sample with some of its pictures."""
-    settings = replace(SMALL, cameras=CAMERAS[:1], lidar_beams=8, lidar_azimuths=100)
-    reader = SyntheticReader(tmp_path / "town", 1, 0, settings)
-    reader.index()
-    for photos in reader.root.glob("*/sensors/cameras"):
-        shutil.rmtree(photos)
-
-    def sample(reach_m: float) -> Columns:
-        work, prepared = prepared_by(reader.root, tmp_path)
-        work = replace(work, render=replace(work.render, lidar_only_reach_m=reach_m))
         results = (run_attempt(work, prepared, row.index, "pdm_closed") for row in prepared.candidates)
-        return next(result for result in results if isinstance(result, Columns))
-
-    everywhere = sample(1000.0)
-    assert everywhere.row["image_source"] == "render" and everywhere.row["tags"][-1] == "lidar_only"  # type: ignore[index]
-    images: Any = everywhere.row["images"]
-    drawn_at = np.array([np.reshape(image["ego_pose"], (4, 4))[:2, 3] for image in images])
-    swept_at = np.array([file.world_from_ego[:2, 3] for file in block_of(clip_of(reader.root, tmp_path)).sweeps])
-    away_m = np.linalg.norm(drawn_at[:, None] - swept_at, axis=-1).min(axis=1)
-    assert away_m.min() + 0.05 < away_m.max()
-    for reach_m, source in (
-        (0.99 * away_m.min(), "none"),
-        ((away_m.min() + away_m.max()) / 2.0, "none"),
-        (1.01 * away_m.max(), "render"),
-    ):
-        assert sample(reach_m).row["image_source"] == source, reach_m
-
-
-@pytest.mark.slow
 def test_a_missing_photo_is_a_bad_clip_that_names_camera_and_time(town: Path, tmp_path: Path) -> None:
     root = tmp_path / "logs"
     shutil.copytree(town, root)

@@ -223,23 +223,10 @@ def test_a_clip_with_photos_alone_has_a_scene(clip: Clip, tmp_path: Path) -> Non
     assert asset is not None and asset.n_held_out == 1 and np.isfinite(asset.psnr_db) and len(asset.digest) == 16
 
 
-def test_a_clip_with_lidar_alone_has_a_grey_scene_of_unknown_quality(clip: Clip, tmp_path: Path) -> None:
-    for file in clip.sweeps:
-        table = pyarrow.feather.read_table(file.uri)
-        grey = pa.array(np.arange(len(table)) % 100, pa.uint8())
-        pyarrow.feather.write_feather(table.append_column("intensity", grey), file.uri)
+def test_a_clip_with_lidar_alone_has_no_scene(clip: Clip, tmp_path: Path) -> None:
     unseen = replace(clip, images=())
-    assert sensing(unseen, SETTINGS) is Sensing.LIDAR_ONLY and sensing(clip, SETTINGS) is Sensing.PHOTOS
-    asset = asset_for(unseen, SETTINGS, tmp_path)
-    assert asset is not None and np.isnan(asset.psnr_db) and len(asset.background) > 1000
-    assert np.ptp(asset.background.colours, axis=1).max() == 0.0
-    again = asset_for(unseen, SETTINGS, tmp_path)
-    assert again is not None and again.digest == asset.digest
-
-
-def test_lidar_without_intensity_is_a_bad_clip_where_there_are_no_photos(clip: Clip, tmp_path: Path) -> None:
-    with pytest.raises(BadClip, match=r"0\.feather: intensity: column is missing"):
-        asset_for(replace(clip, images=()), SETTINGS, tmp_path)
+    assert sensing(unseen, SETTINGS) is Sensing.NOTHING and sensing(clip, SETTINGS) is Sensing.PHOTOS
+    assert asset_for(unseen, SETTINGS, tmp_path) is None
 
 
 def test_another_size_or_window_is_another_block(clip: Clip) -> None:

@@ -70,7 +70,7 @@ def test_a_clip_has_the_cameras_photos_and_sweeps_of_its_frames(written: Path) -
     assert [sweep.time_s for sweep in clip.sweeps] == [0.5 * k for k in range(FRAMES)]
     for k, sweep in enumerate(clip.sweeps):
         assert (sweep.world_from_ego[:3, 3] == frames[k]["ego2global_translation"]).all()
-    assert block_of(clip).images == clip.images and len(load_sweeps(clip.sweeps, with_intensity=True)) == FRAMES
+    assert block_of(clip).images == clip.images and len(load_sweeps(clip.sweeps)) == FRAMES
 
 
 def test_without_a_folder_of_sensors_a_clip_has_none(written: Path) -> None:
