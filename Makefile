@@ -97,8 +97,8 @@ mutants: install
 	$(PY) -m factory warm
 	$(PY) -m tests.mutants --only "$(ONLY)" -j $(or $(J),2)
 
-# All quick tables, or NAME=reward (or another tests/bench/bench_*.py) ARGS="its own": planners' device=, render's scene
-# file. PEER=<...> of reward, traffic and render: what runs beside; see there.
+# All quick tables, or NAME=reward (or another tests/bench/bench_*.py) ARGS="its own": render's scene
+# file. PEER=<...> of reward and traffic: what runs beside; see there.
 bench: install
 	$(if $(filter reward,$(NAME)),OMP_NUM_THREADS=1) $(PY) -m tests.bench$(if $(NAME),.bench_$(NAME)) $(ARGS)
 

@@ -1,13 +1,11 @@
 """The benchmarks' peers: a ratio needs a peer that is there, and one that is not is refused in one line."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.bench.peer import Beside, peer_python
-from tests.bench.peer_splat import peer_checkout
 
 
 @pytest.mark.parametrize("python", ["/nowhere/python", sys.executable])
@@ -19,14 +17,6 @@ def test_a_python_without_the_public_metric_is_refused_in_one_line(
         peer_python()
     assert str(refused.value).startswith(f"PEER={python} ")
     assert "\n" not in str(refused.value)
-
-
-def test_a_checkout_without_the_rasteriser_is_refused_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("PEER", str(tmp_path))
-    with pytest.raises(SystemExit, match="give a checkout of pierotofy/OpenSplat"):
-        peer_checkout()
 
 
 def test_ratios_are_of_turns_and_unequal_scores_are_said() -> None:

@@ -15,7 +15,7 @@ FIT_S_OWN = ("picture_of(", "backend import compose")  # what the fit draws with
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(bench_planner_steps.VOCABULARY, "paper", 256)
+    monkeypatch.setattr(bench_planner_steps, "VOCABULARY_SIZE", 256)
 
 
 @pytest.mark.slow

@@ -19,17 +19,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from planners.data.batch import Batch
+from factory.config.compose import compose, fill
+from planners.data.batch import Batch, Needs
 from planners.models.backbones import set_recompute
-from planners.models.planner import Planner
+from planners.models.planner import Planner, planner_class, settings_of
 from planners.training.optim import TrainingSettings, build_optimiser
-from tests.bench.bench_planners import VOCABULARY, made, random_batch
+from planners.training.train import PlannerEntry
+from tasks.subscores import LABELLED
+from tasks.world.vocabulary import kinematic_trajectories
 from tests.bench.timing import memory_mb
 
 PUBLIC = ("ltf_public", "diffusiondrive_public", "gtrs_dense_public", "gtrs_dense_v2_99_public")
@@ -39,6 +43,42 @@ SEEN = {"real": REAL, "real and simulated": REAL + SIMULATED}
 GPUS = 8
 PEAKS = {"H100 SXM": 989.0, "H20": 148.0}  # TFLOP/s of dense bf16, as NVIDIA publishes them
 SHARE = 0.3  # of the peak that a training reaches: an assumption, `share=` is another
+VOCABULARY_SIZE = 16384  # the paper's
+
+
+def random_batch(size: int, needs: Needs, k: int) -> Batch:
+    """A batch of what a planner reads; values as a sample has them, content of none."""
+    rng = torch.Generator().manual_seed(0)
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(size, *shape, generator=rng)
+
+    plan = torch.cumsum(uniform(40, 3) * torch.tensor([1.0, 0.1, 0.01]), dim=1)
+    shape = (needs.image.height, needs.image.width) if needs.image is not None else (0, 0)
+    image = torch.randint(0, 256, (size, 3, *shape), dtype=torch.uint8, generator=rng)
+    classes = (len(needs.bev.times_s), *needs.bev.shape) if needs.bev is not None else ()
+    return Batch(
+        attempt_ids=tuple(map(str, range(size))),
+        status=uniform(8),
+        history=uniform(4, 3),
+        plan_2hz=plan[:, 4::5],
+        plan_10hz=plan,
+        simulated=torch.zeros(size, dtype=torch.bool),
+        imitate=torch.ones(size, dtype=torch.bool),
+        image=image.contiguous(memory_format=torch.channels_last) if needs.image is not None else None,
+        bev=torch.randint(0, 7, (size, *classes), dtype=torch.uint8, generator=rng) if needs.bev is not None else None,
+        agents=10.0 * uniform(needs.n_agents, 5) if needs.n_agents else None,
+        agents_valid=uniform(needs.n_agents) > 0.5 if needs.n_agents else None,
+        labels={name: (uniform(k) > 0.5).float() for name in LABELLED} if needs.labels is not None else None,
+    )
+
+
+def made(name: str, k: int) -> tuple[Planner, PlannerEntry]:
+    """A planner of conf/planner around made-up anchors and a kinematic vocabulary."""
+    entry = fill(PlannerEntry, compose("train", [f"planner={name}"])["planner"], "planner")
+    vocabulary = kinematic_trajectories(k, seed=0)
+    arrays: dict[str, np.ndarray[Any, Any]] = {"vocabulary": vocabulary, "anchors": vocabulary[:20, 4::5, :2]}
+    return planner_class(entry.name)(settings_of(entry), arrays), entry
 
 
 @dataclass(frozen=True)
@@ -114,7 +154,7 @@ def number(value: float) -> str:
 
 def measured(name: str, device: torch.device, batch: int, repeats: int) -> Measured:
     """Builds a preset and runs it."""
-    k = VOCABULARY["paper"]
+    k = VOCABULARY_SIZE
     planner, entry = made(name, k)
     assert entry.training is not None
     planner.to(device)
@@ -160,7 +200,7 @@ def measured(name: str, device: torch.device, batch: int, repeats: int) -> Measu
 
 def counted_alone(name: str, batch: int) -> Measured:
     """Operations and bytes of a preset, from the shapes of what it would compute."""
-    k = VOCABULARY["paper"]
+    k = VOCABULARY_SIZE
     planner, entry = made(name, k)
     assert entry.training is not None
     data = random_batch(batch, planner.needs, k)
