@@ -23,8 +23,8 @@ from factory.graph.steps import (
 )
 from factory.readers.base import BadClip, ClipReader, ClipRef, Unreadable
 from factory.readers.validate import read_clip
-from factory.stages.assets import fits_going_on
-from factory.stages.imaging import Imaging, scene_lookups
+from factory.stages.assets import running_fits
+from factory.stages.imaging import Imaging, scene_cache_counts
 from factory.stages.rows import label_columns, sample_row
 from factory.store.samples import CandidateRow
 from factory.store.schema import UNLISTED, RunIdentity
@@ -33,7 +33,7 @@ from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Expert, Human, tried_once
 from tasks.hard_scenes import BEFORE_STEPS, BenchmarkClip, follow_up, frame_digest, half_a_second_before
 from tasks.perturb import NO_STARTS, Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
-from tasks.render.scene.engine import check
+from tasks.render.scene.engine import require_backend
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling, vocabulary_labels
@@ -235,7 +235,7 @@ class FactoryWork:
 
     def draw(self, driven: AcceptedDrive) -> Columns | RejectedAttempt:
         """The pictures; RejectedAttempt where they are no sample's. Raises BadClip."""
-        watch, drive, before = Stopwatch(), drive_of(driven), scene_lookups()
+        watch, drive, before = Stopwatch(), drive_of(driven), scene_cache_counts()
         with watch.timing("render"):
             sensed = self._with_sensors(drive)
             unfit = self.unfit(sensed, drive)
@@ -300,7 +300,7 @@ class FactoryWork:
 
     def doing(self) -> str:
         """The fits that are going on here."""
-        return "; ".join(fits_going_on(Path(self.cache_dir)))
+        return "; ".join(running_fits(Path(self.cache_dir)))
 
     # What the machine asks beside.
 
@@ -310,7 +310,7 @@ class FactoryWork:
 
         if draws and self.render.mode is RenderMode.AUTO:
             try:
-                check(self.render.backend)
+                require_backend(self.render.backend)
             except BackendMissing as error:
                 raise NotReady(str(error)) from error
         label_traffic = None if self.labelling is None else self.labelling.traffic.mode
@@ -355,7 +355,7 @@ class FactoryWork:
 
 def _at_hand(before: tuple[int, int]) -> bool | None:
     """Whether every scene wanted since `before` was in memory; None where none was."""
-    hits, misses = scene_lookups()
+    hits, misses = scene_cache_counts()
     return None if (hits, misses) == before else misses == before[1]
 
 

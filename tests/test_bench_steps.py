@@ -35,4 +35,4 @@ def test_counts_from_shapes_are_those_of_a_computed_step() -> None:
 def test_benches_draw_as_samples_are_drawn() -> None:
     files = sorted(Path(bench_decoding.__file__).parent.glob("*.py"))
     found = [f"{file.name}: {name}" for file in files for name in FIT_S_OWN if name in file.read_text()]
-    assert len(files) > 20 and not found, "draw the finished scene: tasks.render.fit.reconstruct.drawn"
+    assert len(files) > 20 and not found, "draw the finished scene: tasks.render.fit.reconstruct.draw_photo"

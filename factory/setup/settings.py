@@ -27,7 +27,7 @@ from factory.setup.vocabulary import (
     save_recovery_table,
     train_windows,
 )
-from factory.stages.sensors import chosen_cameras, masks_digest, refuse_unknown_masks
+from factory.stages.sensors import choose_cameras, masks_digest, refuse_unknown_masks
 from factory.store.schema import UNLISTED, RunIdentity, canonical_json
 from tasks.caches import check, user_cache
 from tasks.experts.protocol import Expert, tried_once
@@ -99,7 +99,7 @@ def refuse_missing_backend(config: RunConfig) -> None:
     if config.render.mode is not RenderMode.AUTO or (config.executor == "ray" and "RAY_ADDRESS" in os.environ):
         return
     try:
-        engine.check(config.render.backend)
+        engine.require_backend(config.render.backend)
     except BackendMissing as error:
         raise ConfigError(str(error)) from error
 
@@ -166,7 +166,7 @@ def refuse_unknown_cameras(config: RunConfig, reader: ClipReader, index: ClipInd
         if not rig and config.render.mode is RenderMode.MAP:
             rig = MAP_RIG
         if rig:
-            chosen_cameras(rig, wanted)
+            choose_cameras(rig, wanted)
             refuse_unknown_masks(masks, rig)
             return
 

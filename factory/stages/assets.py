@@ -28,26 +28,26 @@ from factory.stages.sensors import (
     SensorData,
     block_cameras,
     block_of,
-    chosen_cameras,
+    choose_cameras,
+    ego_poses_of_files,
+    files_of_cameras,
     load_sensors,
     masks_digest,
     opened_photos,
-    poses_of,
     read_masks,
-    taken_by,
 )
 from factory.store.location import Location
 from factory.wording import time_text
 from tasks.caches import Damaged, check, seal
-from tasks.render.fit.reconstruct import advance, backend_of, finish
-from tasks.render.fit.start import prepare
+from tasks.render.fit.reconstruct import finish_scene, fit_backend, run_iterations
+from tasks.render.fit.start import prepare_fit
 from tasks.render.fit.state import FitState
-from tasks.render.rig.correct import Correction, corners_of, corrected, ground_below, hidden_by
-from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom, rises_of
+from tasks.render.rig.correct import RigCorrection, correct_rig, detect_corners, estimate_ground_height, movable_mask
+from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom, photo_rises
 from tasks.render.scene.build import build_asset
-from tasks.render.scene.features import Known, driven_roads
-from tasks.render.scene.movers import lifted
-from tasks.render.scene.sensed import own_bodies
+from tasks.render.scene.features import KnownPoints, driven_roads
+from tasks.render.scene.movers import lift_tracks
+from tasks.render.scene.sensed import median_own_bodies
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
 from tasks.render.settings import Adjust, Backend, FitSettings, RenderSettings, RigSettings, SceneDtype, SceneFrom
 from tasks.sealed import Damaged, check, seal, sealed_json, unsealed_json
@@ -60,13 +60,13 @@ from tasks.world.clip import AgentTracks, Block, Camera, Clip, SensorFile, of_ot
 # than what their neighbours say, and cameras and poses as they were used. Photos that samples keep are cut and
 # described by it as well, without the scene.
 
-SAID = ".rig.json"
+RIG_SUFFIX = ".rig.json"
 SAME_S = 1e-3  # between the stamp of a photo counted from its clip and from its block
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class UsedRig:
+class CorrectedRig:
     """A block's cameras, and where its photos were taken, as these say; times count from the block's first step."""
 
     cameras: tuple[Camera, ...]
@@ -93,42 +93,42 @@ class UsedRig:
 
     def lifted(self, agents: AgentTracks, first_s: float) -> AgentTracks:
         """Tracks whose first step is at `first_s` of the block, as high above that road as they were logged."""
-        times, rises = rises_of(self.taken)
-        return lifted(agents, times - first_s, rises)
+        times, rises = photo_rises(self.taken)
+        return lift_tracks(agents, times - first_s, rises)
 
 
-def wanted(block: Block, settings: RigSettings) -> bool:
+def is_rig_corrected(block: Block, settings: RigSettings) -> bool:
     """Whether the block's rig is to be corrected."""
     return bool(block.images) and (
         settings.adjust is Adjust.ON or (settings.adjust is Adjust.AUTO and not block.sweeps)
     )
 
 
-def corrected_rig(
+def correct_block_rig(
     path: Path,
     block: Block,
     cameras: Sequence[Camera],
     own_body: Mapping[str, Bools] = NO_MASKS,
-) -> tuple[Block, tuple[Camera, ...], Correction | None]:
+) -> tuple[Block, tuple[Camera, ...], RigCorrection | None]:
     """Block and cameras as the photos say they are, and what was found, which is written beside `path`.
 
     As given, and None, where too few corners are shared to find anything, which is written as well. Raises BadClip for
     a photo that is missing, broken or not of its camera's size.
     """
-    files = taken_by(cameras, block.images)
+    files = files_of_cameras(cameras, block.images)
     corners = {}
     for row, image in opened_photos(files, cameras):
         (camera,) = (camera for camera in cameras if camera.name == files[row].sensor)
-        hidden = hidden_by(block.agents, camera, files[row], own_body.get(camera.name))
-        corners[row] = corners_of(image, hidden)
-    found = corrected(cameras, files, [corners[row] for row in range(len(files))])
+        hidden = movable_mask(block.agents, camera, files[row], own_body.get(camera.name))
+        corners[row] = detect_corners(image, hidden)
+    found = correct_rig(cameras, files, [corners[row] for row in range(len(files))])
     if found is None:
         log.warning("%s: too few corners are shared by the photos: calibration and poses are used as given", path.stem)
-        _say(path, {"cameras": [], "used": [], "taken": []})
+        _write_rig_file(path, {"cameras": [], "used": [], "taken": []})
         return block, tuple(cameras), None
-    for line in lines_of(found):
+    for line in rig_report_lines(found):
         log.info("%s: %s", path.stem, line)
-    _say(path, described(found, files))
+    _write_rig_file(path, rig_report(found, files))
     for file in (files[row] for row in found.strangers):
         log.warning("%s: %s at %.2f s is left out: it does not show what its neighbours do: %s", path.stem, file.sensor,
                     file.time_s, file.uri)  # fmt: skip
@@ -136,35 +136,35 @@ def corrected_rig(
     return replace(block, images=kept), found.cameras, found
 
 
-def _say(path: Path, found: dict[str, object]) -> None:
+def _write_rig_file(path: Path, found: dict[str, object]) -> None:
     text = sealed_json({"block": path.stem, **found})
-    with whole_file(path.with_suffix(SAID), len(text)) as draft:
+    with whole_file(path.with_suffix(RIG_SUFFIX), len(text)) as draft:
         draft.write_text(text, encoding="utf-8")
 
 
-def told_of(said: Path) -> dict[str, Any]:
+def read_rig_file(said: Path) -> dict[str, Any]:
     """What a file tells of its block. Raises Damaged, OSError."""
     told = unsealed_json(said.read_bytes())
-    if told.pop("block", None) != said.name.removesuffix(SAID):
+    if told.pop("block", None) != said.name.removesuffix(RIG_SUFFIX):
         raise Damaged("it was written of another block")
     return told
 
 
-def used_rig(
+def read_or_correct_rig(
     path: Path, block: Block, cameras: Sequence[Camera], own_body: Mapping[str, Bools] = NO_MASKS
-) -> UsedRig | None:
+) -> CorrectedRig | None:
     """The rig as it is told beside `path`, found first where nothing is told there; None where nothing can be found.
 
     Raises BadClip.
     """
-    said = path.with_suffix(SAID)
+    said = path.with_suffix(RIG_SUFFIX)
     try:
-        told = told_of(said)
+        told = read_rig_file(said)
     except (FileNotFoundError, Damaged) as error:
         if isinstance(error, Damaged):
             log.warning("%s: %s; it is written again", said, error)
-        corrected_rig(path, block, cameras, own_body)
-        told = told_of(said)
+        correct_block_rig(path, block, cameras, own_body)
+        told = read_rig_file(said)
     used: dict[str, dict[str, Any]] = {
         row["name"]: {key: np.array(row[key], np.float64) for key in CALIBRATED} for row in told["used"]
     }
@@ -174,34 +174,36 @@ def used_rig(
         TakenFrom(name, time_s, np.reshape(pose, (4, 4)), rise_m, late_s)
         for name, time_s, rise_m, late_s, pose in told["taken"]
     )
-    return UsedRig(tuple(replace(camera, **used[camera.name]) for camera in cameras), tuple(taken))
+    return CorrectedRig(tuple(replace(camera, **used[camera.name]) for camera in cameras), tuple(taken))
 
 
-def said_again(path: Path, block: Block, cameras: Sequence[Camera], own_body: Mapping[str, Bools] = NO_MASKS) -> None:
+def rewrite_damaged_rig_file(
+    path: Path, block: Block, cameras: Sequence[Camera], own_body: Mapping[str, Bools] = NO_MASKS
+) -> None:
     """Writes what was found anew where the file beside `path` is damaged; the scene there stays. Raises BadClip."""
-    said = path.with_suffix(SAID)
+    said = path.with_suffix(RIG_SUFFIX)
     try:
-        told_of(said)
+        read_rig_file(said)
     except FileNotFoundError:  # somebody took it away
         return
     except Damaged as error:
         log.warning("%s: %s; it is written again", said, error)
-        corrected_rig(path, block, cameras, own_body)
+        correct_block_rig(path, block, cameras, own_body)
 
 
-def known_of(data: SensorData, block: Block, found: Correction) -> Known:
+def known_points(data: SensorData, block: Block, found: RigCorrection) -> KnownPoints:
     """What is known of a corrected block: its corners, and the road, looked for where no reader says where it is."""
     road = data.known.road
     if road is None and not data.sweeps:
-        poses, times_s = poses_of(block.images)
-        ground_m = ground_below(data.photos, poses)
+        poses, times_s = ego_poses_of_files(block.images)
+        ground_m = estimate_ground_height(data.photos, poses)
         if ground_m is not None:
             log.info("road: %.2f m above the ego's origin", ground_m)
             road = driven_roads(poses, times_s, ground_m)
-    return Known(road, found.points)
+    return KnownPoints(road, found.points)
 
 
-def taken_from(given: Sequence[SensorFile], used: Sequence[SensorFile]) -> tuple[TakenFrom, ...]:
+def photo_poses(given: Sequence[SensorFile], used: Sequence[SensorFile]) -> tuple[TakenFrom, ...]:
     """Where the photos that are used of those given were taken."""
     logged = {(file.sensor, file.time_s): file.world_from_ego[2, 3] for file in given}
     return tuple(
@@ -212,7 +214,7 @@ def taken_from(given: Sequence[SensorFile], used: Sequence[SensorFile]) -> tuple
     )
 
 
-def described(found: Correction, given: Sequence[SensorFile]) -> dict[str, Any]:
+def rig_report(found: RigCorrection, given: Sequence[SensorFile]) -> dict[str, Any]:
     """What was found of the photos as `given`, as plain JSON values."""
     return {
         "cameras": [asdict(change) for change in found.changes],
@@ -226,12 +228,12 @@ def described(found: Correction, given: Sequence[SensorFile]) -> dict[str, Any]:
         ],
         "taken": [
             [photo.camera, photo.time_s, photo.rise_m, photo.late_s, photo.world_from_ego.ravel().tolist()]
-            for photo in taken_from(given, found.files)
+            for photo in photo_poses(given, found.files)
         ],
     }
 
 
-def lines_of(found: Correction) -> list[str]:
+def rig_report_lines(found: RigCorrection) -> list[str]:
     """What was found, for people: a line for each camera and one for the drive."""
     lines = []
     for change in found.changes:
@@ -248,11 +250,11 @@ def lines_of(found: Correction) -> list[str]:
 # A block's scene fitted to its photos, in stretches: a killed fit goes on where the last stretch ended.
 
 STRETCH = 500  # iterations between two saves
-BEGUN, PROGRESS = ".fit.npz", ".fit.json"  # what is half done, and how far it is
+FIT_SUFFIX, PROGRESS_SUFFIX = ".fit.npz", ".fit.json"  # what is half done, and how far it is
 FRESH_S = 120.0  # what was said longer ago is no news
 
 
-def fitted(
+def fit_scene(
     path: Path,
     data: SensorData,
     agents: AgentTracks | None,
@@ -266,9 +268,9 @@ def fitted(
     A fit that was killed or halted comes to the same bytes as one that was not. Raises TaskStopped once it is
     `stopped`, with all of its iterations kept, ValueError without photos to learn from, and BackendMissing.
     """
-    drawing = backend_of(backend, threads)
-    problem, state = prepare(data.photos, data.sweeps, agents, settings, threads=threads, known=data.known)
-    begun, said = path.with_suffix(BEGUN), path.with_suffix(PROGRESS)
+    drawing = fit_backend(backend, threads)
+    problem, state = prepare_fit(data.photos, data.sweeps, agents, settings, threads=threads, known=data.known)
+    begun, said = path.with_suffix(FIT_SUFFIX), path.with_suffix(PROGRESS_SUFFIX)
     state = _resumed(begun, state)
     first, began = state.iteration, time.monotonic()
 
@@ -280,7 +282,7 @@ def fitted(
         said.write_text(json.dumps({"block": path.stem, "text": text}))
 
     while state.iteration < settings.iterations:
-        advance(problem, state, settings, state.iteration + STRETCH, say, threads, stopped, drawing)
+        run_iterations(problem, state, settings, state.iteration + STRETCH, say, threads, stopped, drawing)
         arrays = state.arrays()
         with atomic_file(begun, sum(array.nbytes for array in arrays.values())) as draft:
             with draft.open("wb") as file:
@@ -289,16 +291,16 @@ def fitted(
         if state.iteration < settings.iterations and stopped():
             said.unlink(missing_ok=True)
             raise TaskStopped(f"{path.stem}: {state.iteration} of {settings.iterations} iterations are done")
-    asset = finish(problem, state, threads)
+    asset = finish_scene(problem, state, threads)
     begun.unlink(missing_ok=True)
     said.unlink(missing_ok=True)
     return asset
 
 
-def fits_going_on(folder: Path) -> list[str]:
+def running_fits(folder: Path) -> list[str]:
     """How far each fit in a cache folder is, as it said itself in the last two minutes."""
     found = []
-    for path in sorted(folder.glob(f"*{PROGRESS}")):
+    for path in sorted(folder.glob(f"*{PROGRESS_SUFFIX}")):
         try:
             if time.time() - path.stat().st_mtime < FRESH_S:
                 found.append(json.loads(path.read_text())["text"])
@@ -331,13 +333,13 @@ class Sensing(Enum):
     NOTHING = "nothing"
 
 
-def sensing(clip: Clip, settings: RenderSettings) -> Sensing:
+def block_sensing(clip: Clip, settings: RenderSettings) -> Sensing:
     """What the block can be made of; nothing without photos, or without lidar and parallax.
 
     Raises ValueError for a camera the rig does not have.
     """
-    block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
-    photos = taken_by(cameras, block.images)
+    block, cameras = block_of(clip), choose_cameras(clip.cameras, settings.cameras)
+    photos = files_of_cameras(cameras, block.images)
     if block.sweeps and photos:
         return Sensing.PHOTOS
     return Sensing.PHOTOS_ONLY if photos and _with_parallax(photos) >= PARALLAX_SHARE else Sensing.NOTHING
@@ -355,62 +357,64 @@ def _with_parallax(photos: Sequence[SensorFile]) -> float:
     return found / len(photos)
 
 
-def asset_for(
+def load_or_build_scene(
     clip: Clip, settings: RenderSettings, cache_dir: str | Path, threads: int = 1, stopped: StopCheck = never_stop
 ) -> RenderAsset | None:
     """The scene of the clip's block with its digest; None where the clip has nothing to make one from.
 
-    Made of photos, with or without lidar (`sensing`); the same on any number of threads.
+    Made of photos, with or without lidar (`block_sensing`); the same on any number of threads.
     Raises BadClip where a sensor file is broken, ValueError for a camera the rig does not have, and TaskStopped where a
     fit is `stopped`.
     """
-    block, rig = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
+    block, rig = block_of(clip), choose_cameras(clip.cameras, settings.cameras)
     cameras = block_cameras(block, rig)
-    if sensing(clip, settings) is Sensing.NOTHING:
+    if block_sensing(clip, settings) is Sensing.NOTHING:
         return None
-    path, masks = scene_path(clip, settings, cache_dir), masks_of(cameras, read_masks(settings.own_body, rig))
-    with only_builder(path):
+    path, masks = scene_path(clip, settings, cache_dir), block_masks(cameras, read_masks(settings.own_body, rig))
+    with builder_lock(path):
         if path.exists():
             try:
                 kept = read_scene(path, path.stem)
             except BadScene as error:
                 log.warning("%s; it is built again", error)
             else:
-                if wanted(block, settings.rig):
-                    said_again(path, block, cameras, masks)
+                if is_rig_corrected(block, settings.rig):
+                    rewrite_damaged_rig_file(path, block, cameras, masks)
                 return kept
         agents, taken, found = block.agents, tuple[TakenFrom, ...](), None
-        if wanted(block, settings.rig):
+        if is_rig_corrected(block, settings.rig):
             given = block.images
-            block, cameras, found = corrected_rig(path, block, cameras, masks)
-            taken = taken_from(given, block.images) if found is not None else ()
-            agents = lifted(agents, *rises_of(taken))
+            block, cameras, found = correct_block_rig(path, block, cameras, masks)
+            taken = photo_poses(given, block.images) if found is not None else ()
+            agents = lift_tracks(agents, *photo_rises(taken))
         data = load_sensors(block, cameras, settings.width, settings.height, masks)
         if found is not None:
-            data = replace(data, known=known_of(data, block, found))
+            data = replace(data, known=known_points(data, block, found))
         if settings.scene is SceneFrom.FIT:
-            asset = fitted(path, data, agents, settings.fit, threads, stopped, settings.backend)
+            asset = fit_scene(path, data, agents, settings.fit, threads, stopped, settings.backend)
         else:
             asset = build_asset(data.photos, data.sweeps, agents, settings.asset, data.known)
-        asset = replace(asset, rig=cameras if taken else (), taken=taken, bodies=own_bodies(data.photos))
-        return write_scene(path, replace(own_part(asset), block=range_of(clip, block)), settings.scene_dtype)
+        asset = replace(asset, rig=cameras if taken else (), taken=taken, bodies=median_own_bodies(data.photos))
+        return write_scene(
+            path, replace(without_other_logs(asset), block=block_range(clip, block)), settings.scene_dtype
+        )
 
 
-def corrected_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> UsedRig | None:
+def load_or_correct_rig(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> CorrectedRig | None:
     """What the photos of the clip's block say of rig and poses, without the scene; None: all is used as given.
 
-    Raises BadClip and ValueError as `asset_for` does.
+    Raises BadClip and ValueError as `load_or_build_scene` does.
     """
-    block, rig = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
-    if sensing(clip, settings) is Sensing.NOTHING or not wanted(block, settings.rig):
+    block, rig = block_of(clip), choose_cameras(clip.cameras, settings.cameras)
+    if block_sensing(clip, settings) is Sensing.NOTHING or not is_rig_corrected(block, settings.rig):
         return None
     cameras = block_cameras(block, rig)
-    path, masks = scene_path(clip, settings, cache_dir), masks_of(cameras, read_masks(settings.own_body, rig))
-    with only_builder(path):
-        return used_rig(path, block, cameras, masks)
+    path, masks = scene_path(clip, settings, cache_dir), block_masks(cameras, read_masks(settings.own_body, rig))
+    with builder_lock(path):
+        return read_or_correct_rig(path, block, cameras, masks)
 
 
-def own_part(asset: RenderAsset) -> RenderAsset:
+def without_other_logs(asset: RenderAsset) -> RenderAsset:
     """A scene without what is of other logs' drives through it alone: their clips have a block of their own."""
     return replace(
         asset,
@@ -419,11 +423,11 @@ def own_part(asset: RenderAsset) -> RenderAsset:
         rig=tuple(camera for camera in asset.rig if not of_other_log(camera.name)),
         taken=tuple(photo for photo in asset.taken if not of_other_log(photo.camera)),
         bodies=tuple(body for body in asset.bodies if not of_other_log(body.camera)),
-        shifts=asset.shifts.of([name for name in asset.shifts.track_ids if not of_other_log(name)]),
+        shifts=asset.shifts.select([name for name in asset.shifts.track_ids if not of_other_log(name)]),
     )
 
 
-def masks_of(cameras: Sequence[Camera], own: Mapping[str, Bools]) -> dict[str, Bools]:
+def block_masks(cameras: Sequence[Camera], own: Mapping[str, Bools]) -> dict[str, Bools]:
     """Masks of a block's cameras from those of its own rig: the same camera of another log's sees about the same of its
     car."""
     masks = {camera.name: own.get(own_name(camera.name)) for camera in cameras}
@@ -436,7 +440,7 @@ def scene_path(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> P
     return Path(cache_dir) / f"block-{block_id(clip, settings)}{SUFFIX}"
 
 
-def range_of(clip: Clip, block: Block) -> BlockRange:
+def block_range(clip: Clip, block: Block) -> BlockRange:
     """When and where the sensors of a clip's block were."""
     files = [file for file in (*block.images, *block.sweeps) if file.time_s <= block.own_s]
     places = np.stack([file.world_from_ego[:2, 3] for file in files])
@@ -445,7 +449,7 @@ def range_of(clip: Clip, block: Block) -> BlockRange:
 
 
 @contextmanager
-def only_builder(path: Path) -> Iterator[None]:
+def builder_lock(path: Path) -> Iterator[None]:
     """Held by one process of the machine at a time; the kernel frees it when its holder dies. Raises PlaceRefused."""
     with ExitStack() as held:
         with raising_place_refused(path.parent):
@@ -465,7 +469,7 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
     if settings.scene is SceneFrom.FIT and settings.backend.on_gpu:
         made["backend"] = Backend.GSPLAT  # another fit to the last bits, so that a run on CPUs never meets it
     how: list[object] = [settings.width, settings.height, sorted(settings.cameras), made]
-    if wanted(block, settings.rig):
+    if is_rig_corrected(block, settings.rig):
         how.append(asdict(settings.rig))
     if settings.own_body:
         how.append(["own_body", masks_digest(settings.own_body)])
@@ -489,17 +493,17 @@ def damaged_blocks(out: Location) -> dict[str, str]:
     found = {}
     for path in sorted(folder.glob("block-*")) if out.is_local else ():
         try:
-            _check(path)
+            _check_file(path)
         except (Damaged, BadScene) as error:
             problem = str(error).removeprefix(f"{path}: ")
             found[f"cache/{path.name}"] = f"{problem}; the next run makes it again"
     return found
 
 
-def _check(path: Path) -> None:
+def _check_file(path: Path) -> None:
     if path.name.endswith(SUFFIX):
         read_scene(path, path.stem)
-    elif path.name.endswith(BEGUN):
+    elif path.name.endswith(FIT_SUFFIX):
         check(path, path.name)
-    elif path.name.endswith(SAID):
-        told_of(path)
+    elif path.name.endswith(RIG_SUFFIX):
+        read_rig_file(path)

@@ -27,7 +27,7 @@ def write_benchmark(
     store: Store, refs: Sequence[ClipRef], identity: RunIdentity, rounds: int, settings: BenchmarkSettings
 ) -> str:
     """benchmark.json of a complete run, and a line that says what is in it."""
-    document = benchmark_of(store, refs, identity, rounds, settings)
+    document = describe_benchmark(store, refs, identity, rounds, settings)
     store.location.write(BENCHMARK_FILE, (json.dumps(document, indent=1) + "\n").encode())
     clips, left_out = document["clips"], document["left_out"]
     whys = ", ".join(f"{why} {n}" for why, n in Counter(clip["why"] for clip in left_out).most_common())
@@ -35,14 +35,14 @@ def write_benchmark(
     return f"benchmark {store.location.uri}/{BENCHMARK_FILE}: {said}; left out {len(left_out)} clips ({whys or 'none'})"
 
 
-def benchmark_of(
+def describe_benchmark(
     store: Store, refs: Sequence[ClipRef], identity: RunIdentity, rounds: int, settings: BenchmarkSettings
 ) -> dict[str, Any]:
     """The document: clips by id with the candidate indices of their follow-ups, and what is left out and why.
 
     `follow_ups` of a clip that is left out is how many it has.
     """
-    rows = _Rows.of(store, identity)
+    rows = _Rows.read(store, identity)
     clips: list[dict[str, Any]] = []
     left_out: list[dict[str, Any]] = []
     for ref in sorted(refs):
@@ -75,7 +75,7 @@ class _Rows:
     dropped: Mapping[str, str]  # clip -> why it has no sample, or no candidate, at all
 
     @classmethod
-    def of(cls, store: Store, identity: RunIdentity) -> "_Rows":
+    def read(cls, store: Store, identity: RunIdentity) -> "_Rows":
         made: dict[tuple[str, str], set[int]] = defaultdict(set)
         for row in store.samples.read([*MADE_UNDER, "clip_id", "candidate_index"]).to_pylist():
             made_by = row["settings_hash"], row["stage_versions"]

@@ -1,8 +1,8 @@
 """The render stage: a sample's images, from the block's scene, the log's own photos, the map or the town's painter.
 
 A human sample of a clip with photos keeps them, whatever its block. Every other sample is drawn from the block where
-`factory.stages.assets.sensing` finds something to make it of, else written with image_source=none and no images. Photos
-without lidar give coarse pictures, tagged `photos_only`.
+`factory.stages.assets.block_sensing` finds something to make it of, else written with image_source=none and no images.
+Photos without lidar give coarse pictures, tagged `photos_only`.
 """
 
 from collections.abc import Sequence
@@ -14,21 +14,29 @@ import numpy as np
 
 from factory.graph.steps import StopCheck, never_stop
 from factory.readers.base import BadClip
-from factory.stages.assets import SAID, Sensing, UsedRig, asset_for, corrected_for, scene_path, sensing
+from factory.stages.assets import (
+    RIG_SUFFIX,
+    CorrectedRig,
+    Sensing,
+    block_sensing,
+    load_or_build_scene,
+    load_or_correct_rig,
+    scene_path,
+)
 from factory.stages.painted import town_cameras, town_pictures
 from factory.stages.rows import agent_columns
-from factory.stages.sensors import block_of, chosen_cameras, encode_jpeg, load_photos, taken_by
+from factory.stages.sensors import block_of, choose_cameras, encode_jpeg, files_of_cameras, load_photos
 from tasks.attempt import Judged
 from tasks.perturb import Candidate
 from tasks.render.gate import (
-    Album,
     VehiclePhoto,
-    fading_of,
+    VehiclePhotos,
+    block_fault,
+    check_drive_pictures,
+    checked_size,
+    estimate_fading,
+    find_sightings,
     likeness_to_photo,
-    looked_at_size,
-    poor_block,
-    sightings,
-    unfit,
 )
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import vehicles_at
@@ -63,10 +71,10 @@ class Imaging:
 
         Raises BadClip for a broken sensor file, TaskStopped where a fit is `stopped`.
         """
-        found = sensing(clip, self.settings) is not Sensing.NOTHING and (
+        found = block_sensing(clip, self.settings) is not Sensing.NOTHING and (
             scene_path(clip, self.settings, self.cache_dir).exists()
         )
-        asset = asset_for(clip, self.settings, self.cache_dir, threads, stopped)
+        asset = load_or_build_scene(clip, self.settings, self.cache_dir, threads, stopped)
         return found, asset.psnr_db if asset is not None and np.isfinite(asset.psnr_db) else None
 
     def build_rig(self, clip: Clip) -> bool:
@@ -74,9 +82,9 @@ class Imaging:
 
         Raises BadClip for a broken photo.
         """
-        said = scene_path(clip, self.settings, self.cache_dir).with_suffix(SAID)
+        said = scene_path(clip, self.settings, self.cache_dir).with_suffix(RIG_SUFFIX)
         before = said.exists()
-        corrected_for(clip, self.settings, self.cache_dir)
+        load_or_correct_rig(clip, self.settings, self.cache_dir)
         return said.exists() == before
 
     def block_verdict(self, clip: Clip) -> Rejected | None:
@@ -86,10 +94,10 @@ class Imaging:
         """
         if self.settings.mode is not RenderMode.AUTO:
             return None
-        if sensing(clip, self.settings) is Sensing.NOTHING:
+        if block_sensing(clip, self.settings) is Sensing.NOTHING:
             return None
-        asset = _block(clip, self.settings, self.cache_dir)
-        found = poor_block(asset, self.settings)
+        asset = _scene_of_block(clip, self.settings, self.cache_dir)
+        found = block_fault(asset, self.settings)
         if found is not None and self.settings.psnr_gate is PsnrGate.REJECT:
             return Rejected("render", "psnr", found)
         return None
@@ -103,20 +111,20 @@ class Imaging:
         """
         if self.settings.mode is RenderMode.MAP:
             rig = clip.cameras or MAP_RIG
-            return self._drawn(clip, judged, None, chosen_cameras(rig, self.settings.cameras))
+            return self._drawn(clip, judged, None, choose_cameras(rig, self.settings.cameras))
         if self.settings.mode is RenderMode.PAINTER:
             return self._painted(clip, judged)
         if self.settings.mode is RenderMode.NONE:
             return NO_IMAGES
-        cameras = chosen_cameras(clip.cameras, self.settings.cameras)
-        if candidate is None and taken_by(cameras, (*clip.images, *block_of(clip).images)):
+        cameras = choose_cameras(clip.cameras, self.settings.cameras)
+        if candidate is None and files_of_cameras(cameras, (*clip.images, *block_of(clip).images)):
             return self._photos(clip, judged, cameras)
-        made_of = sensing(clip, self.settings)
+        made_of = block_sensing(clip, self.settings)
         if made_of is Sensing.NOTHING:
             return NO_IMAGES
-        asset = in_time_of(clip, _block(clip, self.settings, self.cache_dir))
+        asset = scene_in_clip_time(clip, _scene_of_block(clip, self.settings, self.cache_dir))
         tags = [TAG_OF[made_of]] if made_of in TAG_OF else []
-        if poor_block(asset, self.settings) is not None:
+        if block_fault(asset, self.settings) is not None:
             tags.append(LOW_PSNR)
         return self._drawn(clip, judged, asset, asset.as_corrected(cameras)) | {"tags": tags}
 
@@ -129,7 +137,7 @@ class Imaging:
         """
         if self.settings.mode is not RenderMode.AUTO or not self.settings.gate.enabled:
             return None
-        if sensing(clip, self.settings) is Sensing.NOTHING:
+        if block_sensing(clip, self.settings) is Sensing.NOTHING:
             return None
         start, now = candidate.rollout.start_step, judged.scene.step
         steps: Sequence[int] = range(start, now + HORIZON_STEPS + 1, GATE_STRIDE)
@@ -137,15 +145,15 @@ class Imaging:
         if shared:
             steps = stored
         looks = self.settings.gate.vehicle_min > 0.0  # at vehicles
-        album = _kept_album(_of_block(clip, self.settings, self.cache_dir)) if looks else None
+        album = _cached_vehicle_photos(_block_key(clip, self.settings, self.cache_dir)) if looks else None
         states = np.concatenate([candidate.rollout.ego_states, judged.rollout.ego_states[1:]])
-        asset = in_time_of(clip, _block(clip, self.settings, self.cache_dir))
+        asset = scene_in_clip_time(clip, _scene_of_block(clip, self.settings, self.cache_dir))
         agents = judged.scene.agents.overwritten(now, judged.rollout.agents)
-        return unfit(
+        return check_drive_pictures(
             asset,
-            asset.as_corrected(chosen_cameras(clip.cameras, self.settings.cameras)),
+            asset.as_corrected(choose_cameras(clip.cameras, self.settings.cameras)),
             pose_on_ground(asset.on_road(clip.world_from_ego), states[[step - start for step in steps]]),
-            asset.lifted(agents, first_of(clip)),
+            asset.lifted(agents, clip_offset_s(clip)),
             steps,
             (self.settings.width, self.settings.height),
             self.settings.gate,
@@ -172,7 +180,7 @@ class Imaging:
         if asset is None:
             images = draw_map_views(clip.road_map, *seen)
         else:
-            lifted = asset.lifted(agents, first_of(clip))
+            lifted = asset.lifted(agents, clip_offset_s(clip))
             images = render_views(asset, cameras, poses, lifted, *seen[3:], self.settings.backend)
         found = [
             self.image(camera.name, offset * STEP_S, poses[f], images[f, c])
@@ -184,7 +192,7 @@ class Imaging:
         if asset is not None:
             measured = {"asset_digest": asset.digest, "psnr": asset.psnr_db if np.isfinite(asset.psnr_db) else None}
             if asset.taken:
-                measured |= heights(scene, asset.on_road(logged), lifted)
+                measured |= height_columns(scene, asset.on_road(logged), lifted)
         return {"cameras": self.rig(cameras), "images": found, "image_source": str(source), **measured}
 
     def _painted(self, clip: Clip, judged: Judged) -> dict[str, object]:
@@ -200,16 +208,16 @@ class Imaging:
     def _photos(self, clip: Clip, judged: Judged, cameras: Sequence[Camera]) -> dict[str, object]:
         now_s = judged.scene.step * STEP_S
         files = [
-            photo_at(clip, camera.name, now_s + offset * STEP_S)
+            nearest_photo(clip, camera.name, now_s + offset * STEP_S)
             for offset in STEPS_OF[self.settings.frames]
             for camera in cameras
         ]
-        corrected, higher = _kept_rig(_of_block(clip, self.settings, self.cache_dir)), dict[str, object]()
+        corrected, higher = _cached_rig(_block_key(clip, self.settings, self.cache_dir)), dict[str, object]()
         if corrected is not None:
-            first_s = first_of(clip)
+            first_s = clip_offset_s(clip)
             cameras, files = corrected.as_corrected(cameras), list(corrected.posed(files, first_s))
             agents = judged.scene.agents.overwritten(judged.scene.step, judged.rollout.agents)
-            higher = heights(judged.scene, corrected.on_road(), corrected.lifted(agents, first_s))
+            higher = height_columns(judged.scene, corrected.on_road(), corrected.lifted(agents, first_s))
         photos = load_photos(files, cameras, self.settings.width, self.settings.height)
         poses = {(file.sensor, file.time_s): file.world_from_ego for file in files}
         found = [
@@ -243,7 +251,7 @@ class Imaging:
         ]
 
 
-def heights(scene: Scene, on_road: Array, lifted: AgentTracks) -> dict[str, object]:
+def height_columns(scene: Scene, on_road: Array, lifted: AgentTracks) -> dict[str, object]:
     """The columns that say how high ego and agents of a sample are, where photos say what the log does not.
 
     on_road: (P, 4, 4) poses of the ego on the road as photos show it; lifted: the sample's agents, as high above it as
@@ -256,7 +264,7 @@ def heights(scene: Scene, on_road: Array, lifted: AgentTracks) -> dict[str, obje
     }
 
 
-def photo_at(clip: Clip, camera: str, time_s: float) -> SensorFile:
+def nearest_photo(clip: Clip, camera: str, time_s: float) -> SensorFile:
     """The clip's photo of a camera nearest to a time since its first step. Raises BadClip where none is near."""
     mine = [file for file in clip.images if file.sensor == camera]
     nearest = min(mine, key=lambda file: abs(file.time_s - time_s), default=None)
@@ -271,25 +279,25 @@ def photo_at(clip: Clip, camera: str, time_s: float) -> SensorFile:
     return nearest
 
 
-def _block(clip: Clip, settings: RenderSettings, cache_dir: str) -> RenderAsset:
-    asset = _kept(_of_block(clip, settings, cache_dir))
+def _scene_of_block(clip: Clip, settings: RenderSettings, cache_dir: str) -> RenderAsset:
+    asset = _cached_scene(_block_key(clip, settings, cache_dir))
     assert asset is not None, "asked for a block only where there are sensors"
     return asset
 
 
-def in_time_of(clip: Clip, asset: RenderAsset) -> RenderAsset:
+def scene_in_clip_time(clip: Clip, asset: RenderAsset) -> RenderAsset:
     """The scene of a clip's block, its times counted from the clip's first step."""
-    return asset.since(first_of(clip))
+    return asset.since(clip_offset_s(clip))
 
 
-def first_of(clip: Clip) -> float:
+def clip_offset_s(clip: Clip) -> float:
     """Seconds from the first step of a clip's block to its own."""
     return clip.start_s - block_of(clip).start_s
 
 
-def scene_lookups() -> tuple[int, int]:
+def scene_cache_counts() -> tuple[int, int]:
     """How often a scene was wanted in this process: found in its memory, read or built."""
-    info = _kept.cache_info()
+    info = _cached_scene.cache_info()
     return info.hits, info.misses
 
 
@@ -303,39 +311,39 @@ class _Block:
     cache_dir: str = field(compare=False)
 
 
-def _of_block(clip: Clip, settings: RenderSettings, cache_dir: str) -> _Block:
+def _block_key(clip: Clip, settings: RenderSettings, cache_dir: str) -> _Block:
     """Equal for all clips of a block, so that a worker that goes from clip to clip reads its scene once."""
     how = repr(settings)
     of_clip = _Block((clip.clip_id, clip.content_digest, how, cache_dir), clip, settings, cache_dir)
-    return replace(of_clip, key=(_place(of_clip), how))
+    return replace(of_clip, key=(_cached_scene_path(of_clip), how))
 
 
 @lru_cache(maxsize=16)
-def _place(of_clip: _Block) -> Path:
+def _cached_scene_path(of_clip: _Block) -> Path:
     return scene_path(of_clip.clip, of_clip.settings, of_clip.cache_dir)
 
 
 @lru_cache(maxsize=2)
-def _kept(block: _Block) -> RenderAsset | None:
-    return asset_for(block.clip, block.settings, Path(block.cache_dir))
+def _cached_scene(block: _Block) -> RenderAsset | None:
+    return load_or_build_scene(block.clip, block.settings, Path(block.cache_dir))
 
 
 @lru_cache(maxsize=2)
-def _kept_rig(block: _Block) -> UsedRig | None:
-    return corrected_for(block.clip, block.settings, Path(block.cache_dir))
+def _cached_rig(block: _Block) -> CorrectedRig | None:
+    return load_or_correct_rig(block.clip, block.settings, Path(block.cache_dir))
 
 
-def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
+def open_vehicle_photos(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> VehiclePhotos:
     """The photos of a clip's block; one is opened when a vehicle is first held against it. Raises BadClip then."""
-    block, cameras = block_of(clip), asset.as_corrected(chosen_cameras(clip.cameras, settings.cameras))
+    block, cameras = block_of(clip), asset.as_corrected(choose_cameras(clip.cameras, settings.cameras))
     files = asset.photos_of(block.images)
     agents = asset.settled(block.agents, 0.0)
-    shown = sightings(files, cameras, agents)
+    shown = find_sightings(files, cameras, agents)
     tracks: dict[int, list[str]] = {}
     for track_id, seen in shown.items():
         for row in seen.photos:
             tracks.setdefault(int(row), []).append(track_id)
-    size = looked_at_size((settings.width, settings.height), settings.gate)
+    size = checked_size((settings.width, settings.height), settings.gate)
     known: dict[int, dict[str, float]] = {}
 
     @cache
@@ -354,9 +362,9 @@ def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
 
     held_out = {(view.camera, view.time_s) for view in asset.views if view.held_out}
     rows = frozenset(row for row, file in enumerate(files) if (file.sensor, file.time_s) in held_out)
-    return Album(shown, likeness, cache(lambda: fading_of(shown, likeness, rows)), taken)
+    return VehiclePhotos(shown, likeness, cache(lambda: estimate_fading(shown, likeness, rows)), taken)
 
 
 @lru_cache(maxsize=2)
-def _kept_album(block: _Block) -> Album:
-    return album_of(block.clip, _block(block.clip, block.settings, block.cache_dir), block.settings)
+def _cached_vehicle_photos(block: _Block) -> VehiclePhotos:
+    return open_vehicle_photos(block.clip, _scene_of_block(block.clip, block.settings, block.cache_dir), block.settings)

@@ -15,7 +15,7 @@ from factory.datasets.town.draw import Theatre, build_rig, paint, world_from_ego
 from factory.datasets.town.drive import TownDrive, TownTrack
 from factory.datasets.town.town import Town, log_name, plan_log
 from factory.readers.settings import TownSettings
-from factory.stages.sensors import chosen_cameras
+from factory.stages.sensors import choose_cameras
 from tasks.render.settings import RenderSettings
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import STEP_S, AgentTracks, Camera, Clip
@@ -49,7 +49,7 @@ def town_cameras(clip: Clip, settings: RenderSettings) -> tuple[Camera, ...]:
     """
     width, height = settings.width, settings.height
     rig = clip.cameras or build_rig(TownSettings().cameras, width, height)
-    return tuple(camera.resized(width, height) for camera in chosen_cameras(rig, settings.cameras))
+    return tuple(camera.resized(width, height) for camera in choose_cameras(rig, settings.cameras))
 
 
 def town_pictures(

@@ -118,16 +118,16 @@ def find_scene(folder: Path, digest: str) -> RenderAsset | None:
     return None
 
 
-def stored_views(path: Path) -> tuple[ViewQuality, ...]:
+def read_view_qualities(path: Path) -> tuple[ViewQuality, ...]:
     """What was measured on a scene's photos, by its header alone. Raises BadScene where it has none."""
     try:
         with safe_open(path, framework="numpy") as file:
-            return tuple(_view(view) for view in json.loads((file.metadata() or {})[KEY])["views"])
+            return tuple(_view_from_json(view) for view in json.loads((file.metadata() or {})[KEY])["views"])
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise BadScene(f"{path}: no scene: {type(error).__name__} {error}") from error
 
 
-def stored_dtype(path: Path) -> SceneDtype:
+def read_dtype(path: Path) -> SceneDtype:
     """What a scene's file holds its Gaussians in, by its header alone. Raises BadScene where it has none."""
     try:
         with safe_open(path, framework="numpy") as file:
@@ -158,7 +158,7 @@ def tensors_of(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> di
 def described_by(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> dict[str, Any]:
     """What of the scene is no array, as plain JSON values; NaN is null."""
     block = asset.block
-    rig = [_calibration(camera) for camera in asset.rig]
+    rig = [_camera_to_json(camera) for camera in asset.rig]
     taken = [[photo.camera, photo.time_s, photo.rise_m, photo.late_s] for photo in asset.taken]
     bodies, shifts = [body.camera for body in asset.bodies], list(asset.shifts.track_ids)
     more = {"rig": rig, "taken": taken, "bodies": bodies, "shifts": shifts}
@@ -167,9 +167,9 @@ def described_by(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> 
         "version": VERSION_OF[dtype],
         "screen": list(asset.screen),
         "nodes": list(asset.nodes),
-        "psnr_db": _number(asset.psnr_db),
+        "psnr_db": _number_to_json(asset.psnr_db),
         "n_held_out": asset.n_held_out,
-        "views": [_plain(asdict(view)) for view in asset.views],
+        "views": [_view_to_json(asdict(view)) for view in asset.views],
         "exposures": [[exposure.camera, exposure.time_s] for exposure in asset.exposures],
         "block": None if block is None else asdict(block) | {"low": block.low.tolist(), "high": block.high.tolist()},
     } | {name: values for name, values in more.items() if values}
@@ -179,7 +179,7 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
     """The opposite of `tensors_of` and `described_by`. Raises KeyError, TypeError, ValueError where one is absent."""
 
     def part(name: str) -> Gaussians:
-        return _whole({field.name: tensors[f"{name}.{field.name}"] for field in fields(Gaussians)})
+        return _in_float32({field.name: tensors[f"{name}.{field.name}"] for field in fields(Gaussians)})
 
     block = described["block"]
     if block is not None:
@@ -189,17 +189,17 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
         background=part("background"),
         nodes={name: part(f"nodes.{i}") for i, name in enumerate(described["nodes"])},
         sky=SkyMap(tensors["sky"].astype(np.float32)),
-        psnr_db=_nan(described["psnr_db"]),
+        psnr_db=_number_from_json(described["psnr_db"]),
         n_held_out=described["n_held_out"],
         digest=digest,
         screen=ScreenFilter(*described["screen"]),
-        views=tuple(_view(view) for view in described["views"]),
+        views=tuple(_view_from_json(view) for view in described["views"]),
         exposures=tuple(
             Exposure(camera, time_s, tensors["exposures"][i])
             for i, (camera, time_s) in enumerate(described["exposures"])
         ),
         block=block,
-        rig=tuple(_camera(camera) for camera in described.get("rig", ())),
+        rig=tuple(_camera_from_json(camera) for camera in described.get("rig", ())),
         taken=tuple(
             TakenFrom(camera, time_s, tensors["taken"][i], rise_m, late_s)
             for i, (camera, time_s, rise_m, late_s) in enumerate(described.get("taken", ()))
@@ -224,7 +224,7 @@ def _in_half(name: str, array: NDArray[Any]) -> NDArray[np.float16]:
     return half
 
 
-def _whole(arrays: Mapping[str, NDArray[Any]]) -> Gaussians:
+def _in_float32(arrays: Mapping[str, NDArray[Any]]) -> Gaussians:
     """Gaussians of a file's arrays; what was in 16 bits is float32, its quaternions of length 1 again."""
     if arrays["quats"].dtype != np.float16:
         return Gaussians(**arrays)
@@ -242,14 +242,16 @@ def digest_of(tensors: Tensors, described: Mapping[str, Any]) -> str:
     return digest.hexdigest()[:16]
 
 
-def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+def _view_to_json(values: Mapping[str, Any]) -> dict[str, Any]:
     """A view's fields as JSON has them, those of its classes as well."""
-    numbers = {name: _number(value) for name, value in values.items() if isinstance(value, float)}
-    parts = {name: [_plain(part) for part in value] for name, value in values.items() if isinstance(value, tuple)}
+    numbers = {name: _number_to_json(value) for name, value in values.items() if isinstance(value, float)}
+    parts = {
+        name: [_view_to_json(part) for part in value] for name, value in values.items() if isinstance(value, tuple)
+    }
     return dict(values) | numbers | parts
 
 
-def _calibration(camera: Camera) -> dict[str, Any]:
+def _camera_to_json(camera: Camera) -> dict[str, Any]:
     plain = {name: getattr(camera, name) for name in ("name", "width", "height")}
     plain |= {name: getattr(camera, name).tolist() for name in CALIBRATED}
     lens = camera.fisheye
@@ -258,28 +260,28 @@ def _calibration(camera: Camera) -> dict[str, Any]:
     return plain if lens is None else plain | {"fisheye": [lens.intrinsics.tolist(), lens.terms.tolist()]}
 
 
-def _camera(plain: Mapping[str, Any]) -> Camera:
+def _camera_from_json(plain: Mapping[str, Any]) -> Camera:
     arrays = {name: np.array(plain[name], np.float64) for name in CALIBRATED}
     lens = Fisheye(*(np.array(part, np.float64) for part in plain["fisheye"])) if "fisheye" in plain else None
     return Camera(**dict(plain) | arrays | {"fisheye": lens})
 
 
-def _view(plain: Mapping[str, Any]) -> ViewQuality:
-    """The opposite of `_plain` for a view."""
+def _view_from_json(plain: Mapping[str, Any]) -> ViewQuality:
+    """The opposite of `_view_to_json` for a view."""
     classes = tuple(ClassQuality(**_measures(part)) for part in plain["classes"])
     return ViewQuality(**_measures(plain) | {"classes": classes})
 
 
 def _measures(plain: Mapping[str, Any]) -> dict[str, Any]:
-    return dict(plain) | {name: _nan(plain[name]) for name in MEASURES if name in plain}
+    return dict(plain) | {name: _number_from_json(plain[name]) for name in MEASURES if name in plain}
 
 
-def _number(value: float) -> float | str | None:
+def _number_to_json(value: float) -> float | str | None:
     """A number as JSON has it: NaN is null, infinity (a photo without a fault) a word."""
     if math.isnan(value):
         return None
     return value if math.isfinite(value) else str(value)
 
 
-def _nan(value: float | str | None) -> float:
+def _number_from_json(value: float | str | None) -> float:
     return float("nan") if value is None else float(value)

@@ -14,8 +14,8 @@ from factory.files import matching
 from factory.readers.base import BadClip
 from factory.readers.pictures import BadPicture, decode_grey, decode_rgb, file_and_frame, video_frames
 from factory.readers.points import read_pcd, read_points
-from tasks.render.scene.features import NOTHING_KNOWN, Known, driven_roads
-from tasks.render.scene.sensed import Photo, Sweep, on_ego
+from tasks.render.scene.features import NOTHING_KNOWN, KnownPoints, driven_roads
+from tasks.render.scene.sensed import Photo, Sweep, is_on_ego
 from tasks.render.views import straightened, undistorted
 from tasks.world.arrays import Array, Bools, Bytes
 from tasks.world.clip import Block, Camera, Clip, SensorFile, own_name
@@ -95,7 +95,7 @@ class SensorData:
 
     photos: tuple[Photo, ...]  # without distortion, at the size asked for
     sweeps: tuple[Sweep, ...]
-    known: Known = NOTHING_KNOWN  # of blocks without lidar, world
+    known: KnownPoints = NOTHING_KNOWN  # of blocks without lidar, world
 
 
 def block_of(clip: Clip) -> Block:
@@ -115,25 +115,25 @@ def load_sensors(
     photos = tuple(replace(photo, own_body=masks.get(photo.camera)) for photo in taken)
     if block.sweeps or block.ground_m is None or not block.images:
         return SensorData(photos, load_sweeps(block.sweeps))
-    return SensorData(photos, (), Known(road=driven_roads(*poses_of(block.images), block.ground_m)))
+    return SensorData(photos, (), KnownPoints(road=driven_roads(*ego_poses_of_files(block.images), block.ground_m)))
 
 
 def load_photos(files: Sequence[SensorFile], cameras: Sequence[Camera], width: int, height: int) -> tuple[Photo, ...]:
     """The files that `cameras` took, without distortion, resized to width x height. Raises BadClip."""
     took = {camera.name: camera for camera in cameras}
-    mine = taken_by(cameras, files)
+    mine = files_of_cameras(cameras, files)
     opened = opened_photos(mine, cameras)
     photos = {row: _photo(mine[row], image, took[mine[row].sensor], width, height) for row, image in opened}
     return tuple(photos[row] for row in range(len(mine)))
 
 
-def taken_by(cameras: Sequence[Camera], files: Sequence[SensorFile]) -> tuple[SensorFile, ...]:
+def files_of_cameras(cameras: Sequence[Camera], files: Sequence[SensorFile]) -> tuple[SensorFile, ...]:
     """The files that one of the `cameras` took, in their order."""
     names = {camera.name for camera in cameras}
     return tuple(file for file in files if file.sensor in names)
 
 
-def poses_of(files: Sequence[SensorFile]) -> tuple[Array, Array]:
+def ego_poses_of_files(files: Sequence[SensorFile]) -> tuple[Array, Array]:
     """Where the ego was when each was taken: poses (F, 4, 4) and times (F,) [s]."""
     return np.stack([file.world_from_ego for file in files]), np.array([file.time_s for file in files])
 
@@ -145,7 +145,7 @@ def block_cameras(block: Block, cameras: Sequence[Camera]) -> tuple[Camera, ...]
     return (*cameras, *others)
 
 
-def chosen_cameras(rig: Sequence[Camera], names: Sequence[str] | None) -> tuple[Camera, ...]:
+def choose_cameras(rig: Sequence[Camera], names: Sequence[str] | None) -> tuple[Camera, ...]:
     """The named cameras in the order of `names`; the whole rig for none. Raises ValueError for an unknown name."""
     if not names:
         return tuple(rig)
@@ -237,7 +237,7 @@ def _sweep(file: SensorFile) -> Sweep:
     if file.ego_from_sensor is not None:
         turn = file.ego_from_sensor
         points = (points @ turn[:3, :3].T + turn[:3, 3]).astype(np.float32)
-    if on_ego(points).all():
+    if is_on_ego(points).all():
         raise BadClip(file.uri, "x y z", f"none of the {len(points)} returns lies outside of the ego's own body")
     return Sweep(file.time_s, points, file.world_from_ego)
 

@@ -23,14 +23,14 @@ from tasks.attempt import drive_and_judge
 from tasks.caches import Damaged, sealed, unsealed
 from tasks.experts.pdm_closed import forecast, proposals
 from tasks.experts.protocol import Plan
-from tasks.kernels.compiled import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole
-from tasks.render.fit.reconstruct import advance, finish
-from tasks.render.fit.start import prepare
-from tasks.render.rig.adjust import N_CAMERA, Bundle, Matched, adjusted, given_rig
+from tasks.kernels.compiled import USED, cache_dir, cache_write_error, make_cache_dir, processor_key, write_whole
+from tasks.render.fit.reconstruct import finish_scene, run_iterations
+from tasks.render.fit.start import prepare_fit
+from tasks.render.rig.adjust import N_CAMERA, AdjustedRig, CornerTracks, bundle_adjust, initial_rig
 from tasks.render.scene.build import AssetSettings, RenderAsset, build_asset
-from tasks.render.scene.depth import confirmed
+from tasks.render.scene.depth import confirm_depths
 from tasks.render.scene.sensed import Photo, Sweep
-from tasks.render.scene.stereo import partners, wide_depth
+from tasks.render.scene.stereo import choose_partners, wide_baseline_depth
 from tasks.render.settings import FitSettings, RenderMode, RenderSettings, SceneFrom
 from tasks.render.splatting.sh import turned
 from tasks.reward.epdms import prepare_scene, score
@@ -114,12 +114,12 @@ def compile_kernels(parts: Sequence[str], enough: Event | None = None) -> None:
                         enough.set()
                         raise
     except OSError as error:
-        raise NotReady(not_kept(error)) from error
+        raise NotReady(cache_write_error(error)) from error
 
 
 def _key() -> str:
     """8 hex digits of the processor and of what is called here for it to be compiled."""
-    sha = hashlib.sha256(processor().encode())
+    sha = hashlib.sha256(processor_key().encode())
     sha.update(Path(__file__).read_bytes())
     return sha.hexdigest()[:8]
 
@@ -151,14 +151,14 @@ def _compile_part(name: str, enough: Event) -> None:
     with terminal_signals_blocked():
         part = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)  # noqa: S603 (ours)
     with part:
-        said = _ended(part, enough)
+        said = _wait_for_part(part, enough)
     if part.returncode == DISK_FULL:
         raise OSError(said.strip().splitlines()[-1])
     if part.returncode != 0:
         raise RuntimeError(f"compiling the kernels of {name} failed: {said[-2000:]}")
 
 
-def _ended(part: "subprocess.Popen[str]", enough: Event) -> str:
+def _wait_for_part(part: "subprocess.Popen[str]", enough: Event) -> str:
     """What it said once it has ended, by itself or because there is enough."""
     while True:
         try:
@@ -168,7 +168,7 @@ def _ended(part: "subprocess.Popen[str]", enough: Event) -> str:
                 part.terminate()
 
 
-def _warm(name: str) -> int:
+def _compile_and_mark(name: str) -> int:
     """One part, in this process; the exit code."""
     become_worker()
     gc.disable()  # a process that ends soon: some 220 MB more for a sixth of its time
@@ -245,7 +245,7 @@ POINTS = ((8.0, 1.0, 1.0), (9.0, -1.0, 2.0))  # that the rig is adjusted to
 def compile_render_kernels() -> RenderAsset:
     """Builds and measures a scene of two 32 x 32 photos, some ground and one box that drives."""
     turned(np.zeros((1, 3, 3), np.float32), np.diag([1.0, -1.0, 1.0]))
-    return build_asset(*_seen(), AssetSettings(hold_out_every=3))
+    return build_asset(*_tiny_recording(), AssetSettings(hold_out_every=3))
 
 
 def compile_fit_kernels() -> RenderAsset:
@@ -253,33 +253,35 @@ def compile_fit_kernels() -> RenderAsset:
     settings = FitSettings(
         iterations=4, start_gaussians=200, most_gaussians=300, refine_every=2, refine_from=2, pose_from=0
     )
-    problem, state = prepare(*_seen(), settings, held_out=[1])
-    advance(problem, state, settings, settings.iterations)
-    return finish(problem, state)
+    problem, state = prepare_fit(*_tiny_recording(), settings, held_out=[1])
+    run_iterations(problem, state, settings, settings.iterations)
+    return finish_scene(problem, state)
 
 
-def compile_rig_kernels() -> Bundle:
+def compile_rig_kernels() -> AdjustedRig:
     """Adjusts a rig of one camera at three places to two points that it sees, and looks for a photo's depth in others.
 
     What else a block without lidar enters, the other two compile.
     """
-    photos, _, _ = _seen()
+    photos, _, _ = _tiny_recording()
     photo, k = photos[1], photos[1].intrinsics
     rgb, nowhere, everywhere = (
         np.zeros((32, 32, 3), np.float32),
         np.zeros((32, 32), np.float32),
         np.ones((32, 32), bool),
     )
-    wide_depth(rgb, nowhere, nowhere, partners(photo, photos, 2), k, photo.world_from_camera, everywhere)
-    confirmed(photos, [nowhere] * len(photos))
+    wide_baseline_depth(
+        rgb, nowhere, nowhere, choose_partners(photo, photos, 2), k, photo.world_from_camera, everywhere
+    )
+    confirm_depths(photos, [nowhere] * len(photos))
     files = [SensorFile(p.camera, "", p.time_s, p.world_from_camera @ np.linalg.inv(FRONT)) for p in photos]
-    rig, shots = given_rig([Camera(photo.camera, 32, 32, k, np.zeros(5), FRONT)], files)
+    rig, shots = initial_rig([Camera(photo.camera, 32, 32, k, np.zeros(5), FRONT)], files)
     at = [[16.0 - 20.0 * y / (x - k), 16.0 + 20.0 * (1.5 - z) / (x - k)] for x, y, z in POINTS for k in range(3)]
-    matched = Matched(np.array([0, 3, 6]), np.tile(np.arange(3), 2), np.array(at), np.ones(6))
-    return adjusted(rig, shots, matched, np.ones(6 * len(files) + N_CAMERA))
+    matched = CornerTracks(np.array([0, 3, 6]), np.tile(np.arange(3), 2), np.array(at), np.ones(6))
+    return bundle_adjust(rig, shots, matched, np.ones(6 * len(files) + N_CAMERA))
 
 
-def _seen() -> tuple[list[Photo], list[Sweep], AgentTracks]:
+def _tiny_recording() -> tuple[list[Photo], list[Sweep], AgentTracks]:
     x, y = np.meshgrid(np.linspace(2.0, 20.0, 40), np.linspace(-6.0, 6.0, 40))
     ground = np.stack([x, y, 0.0 * x], axis=-1).reshape(-1, 3).astype(np.float32)
     intrinsics = np.array([[20.0, 0.0, 16.0], [0.0, 20.0, 16.0], [0.0, 0.0, 1.0]])
@@ -368,4 +370,4 @@ def tiny_clip() -> Clip:
 
 
 if __name__ == "__main__":  # what compiling a part starts, in a process of its own
-    sys.exit(_warm(sys.argv[1]))
+    sys.exit(_compile_and_mark(sys.argv[1]))

@@ -16,7 +16,7 @@ import pyarrow as pa
 from factory.graph.steps import cache_key
 from factory.pipeline import logged_clip
 from factory.readers.pickles import load_tensors
-from factory.stages.scene_file import SUFFIX, BadScene, described_by, read_scene, stored_dtype, stored_views
+from factory.stages.scene_file import SUFFIX, BadScene, described_by, read_dtype, read_scene, read_view_qualities
 from factory.store.location import BadCacheFile
 from factory.wording import one_line
 from tasks.render.scene.asset import BlockRange, RenderAsset, ViewQuality
@@ -167,7 +167,7 @@ def scene_tables(folder: Path) -> dict[str, dict[str, str]]:
     found = {}
     for path in sorted(folder.glob(f"block-*{SUFFIX}")):
         try:
-            found[path.name] = {row.camera: row.text for row in camera_rows(stored_views(path))}
+            found[path.name] = {row.camera: row.text for row in camera_rows(read_view_qualities(path))}
         except BadScene:
             continue  # whoever needs that scene says so, and builds it again
     return found
@@ -318,7 +318,7 @@ def _saved(content: Mapping[str, Any]) -> bytes:
 
 def info_text(path: Path, asset: RenderAsset) -> str:
     """What a scene holds, a few lines."""
-    lines = [str(path), f"file        {stored_dtype(path)}, {path.stat().st_size / 1e6:.1f} MB"]
+    lines = [str(path), f"file        {read_dtype(path)}, {path.stat().st_size / 1e6:.1f} MB"]
     lines += [f"digest      {asset.digest}", f"origin      {', '.join(f'{v:.2f}' for v in asset.origin)} m"]
     if (block := asset.block) is not None:
         x, y = (f"{low:.1f} .. {high:.1f}" for low, high in zip(block.low, block.high))

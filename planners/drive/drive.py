@@ -107,7 +107,7 @@ def _asked(settings: DriveSettings) -> DrivesAsked:
         raise ConfigError("pictures=truth is the painter's of the synthetic town: give pictures=engine for these clips")
     if any("engine" in kinds for _, kinds in planners):
         try:
-            engine.check(settings.render.backend)
+            engine.require_backend(settings.render.backend)
         except BackendMissing as error:
             raise ConfigError(str(error)) from error
     out = Location.parse(settings.out)

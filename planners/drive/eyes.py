@@ -9,14 +9,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from factory.readers.base import BadClip
-from factory.stages.assets import asset_for
-from factory.stages.imaging import Imaging, first_of, in_time_of
+from factory.stages.assets import load_or_build_scene
+from factory.stages.imaging import Imaging, clip_offset_s, scene_in_clip_time
 from factory.stages.painted import town_cameras, town_pictures
 from factory.stages.rows import scene_columns
-from factory.stages.sensors import chosen_cameras
+from factory.stages.sensors import choose_cameras
 from factory.store.reader import Sample
 from factory.store.schema import COLUMNS
-from tasks.render.gate import poor_block
+from tasks.render.gate import block_fault
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderSettings
 from tasks.render.views import render_views
@@ -177,7 +177,7 @@ class RenderedEyes:
         """As a sample's pictures are drawn (factory.stages.imaging)."""
         s, step = self.settings, scene.step + offset
         poses = pose_on_ground(self.asset.on_road(ground_of(self.clip)), states_at(scene, offset))
-        agents = self.asset.lifted(scene.agents, first_of(self.clip))
+        agents = self.asset.lifted(scene.agents, clip_offset_s(self.clip))
         seen = render_views(self.asset, self.cameras, poses, agents, [step], s.width, s.height, s.backend)[0]
         imaging = Imaging(s, "")
         return [imaging.image(c.name, offset * STEP_S, poses[0], rgb) for c, rgb in zip(self.cameras, seen)]
@@ -189,12 +189,12 @@ def rendered_eyes(clip: Clip, settings: RenderSettings, cache_dir: str) -> Rende
     Raises BadClip for a clip without anything to build it from, for a broken sensor file, and for a scene whose
     held-out photos are below psnr_min where `render.psnr_gate` rejects such.
     """
-    built = asset_for(clip, settings, cache_dir)
+    built = load_or_build_scene(clip, settings, cache_dir)
     if built is None:
         raise BadClip(f"log {clip.log_id}", "cameras", "no photos and no lidar to build a scene from: pictures=none")
-    if settings.psnr_gate is PsnrGate.REJECT and (why := poor_block(built, settings)) is not None:
+    if settings.psnr_gate is PsnrGate.REJECT and (why := block_fault(built, settings)) is not None:
         raise BadClip(f"log {clip.log_id}", "scene", f"{why}; render.psnr_gate=mark drives in it all the same")
-    asset = in_time_of(clip, built)
+    asset = scene_in_clip_time(clip, built)
     return RenderedEyes(
-        clip, settings, asset, tuple(asset.as_corrected(chosen_cameras(clip.cameras, settings.cameras)))
+        clip, settings, asset, tuple(asset.as_corrected(choose_cameras(clip.cameras, settings.cameras)))
     )

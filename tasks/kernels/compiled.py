@@ -104,7 +104,7 @@ def remove_unused(caches: Path) -> None:
 
 
 @cache
-def processor() -> str:
+def processor_key() -> str:
     """What machine code is made for: Python's version, the system, the processor and what it can do."""
     return repr((sys.version_info[:2], cpu_target.target_context.codegen().magic_tuple()))
 
@@ -168,12 +168,12 @@ class KernelCache:
             make_cache_dir()
             write_whole(path, sealed(dumps(compiled._reduce()), _key(path)))
         except OSError as error:
-            warnings.warn(not_kept(error), RuntimeWarning, stacklevel=1)
+            warnings.warn(cache_write_error(error), RuntimeWarning, stacklevel=1)
             return
         _use(path)
 
     def _path(self, signature: Any) -> Path:
-        takes = f"{signature} {processor()} {self._enclosed}"
+        takes = f"{signature} {processor_key()} {self._enclosed}"
         return Path(self.cache_path) / f"{self._name}-{hashlib.sha256(takes.encode()).hexdigest()[:16]}.kernel"
 
     def flush(self) -> None:
@@ -199,7 +199,7 @@ def write_whole(path: Path, data: bytes) -> None:
         raise
 
 
-def not_kept(error: OSError) -> str:
+def cache_write_error(error: OSError) -> str:
     """What to say where the cache folder cannot be written."""
     why = error.strerror or str(error)
     return f"compiled kernels cannot be kept in {cache_dir()} ({why}): name a folder with free space in NUMBA_CACHE_DIR"

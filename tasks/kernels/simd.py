@@ -74,7 +74,7 @@ def fill(typing_context: Any, number: Any) -> Any:
 
 
 @intrinsic
-def columns(typing_context: Any) -> Any:
+def lane_indices(typing_context: Any) -> Any:
     """0, 1, 2, ... 15."""
     return lanes(), lambda context, builder, sig, arguments: _constant(range(LANES))
 
@@ -128,7 +128,7 @@ def _called(builder: Any, name: str, arguments: Any) -> Any:
 
 
 @intrinsic
-def fused(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
+def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
     """a * b + c in one rounding."""
 
     def build(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
@@ -138,7 +138,7 @@ def fused(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 @intrinsic
-def root(typing_context: Any, values: Any) -> Any:
+def sqrt(typing_context: Any, values: Any) -> Any:
     """Square roots; NaN of what is negative."""
     return lanes(lanes), lambda context, builder, sig, arguments: _called(builder, "llvm.sqrt.v16f32", arguments)
 

@@ -18,7 +18,7 @@ def _helpers(n: int) -> ThreadPoolExecutor:
 os.register_at_fork(after_in_child=_helpers.cache_clear)  # a forked process has the pools but not their threads
 
 
-def in_chunks(work: Callable[[int, int], T], n: int, size: int, threads: int) -> list[T]:
+def run_in_chunks(work: Callable[[int, int], T], n: int, size: int, threads: int) -> list[T]:
     """What `work(first, last)` returns for each `size` of n items, in order; `work` is to release the GIL.
 
     Raises ValueError for less than one thread.

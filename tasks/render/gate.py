@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from tasks.render.scene.asset import OwnBody, RenderAsset, camera_psnr_db, scene_at
+from tasks.render.scene.asset import OwnBody, RenderAsset, camera_psnr_db, compose_gaussians
 from tasks.render.scene.engine import Backend, Vehicles, render, vehicles_at
 from tasks.render.scene.movers import BEYOND_M, behind_boxes, boxes_at, world_from_boxes
 from tasks.render.scene.sensed import Photo
@@ -76,16 +76,16 @@ class VehiclePhoto:
 
 
 @dataclass(frozen=True)
-class Album:
+class VehiclePhotos:
     """A block's photos, for holding vehicles against them."""
 
-    sightings: Mapping[str, Sightings]  # by track id
+    find_sightings: Mapping[str, Sightings]  # by track id
     likeness: Callable[[str, int], float]  # of a track as the scene draws it to a photo that shows it, 0 to 1
     fading: Callable[[], Mapping[str, float]] = dict  # of tracks; FADING of others
     taken: Callable[[str, int], VehiclePhoto] | None = None  # a track in a photo; None: there is none beside pictures
 
 
-def sightings(files: Sequence[SensorFile], cameras: Sequence[Camera], agents: AgentTracks) -> dict[str, Sightings]:
+def find_sightings(files: Sequence[SensorFile], cameras: Sequence[Camera], agents: AgentTracks) -> dict[str, Sightings]:
     """Which of a block's photos show which vehicle; `agents` are the block's, with the files' times."""
     rig = {camera.name: camera for camera in cameras}
     found: dict[str, list[tuple[int, Array]]] = {}
@@ -102,19 +102,19 @@ def sightings(files: Sequence[SensorFile], cameras: Sequence[Camera], agents: Ag
             inside = (depth > 0.0) & (u >= 0.0) & (u < camera.width) & (v >= 0.0) & (v < camera.height)
         for j, share in zip(rows, inside.mean(axis=1), strict=True):
             if share >= SHOWN:
-                found.setdefault(agents.track_ids[j], []).append((row, eye_in_box(pose[:3, 3], boxes[j])))
+                found.setdefault(agents.track_ids[j], []).append((row, to_box_frame(pose[:3, 3], boxes[j])))
     return {
         track_id: Sightings(np.array([row for row, _ in seen]), np.stack([eye for _, eye in seen]))
         for track_id, seen in found.items()
     }
 
 
-def eye_in_box(eye: Array, box: Array) -> Array:
+def to_box_frame(eye: Array, box: Array) -> Array:
     """A place (3,) in the coordinates of a box (7,): from its centre, x along its heading."""
     return np.asarray((eye - box[:3]) @ world_from_boxes(box[None])[0, :3, :3])
 
 
-def expected(album: Album, track_id: str, eye: Array) -> float:
+def expected_likeness(album: VehiclePhotos, track_id: str, eye: Array) -> float:
     """The likeness, 0 to 1, that a track can be expected to have from `eye` (3,) in its box; 0 where no photo shows
     it."""
     seen = album.sightings.get(track_id)
@@ -124,7 +124,7 @@ def expected(album: Album, track_id: str, eye: Array) -> float:
     return album.likeness(track_id, photo) * math.exp(-album.fading().get(track_id, FADING) * gap)
 
 
-def fading_of(
+def estimate_fading(
     seen: Mapping[str, Sightings], likeness: Callable[[str, int], float], held_out: Collection[int]
 ) -> Mapping[str, float]:
     """How fast the likeness of each track fades away from the photos that a scene was made of.
@@ -171,7 +171,7 @@ def large_vehicles(there: Vehicles, eye: Pinhole, view: View, share: float) -> I
     for j in sorted(np.flatnonzero(possible), key=lambda j: nearest[j]):
         if rays is None:
             rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
-        outline = outline_of(there.boxes[j], eye, rays)
+        outline = box_outline(there.boxes[j], eye, rays)
         hidden = (view.depth < nearest[j] - HIDDEN_M) & (view.alpha > 0.5)
         covered = float((outline & free & ~hidden).mean())
         free &= ~outline
@@ -179,7 +179,7 @@ def large_vehicles(there: Vehicles, eye: Pinhole, view: View, share: float) -> I
             yield int(j), covered
 
 
-def outline_of(box: Array, eye: Pinhole, rays: Array | None = None) -> Bools:
+def box_outline(box: Array, eye: Pinhole, rays: Array | None = None) -> Bools:
     """(H, W) the pixels that look at a box (7,) in the world; `rays` (H * W, 3) where they are known."""
     if rays is None:
         rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
@@ -199,20 +199,20 @@ def likeness_to_photo(
     eye = Pinhole(photo.intrinsics, photo.world_from_camera, width, height)
     there = vehicles_at(agents, photo.taken_s)
     seen = render(asset, [eye], there, backend, affines=[asset.affine_of(photo.camera, photo.time_s)])[0].rgb
-    similar = similarity(seen, photo.rgb.astype(np.float32) / np.float32(255.0))
+    similar = ssim_map(seen, photo.rgb.astype(np.float32) / np.float32(255.0))
     out = {}
     for track_id in track_ids:
-        inside = outline_of(there.boxes[there.track_ids.index(track_id)], eye)
-        out[track_id] = inside_mean(similar, inside)
+        inside = box_outline(there.boxes[there.track_ids.index(track_id)], eye)
+        out[track_id] = masked_mean(similar, inside)
     return out
 
 
-def inside_mean(similar: F32, inside: Bools) -> float:
+def masked_mean(similar: F32, inside: Bools) -> float:
     """Mean of a similarity map over the pixels inside, from 0 to 1; 0 where there are none."""
     return max(0.0, float(similar[inside].mean())) if inside.any() else 0.0
 
 
-def similarity(a: F32, b: F32) -> F32:
+def ssim_map(a: F32, b: F32) -> F32:
     """(H, W) SSIM of two pictures (H, W, 3) in [0, 1], mean over the channels, at half their size."""
     height, width = a.shape[:2]
     half = (max(1, width // 2), max(1, height // 2))
@@ -253,7 +253,9 @@ def _projected(boxes: Array, points: Array, intrinsics: Array, world_from_camera
 SHIFTS_PX = (-2, -1, 0, 1, 2)  # by which the photo is moved either way to fit: a box is no car, nor where it is exactly
 
 
-def beside_photo(rgb: F32, eye: Pinhole, box: Array, others: Array, taken: VehiclePhoto) -> tuple[float, float]:
+def likeness_beside_photo(
+    rgb: F32, eye: Pinhole, box: Array, others: Array, taken: VehiclePhoto
+) -> tuple[float, float]:
     """How like a photo a picture (H, W, 3) of a vehicle is, 0 to 1, and the share of its outline that both show.
 
     `box` (7,) is the vehicle's and `others` (N, 7) those that may hide it, as `eye` sees them. Likeness is the SSIM at
@@ -261,7 +263,7 @@ def beside_photo(rgb: F32, eye: Pinhole, box: Array, others: Array, taken: Vehic
     """
     rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
     place, photo = eye.world_from_camera[:3, 3], taken.photo
-    points, axis, side, along = on_box(box, place, rays)
+    points, axis, side, along = intersect_box(box, place, rays)
     outline = along < np.inf
     if not outline.any():
         return 0.0, 0.0
@@ -286,10 +288,12 @@ def beside_photo(rgb: F32, eye: Pinhole, box: Array, others: Array, taken: Vehic
         return 0.0, 0.0
     shape = (eye.height, eye.width)
     columns, rows = ((np.where(clear, at, 0.0) - 0.5).astype(np.float32).reshape(shape) for at in (u, v))
-    return _best(rgb, photo.rgb, columns, rows, clear.reshape(shape)), float(clear.sum() / outline.sum())
+    return _best_shifted_likeness(rgb, photo.rgb, columns, rows, clear.reshape(shape)), float(
+        clear.sum() / outline.sum()
+    )
 
 
-def on_box(box: Array, eye: Array, rays: Array) -> tuple[Array, Ints, Array, Array]:
+def intersect_box(box: Array, eye: Array, rays: Array) -> tuple[Array, Ints, Array, Array]:
     """Where rays (N, 3) from `eye` (3,) first meet a box (7,) that the eye is outside of.
 
     Returns the places (N, 3) in box coordinates, the axis (N,) and the side (N,), 1 or -1, of the face, and how many
@@ -308,7 +312,7 @@ def on_box(box: Array, eye: Array, rays: Array) -> tuple[Array, Ints, Array, Arr
     return start + np.where(met, along, 0.0)[:, None] * steps, axis, side, along
 
 
-def _best(rgb: F32, photo: Bytes, columns: F32, rows: F32, clear: Bools) -> float:
+def _best_shifted_likeness(rgb: F32, photo: Bytes, columns: F32, rows: F32, clear: Bools) -> float:
     """Likeness of the `clear` pixels to the photo's at columns and rows (H, W) under the best of the shifts."""
     theirs = photo.astype(np.float32) / np.float32(255.0)
     best = 0.0
@@ -317,7 +321,7 @@ def _best(rgb: F32, photo: Bytes, columns: F32, rows: F32, clear: Bools) -> floa
             at = columns + np.float32(right), rows + np.float32(down)
             moved = cv2.remap(theirs, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             mixed = np.where(clear[..., None], moved, rgb).astype(np.float32)
-            best = max(best, inside_mean(similarity(rgb, mixed), clear))
+            best = max(best, masked_mean(ssim_map(rgb, mixed), clear))
     return best
 
 
@@ -342,7 +346,7 @@ DETAIL_MIN = 0.06  # standard deviation of the grey picture less its 3 x 3 mean,
 
 
 @dataclass(frozen=True)
-class Measures:
+class PictureMeasures:
     """What was found on one picture; see GateSettings."""
 
     holes: float
@@ -351,7 +355,7 @@ class Measures:
     detail: float
 
 
-def unfit(
+def check_drive_pictures(
     asset: RenderAsset,
     cameras: Sequence[Camera],
     world_from_ego: Array,
@@ -360,7 +364,7 @@ def unfit(
     size: tuple[int, int],
     settings: GateSettings,
     backend: Backend = Backend.CPU,
-    album: Album | None = None,
+    album: VehiclePhotos | None = None,
     stored: Collection[int] = (),
 ) -> Rejected | None:
     """The first picture of a drive that is not fit to be a sample's; None where all are.
@@ -369,42 +373,44 @@ def unfit(
     0, `size` width, height [px] of the pictures to be stored, whose shape the small ones have. Of the `stored` steps
     alone vehicles are held against the photos of an `album`: what is torn elsewhere nobody learns from.
     """
-    width, height = looked_at_size(size, settings)
+    width, height = checked_size(size, settings)
     rig = [camera.resized(width, height) for camera in cameras]
     for pose, step in zip(world_from_ego, steps, strict=True):
         there = vehicles_at(agents, step * STEP_S, pose[:2, 3], settings.reach_m)
         eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, c.width, c.height) for c in rig]
-        scene = composed(asset, there, pose[:3, 3], settings.reach_m)
+        scene = compose_near(asset, there, pose[:3, 3], settings.reach_m)
         affines = [asset.affine_of(camera.name, step * STEP_S) for camera in cameras]
         views = render(scene, eyes, backend=backend, affines=affines)
         own = [asset.own_body(camera.name) for camera in cameras]
-        looked_at = measures(scene, eyes, views, pose, backend, own)
+        looked_at = measure_views(scene, eyes, views, pose, backend, own)
         for camera, eye, view, found in zip(rig, eyes, views, looked_at, strict=True):
             inside = _tracks_around(eye.world_from_camera[:3, 3], there)
-            fault = ("lens_covered", f"inside track {inside[0]}") if inside else fault_of(found, settings)
+            fault = ("lens_covered", f"inside track {inside[0]}") if inside else picture_fault(found, settings)
             if fault is None and album is not None and step in stored:
-                fault = unlike(album, there, eye, view, settings)
+                fault = vehicle_fault(album, there, eye, view, settings)
             if fault is not None:
                 return Rejected("render", fault[0], f"{camera.name} at step {step}: {fault[1]}")
     return None
 
 
-def looked_at_size(size: tuple[int, int], settings: GateSettings) -> tuple[int, int]:
+def checked_size(size: tuple[int, int], settings: GateSettings) -> tuple[int, int]:
     """Width and height [px] of the pictures that are looked at, for those of `size` to be stored."""
     width = min(settings.width, size[0])
     return width, max(1, round(width * size[1] / size[0]))
 
 
-def unlike(album: Album, there: Vehicles, eye: Pinhole, view: View, settings: GateSettings) -> tuple[str, str] | None:
+def vehicle_fault(
+    album: VehiclePhotos, there: Vehicles, eye: Pinhole, view: View, settings: GateSettings
+) -> tuple[str, str] | None:
     """(reason, detail) of the nearest large vehicle that cannot be expected to look like its photos."""
     if settings.vehicle_min == 0.0:
         return None
     for j, share in large_vehicles(there, eye, view, settings.vehicle_share):
         track_id, box = there.track_ids[j], there.boxes[j]
-        alike = expected(album, track_id, eye_in_box(eye.world_from_camera[:3, 3], box))
+        alike = expected_likeness(album, track_id, to_box_frame(eye.world_from_camera[:3, 3], box))
         if alike < settings.vehicle_min:
             return "unlike_photos", f"track {track_id} on {share:.0%} of the picture, expected likeness {alike:.2f}"
-        alike = seen_beside(album, there, j, eye, view)
+        alike = likeness_to_nearest_photo(album, there, j, eye, view)
         if alike < settings.beside_min:
             return (
                 "unlike_photos",
@@ -413,22 +419,24 @@ def unlike(album: Album, there: Vehicles, eye: Pinhole, view: View, settings: Ga
     return None
 
 
-def seen_beside(album: Album, there: Vehicles, j: int, eye: Pinhole, view: View) -> float:
+def likeness_to_nearest_photo(album: VehiclePhotos, there: Vehicles, j: int, eye: Pinhole, view: View) -> float:
     """How like the photo that was taken from nearest to here the j-th vehicle in a picture is, 0 to 1; 1 where no photo
     was taken near enough to say."""
     track_id, box = there.track_ids[j], there.boxes[j]
     seen = album.sightings.get(track_id)
     if seen is None or album.taken is None:
         return 1.0
-    inside = eye_in_box(eye.world_from_camera[:3, 3], box)
+    inside = to_box_frame(eye.world_from_camera[:3, 3], box)
     row, gap = seen.nearest(inside)
     if gap > BESIDE_GAP or gap * BEHIND_BOX_M > BESIDE_RAD * float(np.linalg.norm(inside)):
         return 1.0
-    alike, share = beside_photo(view.rgb, eye, box, np.delete(there.boxes, j, axis=0), album.taken(track_id, row))
+    alike, share = likeness_beside_photo(
+        view.rgb, eye, box, np.delete(there.boxes, j, axis=0), album.taken(track_id, row)
+    )
     return alike if share >= BESIDE_SHARE else 1.0
 
 
-def fault_of(found: Measures, settings: GateSettings) -> tuple[str, str] | None:
+def picture_fault(found: PictureMeasures, settings: GateSettings) -> tuple[str, str] | None:
     """(reason, detail) of the first measure that does not come up to the settings."""
     if found.lens > LENS_MAX:
         return "lens_covered", f"{found.lens:.0%} of the picture by what is nearer than {LENS_M:g} m"
@@ -441,24 +449,24 @@ def fault_of(found: Measures, settings: GateSettings) -> tuple[str, str] | None:
     return None
 
 
-def composed(asset: RenderAsset, there: Vehicles, place: Array, reach_m: float) -> RenderAsset:
+def compose_near(asset: RenderAsset, there: Vehicles, place: Array, reach_m: float) -> RenderAsset:
     """The scene with who is there as its background, without what is farther than reach_m from a place (3,) in the
     world, seen from above."""
     east, north = (asset.background.means[:, k] - np.float32(place[k] - asset.origin[k]) for k in (0, 1))
     rows = np.flatnonzero(east * east + north * north < reach_m * reach_m)
     near = replace(asset, background=asset.background.take(rows))
-    scene = scene_at(near, there.track_ids, there.kinds, there.boxes)
+    scene = compose_gaussians(near, there.track_ids, there.kinds, there.boxes)
     return replace(asset, background=scene, nodes={})
 
 
-def measures(
+def measure_views(
     scene: RenderAsset,
     eyes: Sequence[Pinhole],
     views: Sequence[View],
     world_from_ego: Array,
     backend: Backend = Backend.CPU,
     own: Sequence[OwnBody | None] | None = None,
-) -> list[Measures]:
+) -> list[PictureMeasures]:
     """Of the view that each camera has of a composed scene; nothing is missed where its `own` body is in front."""
     out = []
     for eye, seen, body in zip(eyes, views, own or [None] * len(eyes), strict=True):
@@ -468,16 +476,16 @@ def measures(
             road &= ~body.in_front(eye.width, eye.height)
         close = _on_the_lens(scene.background, eye.world_from_camera[:3, 3] - scene.origin)
         lens = render(replace(scene, background=close), [eye], backend=backend)[0].alpha if len(close) else None
-        out.append(measured(seen, road, lens))
+        out.append(measure_view(seen, road, lens))
     return out
 
 
-def measured(seen: View, road: Bools, lens: F32 | None = None) -> Measures:
+def measure_view(seen: View, road: Bools, lens: F32 | None = None) -> PictureMeasures:
     """Of one picture; `road` (H, W) pixels that are not to show sky, `lens` (H, W) alpha of what is on the lens."""
     grey = seen.rgb @ GREY
     contrast = float(grey.std())
     fine = grey - uniform_filter(grey, 3, mode="nearest")
-    return Measures(
+    return PictureMeasures(
         holes=float((seen.alpha[road] < SOLID).mean()) if road.any() else 0.0,
         lens=0.0 if lens is None else float((lens > SOLID).mean()),
         contrast=contrast,
@@ -526,7 +534,7 @@ def _tracks_around(eye: Array, there: Vehicles) -> list[str]:
 # PSNR depends on that size: fine texture, which no scene has in full, is averaged away in small pictures.
 
 
-def poor_block(asset: RenderAsset, settings: RenderSettings) -> str | None:
+def block_fault(asset: RenderAsset, settings: RenderSettings) -> str | None:
     """In what a block does not come up to `psnr_min` and, camera by camera, `camera_psnr_min`.
 
     None where it does, where nothing was held out, and where `psnr_min` is 0: then any block will do.

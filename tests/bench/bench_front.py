@@ -15,13 +15,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from factory.datasets.scenarionet.reader import ScenarioNetReader
-from factory.stages.assets import corrected_rig, known_of, lines_of, taken_from
+from factory.stages.assets import correct_block_rig, known_points, photo_poses, rig_report_lines
 from factory.stages.sensors import block_of, load_sensors
-from tasks.render.fit.reconstruct import advance, finish
-from tasks.render.fit.start import prepare
-from tasks.render.rig.correct import Correction
-from tasks.render.scene.asset import rises_of
-from tasks.render.scene.movers import lifted
+from tasks.render.fit.reconstruct import finish_scene, run_iterations
+from tasks.render.fit.start import prepare_fit
+from tasks.render.rig.correct import RigCorrection
+from tasks.render.scene.asset import photo_rises
+from tasks.render.scene.movers import lift_tracks
 from tasks.render.settings import FitSettings
 from tasks.world.clip import Block, Camera, SensorFile
 
@@ -46,12 +46,12 @@ def beside(given: SensorFile, before: Pair, after: Pair) -> SensorFile:
 
 def unmatched(
     path: Path, block: Block, cameras: Sequence[Camera]
-) -> tuple[Block, tuple[Camera, ...], Correction | None]:
+) -> tuple[Block, tuple[Camera, ...], RigCorrection | None]:
     """The block corrected without its held-out photos, which are moved as their neighbours were."""
     kept = [k for k in range(len(block.images)) if k % EVERY != EVERY // 2]
     given = {k: block.images[k] for k in kept}
     fewer = replace(block, images=tuple(given.values()))
-    corrected, rig, found = corrected_rig(path, fewer, cameras)
+    corrected, rig, found = correct_block_rig(path, fewer, cameras)
     known = dict(zip(kept, corrected.images, strict=True))
     files = [
         known[k] if k in known else beside(file, (given[k - 1], known[k - 1]), (given[k + 1], known[k + 1]))
@@ -75,19 +75,19 @@ def main() -> None:
     if adjust:
         path = out / "front.safetensors"
         if matched:
-            block, cameras, found = corrected_rig(path, block, cameras)
+            block, cameras, found = correct_block_rig(path, block, cameras)
         else:
             block, cameras, found = unmatched(path, block, cameras)
     data = load_sensors(block, cameras, *SIZE)
     if found is not None:
-        data = replace(data, known=known_of(data, block, found))
-        print("\n".join(lines_of(found)))
+        data = replace(data, known=known_points(data, block, found))
+        print("\n".join(rig_report_lines(found)))
     agents = block.agents
     if found is not None:
-        agents = lifted(agents, *rises_of(taken_from(block_of(clip).images, block.images)))
-    problem, state = prepare(data.photos, data.sweeps, agents, settings, threads=threads, known=data.known)
-    advance(problem, state, settings, settings.iterations, threads=threads)
-    asset = finish(problem, state, threads)
+        agents = lift_tracks(agents, *photo_rises(photo_poses(block_of(clip).images, block.images)))
+    problem, state = prepare_fit(data.photos, data.sweeps, agents, settings, threads=threads, known=data.known)
+    run_iterations(problem, state, settings, settings.iterations, threads=threads)
+    asset = finish_scene(problem, state, threads)
     each = ", ".join(f"{view.psnr_db:.1f} at {view.time_s:g} s" for view in asset.views)
     print(f"{time.process_time() - started:.0f} CPU s, {len(state)} Gaussians, held out {asset.psnr_db:.2f} dB: {each}")
     parts = [part for view in asset.views for part in view.classes]

@@ -23,10 +23,10 @@ from factory.config.run import load_config
 from factory.graph.steps import PreparedClip
 from factory.pipeline import FactoryWork
 from factory.setup.settings import assemble
-from factory.stages.assets import asset_for
-from factory.stages.imaging import album_of, in_time_of
-from factory.stages.sensors import chosen_cameras
-from tasks.render.gate import Album, GateSettings, looked_at_size, unfit
+from factory.stages.assets import load_or_build_scene
+from factory.stages.imaging import open_vehicle_photos, scene_in_clip_time
+from factory.stages.sensors import choose_cameras
+from tasks.render.gate import GateSettings, VehiclePhotos, check_drive_pictures, checked_size
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.settings import STEPS_OF, Frames
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip
@@ -71,13 +71,13 @@ def labelled(seed: int, clips: int, most: int, every: int, share_min: float, out
             print(f"{ref.log_id} at {ref.start_ms} ms: {prepared}", flush=True)
             continue
         clip = work.reader.read(ref)
-        asset = asset_for(clip, work.render, work.cache_dir, threads=2)
+        asset = load_or_build_scene(clip, work.render, work.cache_dir, threads=2)
         assert asset is not None, "a town has photos"
-        album, town = album_of(clip, asset, work.render), Painted(seed, ref.log_id)
-        timed_album = album_of(clip, asset, work.render)  # whose photos are opened while the clock runs
-        asset = in_time_of(clip, asset)
-        size = looked_at_size((work.render.width, work.render.height), settings)
-        rig = [camera.resized(*size) for camera in chosen_cameras(clip.cameras, work.render.cameras)]
+        album, town = open_vehicle_photos(clip, asset, work.render), Painted(seed, ref.log_id)
+        timed_album = open_vehicle_photos(clip, asset, work.render)  # whose photos are opened while the clock runs
+        asset = scene_in_clip_time(clip, asset)
+        size = checked_size((work.render.width, work.render.height), settings)
+        rig = [camera.resized(*size) for camera in choose_cameras(clip.cameras, work.render.cameras)]
         for drive in drives(work, prepared, EXPERTS, most):
             name = f"{clip.clip_id}/{drive.expert}/{drive.candidate}"
             costs.append([cpu_ms(drive, asset, clip, work, kept_album) for kept_album in (None, timed_album)])
@@ -97,11 +97,13 @@ def labelled(seed: int, clips: int, most: int, every: int, share_min: float, out
     return rows
 
 
-def cpu_ms(drive: Simulated, asset: RenderAsset, clip: Clip, work: FactoryWork, album: Album | None) -> float:
+def cpu_ms(drive: Simulated, asset: RenderAsset, clip: Clip, work: FactoryWork, album: VehiclePhotos | None) -> float:
     """CPU time of the gate on a drive [ms]; NaN where it refuses it, which ends it early."""
     render, began = work.render, time.process_time()
-    cameras, size = chosen_cameras(clip.cameras, render.cameras), (render.width, render.height)
-    found = unfit(asset, cameras, drive.poses, drive.agents, drive.steps, size, render.gate, album=album, stored=STORED)
+    cameras, size = choose_cameras(clip.cameras, render.cameras), (render.width, render.height)
+    found = check_drive_pictures(
+        asset, cameras, drive.poses, drive.agents, drive.steps, size, render.gate, album=album, stored=STORED
+    )
     return 1e3 * (time.process_time() - began) if found is None else float("nan")
 
 

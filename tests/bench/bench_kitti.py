@@ -19,15 +19,22 @@ from numpy.typing import NDArray
 
 from factory.datasets.kitti.reader import read_drive, steadied
 from factory.stages.scene_file import write_scene
-from tasks.render.fit.corrections import corrected, exposed
+from tasks.render.fit.corrections import apply_exposure, corrected_pose
 from tasks.render.fit.losses import ssim, target_of
-from tasks.render.fit.on_torch import OnTorch
-from tasks.render.fit.reconstruct import advance, backend_of, corrections_at, drawn, finish, pose_of
-from tasks.render.fit.start import Problem, prepare
+from tasks.render.fit.on_torch import TorchBackend
+from tasks.render.fit.reconstruct import (
+    draw_photo,
+    finish_scene,
+    fit_backend,
+    interpolated_corrections,
+    refined_pose,
+    run_iterations,
+)
+from tasks.render.fit.start import FitProblem, prepare_fit
 from tasks.render.fit.state import FitState
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import render
-from tasks.render.scene.sensed import Photo, shifted
+from tasks.render.scene.sensed import Photo, shift_pose
 from tasks.render.settings import Backend, FitSettings
 from tasks.world.clip import Pinhole
 from tests.bench.by_kernels import by_kernels
@@ -46,17 +53,17 @@ class Beside:
     """What a scene shows of image_03: posed by what was learned of image_02, plus a rigid correction."""
 
     def __init__(
-        self, asset: RenderAsset, problem: Problem, state: FitState, left: dict[float, F64], threads: int
+        self, asset: RenderAsset, problem: FitProblem, state: FitState, left: dict[float, F64], threads: int
     ) -> None:
         self.asset, self.problem, self.state, self.left, self.threads = asset, problem, state, left, threads
 
     def picture(self, photo: Photo, row: F64) -> F32:
         """`photo` local; `row` (6,) the correction."""
-        learned, _ = corrections_at(self.problem, self.state, "image_02", photo.time_s)
+        learned, _ = interpolated_corrections(self.problem, self.state, "image_02", photo.time_s)
         left = self.left[photo.time_s]
-        moved = corrected(left, learned) @ np.linalg.inv(left) @ photo.world_from_camera
+        moved = corrected_pose(left, learned) @ np.linalg.inv(left) @ photo.world_from_camera
         as_left = replace(photo, camera="image_02")
-        return drawn(self.asset, self.problem, as_left, corrected(moved, row), self.threads)
+        return draw_photo(self.asset, self.problem, as_left, corrected_pose(moved, row), self.threads)
 
     def fitted(self, photos: list[Photo], rigid: bool) -> tuple[F64, F32]:
         """Correction and affine colour (12,) that fit `photos` best: Gauss-Newton on what the affine leaves over."""
@@ -67,7 +74,7 @@ class Beside:
             colour = affine_between(base, truth)
             slopes = np.stack([self._flat(photos, row + s) - self._flat(photos, row - s) for s in np.diag(STEPS)], -1)
             slopes = slopes.reshape(-1, 6) / (2.0 * STEPS)
-            off = (truth - exposed(base, colour)).ravel()
+            off = (truth - apply_exposure(base, colour)).ravel()
             calm = np.abs(off) < 0.1  # what moved, or is not there, says nothing of the camera
             row = row + np.linalg.lstsq(slopes[calm], off[calm], rcond=None)[0]
         return row, affine_between(self._flat(photos, row), truth)
@@ -80,7 +87,7 @@ class Beside:
 class Trial:
     """A fit under way, and the photos that it is measured by; poses local."""
 
-    problem: Problem
+    problem: FitProblem
     state: FitState
     left: dict[float, F64]  # poses of image_02 by time
     test: list[Photo]  # image_03 of the frames held out
@@ -90,15 +97,17 @@ class Trial:
     def row(self) -> str:
         """Held-out image_02; image_03 as it comes, with an affine colour, and with a rigid correction as well; by the
         scene as it is now."""
-        asset = kept(finish(self.problem, self.state, self.threads))
+        asset = kept(finish_scene(self.problem, self.state, self.threads))
         beside = Beside(asset, self.problem, self.state, self.left, self.threads)
         photos = [shot.photo for shot in self.problem.held_out]
-        own = [drawn(asset, self.problem, p, pose_of(self.problem, self.state, p), self.threads) for p in photos]
+        own = [
+            draw_photo(asset, self.problem, p, refined_pose(self.problem, self.state, p), self.threads) for p in photos
+        ]
         raw = [beside.picture(p, np.zeros(6)) for p in self.test]
         _, plain = beside.fitted(self.chosen, rigid=False)
         rigid, colour = beside.fitted(self.chosen, rigid=True)
-        affine = [exposed(p, plain) for p in raw]
-        turned = [exposed(beside.picture(p, rigid), colour) for p in self.test]
+        affine = [apply_exposure(p, plain) for p in raw]
+        turned = [apply_exposure(beside.picture(p, rigid), colour) for p in self.test]
         print("    extrinsic [cm]", np.round(100 * rigid[:3], 2), "[deg]", np.round(np.degrees(rigid[3:]), 3))
         columns = " | ".join(scores(pictures, self.test) for pictures in (raw, affine, turned))
         return f"{scores(own, photos)} | {columns}"
@@ -114,7 +123,7 @@ def scores(pictures: list[F32], photos: list[Photo]) -> str:
 
 def local(photos: list[Photo], origin: F64) -> list[Photo]:
     """With poses minus `origin` (3,)."""
-    return [replace(p, world_from_camera=shifted(p.world_from_camera, -origin)) for p in photos]
+    return [replace(p, world_from_camera=shift_pose(p.world_from_camera, -origin)) for p in photos]
 
 
 def main() -> None:
@@ -126,7 +135,7 @@ def main() -> None:
     kinds = {field.name: type(getattr(FitSettings(), field.name)) for field in fields(FitSettings)}
     out.mkdir(parents=True, exist_ok=True)
 
-    backend = OnTorch(by_kernels, "cpu") if by == "tensors" else backend_of(Backend(by), threads)
+    backend = TorchBackend(by_kernels, "cpu") if by == "tensors" else fit_backend(Backend(by), threads)
 
     drive = steadied(read_drive(root))
     span = int(options.pop("first", "0")), int(options.pop("last", len(drive.times_s) - 1)) + 1
@@ -134,7 +143,7 @@ def main() -> None:
     frames = [f for f in range(*span) if not (validate and f % 8 == 4)]
     held_out = [i for i, f in enumerate(frames) if f % 8 == (0 if validate else 4)]
     photos, started = drive.photos("image_02", frames), time.perf_counter()
-    problem, state = prepare(photos, drive.fused(), None, settings, held_out, threads)
+    problem, state = prepare_fit(photos, drive.fused(), None, settings, held_out, threads)
     left, right = (local(p, problem.origin) for p in (photos, drive.photos("image_03", frames)))
     trained = [p for i, p in enumerate(right) if i not in held_out]
     chosen = [trained[i] for i in np.linspace(0, len(trained) - 1, FITTED_FRAMES).astype(int)]
@@ -147,22 +156,24 @@ def main() -> None:
     told: list[float] = []
     for until in [at for at in SHOWN_AT if at < settings.iterations] + [settings.iterations]:
         started = time.perf_counter()
-        advance(problem, state, settings, until, lambda at, loss, score: told.append(score), threads, backend=backend)
+        run_iterations(
+            problem, state, settings, until, lambda at, loss, score: told.append(score), threads, backend=backend
+        )
         seconds += time.perf_counter() - started
         np.savez(out / "state.npz", **state.arrays())
         mean = np.mean(told[-5:]) if told else np.nan  # of the last 500 iterations
         print(f"| {until} | {seconds:.0f} | {len(state)} | {mean:.2f} | {trial.row()} |", flush=True)
 
-    asset = write_scene(out / "kitti.safetensors", finish(problem, state, threads))
+    asset = write_scene(out / "kitti.safetensors", finish_scene(problem, state, threads))
     looks = []
     for photo in (shot.photo for shot in problem.held_out):
-        pose = pose_of(problem, state, photo)
-        eye = Pinhole(photo.intrinsics, shifted(pose, problem.origin), *photo.rgb.shape[1::-1])
+        pose = refined_pose(problem, state, photo)
+        eye = Pinhole(photo.intrinsics, shift_pose(pose, problem.origin), *photo.rgb.shape[1::-1])
         looks.append(Look(photo.camera, photo.time_s, eye, photo.rgb))
     print(storage_table(asset, looks, threads))
     for frame in [f for f in SHOWN if f in frames]:
         photo = left[frames.index(frame)]
-        pose = pose_of(problem, state, photo)
+        pose = refined_pose(problem, state, photo)
         height, width = photo.rgb.shape[:2]
         strip = []
         for shift in SHIFTS_M:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from factory.stages.scene_file import read_scene
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gradient import backward
-from tasks.render.splatting.raster import forward, splat
+from tasks.render.splatting.raster import forward, project_and_sort
 from tasks.world.clip import Pinhole
 from tests.bench.timing import cpu_milliseconds, milliseconds
 
@@ -57,7 +57,7 @@ def street_view(scene: Path) -> tuple[Gaussians, NDArray[np.float64]]:
         c, s = np.cos(yaw), np.sin(yaw)
         camera[:3, :3] = np.array([[s, 0.0, c], [-c, 0.0, s], [0.0, -1.0, 0.0]])  # right, down, ahead
         camera[:3, 3] = (*middle, ground + EYE_M)
-        seen = len(splat(street, INTRINSICS, camera, WIDTH, HEIGHT).index)
+        seen = len(project_and_sort(street, INTRINSICS, camera, WIDTH, HEIGHT).index)
         if seen > most:
             best, most = camera, seen
     return street, best

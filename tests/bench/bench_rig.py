@@ -16,15 +16,15 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.stages.assets import lines_of
+from factory.stages.assets import rig_report_lines
 from factory.stages.sensors import load_photos, opened_photos
-from tasks.render.fit.corrections import exposed
+from tasks.render.fit.corrections import apply_exposure
 from tasks.render.fit.losses import ssim
-from tasks.render.fit.reconstruct import advance, classes_of, drawn, finish, pose_of
-from tasks.render.fit.start import Problem, Shot, prepare
-from tasks.render.rig.correct import Correction, corners_of, corrected, ground_below
+from tasks.render.fit.reconstruct import draw_photo, finish_scene, pixel_classes, refined_pose, run_iterations
+from tasks.render.fit.start import FitPhoto, FitProblem, prepare_fit
+from tasks.render.rig.correct import RigCorrection, correct_rig, detect_corners, estimate_ground_height
 from tasks.render.scene.asset import psnr
-from tasks.render.scene.features import Known, driven_road
+from tasks.render.scene.features import KnownPoints, driven_road
 from tasks.render.settings import FitSettings
 from tasks.world.arrays import Array
 from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Camera, SensorFile
@@ -86,21 +86,21 @@ def movers(files: list[SensorFile], instants: list[int], ground_m: float) -> Age
     return AgentTracks(tuple(MOVERS), kinds, boxes, np.zeros((n_steps, n, 2)), valid, centre_z, heights)
 
 
-def correct(cameras: list[Camera], files: list[SensorFile]) -> Correction:
+def correct(cameras: list[Camera], files: list[SensorFile]) -> RigCorrection:
     """As a run does it, and what it says of each camera."""
     opened = {}
     for row, image in opened_photos(files, cameras):
-        opened[row] = corners_of(image)
-    found = corrected(cameras, files, [opened[row] for row in range(len(files))])
+        opened[row] = detect_corners(image)
+    found = correct_rig(cameras, files, [opened[row] for row in range(len(files))])
     assert found is not None, "too few corners were matched"
-    print("\n".join(lines_of(found)), f"{len(found.points)} points", sep="\n", flush=True)
+    print("\n".join(rig_report_lines(found)), f"{len(found.points)} points", sep="\n", flush=True)
     return found
 
 
-def _counted(problem: Problem, shot: Shot) -> Array:
+def _counted(problem: FitProblem, shot: FitPhoto) -> Array:
     """Pixels (H, W) of a photo that show no vehicle which drives by."""
     boxes, valid = problem.tracks.at(shot.photo.time_s)
-    return ~classes_of(shot.photo, boxes[valid], None)["vehicles"] & (shot.compared.target.weight > 0.0)
+    return ~pixel_classes(shot.photo, boxes[valid], None)["vehicles"] & (shot.compared.target.weight > 0.0)
 
 
 def main() -> None:
@@ -113,10 +113,10 @@ def main() -> None:
     settings = replace(SETTINGS, **{k: kinds[k](float(v)) for k, v in options.items()})
 
     cameras, files, instants = read_block(root, HELD_OUT if validate else ())
-    known, started = Known(), time.process_time()
+    known, started = KnownPoints(), time.process_time()
     if adjust:
         found = correct(cameras, files)
-        cameras, files, known = list(found.cameras), list(found.files), Known(corners=found.points)
+        cameras, files, known = list(found.cameras), list(found.files), KnownPoints(corners=found.points)
     if ground:
         poses = np.stack([file.world_from_ego for file in files])
         known = replace(known, road=driven_road(poses, float(ground)))
@@ -124,7 +124,7 @@ def main() -> None:
     height = float(ground) if ground else None
     if adjust and not ground:
         poses = np.stack([file.world_from_ego for file in files])
-        height = ground_below(photos, poses)
+        height = estimate_ground_height(photos, poses)
         print(f"the road lies {height} m above the ego's origin")
         known = replace(known, road=None if height is None else driven_road(poses, height))
     print(f"{time.process_time() - started:.0f} CPU s for the rig", flush=True)
@@ -132,21 +132,21 @@ def main() -> None:
     out = VALIDATED if validate else HELD_OUT
     held_out = [i for i, instant in enumerate(instants) if instant in out]
     agents = movers(files, instants, height) if masked and height is not None else None
-    problem, state = prepare(photos, [], agents, settings, held_out, threads, known)
+    problem, state = prepare_fit(photos, [], agents, settings, held_out, threads, known)
     print(
         f"{time.process_time() - started:.0f} CPU s to prepare {len(state)} Gaussians, {state.road.sum()} of them road"
     )
     told: list[float] = []
     for until in [at for at in (2000, 4000) if at < settings.iterations] + [settings.iterations]:
         started = time.process_time()
-        advance(problem, state, settings, until, lambda at, loss, score: told.append(score), threads)
-        asset, rows = kept(finish(problem, state, threads)), {}
+        run_iterations(problem, state, settings, until, lambda at, loss, score: told.append(score), threads)
+        asset, rows = kept(finish_scene(problem, state, threads)), {}
         coloured: dict[str, list[float]] = {}
         for shot in problem.held_out:
-            picture = drawn(asset, problem, shot.photo, pose_of(problem, state, shot.photo), threads)
+            picture = draw_photo(asset, problem, shot.photo, refined_pose(problem, state, shot.photo), threads)
             counted, photo = _counted(problem, shot), shot.compared.target.rgb
             score = psnr(picture[counted], photo[counted]), ssim(picture, shot.compared.target)[0]
-            own = exposed(picture, affine_between(picture[counted], photo[counted]))
+            own = apply_exposure(picture, affine_between(picture[counted], photo[counted]))
             coloured.setdefault(shot.photo.camera, []).append(psnr(own[counted], photo[counted]))
             rows.setdefault(shot.photo.camera, []).append(score)
             rows.setdefault(f"at {shot.photo.time_s:g} s", []).append(score)

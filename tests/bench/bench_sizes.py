@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from factory.stages.sensors import encode_jpeg, load_photos
-from tasks.render.fit.reconstruct import advance, finish
-from tasks.render.fit.start import prepare
+from tasks.render.fit.reconstruct import finish_scene, run_iterations
+from tasks.render.fit.start import prepare_fit
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.engine import Vehicles, render
 from tasks.render.settings import FitSettings
@@ -47,13 +47,13 @@ def one(size: str, root: Path, options: dict[str, str]) -> None:
     photos = load_photos(files, cameras, width, height)
     held_out = [row for row, instant in enumerate(instants) if instant in HELD_OUT]
     started = time.process_time()
-    problem, state = prepare(photos, [], None, settings, held_out, threads)
+    problem, state = prepare_fit(photos, [], None, settings, held_out, threads)
     prepared = time.process_time() - started
-    advance(problem, state, settings, n, threads=threads)
+    run_iterations(problem, state, settings, n, threads=threads)
     started = time.process_time()
-    advance(problem, state, settings, 2 * n, threads=threads)
+    run_iterations(problem, state, settings, 2 * n, threads=threads)
     each = (time.process_time() - started) / n
-    asset, photo = finish(replace(problem, held_out=()), state, threads), photos[0]
+    asset, photo = finish_scene(replace(problem, held_out=()), state, threads), photos[0]
     eye = Pinhole(photo.intrinsics, photo.world_from_camera, width, height)
     nobody = Vehicles((), (), problem.tracks.at(0.0)[0])
     render(asset, [eye], nobody, threads=threads)

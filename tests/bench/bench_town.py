@@ -26,8 +26,8 @@ from factory.readers.settings import TownSettings
 from factory.stages.sensors import block_of, load_sensors
 from factory.views.scene_files import camera_rows
 from tasks.render.fit.reconstruct import LEAST_PIXELS as LEAST_OF_CLASS
-from tasks.render.fit.reconstruct import advance, finish
-from tasks.render.fit.start import prepare
+from tasks.render.fit.reconstruct import finish_scene, run_iterations
+from tasks.render.fit.start import prepare_fit
 from tasks.render.scene.build import held_out_rows
 from tasks.render.scene.engine import vehicles_at
 from tasks.render.scene.sensed import Photo
@@ -131,7 +131,7 @@ def main() -> None:
     block = block_of(clip)
     data = load_sensors(block, clip.cameras, width, height)
     began, cpu = time.perf_counter(), time.process_time()
-    problem, state = prepare(data.photos, data.sweeps, block.agents, settings, threads=threads)
+    problem, state = prepare_fit(data.photos, data.sweeps, block.agents, settings, threads=threads)
     prepared = time.perf_counter()
     print(f"{len(data.photos)} photos, {len(data.sweeps)} sweeps, prepared {prepared - began:.0f} s", flush=True)
 
@@ -140,8 +140,8 @@ def main() -> None:
             seconds = time.perf_counter() - prepared
             print(f"{iteration}: loss {loss:.4f}, training photos {score:.2f} dB, {seconds:.0f} s", flush=True)
 
-    advance(problem, state, settings, settings.iterations, told, threads)
-    asset = finish(problem, state, threads)
+    run_iterations(problem, state, settings, settings.iterations, told, threads)
+    asset = finish_scene(problem, state, threads)
     seconds, cpu_s = time.perf_counter() - began, time.process_time() - cpu
 
     photos = [data.photos[i] for i in sorted(held_out_rows(data.photos, settings.hold_out_every))]

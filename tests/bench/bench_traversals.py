@@ -20,10 +20,10 @@ from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.town.draw import Theatre
 from factory.datasets.town.town import log_name, plan_log, write_log
 from factory.readers.settings import TownSettings
-from factory.stages.assets import own_part
+from factory.stages.assets import without_other_logs
 from factory.stages.sensors import block_cameras, block_of, load_sensors
-from tasks.render.fit.reconstruct import advance, finish
-from tasks.render.fit.start import prepare
+from tasks.render.fit.reconstruct import finish_scene, run_iterations
+from tasks.render.fit.start import prepare_fit
 from tasks.render.scene.build import held_out_rows
 from tasks.render.scene.sensed import Photo
 from tasks.render.settings import FitSettings
@@ -73,9 +73,9 @@ def main() -> None:
         block, began = block_of(clip), time.process_time()
         data = load_sensors(block, block_cameras(block, clip.cameras), width, height)
         held_out = held_out_rows(data.photos, settings.hold_out_every)
-        problem, state = prepare(data.photos, data.sweeps, block.agents, settings, held_out, threads)
-        advance(problem, state, settings, settings.iterations, threads=threads)
-        asset = kept(own_part(finish(problem, state, threads)))
+        problem, state = prepare_fit(data.photos, data.sweeps, block.agents, settings, held_out, threads)
+        run_iterations(problem, state, settings, settings.iterations, threads=threads)
+        asset = kept(without_other_logs(finish_scene(problem, state, threads)))
         took = time.process_time() - began
         photos = [data.photos[i] for i in sorted(held_out)]
         ahead = {photo.time_s: photo for photo in photos if photo.camera == CENTRE}

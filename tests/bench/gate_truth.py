@@ -18,18 +18,18 @@ from factory.graph.steps import PreparedClip
 from factory.pipeline import FactoryWork, perturbed_clip_of
 from factory.stages.imaging import GATE_STRIDE
 from tasks.render.gate import (
-    Album,
     GateSettings,
-    composed,
-    expected,
-    eye_in_box,
-    fault_of,
-    inside_mean,
+    VehiclePhotos,
+    box_outline,
+    compose_near,
+    expected_likeness,
     large_vehicles,
-    measures,
-    outline_of,
-    seen_beside,
-    similarity,
+    likeness_to_nearest_photo,
+    masked_mean,
+    measure_views,
+    picture_fault,
+    ssim_map,
+    to_box_frame,
 )
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Vehicles, render, vehicles_at
@@ -69,12 +69,12 @@ class Shown:
     def label(self, share: float) -> tuple[float, float]:
         """Likeness to the truth of the vehicle that is least like it, of those whose outline covers a share of the
         picture, hidden or not; and that vehicle's share. (1, 0) where there is none."""
-        similar = similarity(self.picture, self.truth)
+        similar = ssim_map(self.picture, self.truth)
         worst = (NOTHING_LARGE, 0.0)
         for kind, box in zip(self.there.kinds, self.there.boxes, strict=True):
-            outline = outline_of(box, self.eye) if kind == AgentKind.VEHICLE else np.zeros(1, bool)
+            outline = box_outline(box, self.eye) if kind == AgentKind.VEHICLE else np.zeros(1, bool)
             if outline.mean() >= share:
-                worst = min(worst, (inside_mean(similar, outline), float(outline.mean())))
+                worst = min(worst, (masked_mean(similar, outline), float(outline.mean())))
         return worst
 
 
@@ -125,20 +125,20 @@ class Painted:
 
 
 def verdicts(
-    shown: Shown, drive: Simulated, asset: RenderAsset, album: Album, settings: GateSettings
+    shown: Shown, drive: Simulated, asset: RenderAsset, album: VehiclePhotos, settings: GateSettings
 ) -> tuple[str, float, float]:
     """What the gate says of a picture: the fault without regard to photos, "" for none; the likeness expected of the
     large vehicle that is to be least like its photos; and that of the one that beside a photo is least like it."""
     pose = shown.world_from_ego
     there = vehicles_at(drive.agents, shown.step * STEP_S, pose[:2, 3], settings.reach_m)
-    scene = composed(asset, there, pose[:3, 3], settings.reach_m)
+    scene = compose_near(asset, there, pose[:3, 3], settings.reach_m)
     views = render(scene, [shown.eye], affines=[asset.affine_of(shown.camera, shown.step * STEP_S)])
-    fault = fault_of(measures(scene, [shown.eye], views, pose)[0], settings)
+    fault = picture_fault(measure_views(scene, [shown.eye], views, pose)[0], settings)
     least, beside = NOTHING_LARGE, NOTHING_LARGE
     for j, _ in large_vehicles(there, shown.eye, views[0], settings.vehicle_share):
         track_id, box = there.track_ids[j], there.boxes[j]
-        least = min(least, expected(album, track_id, eye_in_box(shown.eye.world_from_camera[:3, 3], box)))
-        beside = min(beside, seen_beside(album, there, j, shown.eye, views[0]))
+        least = min(least, expected_likeness(album, track_id, to_box_frame(shown.eye.world_from_camera[:3, 3], box)))
+        beside = min(beside, likeness_to_nearest_photo(album, there, j, shown.eye, views[0]))
     return "" if fault is None else fault[0], least, beside
 
 

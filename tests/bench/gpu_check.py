@@ -22,13 +22,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tasks.render.fit.backend import FitBackend, OnCpu
+from tasks.render.fit.backend import CpuBackend, FitBackend
 from tasks.render.fit.corrections import EXPOSURE_SIZE, POSE_SIZE
 from tasks.render.fit.losses import target_of
-from tasks.render.fit.on_torch import OnTorch, photo_loss
-from tasks.render.fit.reconstruct import advance, finish
-from tasks.render.fit.start import PhotoTarget, Problem, Shot
-from tasks.render.fit.state import BACKGROUND, FitState, Learned, logits_of
+from tasks.render.fit.on_torch import TorchBackend, photo_loss
+from tasks.render.fit.reconstruct import finish_scene, run_iterations
+from tasks.render.fit.start import FitPhoto, FitProblem, PhotoTarget
+from tasks.render.fit.state import BACKGROUND, AdamArray, FitState, logits_of
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.movers import SHIFT_SIZE
 from tasks.render.scene.sensed import Photo, Tracks
@@ -148,7 +148,7 @@ def parity(place: Place) -> bool:
     return well
 
 
-def problem_of(n: int, width: int, height: int, threads: int) -> tuple[Problem, FitState]:
+def problem_of(n: int, width: int, height: int, threads: int) -> tuple[FitProblem, FitState]:
     """Photos of a seeded cloud of n Gaussians from a short drive, and a start that has been shaken; no road, nobody."""
     truth, rng = cloud(n), np.random.default_rng(1)
     k = np.array([[0.6 * width, 0.0, width / 2], [0.0, 0.6 * width, height / 2], [0.0, 0.0, 1.0]])
@@ -159,10 +159,10 @@ def problem_of(n: int, width: int, height: int, threads: int) -> tuple[Problem, 
         picture = forward(truth, k, pose, width, height, np.full(3, SKY, np.float32), threads).view.rgb
         rgb = np.rint(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
         photo = Photo("front", 0.1 * i, rgb, k, pose)
-        shots.append(Shot(photo, None, PhotoTarget(target_of(rgb), np.zeros((height, width), bool))))
+        shots.append(FitPhoto(photo, None, PhotoTarget(target_of(rgb), np.zeros((height, width), bool))))
     held_out = tuple(shots[i] for i in HELD_OUT)
     train = tuple(shot for i, shot in enumerate(shots) if i not in HELD_OUT)
-    return Problem(np.zeros(3), train, held_out, Tracks(None, np.zeros(3)), None), shaken(truth, len(train))
+    return FitProblem(np.zeros(3), train, held_out, Tracks(None, np.zeros(3)), None), shaken(truth, len(train))
 
 
 def shaken(truth: Gaussians, n_photos: int) -> FitState:
@@ -182,35 +182,35 @@ def shaken(truth: Gaussians, n_photos: int) -> FitState:
     }
     nothing, far = np.zeros(n, np.float32), np.full(n, np.inf, np.float32)
     owner = np.full(n, BACKGROUND, np.int32)
-    arrays = {name: Learned.of(values) for name, values in learned.items()}
+    arrays = {name: AdamArray.unstepped(values) for name, values in learned.items()}
     return FitState(0, arrays, owner, np.zeros(n, bool), far, nothing)
 
 
-def fits(place: Place, problem: Problem, start: FitState, settings: FitSettings, threads: int) -> bool:
+def fits(place: Place, problem: FitProblem, start: FitState, settings: FitSettings, threads: int) -> bool:
     """The same fit on the CPU and there; whether both come out alike."""
     print(f"\nThe same {settings.iterations} iterations, density control every {settings.refine_every} included:\n")
     print("| fit by | iterations/s | held out [dB] | Gaussians | device memory [MB] |\n|---|---|---|---|---|")
     scores = []
     backends: tuple[tuple[str, FitBackend], ...] = (
-        (f"CPU, {threads} threads", OnCpu(threads)),
-        (place.name, OnTorch(place.draw, place.device)),
+        (f"CPU, {threads} threads", CpuBackend(threads)),
+        (place.name, TorchBackend(place.draw, place.device)),
     )
     for name, backend in backends:
         state = FitState.from_arrays(start.arrays())
-        advance(problem, state, settings, BEFORE_TIMED, backend=backend)
+        run_iterations(problem, state, settings, BEFORE_TIMED, backend=backend)
         place.peak_mb()
         began = time.perf_counter()
-        advance(problem, state, settings, settings.iterations, backend=backend)
+        run_iterations(problem, state, settings, settings.iterations, backend=backend)
         place.done()
         per_s = (settings.iterations - BEFORE_TIMED) / (time.perf_counter() - began)
-        scores.append(finish(problem, state, threads).psnr_db)
+        scores.append(finish_scene(problem, state, threads).psnr_db)
         print(f"| {name} | {per_s:.1f} | {scores[-1]:.2f} | {len(state):,} | {place.peak_mb()} |", flush=True)
     per_s = plain(place, problem, start, settings)
     print(f"| plain gsplat: {LESS} | {per_s:.1f} | | {len(start):,} | {place.peak_mb()} |", flush=True)
     return abs(scores[0] - scores[1]) <= APART_DB
 
 
-def plain(place: Place, problem: Problem, start: FitState, settings: FitSettings) -> float:
+def plain(place: Place, problem: FitProblem, start: FitState, settings: FitSettings) -> float:
     """Iterations per second of the shortest loop that fits the same photos by the same loss."""
     names = ("means", "quats", "log_scales", "logits", "colours")
     leaves = [torch.tensor(start.learned[name].values, device=place.device, requires_grad=True) for name in names]

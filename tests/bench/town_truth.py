@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.render.fit.losses import ssim, target_of
-from tasks.render.fit.reconstruct import classes_of
+from tasks.render.fit.reconstruct import pixel_classes
 from tasks.render.fit.state import Road
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import Vehicles, render, vehicles_at
 from tasks.render.scene.movers import behind_boxes
-from tasks.render.scene.sensed import Photo, shifted
+from tasks.render.scene.sensed import Photo, shift_pose
 from tasks.render.scene.sky import directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.world.arrays import F32, Array
@@ -103,10 +103,10 @@ class Truth:
         return out
 
     def _classes(self, photo: Photo, there: Vehicles) -> Mapping[str, NDArray[np.bool_]]:
-        local = replace(photo, world_from_camera=shifted(photo.world_from_camera, -self.asset.origin))
+        local = replace(photo, world_from_camera=shift_pose(photo.world_from_camera, -self.asset.origin))
         rows = [kind == AgentKind.VEHICLE for kind in there.kinds]
         boxes = there.boxes[np.array(rows, bool)] - np.concatenate([self.asset.origin, np.zeros(4)])
-        return classes_of(local, boxes, self.road)
+        return pixel_classes(local, boxes, self.road)
 
     def compared_moved(self, photos: Sequence[Photo]) -> list[Compared]:
         """The same with moved vehicles, inside the boxes of those near; views that show little of them are left out."""

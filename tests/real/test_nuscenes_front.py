@@ -15,13 +15,13 @@ from factory.exits import COMPLETE
 from factory.graph.execute import Execution, execute
 from factory.readers.pictures import file_and_frame
 from factory.setup.settings import assemble
-from factory.stages.assets import Sensing, sensing
-from factory.stages.imaging import PHOTO_SLACK_S, photo_at
+from factory.stages.assets import Sensing, block_sensing
+from factory.stages.imaging import PHOTO_SLACK_S, nearest_photo
 from factory.stages.sensors import block_of, load_photos
 from factory.store.reader import SampleTable, image_of
 from factory.store.samples import Store
 from tasks.render.scene.asset import psnr
-from tasks.render.scene.features import triangulated
+from tasks.render.scene.features import triangulate_matches
 from tasks.render.scene.sensed import Tracks
 from tasks.render.settings import STEPS_OF, Frames, RenderSettings
 from tasks.world.clip import NOW, STEP_S, Clip
@@ -45,11 +45,11 @@ def clips(folder: Path) -> list[Clip]:
 
 def test_every_clip_has_a_photo_of_every_instant_and_all_forty_make_its_block(clips: list[Clip]) -> None:
     for clip in clips:
-        assert sensing(clip, RenderSettings()) is Sensing.PHOTOS_ONLY
+        assert block_sensing(clip, RenderSettings()) is Sensing.PHOTOS_ONLY
         assert [file_and_frame(image.uri)[1] for image in block_of(clip).images] == list(range(40))
         for offset in STEPS_OF[Frames.ALL]:
             time_s = (NOW + offset) * STEP_S
-            assert abs(photo_at(clip, "CAM_FRONT", time_s).time_s - time_s) < PHOTO_SLACK_S
+            assert abs(nearest_photo(clip, "CAM_FRONT", time_s).time_s - time_s) < PHOTO_SLACK_S
 
 
 @pytest.mark.slow
@@ -59,7 +59,7 @@ def test_frames_of_the_video_belong_to_the_poses_of_the_sidecar(clips: list[Clip
     photos = load_photos(block.images[:10], clips[0].cameras, 400, 225)
     back = [replace(one, world_from_camera=other.world_from_camera) for one, other in zip(photos, photos[::-1])]
     tracks = Tracks(block.agents, np.zeros(3))
-    right, wrong = (len(triangulated(some, tracks)) for some in (photos, back))
+    right, wrong = (len(triangulate_matches(some, tracks)) for some in (photos, back))
     assert right > 200 and right > 4 * wrong, (right, wrong)
 
 
@@ -84,7 +84,7 @@ def test_a_run_ends_with_photos_and_with_colour_pictures_where_nobody_drove(fold
     assert "photos_only" in simulated["tags"] and simulated["psnr"] > 19.0  # 20.4
     assert simulated["licence"] == "CC BY-NC-SA 4.0 (nuScenes via ScenarioNet)"
     clip = run.reader.read(run.index.refs[0])
-    (photo,) = load_photos([photo_at(clip, "CAM_FRONT", NOW * STEP_S)], clip.cameras, *SIZE)
+    (photo,) = load_photos([nearest_photo(clip, "CAM_FRONT", NOW * STEP_S)], clip.cameras, *SIZE)
     assert psnr(image_of(human, "CAM_FRONT", human["images"][3]["time_s"]) / 255.0, photo.rgb / 255.0) > 30.0
     picture = image_of(simulated, "CAM_FRONT", 0.0).astype(float)
     assert (picture.max(axis=-1) - picture.min(axis=-1)).mean() > 5.0  # bricks and leaves, not lidar's grey

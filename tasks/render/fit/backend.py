@@ -12,14 +12,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from tasks.kernels.compiled import kernel
-from tasks.render.fit.corrections import corrected, exposed, exposed_gradient
+from tasks.render.fit.corrections import apply_exposure, apply_exposure_gradient, corrected_pose
 from tasks.render.fit.losses import opaque_loss, photo_loss
-from tasks.render.fit.start import Problem
+from tasks.render.fit.start import FitProblem
 from tasks.render.fit.state import FitState, Road
 from tasks.render.scene.asset import psnr
-from tasks.render.scene.movers import SHIFT_SIZE, at_knots, shifted_boxes, world_from_boxes
+from tasks.render.scene.movers import SHIFT_SIZE, interpolate_knots, shift_boxes, world_from_boxes
 from tasks.render.scene.sensed import Photo
-from tasks.render.scene.sky import COLUMNS, ROWS, SkyCells, backdrop, sky_cells
+from tasks.render.scene.sky import COLUMNS, ROWS, SkyCells, look_up_sky, sky_cells
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.render.splatting.gradient import Gradients, backward, unmoved
@@ -45,8 +45,8 @@ class Derivatives:
     boxes: F32  # (B, SHIFT_SIZE) by what their boxes are off by at its time
 
 
-class Stepped(Protocol):
-    """As `Learned`: an array that steps against a gradient."""
+class LearnedArray(Protocol):
+    """As `AdamArray`: an array that steps against a gradient."""
 
     @property
     def values(self) -> Any: ...
@@ -54,15 +54,15 @@ class Stepped(Protocol):
     def step(self, rows: Any, gradient: Any, rate: float, scale: Any = None) -> None: ...
 
 
-class Held(Protocol):
+class LearnedState(Protocol):
     """As `FitState`: all that is learned, wherever it lies; exposure, poses and boxes lie on the CPU."""
 
     iteration: int
 
     @property
-    def learned(self) -> Mapping[str, Stepped]: ...
+    def learned(self) -> Mapping[str, LearnedArray]: ...
 
-    def seen(self, rows: Any, depths: Any, screen: Any) -> Any: ...
+    def record_view(self, rows: Any, depths: Any, screen: Any) -> Any: ...
 
     def lay_flat(self, rows: Any, road: Road) -> None: ...
 
@@ -72,13 +72,13 @@ class Held(Protocol):
 class FitBackend(Protocol):
     """Draws and differentiates."""
 
-    def take(self, state: FitState) -> Any:
-        """The state as a `Held`, where this backend works."""
+    def load(self, state: FitState) -> Any:
+        """The state as a `LearnedState`, where this backend works."""
 
-    def give_back(self, held: Any, state: FitState) -> None:
+    def store(self, held: Any, state: FitState) -> None:
         """What became of a taken state, into `state`."""
 
-    def derivatives(self, problem: Problem, held: Any, row: int, settings: FitSettings) -> Derivatives:
+    def derivatives(self, problem: FitProblem, held: Any, row: int, settings: FitSettings) -> Derivatives:
         """Of the photo `row` of those trained on, as `held` is now."""
 
 
@@ -98,14 +98,14 @@ class OwnedGaussians:
     shift: F32 | None = None  # (SHIFT_SIZE,) by which its box is off then
 
 
-def parts_of(problem: Problem, owner: ShortInts, off: F32, photo: Photo) -> list[OwnedGaussians]:
+def visible_parts(problem: FitProblem, owner: ShortInts, off: F32, photo: Photo) -> list[OwnedGaussians]:
     """The parts of the scene that a photo (pose local) may show, the background first; `owner` (N,) and `off`, what
     boxes are off by, (tracks * knots, SHIFT_SIZE), as of the state."""
     n = int(np.searchsorted(owner, 0))
     parts = [OwnedGaussians(0, np.arange(n), None)]
     boxes, valid = problem.tracks.at(photo.taken_s)
-    shifts = at_knots(off.reshape(len(boxes), problem.tracks.n_knots, SHIFT_SIZE), photo.taken_s)
-    boxes = shifted_boxes(boxes, shifts)
+    shifts = interpolate_knots(off.reshape(len(boxes), problem.tracks.n_knots, SHIFT_SIZE), photo.taken_s)
+    boxes = shift_boxes(boxes, shifts)
     frames = world_from_boxes(boxes)
     for j in np.flatnonzero(valid & _in_view(boxes, photo)):
         first, last = np.searchsorted(owner, [j, j + 1])
@@ -115,7 +115,7 @@ def parts_of(problem: Problem, owner: ShortInts, off: F32, photo: Photo) -> list
     return parts
 
 
-def by_box(part: OwnedGaussians, means: Any, quats: Any, d_means: Any, d_quats: Any) -> tuple[Any, Any]:
+def box_gradient(part: OwnedGaussians, means: Any, quats: Any, d_means: Any, d_quats: Any) -> tuple[Any, Any]:
     """Derivatives by what a part's box is off by: (3,) by the shift, and by the turn.
 
     Of those of the part's Gaussians that are in view: `means` (M, 3) and `quats` (M, 4) in their owner's frame, and the
@@ -184,49 +184,51 @@ _PER_GAUSSIAN = ("index", "means", "quats", "log_scales", "logits", "colours", "
 
 
 @dataclass(frozen=True)
-class OnCpu:
+class CpuBackend:
     """The state is worked on where it is."""
 
     threads: int = 1
 
-    def take(self, state: FitState) -> FitState:
+    def load(self, state: FitState) -> FitState:
         """The state itself."""
         return state
 
-    def give_back(self, held: FitState, state: FitState) -> None:
+    def store(self, held: FitState, state: FitState) -> None:
         """It was never away."""
 
-    def derivatives(self, problem: Problem, held: FitState, row: int, settings: FitSettings) -> Derivatives:
+    def derivatives(self, problem: FitProblem, held: FitState, row: int, settings: FitSettings) -> Derivatives:
         """As `FitBackend` has it."""
         shot, state = problem.train[row], held
         compared = shot.compared
-        camera = corrected(shot.photo.world_from_camera, state.learned["poses"].values[row])
-        scene, parts = compose(problem, state, state.learned["boxes"].values, shot.photo)
-        seen, sky = forward_pass(state, scene, shot.photo, camera, self.threads)
+        camera = corrected_pose(shot.photo.world_from_camera, state.learned["poses"].values[row])
+        scene, parts = compose_scene(problem, state, state.learned["boxes"].values, shot.photo)
+        seen, sky = draw_with_sky(state, scene, shot.photo, camera, self.threads)
         colours = state.learned["exposure"].values[row]
-        picture = exposed(seen.view.rgb, colours)
+        picture = apply_exposure(seen.view.rgb, colours)
         loss, d_picture = photo_loss(picture, compared.target, settings.ssim_weight)
-        d_rgb, d_colours = exposed_gradient(seen.view.rgb, colours, d_picture)
+        d_rgb, d_colours = apply_exposure_gradient(seen.view.rgb, colours, d_picture)
         d_alpha = None
         if settings.opaque_weight > 0.0:
             through, d_alpha = opaque_loss(seen.view.alpha, compared.ground, settings.opaque_weight)
             loss += through
         back = backward(seen, scene, d_rgb, d_alpha=d_alpha, threads=self.threads)
         cells, d_cells = backdrop_gradient(d_rgb, seen.view.alpha, sky)
-        rows, mine = _of_owners(back, parts)
-        tracks, boxes = _of_boxes(state, parts, rows, mine)
+        rows, mine = _gradients_by_owner(back, parts)
+        tracks, boxes = _box_gradients(state, parts, rows, mine)
         score = psnr(np.clip(picture, 0.0, 1.0), compared.target.rgb)
         depths = seen.splats.projected[:, DEPTH]
         return Derivatives(loss, score, d_colours, back.camera, cells, d_cells, rows, mine, depths, tracks, boxes)
 
 
-def compose(problem: Problem, state: FitState, off: F32, photo: Photo) -> tuple[Gaussians, list[OwnedGaussians]]:
+def compose_scene(
+    problem: FitProblem, state: FitState, off: F32, photo: Photo
+) -> tuple[Gaussians, list[OwnedGaussians]]:
     """All Gaussians that a photo (pose local) may show, in the scene, and whose they are; the background's first.
 
     `off` (tracks * knots, SHIFT_SIZE): what boxes are off by.
     """
     every = state.gaussians()
-    parts = parts_of(problem, state.owner, off, photo)
+    parts = visible_parts(problem, state.owner, off, photo)
     scenes = []
     for part in parts:
         mine = every.take(slice(part.rows[0], part.rows[-1] + 1) if len(part.rows) else slice(0))
@@ -234,17 +236,17 @@ def compose(problem: Problem, state: FitState, off: F32, photo: Photo) -> tuple[
     return (scenes[0] if len(scenes) == 1 else concatenate(scenes)), parts
 
 
-def forward_pass(
+def draw_with_sky(
     state: FitState, scene: Gaussians, photo: Photo, camera: Array, threads: int
 ) -> tuple[ForwardPass, SkyCells]:
     """The photo's picture from `camera` (4, 4), and where its sky comes from."""
     height, width = photo.rgb.shape[:2]
     sky = sky_cells(photo.intrinsics, camera, width, height, threads)
-    behind = backdrop(state.learned["sky"].values, sky, threads)
+    behind = look_up_sky(state.learned["sky"].values, sky, threads)
     return forward(scene, photo.intrinsics, camera, width, height, behind, threads), sky
 
 
-def _of_owners(back: Gradients, parts: Sequence[OwnedGaussians]) -> tuple[Ints, Gradients]:
+def _gradients_by_owner(back: Gradients, parts: Sequence[OwnedGaussians]) -> tuple[Ints, Gradients]:
     """The gradients in the frames that the Gaussians are learned in, and their rows in the state."""
     rows, pieces = [], []
     for part in parts:
@@ -256,14 +258,14 @@ def _of_owners(back: Gradients, parts: Sequence[OwnedGaussians]) -> tuple[Ints, 
     return np.concatenate(rows), Gradients(**together, camera=back.camera)
 
 
-def _of_boxes(state: FitState, parts: Sequence[OwnedGaussians], rows: Ints, mine: Gradients) -> tuple[Ints, F32]:
+def _box_gradients(state: FitState, parts: Sequence[OwnedGaussians], rows: Ints, mine: Gradients) -> tuple[Ints, F32]:
     """Tracks (B,), and derivatives (B, SHIFT_SIZE) by what their boxes are off by; `rows` and `mine` of all parts."""
     tracks, found = [], []
     means, quats = (state.learned[name].values for name in ("means", "quats"))
     for part in parts:
         if part.track is not None:
             span = slice(*np.searchsorted(rows, [part.rows[0], part.rows[-1] + 1]))
-            shift, turn = by_box(
+            shift, turn = box_gradient(
                 part,
                 *(array.astype(np.float64) for array in (means[rows[span]], quats[rows[span]])),
                 *(array.astype(np.float64) for array in (mine.means[span], mine.quats[span])),

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from tasks.render.scene.depth import Seen
+from tasks.render.scene.depth import PhotoDepth
 from tasks.render.scene.sensed import Photo
 from tasks.world.arrays import F32, Array, Bools, Bytes, FloatArray
 
@@ -35,19 +35,19 @@ FLOOR, PULL = 1e-4, 0.2  # added to variances in [0, 1]^2: FLOOR always, PULL / 
 
 
 @dataclass(frozen=True)
-class Shared:
+class SharedColours:
     """What C cameras show of points that another camera sees as well: moments of colours in [0, 1], by pair."""
 
     count: Array  # (C, C) points that cameras c and d both see; nothing on the diagonal
     first: Array  # (C, C, 3) sums of the colours that c shows of them
     second: Array  # (C, C, 3, 3) sums of their products
 
-    def __add__(self, other: "Shared") -> "Shared":
+    def __add__(self, other: "SharedColours") -> "SharedColours":
         """Of the points of both."""
-        return Shared(self.count + other.count, self.first + other.first, self.second + other.second)
+        return SharedColours(self.count + other.count, self.first + other.first, self.second + other.second)
 
 
-def shared(colours: Array, seen: Bools) -> Shared:
+def shared_colours(colours: Array, seen: Bools) -> SharedColours:
     """The moments of M points' `colours` (C, M, 3) in [0, 1] in C cameras that have `seen` (C, M) them."""
     n, both = len(colours), seen.astype(np.float64)
     products = colours[..., :, None] * colours[..., None, :]
@@ -56,10 +56,10 @@ def shared(colours: Array, seen: Bools) -> Shared:
     count = both @ both.T
     others = 1.0 - np.eye(n)
     sums, count = sums * others[..., None], count * others
-    return Shared(count, sums[..., :3], sums[..., 3:].reshape(n, n, 3, 3))
+    return SharedColours(count, sums[..., :3], sums[..., 3:].reshape(n, n, 3, 3))
 
 
-def aligned(of: Shared) -> F32:
+def align_cameras(of: SharedColours) -> F32:
     """Rows (C, 12) that make cameras agree on the points that several of them see.
 
     A row is a 3 x 3 matrix minus the identity, then 3 offsets (`tasks.render.fit.corrections`). What brings the common
@@ -72,15 +72,15 @@ def aligned(of: Shared) -> F32:
     for _ in range(ROUNDS):
         for c in tied.tolist():
             shown = _moments(of.count[c], of.first[c], of.second[c])
-            now = _developed(of, matrices, offsets, c)
+            now = _aligned_moments(of, matrices, offsets, c)
             matrices[c], offsets[c] = _transport(*shown, *_moments(*now), PULL / of.count[c].sum())
     _, group = connected_components(of.count > 0, directed=False)
     for number in np.unique(group[tied]):
-        _to_photos(matrices, offsets, tied[group[tied] == number])
+        _centre_on_photos(matrices, offsets, tied[group[tied] == number])
     return np.column_stack([(matrices - np.eye(3)).reshape(n, 9), offsets]).astype(np.float32)
 
 
-def brightness(grey: F32, seen: Bools) -> Array:
+def relative_brightness(grey: F32, seen: Bools) -> Array:
     """Log of how much brighter each of N photos shows its points than the others do (N,); their mean is 0.
 
     `grey` (N, M) in (0, 1] of M points in the photos that have `seen` (N, M) them. Least squares over log grey =
@@ -115,7 +115,7 @@ def _moments(count: Array, first: Array, second: Array) -> tuple[Array, Array]:
     return mean, second.sum(axis=0) / n - np.outer(mean, mean)
 
 
-def _developed(of: Shared, matrices: Array, offsets: Array, c: int) -> tuple[Array, Array, Array]:
+def _aligned_moments(of: SharedColours, matrices: Array, offsets: Array, c: int) -> tuple[Array, Array, Array]:
     """Moments (D, ...) of what the other cameras, as they are aligned by now, show of the points shared with `c`."""
     count, first, second = of.count[:, c], of.first[:, c], of.second[:, c]
     turned = np.einsum("dij,dj->di", matrices, first)
@@ -128,19 +128,19 @@ def _developed(of: Shared, matrices: Array, offsets: Array, c: int) -> tuple[Arr
 def _transport(mean: Array, cov: Array, to_mean: Array, to_cov: Array, pull: float) -> tuple[Array, Array]:
     """The symmetric matrix and the offset that take one mean and covariance to another; `pull` towards the identity."""
     noise = (FLOOR + pull) * np.eye(3)
-    root = _root(cov + noise)
+    root = _matrix_root(cov + noise)
     back = np.linalg.inv(root)
-    matrix = back @ _root(root @ (to_cov + noise) @ root) @ back
+    matrix = back @ _matrix_root(root @ (to_cov + noise) @ root) @ back
     return matrix, to_mean - matrix @ mean
 
 
-def _root(matrix: Array) -> Array:
+def _matrix_root(matrix: Array) -> Array:
     """The symmetric root of a positive matrix (3, 3)."""
     values, vectors = np.linalg.eigh(matrix)
     return cast(Array, (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
-def _to_photos(matrices: Array, offsets: Array, rows: Array) -> None:
+def _centre_on_photos(matrices: Array, offsets: Array, rows: Array) -> None:
     """Moves the common colours of cameras `rows`, in place: the exposures' inverses are the identity on average."""
     back = np.linalg.inv(matrices[rows])
     turn, shift = back.mean(axis=0), -np.einsum("cij,cj->ci", back, offsets[rows]).mean(axis=0)
@@ -158,48 +158,48 @@ AROUND_PX = 5  # a point's brightness is the mean of a window
 NEAR = 0.05  # of its depth: a point this close to what the photo shows there is seen
 
 
-def matrix_of(row: F32) -> tuple[F32, F32]:
+def exposure_matrix(row: F32) -> tuple[F32, F32]:
     """Matrix (3, 3) and offset (3,): photo colour = matrix @ scene colour + offset."""
     return np.eye(3, dtype=np.float32) + row[:9].reshape(3, 3), row[9:]
 
 
-def exposed(rgb: F32, row: F32) -> F32:
+def apply_exposure(rgb: F32, row: F32) -> F32:
     """A picture (H, W, 3) as the photo with exposure `row` (12,) would show it."""
-    matrix, offset = matrix_of(row)
+    matrix, offset = exposure_matrix(row)
     return np.asarray(rgb @ matrix.T + offset, np.float32)
 
 
-def inverse(row: F32) -> F32:
+def invert_exposure(row: F32) -> F32:
     """The row (12,) that takes back what `row` does. Raises LinAlgError where that cannot be."""
-    matrix, offset = matrix_of(row)
+    matrix, offset = exposure_matrix(row)
     back = np.linalg.inv(matrix.astype(np.float64))
     return np.concatenate([(back - np.eye(3)).ravel(), -back @ offset]).astype(np.float32)
 
 
-def after(row: F32, first: F32) -> F32:
+def chain_exposures(row: F32, first: F32) -> F32:
     """The row (12,) that does what `first` does and then what `row` does."""
-    matrix, offset = matrix_of(row)
-    before, shift = matrix_of(first)
+    matrix, offset = exposure_matrix(row)
+    before, shift = exposure_matrix(first)
     together = matrix @ before - np.eye(3, dtype=np.float32)
     return np.concatenate([together.ravel(), matrix @ shift + offset]).astype(np.float32)
 
 
-def reference(cameras: Sequence[str], rows: F32) -> F32:
+def mean_exposure(cameras: Sequence[str], rows: F32) -> F32:
     """The row (12,) of a camera that exposes as the `cameras` (N,) do on average, each by its own mean over its photos'
     rows (N, 12)."""
     of = np.array(cameras)
     return np.mean([rows[of == camera].mean(axis=0) for camera in dict.fromkeys(cameras)], axis=0, dtype=np.float32)
 
 
-def exposed_gradient(rgb: F32, row: F32, d_exposed: F32) -> tuple[F32, F32]:
+def apply_exposure_gradient(rgb: F32, row: F32, d_exposed: F32) -> tuple[F32, F32]:
     """Gradients by rgb (H, W, 3) and by the row (12,)."""
-    matrix, _ = matrix_of(row)
+    matrix, _ = exposure_matrix(row)
     flat = d_exposed.reshape(-1, 3)
     d_row = np.concatenate([(flat.T @ rgb.reshape(-1, 3)).ravel(), flat.sum(axis=0)])
     return np.asarray(d_exposed @ matrix, np.float32), d_row.astype(np.float32)
 
 
-def exposures_of(photos: Sequence[Photo], seen: Sequence[Seen], points: Array) -> F32:
+def estimate_exposures(photos: Sequence[Photo], seen: Sequence[PhotoDepth], points: Array) -> F32:
     """Rows (N, 12) of the photos: photo colour = row applied to what all cameras agree on.
 
     Photos of a camera have one, but for how bright each is where the camera exposes anew from photo to photo.
@@ -208,42 +208,42 @@ def exposures_of(photos: Sequence[Photo], seen: Sequence[Seen], points: Array) -
     rows = np.zeros((len(photos), EXPOSURE_SIZE), np.float32)
     cameras = list(dict.fromkeys(photo.camera for photo in photos))
     cloud = points[:: max(1, len(points) // POINTS)]
-    gains = _gains(photos, seen, points)
+    gains = _photo_gains(photos, seen, points)
     found = []
-    for instant in instants(photos):
+    for instant in group_by_instant(photos):
         if len(instant) < 2:
             continue
         colours, shown = np.zeros((len(cameras), len(cloud), 3)), np.zeros((len(cameras), len(cloud)), bool)
         for i in instant:
             c = cameras.index(photos[i].camera)
-            colours[c], shown[c] = _colours(photos[i].rgb, photos[i], seen[i], cloud)
+            colours[c], shown[c] = _colours_at_points(photos[i].rgb, photos[i], seen[i], cloud)
             colours[c] /= gains[i]
-        found.append(shared(colours, shown))
+        found.append(shared_colours(colours, shown))
     if found:
-        back = [inverse(row) for row in aligned(reduce(add, found))]
+        back = [invert_exposure(row) for row in align_cameras(reduce(add, found))]
         rows[:] = [back[cameras.index(photo.camera)] for photo in photos]
     for i in np.flatnonzero(gains != 1.0).tolist():
         gain = np.concatenate([((gains[i] - 1.0) * np.eye(3)).ravel(), np.zeros(3)]).astype(np.float32)
-        rows[i] = after(gain, rows[i])
+        rows[i] = chain_exposures(gain, rows[i])
     return rows
 
 
-def _gains(photos: Sequence[Photo], seen: Sequence[Seen], points: Array) -> Array:
+def _photo_gains(photos: Sequence[Photo], seen: Sequence[PhotoDepth], points: Array) -> Array:
     """How much brighter than its camera's mean each photo is (N,); 1 for all of a camera that is STEADY."""
     cloud = points[:: max(1, len(points) * len(photos) // OVER_TIME, len(points) // POINTS)]
     grey, shown = np.ones((len(photos), len(cloud)), np.float32), np.zeros((len(photos), len(cloud)), bool)
     for i, photo in enumerate(photos):
         blurred = np.asarray(cv2.blur(photo.rgb, (AROUND_PX, AROUND_PX)), np.uint8)
-        colours, shown[i] = _colours(blurred, photo, seen[i], cloud)
+        colours, shown[i] = _colours_at_points(blurred, photo, seen[i], cloud)
         grey[i] = colours.mean(axis=-1)
-    logs, of = brightness(grey, shown), np.array([photo.camera for photo in photos])
+    logs, of = relative_brightness(grey, shown), np.array([photo.camera for photo in photos])
     for camera in dict.fromkeys(of):
         mine = logs[of == camera]
         logs[of == camera] = mine - mine.mean() if np.ptp(mine) > STEADY else 0.0
     return np.exp(logs)
 
 
-def instants(photos: Sequence[Photo]) -> list[list[int]]:
+def group_by_instant(photos: Sequence[Photo]) -> list[list[int]]:
     """Rows of the photos by instant, of each camera one at most."""
     groups: list[list[int]] = []
     for i in sorted(range(len(photos)), key=lambda i: photos[i].time_s):
@@ -256,15 +256,15 @@ def instants(photos: Sequence[Photo]) -> list[list[int]]:
     return groups
 
 
-def in_agreement(photos: Sequence[Photo], rows: F32) -> list[Photo]:
+def with_common_exposure(photos: Sequence[Photo], rows: F32) -> list[Photo]:
     """The photos, whose `light` is as their instant's common exposure shows it."""
     return [
-        replace(photo, to_common=np.column_stack(matrix_of(inverse(row)))) if row.any() else photo
+        replace(photo, to_common=np.column_stack(exposure_matrix(invert_exposure(row)))) if row.any() else photo
         for photo, row in zip(photos, rows)
     ]
 
 
-def _colours(rgb: Bytes, photo: Photo, seen: Seen, points: Array) -> tuple[Array, Bools]:
+def _colours_at_points(rgb: Bytes, photo: Photo, seen: PhotoDepth, points: Array) -> tuple[Array, Bools]:
     """Colours (M, 3) in [0, 1] of the points in a photo's `rgb` (H, W, 3), and which of them (M,) it shows."""
     height, width = seen.depth.shape
     camera_from_scene = np.linalg.inv(photo.world_from_camera)
@@ -278,7 +278,7 @@ def _colours(rgb: Bytes, photo: Photo, seen: Seen, points: Array) -> tuple[Array
     return rgb[v, u] / 255.0, shown
 
 
-def motion(row: FloatArray) -> Array:
+def rigid_motion(row: FloatArray) -> Array:
     """(4, 4): x' = R(turn) x + shift of a row (6,)."""
     out = np.eye(4)
     turn = np.asarray(row[3:], np.float64)
@@ -291,12 +291,12 @@ def motion(row: FloatArray) -> Array:
     return out
 
 
-def corrected(scene_from_camera: Array, row: FloatArray) -> Array:
+def corrected_pose(scene_from_camera: Array, row: FloatArray) -> Array:
     """The pose (4, 4) of a camera whose points move by `row` (6,)."""
-    return np.asarray(scene_from_camera @ np.linalg.inv(motion(row)))
+    return np.asarray(scene_from_camera @ np.linalg.inv(rigid_motion(row)))
 
 
-def between(times: FloatArray, rows: F32, time_s: float) -> F32:
+def interpolate_in_time(times: FloatArray, rows: F32, time_s: float) -> F32:
     """The row (C,) at a time, linear between those (N, C) at `times` (N,) in any order; the nearest one outside."""
     by_time = np.argsort(times, kind="stable")
     return np.array([np.interp(time_s, times[by_time], column[by_time]) for column in rows.T], np.float32)

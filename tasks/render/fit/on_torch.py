@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from tasks.render.fit.backend import HIDDEN, Derivatives, OwnedGaussians, by_box, parts_of
-from tasks.render.fit.corrections import corrected
+from tasks.render.fit.backend import HIDDEN, Derivatives, OwnedGaussians, box_gradient, visible_parts
+from tasks.render.fit.corrections import corrected_pose
 from tasks.render.fit.losses import C1, C2, SIGMA, WINDOW
-from tasks.render.fit.start import Problem
+from tasks.render.fit.start import FitProblem
 from tasks.render.fit.state import (
     BACKGROUND,
     BETA1,
@@ -30,8 +30,8 @@ from tasks.render.fit.state import (
     SHAPES,
     SLACK_M,
     THICKNESS_M,
+    AdamArray,
     FitState,
-    Learned,
     Road,
 )
 from tasks.render.scene.movers import SHIFT_SIZE
@@ -65,8 +65,8 @@ class LearnedTensor:
         self.values[rows] -= (size * first / spread).float()
 
 
-def exposed(rgb: Tensor, row: Tensor) -> Tensor:
-    """`corrections.exposed`."""
+def apply_exposure(rgb: Tensor, row: Tensor) -> Tensor:
+    """`corrections.apply_exposure`."""
     matrix = torch.eye(3, dtype=row.dtype, device=row.device) + row[:9].view(3, 3)
     return rgb @ matrix.T + row[9:]
 
@@ -82,13 +82,13 @@ def photo_loss(rgb: Tensor, photo: Tensor, weight: Tensor, ssim_weight: float) -
 
 def _similarity(x: Tensor, y: Tensor) -> Tensor:
     """(H, W, 3) SSIM of each pixel and channel; `y` is not derived by."""
-    mean_x, square_x, product = Blurred.apply(torch.cat([x, x * x, x * y], dim=-1)).split(3, dim=-1)
+    mean_x, square_x, product = SelfAdjointBlur.apply(torch.cat([x, x * x, x * y], dim=-1)).split(3, dim=-1)
     mean_y, square_y = _blur(torch.cat([y, y * y], dim=-1)).split(3, dim=-1)
     cross, spread = product - mean_x * mean_y, square_x - mean_x**2 + square_y - mean_y**2
     return (2.0 * mean_x * mean_y + C1) * (2.0 * cross + C2) / ((mean_x**2 + mean_y**2 + C1) * (spread + C2))
 
 
-class Blurred(torch.autograd.Function):
+class SelfAdjointBlur(torch.autograd.Function):
     """`_blur`, which is its own adjoint."""
 
     @staticmethod
@@ -116,7 +116,7 @@ def opaque_loss(alpha: Tensor, ground: Tensor, weight: float) -> Tensor:
     return weight / alpha.numel() * ((1.0 - alpha) * ground).sum()
 
 
-def before_sky(
+def composite_sky(
     rgb: Tensor, alpha: Tensor, cells: Tensor, intrinsics: Array, scene_from_camera: Array
 ) -> tuple[Tensor, Tensor]:
     """A picture (H, W, 3) with the sky behind it, and which of the `cells` (ROWS * COLUMNS, 3) that it asks for.
@@ -174,8 +174,8 @@ def lay_flat(means: Tensor, quats: Tensor, log_scales: Tensor, rows: Tensor, roa
     quats[rows] = _upright(quats[rows].double(), slope_x, slope_y).float()
 
 
-def rounded(log_scales: Tensor, most: float) -> Tensor:
-    """`state.rounded`."""
+def limit_stretch(log_scales: Tensor, most: float) -> Tensor:
+    """`state.limit_stretch`."""
     return torch.maximum(log_scales, log_scales.amax(dim=1, keepdim=True) - math.log(most))
 
 
@@ -213,8 +213,8 @@ class StateTensors:
     nearest: Tensor
     wanted: Tensor
 
-    def seen(self, rows: Tensor, depths: Tensor, screen: Tensor) -> Tensor:
-        """`FitState.seen`."""
+    def record_view(self, rows: Tensor, depths: Tensor, screen: Tensor) -> Tensor:
+        """`FitState.record_view`."""
         self.nearest[rows] = torch.minimum(self.nearest[rows], depths)
         self.wanted[rows] += torch.hypot(screen[:, 0], screen[:, 1])
         return self.nearest[rows]
@@ -229,11 +229,11 @@ class StateTensors:
         log_scales, owned = self.learned["log_scales"].values, rows >= int((self.owner == BACKGROUND).sum())
         for most, mine in ((background, rows[~owned & ~self.road[rows]]), (boxes, rows[owned])):
             if most > 0.0:
-                log_scales[mine] = rounded(log_scales[mine], most)
+                log_scales[mine] = limit_stretch(log_scales[mine], most)
 
 
 @dataclass(frozen=True)
-class OnTorch:
+class TorchBackend:
     """Draws with `draw`, on `device`."""
 
     draw: Draw
@@ -243,37 +243,37 @@ class OnTorch:
         # In this process: containers that set TORCH_ALLOW_TF32_CUBLAS_OVERRIDE multiply by ten bits, poses need more.
         torch.set_float32_matmul_precision("highest")
 
-    def take(self, state: FitState) -> StateTensors:
+    def load(self, state: FitState) -> StateTensors:
         """A copy of it, on the device."""
         learned: dict[str, Any] = dict(state.learned)
         for name in DEVICE_SIDE:
             here = state.learned[name]
-            learned[name] = LearnedTensor(*(self._sent(getattr(here, each.name)) for each in fields(Learned)))
+            learned[name] = LearnedTensor(*(self._sent(getattr(here, each.name)) for each in fields(AdamArray)))
         others = (self._sent(array) for array in (state.road, state.nearest, state.wanted))
         return StateTensors(state.iteration, learned, state.owner, *others)
 
-    def give_back(self, held: StateTensors, state: FitState) -> None:
+    def store(self, held: StateTensors, state: FitState) -> None:
         """Exposure, poses and boxes never left."""
         state.iteration = held.iteration
         for name in DEVICE_SIDE:
             there = held.learned[name]
-            state.learned[name] = Learned(*(getattr(there, each.name).cpu().numpy() for each in fields(Learned)))
+            state.learned[name] = AdamArray(*(getattr(there, each.name).cpu().numpy() for each in fields(AdamArray)))
         state.nearest, state.wanted = held.nearest.cpu().numpy(), held.wanted.cpu().numpy()
 
-    def derivatives(self, problem: Problem, held: StateTensors, row: int, settings: FitSettings) -> Derivatives:
+    def derivatives(self, problem: FitProblem, held: StateTensors, row: int, settings: FitSettings) -> Derivatives:
         """As `FitBackend` has it."""
         shot = problem.train[row]
         compared = shot.compared
         leaves = [held.learned[name].values.detach().requires_grad_() for name in DEVICE_SIDE]
         exposure = self._sent(held.learned["exposure"].values[row]).requires_grad_()
         height, width = shot.photo.rgb.shape[:2]
-        camera = corrected(shot.photo.world_from_camera, held.learned["poses"].values[row])
+        camera = corrected_pose(shot.photo.world_from_camera, held.learned["poses"].values[row])
         eye = Eye(shot.photo.intrinsics, camera, width, height, torch.zeros(6, device=self.device, requires_grad=True))
-        parts = parts_of(problem, held.owner, held.learned["boxes"].values, shot.photo)
-        seen = self.draw(_composed(leaves[:-1], parts), eye)
+        parts = visible_parts(problem, held.owner, held.learned["boxes"].values, shot.photo)
+        seen = self.draw(_compose_scene(leaves[:-1], parts), eye)
 
-        rgb, cells = before_sky(seen.rgb, seen.alpha, leaves[-1], eye.intrinsics, camera)
-        picture, photo = exposed(rgb, exposure), self._sent(shot.photo.rgb).float() / 255.0
+        rgb, cells = composite_sky(seen.rgb, seen.alpha, leaves[-1], eye.intrinsics, camera)
+        picture, photo = apply_exposure(rgb, exposure), self._sent(shot.photo.rgb).float() / 255.0
         loss = photo_loss(picture, photo, self._sent(compared.target.weight), settings.ssim_weight)
         if settings.opaque_weight > 0.0:
             loss = loss + opaque_loss(seen.alpha, self._sent(compared.ground), settings.opaque_weight)
@@ -281,9 +281,9 @@ class OnTorch:
         asked = [*leaves, exposure, eye.motion, seen.screen]
         by = torch.autograd.grad(loss, asked, materialize_grads=True)
         means, quats, log_scales, logits, colours, sky, d_exposure, d_camera, screen = by
-        spans = [torch.arange(span.start, span.stop, device=self.device) for span in map(_span, parts)]
+        spans = [torch.arange(span.start, span.stop, device=self.device) for span in map(_row_slice, parts)]
         rows = torch.cat(spans)[seen.index]
-        tracks, boxes = _of_boxes(parts, leaves[0].detach(), leaves[1].detach(), means, quats)
+        tracks, boxes = _box_gradients(parts, leaves[0].detach(), leaves[1].detach(), means, quats)
         shapes = {"means": means, "quats": quats, "log_scales": log_scales, "logits": logits[:, 0], "colours": colours}
         back: dict[str, Any] = {name: tensor[rows] for name, tensor in shapes.items()}
         back |= {"index": rows, "screen": screen}
@@ -297,18 +297,18 @@ class OnTorch:
         return torch.as_tensor(array, device=self.device).clone()
 
 
-def _composed(leaves: Sequence[Tensor], parts: Sequence[OwnedGaussians]) -> SceneTensors:
+def _compose_scene(leaves: Sequence[Tensor], parts: Sequence[OwnedGaussians]) -> SceneTensors:
     """The scene of `parts`, of which a photo shows some; `leaves` as of SHAPES."""
     means, quats, log_scales, logits, colours = leaves
     every = SceneTensors(means, quats, log_scales, logits[:, 0], colours)
     scenes = []
     for part in parts:
-        mine = SceneTensors(*(tensor[_span(part)] for tensor in every.parts()))
+        mine = SceneTensors(*(tensor[_row_slice(part)] for tensor in every.parts()))
         scenes.append(mine if part.scene_from_owner is None else moved(mine, part.scene_from_owner))
     return SceneTensors(*(torch.cat(tensors) for tensors in zip(*(scene.parts() for scene in scenes))))
 
 
-def _of_boxes(
+def _box_gradients(
     parts: Sequence[OwnedGaussians], means: Tensor, quats: Tensor, d_means: Tensor, d_quats: Tensor
 ) -> tuple[Ints, F32]:
     """Tracks (B,), and derivatives (B, SHIFT_SIZE) by what their boxes are off by; the tensors are the state's."""
@@ -316,12 +316,14 @@ def _of_boxes(
     found = [
         torch.cat([shift, turn[None]])
         for part in mine
-        for shift, turn in [by_box(part, *(one[_span(part)].double() for one in (means, quats, d_means, d_quats)))]
+        for shift, turn in [
+            box_gradient(part, *(one[_row_slice(part)].double() for one in (means, quats, d_means, d_quats)))
+        ]
     ]
     together = torch.stack(found).float().cpu().numpy() if found else np.zeros((0, SHIFT_SIZE), np.float32)
     return np.array([part.track for part in mine], np.int64), together
 
 
-def _span(part: OwnedGaussians) -> slice:
+def _row_slice(part: OwnedGaussians) -> slice:
     """Its rows of the state."""
     return slice(int(part.rows[0]), int(part.rows[-1]) + 1) if len(part.rows) else slice(0, 0)

@@ -7,24 +7,32 @@ from typing import Any
 import numpy as np
 
 from tasks.kernels.compiled import kernel
-from tasks.render.fit.backend import Derivatives, FitBackend, Held, OnCpu
-from tasks.render.fit.corrections import after, between, corrected, exposed, inverse, matrix_of, reference
+from tasks.render.fit.backend import CpuBackend, Derivatives, FitBackend, LearnedState
+from tasks.render.fit.corrections import (
+    apply_exposure,
+    chain_exposures,
+    corrected_pose,
+    exposure_matrix,
+    interpolate_in_time,
+    invert_exposure,
+    mean_exposure,
+)
 from tasks.render.fit.losses import Target, ssim
-from tasks.render.fit.start import Problem, Shot
-from tasks.render.fit.state import BACKGROUND, FitState, Road, above_road, opacities_of, refine
+from tasks.render.fit.start import FitPhoto, FitProblem
+from tasks.render.fit.state import BACKGROUND, FitState, Road, height_above_road, opacities_of, relocate_and_grow
 from tasks.render.scene.asset import ClassQuality, Exposure, RenderAsset, ViewQuality, mean_psnr_db, psnr
-from tasks.render.scene.body import BEFORE_M, bodies_near, nearest_box
+from tasks.render.scene.body import BEFORE_M, bodies_near, nearest_box_along_rays
 from tasks.render.scene.engine import Vehicles, render
 from tasks.render.scene.movers import (
     SHIFT_SIZE,
     BoxShifts,
-    at_knots,
     behind_boxes,
+    interpolate_knots,
     knots_at,
-    shifted_boxes,
+    shift_boxes,
     world_from_boxes,
 )
-from tasks.render.scene.sensed import Photo, shifted
+from tasks.render.scene.sensed import Photo, shift_pose
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap, directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import Backend, FitSettings
@@ -45,8 +53,8 @@ LEAST_PIXELS = 40  # of a class in a photo, that it is measured
 SAME_WAY = 0.87  # cosine: photos that look within 30 degrees of each other
 
 
-def measured(
-    asset: RenderAsset, problem: Problem, shot: Shot, scene_from_camera: Array, threads: int = 1
+def measure_photo(
+    asset: RenderAsset, problem: FitProblem, shot: FitPhoto, scene_from_camera: Array, threads: int = 1
 ) -> ViewQuality:
     """Of a photo that was held out, as `asset` shows it from a pose (4, 4) in the problem's frame.
 
@@ -54,11 +62,11 @@ def measured(
     without weight say nothing.
     """
     photo, target = shot.photo, shot.compared.target
-    picture = drawn(asset, problem, photo, scene_from_camera, threads)
-    boxes, valid = boxes_in(asset, problem, photo)
+    picture = draw_photo(asset, problem, photo, scene_from_camera, threads)
+    boxes, valid = boxes_at_photo(asset, problem, photo)
     vehicles = boxes[[j for j in np.flatnonzero(valid) if problem.tracks.kinds[j] == AgentKind.VEHICLE]]
-    classes = classes_of(photo, vehicles, problem.road)
-    found = [_of_class(name, picture, target, inside) for name, inside in classes.items()]
+    classes = pixel_classes(photo, vehicles, problem.road)
+    found = [_class_quality(name, picture, target, inside) for name, inside in classes.items()]
     counted = target.weight > 0.0
     return ViewQuality(
         photo.camera,
@@ -66,15 +74,17 @@ def measured(
         psnr(picture[counted], target.rgb[counted]) if counted.any() else float("nan"),
         ssim(picture, target)[0],
         held_out=True,
-        away_m=away(photo, [other.photo for other in problem.train]),
+        away_m=distance_to_nearest_m(photo, [other.photo for other in problem.train]),
         classes=tuple(of for of in found if of is not None),
     )
 
 
-def drawn(asset: RenderAsset, problem: Problem, photo: Photo, scene_from_camera: Array, threads: int = 1) -> F32:
+def draw_photo(
+    asset: RenderAsset, problem: FitProblem, photo: Photo, scene_from_camera: Array, threads: int = 1
+) -> F32:
     """What `asset` shows (H, W, 3) in place of a photo from a pose (4, 4) in the problem's frame: as pictures of
     samples are drawn, in the colours of its camera then, its tracks where photos say that they were."""
-    boxes, valid = boxes_in(asset, problem, photo)
+    boxes, valid = boxes_at_photo(asset, problem, photo)
     rows = np.flatnonzero(valid)
     there = Vehicles(
         tuple(problem.tracks.ids[j] for j in rows),
@@ -82,40 +92,40 @@ def drawn(asset: RenderAsset, problem: Problem, photo: Photo, scene_from_camera:
         boxes[rows] + np.concatenate([problem.origin, np.zeros(4)]),
     )
     height, width = photo.rgb.shape[:2]
-    eye = Pinhole(photo.intrinsics, shifted(scene_from_camera, problem.origin), width, height)
+    eye = Pinhole(photo.intrinsics, shift_pose(scene_from_camera, problem.origin), width, height)
     affines = [asset.affine_of(photo.camera, photo.time_s)]
     return render(asset, [eye], there, threads=threads, affines=affines)[0].rgb
 
 
-def boxes_in(asset: RenderAsset, problem: Problem, photo: Photo) -> tuple[Array, Bools]:
+def boxes_at_photo(asset: RenderAsset, problem: FitProblem, photo: Photo) -> tuple[Array, Bools]:
     """Boxes (N, 7) of the problem's tracks when a photo was taken, in its frame, and which of them are there (N,)."""
     boxes, valid = problem.tracks.at(photo.taken_s)
-    return shifted_boxes(boxes, asset.shifts.at(photo.taken_s, problem.tracks.ids)), valid
+    return shift_boxes(boxes, asset.shifts.at(photo.taken_s, problem.tracks.ids)), valid
 
 
-def classes_of(photo: Photo, vehicles: Array, road: Road | None) -> dict[str, Bools]:
+def pixel_classes(photo: Photo, vehicles: Array, road: Road | None) -> dict[str, Bools]:
     """Pixels (H, W) of a photo by class; `vehicles` (N, 7) boxes in its frame."""
     height, width = photo.rgb.shape[:2]
     rays = directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3)
     eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
     on_vehicle = np.asarray(behind_boxes(eye + FAR_M * rays, eye, np.ascontiguousarray(vehicles)), bool)
-    on_road = np.zeros(len(rays), bool) if road is None else meets(road, eye, rays) & ~on_vehicle
+    on_road = np.zeros(len(rays), bool) if road is None else rays_meet_road(road, eye, rays) & ~on_vehicle
     classes = {"road": on_road, "vehicles": on_vehicle, "rest": ~(on_road | on_vehicle)}
     return {name: inside.reshape(height, width) for name, inside in classes.items()}
 
 
-def meets(road: Road, eye: Array, rays: Array) -> Bools:
+def rays_meet_road(road: Road, eye: Array, rays: Array) -> Bools:
     """Which rays (M, 3) from `eye` (3,) go below the known road within ROAD_M, not where it is unknown."""
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     over, found = np.zeros(len(rays), bool), np.zeros(len(rays), bool)
     for length in np.geomspace(RAY_FROM_M, ROAD_M, STEPS):
-        height = above_road((eye + length * unit).astype(np.float32), road)
+        height = height_above_road((eye + length * unit).astype(np.float32), road)
         found |= over & (height <= 0.0)
         over = ~found & (height > 0.0)
     return found
 
 
-def away(photo: Photo, others: Sequence[Photo]) -> float:
+def distance_to_nearest_m(photo: Photo, others: Sequence[Photo]) -> float:
     """How far [m] a photo was taken from the nearest of `others` that look the same way; inf where none does."""
     poses = np.stack([other.world_from_camera for other in others])
     same = poses[:, :3, 2] @ photo.world_from_camera[:3, 2] > SAME_WAY
@@ -123,7 +133,7 @@ def away(photo: Photo, others: Sequence[Photo]) -> float:
     return float(np.linalg.norm(places, axis=1).min(initial=np.inf))
 
 
-def _of_class(name: str, picture: F32, target: Target, inside: Bools) -> ClassQuality | None:
+def _class_quality(name: str, picture: F32, target: Target, inside: Bools) -> ClassQuality | None:
     counted = inside & (target.weight > 0.0)
     if counted.sum() < LEAST_PIXELS:
         return None
@@ -146,9 +156,9 @@ NEAREST_M = 0.3  # to a camera
 GONE_LOGIT = -8.0  # of its opacity
 
 
-def clear_floaters(problem: Problem, state: FitState) -> int:
-    """Makes floaters transparent, in place, for `refine` to put them elsewhere. Returns how many there were."""
-    rows = floaters(problem, state)
+def clear_floaters(problem: FitProblem, state: FitState) -> int:
+    """Makes floaters transparent, in place, for `relocate_and_grow` to move them. Returns how many there were."""
+    rows = find_floaters(problem, state)
     state.learned["logits"].values[rows] = GONE_LOGIT
     state.learned["logits"].forget(rows)
     if state.noted:
@@ -156,7 +166,7 @@ def clear_floaters(problem: Problem, state: FitState) -> int:
     return len(rows)
 
 
-def floaters(problem: Problem, state: FitState) -> Ints:
+def find_floaters(problem: FitProblem, state: FitState) -> Ints:
     """Rows (M,) of Gaussians of the street, not of its road, that hide the body of a vehicle which drives in some photo
     by BEFORE_M or more, and that at most SHOWN_BY of the other photos which look there show in their own colour.
 
@@ -179,27 +189,29 @@ def floaters(problem: Problem, state: FitState) -> Ints:
         looking = (pixel >= 0) & (depth_m < FARTHER * least_m[found]) & ~np.isin(found, silent[i])
         if shot.hidden is not None:
             looking &= ~shot.hidden.ravel()[pixel]
-        mine = exposed(colours[looking], state.learned["exposure"].values[i])
+        mine = apply_exposure(colours[looking], state.learned["exposure"].values[i])
         theirs = shot.photo.rgb.reshape(-1, 3)[pixel[looking]] / np.float32(255.0)
         looked += looking
         shown[looking] += np.abs(np.clip(mine, 0.0, 1.0) - theirs).max(axis=1) < ALIKE
     return rows[found[shown <= SHOWN_BY * looked]]
 
 
-def _hiding_and_hidden_by_bodies(problem: Problem, state: FitState, i: int, means: Array) -> tuple[Ints, Array, Ints]:
+def _hiding_and_hidden_by_bodies(
+    problem: FitProblem, state: FitState, i: int, means: Array
+) -> tuple[Ints, Array, Ints]:
     """Of `means` (M, 3) those that hide the body of a vehicle which drives in photo `i`, their depths in it [m], and
     those that such a body hides."""
     shot, tracks, nothing = problem.train[i], problem.tracks, np.zeros(0, np.int64)
     boxes, valid = tracks.at(shot.photo.taken_s)
     off = state.learned["boxes"].values.reshape(len(boxes), tracks.n_knots, SHIFT_SIZE)
-    boxes = shifted_boxes(boxes, at_knots(off, shot.photo.taken_s))
-    eye = corrected(shot.photo.world_from_camera, state.learned["poses"].values[i])[:3, 3].copy()
+    boxes = shift_boxes(boxes, interpolate_knots(off, shot.photo.taken_s))
+    eye = corrected_pose(shot.photo.world_from_camera, state.learned["poses"].values[i])[:3, 3].copy()
     bodies, drives = bodies_near(boxes, valid, tracks, eye)
     if not drives.any():
         return nothing, np.zeros(0), nothing
     pixel, depth_m = _in_photo(shot, state.learned["poses"].values[i], means)
     rows = np.flatnonzero(pixel >= 0)
-    along, first = nearest_box(means[rows] - eye, eye, bodies)
+    along, first = nearest_box_along_rays(means[rows] - eye, eye, bodies)
     on = (first >= 0) & drives[first]
     rows, along = rows[on], along[on]
     before_m = (along - 1.0) * np.linalg.norm(means[rows] - eye, axis=1)
@@ -207,14 +219,14 @@ def _hiding_and_hidden_by_bodies(problem: Problem, state: FitState, i: int, mean
     return hiding, depth_m[hiding], rows[before_m < 0.0]
 
 
-def _in_photo(shot: Shot, pose: F32, means: Array) -> tuple[Ints, Array]:
+def _in_photo(shot: FitPhoto, pose: F32, means: Array) -> tuple[Ints, Array]:
     """Which pixel of the photo shows each mean (M, 3), row by row, -1 where none does; and its depth [m]."""
-    camera_from_scene = np.linalg.inv(corrected(shot.photo.world_from_camera, pose))
-    return project(means, camera_from_scene, shot.photo.intrinsics, *shot.photo.rgb.shape[:2])
+    camera_from_scene = np.linalg.inv(corrected_pose(shot.photo.world_from_camera, pose))
+    return project_points(means, camera_from_scene, shot.photo.intrinsics, *shot.photo.rgb.shape[:2])
 
 
 @kernel
-def project(means: Any, camera_from_scene: Any, k: Any, height: int, width: int) -> Any:
+def project_points(means: Any, camera_from_scene: Any, k: Any, height: int, width: int) -> Any:
     """As `_in_photo` has it, for a camera (4, 4) with intrinsics (3, 3)."""
     pixel, depth = np.full(means.shape[0], -1, np.int64), np.zeros(means.shape[0])
     m = camera_from_scene
@@ -237,8 +249,8 @@ LEAST_SHARE = 1e-3  # of a photo in a knot, for it to say anything there
 Progress = Callable[[int, float, float], None]  # iteration, mean loss and mean PSNR [dB] of the last REPORT_EVERY
 
 
-def advance(
-    problem: Problem,
+def run_iterations(
+    problem: FitProblem,
     state: FitState,
     settings: FitSettings,
     until: int,
@@ -251,8 +263,8 @@ def advance(
 
     In how many calls the iterations are done makes no difference. `backend`: the compiled kernels where None is given.
     """
-    drawing: FitBackend = OnCpu(threads) if backend is None else backend
-    held: Held = drawing.take(state)
+    drawing: FitBackend = CpuBackend(threads) if backend is None else backend
+    held: LearnedState = drawing.load(state)
     losses, scores = [], []
     while held.iteration < min(until, settings.iterations) and not stopped():
         loss, score = _iterate(problem, held, settings, drawing)
@@ -263,47 +275,49 @@ def advance(
         due = at % settings.refine_every == 0 and settings.refine_from <= at < settings.iterations
         relocates = at <= REFINE_UNTIL * settings.iterations
         if due and (relocates or problem.tracks.driving.any()):
-            drawing.give_back(held, state)
+            drawing.store(held, state)
             clear_floaters(problem, state)
             if relocates:
-                refine(state, settings)
-            held = drawing.take(state)
+                relocate_and_grow(state, settings)
+            held = drawing.load(state)
         if not relocates and (at % max(1, round(NOTED_EVERY * settings.iterations)) == 0 or at == settings.iterations):
-            drawing.give_back(held, state)
-            state.note()
-            held = drawing.take(state)
+            drawing.store(held, state)
+            state.add_to_average()
+            held = drawing.load(state)
         if progress is not None and at % REPORT_EVERY == 0:
             progress(at, float(np.mean(losses)), float(np.mean(scores)))
             losses, scores = [], []
-    drawing.give_back(held, state)
+    drawing.store(held, state)
     if state.iteration >= settings.iterations:
-        state.settle(problem.road)
+        state.apply_average(problem.road)
 
 
-def backend_of(backend: Backend, threads: int) -> FitBackend:
+def fit_backend(backend: Backend, threads: int) -> FitBackend:
     """Who draws for the fit. Raises BackendMissing where it cannot work on this machine."""
     if not backend.on_gpu:
-        return OnCpu(threads)
+        return CpuBackend(threads)
     require()
-    from tasks.render.fit.on_torch import OnTorch  # torch is loaded only where it is asked for
+    from tasks.render.fit.on_torch import TorchBackend  # torch is loaded only where it is asked for
     from tasks.render.splatting.tensors import by_gsplat
 
-    return OnTorch(by_gsplat, "cuda")
+    return TorchBackend(by_gsplat, "cuda")
 
 
-def decayed(end: float, progress: float) -> float:
+def decay(end: float, progress: float) -> float:
     """What is left of a step size: 1 at progress 0, falling exponentially to `end` at 1 (Kerbl et al. 2023)."""
     return float(end**progress)
 
 
-def photo_at(iteration: int, n: int, seed: int) -> int:
+def photo_of_iteration(iteration: int, n: int, seed: int) -> int:
     """Which of n photos an iteration looks at: each once per round, shuffled by seed and round alone."""
     order = np.random.Generator(np.random.Philox(key=[seed, iteration // n])).permutation(n)
     return int(order[iteration % n])
 
 
-def _iterate(problem: Problem, held: Held, settings: FitSettings, backend: FitBackend) -> tuple[float, float]:
-    row = photo_at(held.iteration, len(problem.train), settings.seed)
+def _iterate(
+    problem: FitProblem, held: LearnedState, settings: FitSettings, backend: FitBackend
+) -> tuple[float, float]:
+    row = photo_of_iteration(held.iteration, len(problem.train), settings.seed)
     found = backend.derivatives(problem, held, row, settings)
     _step_world(problem, held, settings, row, found)
     _step_gaussians(held, settings, found)
@@ -313,9 +327,9 @@ def _iterate(problem: Problem, held: Held, settings: FitSettings, backend: FitBa
     return found.loss, found.psnr_db
 
 
-def _step_world(problem: Problem, held: Held, settings: FitSettings, row: int, found: Derivatives) -> None:
+def _step_world(problem: FitProblem, held: LearnedState, settings: FitSettings, row: int, found: Derivatives) -> None:
     """Exposure and pose of the photo, the boxes that it shows, and the sky behind it."""
-    at, fall = np.array([row]), decayed(settings.rate_end, held.iteration / settings.iterations)
+    at, fall = np.array([row]), decay(settings.rate_end, held.iteration / settings.iterations)
     held.learned["exposure"].step(at, found.exposure[None], fall * settings.exposure_rate)
     if held.iteration >= settings.pose_from:
         poses = held.learned["poses"]
@@ -328,7 +342,7 @@ def _step_world(problem: Problem, held: Held, settings: FitSettings, row: int, f
     held.learned["sky"].step(found.cells, found.sky, fall * settings.sky_rate)
 
 
-def _step_boxes(problem: Problem, held: Held, settings: FitSettings, row: int, found: Derivatives) -> None:
+def _step_boxes(problem: FitProblem, held: LearnedState, settings: FitSettings, row: int, found: Derivatives) -> None:
     """Those that the photo may show, at the knots before and behind it."""
     shown = found.boxes.any(axis=1)
     if settings.box_shift_rate == settings.box_turn_rate == 0.0 or not shown.any():
@@ -336,7 +350,7 @@ def _step_boxes(problem: Problem, held: Held, settings: FitSettings, row: int, f
     boxes, n_knots = held.learned["boxes"], problem.tracks.n_knots
     before, share = knots_at(problem.train[row].photo.taken_s, n_knots)
     rates = np.array([settings.box_shift_rate] * 3 + [settings.box_turn_rate], np.float32)
-    fall = decayed(settings.rate_end, held.iteration / settings.iterations)
+    fall = decay(settings.rate_end, held.iteration / settings.iterations)
     for knot, weight in ((before, 1.0 - share), (before + 1, share)):
         if weight > LEAST_SHARE:
             at = found.tracks[shown] * n_knots + knot
@@ -345,12 +359,12 @@ def _step_boxes(problem: Problem, held: Held, settings: FitSettings, row: int, f
             boxes.values[at] = values + np.float32(weight) * rates * (boxes.values[at] - values)
 
 
-def _step_gaussians(held: Held, settings: FitSettings, found: Derivatives) -> None:
+def _step_gaussians(held: LearnedState, settings: FitSettings, found: Derivatives) -> None:
     """Those that the photo shows."""
     learned, rows, mine = held.learned, found.rows, found.gaussians
-    nearest = held.seen(rows, found.depths, mine.screen)
-    fall = decayed(settings.rate_end, held.iteration / settings.iterations)
-    mean_rate = settings.mean_rate * decayed(settings.mean_rate_end, held.iteration / settings.iterations)
+    nearest = held.record_view(rows, found.depths, mine.screen)
+    fall = decay(settings.rate_end, held.iteration / settings.iterations)
+    mean_rate = settings.mean_rate * decay(settings.mean_rate_end, held.iteration / settings.iterations)
     learned["means"].step(rows, mine.means, mean_rate, nearest)
     learned["quats"].step(rows, mine.quats, fall * settings.quat_rate)
     learned["log_scales"].step(rows, mine.log_scales, fall * settings.scale_rate)
@@ -358,22 +372,24 @@ def _step_gaussians(held: Held, settings: FitSettings, found: Derivatives) -> No
     learned["colours"].step(rows, mine.colours, fall * settings.colour_rate)
 
 
-def pose_of(problem: Problem, state: FitState, photo: Photo) -> Array:
+def refined_pose(problem: FitProblem, state: FitState, photo: Photo) -> Array:
     """Where a photo (pose local) was taken (4, 4), as the corrections of its camera's before and after have it."""
-    return corrected(photo.world_from_camera, corrections_at(problem, state, photo.camera, photo.time_s)[0])
+    return corrected_pose(
+        photo.world_from_camera, interpolated_corrections(problem, state, photo.camera, photo.time_s)[0]
+    )
 
 
-def corrections_at(problem: Problem, state: FitState, camera: str, time_s: float) -> tuple[F32, F32]:
+def interpolated_corrections(problem: FitProblem, state: FitState, camera: str, time_s: float) -> tuple[F32, F32]:
     """Pose correction (6,) and exposure (12,) of a camera at a time; zeros for one that no photo was learned from."""
     rows = [i for i, shot in enumerate(problem.train) if shot.photo.camera == camera]
     poses, colours = state.learned["poses"].values, state.learned["exposure"].values
     if not rows:
         return np.zeros(poses.shape[1], np.float32), np.zeros(colours.shape[1], np.float32)
     times = np.array([problem.train[i].photo.time_s for i in rows])
-    return between(times, poses[rows], time_s), between(times, colours[rows], time_s)
+    return interpolate_in_time(times, poses[rows], time_s), interpolate_in_time(times, colours[rows], time_s)
 
 
-def boxes_off(problem: Problem, state: FitState) -> F32:
+def learned_box_shifts(problem: FitProblem, state: FitState) -> F32:
     """What boxes are off by (tracks * knots, SHIFT_SIZE); a knot that no photo says anything of lies between those that
     do, or has what the nearest has."""
     learned, n_knots = state.learned["boxes"], problem.tracks.n_knots
@@ -386,40 +402,40 @@ def boxes_off(problem: Problem, state: FitState) -> F32:
     return out.reshape(-1, SHIFT_SIZE)
 
 
-def box_shifts(problem: Problem, state: FitState) -> tuple[Array, BoxShifts]:
+def split_box_shifts(problem: FitProblem, state: FitState) -> tuple[Array, BoxShifts]:
     """What tracks' boxes are off by, less what each is off by on average: that is how its Gaussians lie in its box.
 
     Returns as well where those go by that, poses (tracks, 4, 4).
     """
     n = len(problem.tracks.ids)
-    rows = boxes_off(problem, state).reshape(n, problem.tracks.n_knots, SHIFT_SIZE).astype(np.float64)
+    rows = learned_box_shifts(problem, state).reshape(n, problem.tracks.n_knots, SHIFT_SIZE).astype(np.float64)
     stepped = state.learned["boxes"].steps.reshape(n, problem.tracks.n_knots) > 0
     moved_by = np.tile(np.eye(4), (n, 1, 1))
     known = np.flatnonzero(stepped.any(axis=1))
     for j in known:
         mean = rows[j, stepped[j]].mean(axis=0)
         box = np.zeros((1, 7))
-        moved_by[j] = world_from_boxes(shifted_boxes(box, mean[None]))[0]
+        moved_by[j] = world_from_boxes(shift_boxes(box, mean[None]))[0]
         turn = moved_by[j, :3, :3]
         rows[j] = np.column_stack([(rows[j, :, :3] - mean[:3]) @ turn.T, rows[j, :, 3] - mean[3]])
     return moved_by, BoxShifts(tuple(problem.tracks.ids[j] for j in known), rows[known].astype(np.float32))
 
 
-def finish(problem: Problem, state: FitState, threads: int = 2) -> RenderAsset:
+def finish_scene(problem: FitProblem, state: FitState, threads: int = 2) -> RenderAsset:
     """The scene as it is rendered, with what it makes of the photos held out.
 
     What all cameras make of the scene's light on average is folded into it: its own colours are those of photos.
     """
     rows, cameras = state.learned["exposure"].values, [shot.photo.camera for shot in problem.train]
-    common = reference(cameras, rows)
-    moved_by, shifts = box_shifts(problem, state)
+    common = mean_exposure(cameras, rows)
+    moved_by, shifts = split_box_shifts(problem, state)
     every = state.gaussians()
     every = replace(
         every,
         quats=every.quats / np.linalg.norm(every.quats, axis=1, keepdims=True),
-        colours=exposed(every.colours, common),
+        colours=apply_exposure(every.colours, common),
     )
-    sky = exposed(state.learned["sky"].values, common)
+    sky = apply_exposure(state.learned["sky"].values, common)
     nodes = {
         problem.tracks.ids[j]: moved(every.take(state.owner == j), moved_by[j])
         for j in np.unique(state.owner[state.owner >= 0])
@@ -431,12 +447,16 @@ def finish(problem: Problem, state: FitState, threads: int = 2) -> RenderAsset:
         SkyMap(np.maximum(sky, np.float32(0.0)).reshape(ROWS, COLUMNS, 3)),
         float("nan"),
         exposures=tuple(
-            Exposure(shot.photo.camera, shot.photo.time_s, np.column_stack(matrix_of(after(row, inverse(common)))))
+            Exposure(
+                shot.photo.camera,
+                shot.photo.time_s,
+                np.column_stack(exposure_matrix(chain_exposures(row, invert_exposure(common)))),
+            )
             for shot, row in zip(problem.train, rows)
         ),
         shifts=shifts,
     )
     views = []
     for shot in problem.held_out:
-        views.append(measured(asset, problem, shot, pose_of(problem, state, shot.photo), threads))
+        views.append(measure_photo(asset, problem, shot, refined_pose(problem, state, shot.photo), threads))
     return replace(asset, views=tuple(views), psnr_db=mean_psnr_db(views), n_held_out=len(views))

@@ -5,16 +5,32 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tasks.kernels.threads import in_chunks
-from tasks.render.fit.corrections import EXPOSURE_SIZE, POSE_SIZE, between, exposures_of, in_agreement, instants
+from tasks.kernels.threads import run_in_chunks
+from tasks.render.fit.corrections import (
+    EXPOSURE_SIZE,
+    POSE_SIZE,
+    estimate_exposures,
+    group_by_instant,
+    interpolate_in_time,
+    with_common_exposure,
+)
 from tasks.render.fit.losses import Target, target_of
-from tasks.render.fit.state import BACKGROUND, FitState, Learned, Road, above_road, find_road, lay_flat, logits_of
-from tasks.render.scene.body import on_bodies, unseen_body
-from tasks.render.scene.build import held_out_rows, sky_of, surfaces
-from tasks.render.scene.depth import Seen, see, with_confirmed
-from tasks.render.scene.features import NOTHING_KNOWN, Known, Points, known_without_lidar
+from tasks.render.fit.state import (
+    BACKGROUND,
+    AdamArray,
+    FitState,
+    Road,
+    fit_road,
+    height_above_road,
+    lay_flat,
+    logits_of,
+)
+from tasks.render.scene.body import unseen_body_gaussians, with_body_depths
+from tasks.render.scene.build import build_sky, build_surfaces, held_out_rows
+from tasks.render.scene.depth import PhotoDepth, estimate_photo_depth, label_confirmed
+from tasks.render.scene.features import NOTHING_KNOWN, KnownPoints, SurfacePoints, points_without_lidar
 from tasks.render.scene.movers import SHIFT_SIZE, behind_boxes
-from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, reduced, shifted
+from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse_sweeps, resize_photo, shift_pose
 from tasks.render.scene.sky import directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import FitSettings
@@ -38,7 +54,7 @@ class PhotoTarget:
 
 
 @dataclass(frozen=True)
-class Shot:
+class FitPhoto:
     """A photo as the fit uses it, in the block's local frame."""
 
     photo: Photo
@@ -48,29 +64,29 @@ class Shot:
     @property
     def compared(self) -> PhotoTarget:
         """What is kept, or the same once more."""
-        return _compared(self.photo, self.hidden) if self.kept is None else self.kept
+        return _photo_target(self.photo, self.hidden) if self.kept is None else self.kept
 
 
 @dataclass(frozen=True)
-class Problem:
+class FitProblem:
     """What is to be fitted. The same photos, sweeps, agents and settings give the same problem."""
 
     origin: Array  # (3,) world [m]
-    train: tuple[Shot, ...]
-    held_out: tuple[Shot, ...]
+    train: tuple[FitPhoto, ...]
+    held_out: tuple[FitPhoto, ...]
     tracks: Tracks
     road: Road | None
 
 
-def prepare(
+def prepare_fit(
     photos: Sequence[Photo],
     sweeps: Sequence[Sweep],
     agents: AgentTracks | None,
     settings: FitSettings,
     held_out: Collection[int] | None = None,
     threads: int = 2,
-    known: Known = NOTHING_KNOWN,
-) -> tuple[Problem, FitState]:
+    known: KnownPoints = NOTHING_KNOWN,
+) -> tuple[FitProblem, FitState]:
     """The problem and its first state. `held_out`: indices of photos that only measure, else as `settings` says.
     The number of `threads` changes no bit, here and in all of the fit. `known`: as of `build_asset`.
 
@@ -80,44 +96,47 @@ def prepare(
     if len(photos) <= len(out):
         raise ValueError(f"reconstruct: {len(photos)} photos, of which {len(out)} are held out: none to learn from")
     origin = np.round(photos[0].world_from_camera[:3, 3])
-    local = [replace(p, world_from_camera=shifted(p.world_from_camera, -origin)) for p in photos]
+    local = [replace(p, world_from_camera=shift_pose(p.world_from_camera, -origin)) for p in photos]
     tracks = Tracks(agents, origin)
     train = [p for i, p in enumerate(local) if i not in out]
-    static, per_track = fuse([replace(s, world_from_ego=shifted(s.world_from_ego, -origin)) for s in sweeps], tracks)
-    points = Points(static) if sweeps else known_without_lidar(train, tracks, known.shifted(-origin))
+    static, per_track = fuse_sweeps(
+        [replace(s, world_from_ego=shift_pose(s.world_from_ego, -origin)) for s in sweeps], tracks
+    )
+    points = SurfacePoints(static) if sweeps else points_without_lidar(train, tracks, known.shifted(-origin))
 
-    first_seen = [i for k, group in enumerate(instants(train)) if k % settings.start_every == 0 for i in group]
-    small = [reduced(p, START_WIDTH) for p in train]
+    first_seen = [i for k, group in enumerate(group_by_instant(train)) if k % settings.start_every == 0 for i in group]
+    small = [resize_photo(p, START_WIDTH) for p in train]
     looked_at = [small[i] for i in sorted(first_seen)]
 
-    def look(first: int, last: int) -> list[Seen]:
+    def look(first: int, last: int) -> list[PhotoDepth]:
         n = settings.stereo_photos
-        return [see(p, small, points, per_track, tracks, n) for p in looked_at[first:last]]
+        return [estimate_photo_depth(p, small, points, per_track, tracks, n) for p in looked_at[first:last]]
 
-    seen = [s for part in in_chunks(look, len(looked_at), 1, threads) for s in part]
+    seen = [s for part in run_in_chunks(look, len(looked_at), 1, threads) for s in part]
     if points.corners is not None:
-        seen = with_confirmed(looked_at, seen)
+        seen = label_confirmed(looked_at, seen)
     if not sweeps:
-        seen = on_bodies(looked_at, seen, tracks)
+        seen = with_body_depths(looked_at, seen, tracks)
     exposures = np.zeros((len(train), EXPOSURE_SIZE), np.float32)
     if settings.exposure_rate > 0.0:
-        exposures = _exposures(train, looked_at, exposures_of(looked_at, seen, points.every))
-    alike = in_agreement(looked_at, exposures[sorted(first_seen)])
-    background, nodes = surfaces(alike, seen, tracks)
+        exposures = _exposures(train, looked_at, estimate_exposures(looked_at, seen, points.every))
+    alike = with_common_exposure(looked_at, exposures[sorted(first_seen)])
+    background, nodes = build_surfaces(alike, seen, tracks)
     eyes = np.stack([p.world_from_camera[:3, 3] for p in train])
-    surface = find_road(points.every, eyes) if settings.road else None
+    surface = fit_road(points.every, eyes) if settings.road else None
     cars = [nodes.get(i) for i in tracks.ids]
-    bodies = _bodies(cars, tracks, [p.taken_s for p in train])
+    bodies = _unseen_bodies(cars, tracks, [p.taken_s for p in train])
     state = _first_state(
-        background, cars, bodies, sky_of(alike, seen).rgb, exposures, surface, tracks.n_knots, settings
+        background, cars, bodies, build_sky(alike, seen).rgb, exposures, surface, tracks.n_knots, settings
     )
     unknown = [track_id not in nodes for track_id in tracks.ids]
-    hidden = [_hidden(p, tracks, np.array(unknown, bool)) for p in local]
+    hidden = [_hidden_pixels(p, tracks, np.array(unknown, bool)) for p in local]
     sizes = np.cumsum([COMPARED_BYTES * p.rgb[..., 0].size for p in local])
     shots = [
-        Shot(p, h, _compared(p, h) if size <= KEPT_BYTES else None) for p, h, size in zip(local, hidden, sizes.tolist())
+        FitPhoto(p, h, _photo_target(p, h) if size <= KEPT_BYTES else None)
+        for p, h, size in zip(local, hidden, sizes.tolist())
     ]
-    problem = Problem(
+    problem = FitProblem(
         origin,
         tuple(shot for i, shot in enumerate(shots) if i not in out),
         tuple(shot for i, shot in enumerate(shots) if i in out),
@@ -133,23 +152,25 @@ def _exposures(photos: Sequence[Photo], known: Sequence[Photo], rows: F32) -> F3
     for i, photo in enumerate(photos):
         mine = [k for k, other in enumerate(known) if other.camera == photo.camera]
         if mine:
-            out[i] = between(np.array([known[k].time_s for k in mine]), rows[mine], photo.time_s)
+            out[i] = interpolate_in_time(np.array([known[k].time_s for k in mine]), rows[mine], photo.time_s)
     return out
 
 
-def _bodies(nodes: Sequence[Gaussians | None], tracks: Tracks, times_s: Sequence[float]) -> list[Gaussians | None]:
+def _unseen_bodies(
+    nodes: Sequence[Gaussians | None], tracks: Tracks, times_s: Sequence[float]
+) -> list[Gaussians | None]:
     """Of each track that is a vehicle with Gaussians what no photo shows."""
     sizes = np.zeros((len(nodes), 3))
     for time_s in times_s:
         boxes, valid = tracks.at(time_s)
         sizes[valid] = boxes[valid, 4:]
     return [
-        unseen_body(node, size) if node is not None and kind == AgentKind.VEHICLE else None
+        unseen_body_gaussians(node, size) if node is not None and kind == AgentKind.VEHICLE else None
         for node, size, kind in zip(nodes, sizes, tracks.kinds)
     ]
 
 
-def _hidden(photo: Photo, tracks: Tracks, unknown: Bools) -> Bools | None:
+def _hidden_pixels(photo: Photo, tracks: Tracks, unknown: Bools) -> Bools | None:
     """Pixels of what moves and has no Gaussians of its own, the own body too: it would be painted on the street."""
     boxes, valid = tracks.at(photo.taken_s)
     if not (valid & unknown).any():
@@ -162,7 +183,7 @@ def _hidden(photo: Photo, tracks: Tracks, unknown: Bools) -> Bools | None:
     return hidden if photo.own_body is None else hidden | photo.own_body
 
 
-def _compared(photo: Photo, hidden: Bools | None) -> PhotoTarget:
+def _photo_target(photo: Photo, hidden: Bools | None) -> PhotoTarget:
     height, width = photo.rgb.shape[:2]
     rays = directions(photo.intrinsics, photo.world_from_camera, width, height)
     ground = rays[..., 2] < -LOOKS_DOWN * np.linalg.norm(rays, axis=-1)
@@ -181,46 +202,46 @@ def _first_state(
 ) -> FitState:
     """Of the background's and of each track's discs as many as are wanted, each as much larger."""
     rng = np.random.Generator(np.random.Philox(key=[settings.seed, 2**33]))
-    weight = np.where(_lies_on(background, road), settings.road_share, 1.0)
-    parts, owner = [_thinned(background, settings.start_gaussians, weight, rng)], [BACKGROUND]
+    weight = np.where(_is_on_road(background, road), settings.road_share, 1.0)
+    parts, owner = [_sample_gaussians(background, settings.start_gaussians, weight, rng)], [BACKGROUND]
     for j, (node, body) in enumerate(zip(nodes, bodies)):
         if node is not None:
-            parts.append(_thinned(node, settings.start_node_gaussians, np.ones(len(node)), rng))
+            parts.append(_sample_gaussians(node, settings.start_node_gaussians, np.ones(len(node)), rng))
             owner.append(j)
         if body is not None:
             parts.append(body)
             owner.append(j)
     start = concatenate(parts)
     owners = np.repeat(owner, [len(part) for part in parts]).astype(np.int32)
-    on_road = _lies_on(start, road) & (owners == BACKGROUND)
+    on_road = _is_on_road(start, road) & (owners == BACKGROUND)
     if road is not None:
         lay_flat(start.means, start.quats, start.log_scales, np.flatnonzero(on_road), road)
     bodily = np.repeat([any(part is body for body in bodies) for part in parts], [len(part) for part in parts])
     opacities = np.where(bodily, start.opacities, np.float32(settings.start_opacity))[:, None]
     learned = {
-        "means": Learned.of(start.means),
-        "quats": Learned.of(start.quats),
-        "log_scales": Learned.of(start.log_scales),
-        "logits": Learned.of(logits_of(opacities)),
-        "colours": Learned.of(start.colours),
-        "sky": Learned.of(sky.reshape(-1, 3)),
-        "exposure": Learned.of(exposures),
-        "poses": Learned.of(np.zeros((len(exposures), POSE_SIZE))),
-        "boxes": Learned.of(np.zeros((len(nodes) * n_knots, SHIFT_SIZE))),
+        "means": AdamArray.unstepped(start.means),
+        "quats": AdamArray.unstepped(start.quats),
+        "log_scales": AdamArray.unstepped(start.log_scales),
+        "logits": AdamArray.unstepped(logits_of(opacities)),
+        "colours": AdamArray.unstepped(start.colours),
+        "sky": AdamArray.unstepped(sky.reshape(-1, 3)),
+        "exposure": AdamArray.unstepped(exposures),
+        "poses": AdamArray.unstepped(np.zeros((len(exposures), POSE_SIZE))),
+        "boxes": AdamArray.unstepped(np.zeros((len(nodes) * n_knots, SHIFT_SIZE))),
     }
     nearest = np.full(len(start), np.inf, np.float32)
     return FitState(0, learned, owners, on_road, nearest, np.zeros(len(start), np.float32))
 
 
-def _lies_on(gaussians: Gaussians, road: Road | None) -> Bools:
+def _is_on_road(gaussians: Gaussians, road: Road | None) -> Bools:
     if road is None:
         return np.zeros(len(gaussians), bool)
     flat = np.abs(rotations_of(gaussians.quats)[:, 2, 2]) > UPRIGHT
     with np.errstate(invalid="ignore"):
-        return np.asarray((np.abs(above_road(gaussians.means, road)) < ROAD_TOP_M) & flat)
+        return np.asarray((np.abs(height_above_road(gaussians.means, road)) < ROAD_TOP_M) & flat)
 
 
-def _thinned(gaussians: Gaussians, n: int, weight: Array, rng: np.random.Generator) -> Gaussians:
+def _sample_gaussians(gaussians: Gaussians, n: int, weight: Array, rng: np.random.Generator) -> Gaussians:
     """`n` of them by `weight`, each as much larger as there are fewer of its kind."""
     if len(gaussians) <= n:
         return gaussians

@@ -22,7 +22,7 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
 
 @dataclass
-class Learned:
+class AdamArray:
     """An array that is learned, with its moments."""
 
     values: F32  # (N, C)
@@ -31,7 +31,7 @@ class Learned:
     steps: ShortInts  # (N,) how often each row was stepped
 
     @classmethod
-    def of(cls, values: FloatArray) -> "Learned":
+    def unstepped(cls, values: FloatArray) -> "AdamArray":
         """Never stepped yet; `values` (N, C)."""
         start = np.array(values, np.float32, order="C")
         return cls(start, np.zeros_like(start), np.zeros_like(start), np.zeros(len(start), np.int32))
@@ -42,11 +42,11 @@ class Learned:
         self.steps[rows] += 1
         counts = np.arange(self.steps.max(initial=0) + 1)
         unbiased = np.stack([1.0 - BETA1**counts, 1.0 - BETA2**counts], axis=1)
-        step_rows(self.values, self.first, self.second, self.steps, rows, gradient, rate, sizes, unbiased)
+        adam_step(self.values, self.first, self.second, self.steps, rows, gradient, rate, sizes, unbiased)
 
-    def take(self, rows: Ints) -> "Learned":
+    def take(self, rows: Ints) -> "AdamArray":
         """The rows (M,), moments and all."""
-        return Learned(self.values[rows], self.first[rows], self.second[rows], self.steps[rows])
+        return AdamArray(self.values[rows], self.first[rows], self.second[rows], self.steps[rows])
 
     def forget(self, rows: Ints) -> None:
         """What `rows` are now has nothing to do with what they were."""
@@ -54,10 +54,10 @@ class Learned:
 
 
 @kernel
-def step_rows(
+def adam_step(
     values: Any, first: Any, second: Any, steps: Any, rows: Any, gradient: Any, rate: float, sizes: Any, unbiased: Any
 ) -> None:
-    """One step of `Learned`, in place: x -= rate size m / (sqrt(v) + eps), m and v without their start's bias."""
+    """One step of `AdamArray`, in place: x -= rate size m / (sqrt(v) + eps), m and v without their start's bias."""
     for k in range(rows.shape[0]):
         i = rows[k]
         size = rate * sizes[k] / unbiased[steps[i], 0]
@@ -101,7 +101,7 @@ class Road:
     slopes: Array  # (X, Y, 2) d height / d x, d y
 
 
-def find_road(points: Array, eyes: Array) -> Road | None:
+def fit_road(points: Array, eyes: Array) -> Road | None:
     """The road under the cameras: lidar `points` (M, 3), camera centres `eyes` (V, 3); None where there is none.
 
     Around each few metres of the way a plane is fitted to what lies below the cameras, and fitted again to what is
@@ -120,7 +120,7 @@ def find_road(points: Array, eyes: Array) -> Road | None:
         on_road[np.flatnonzero(near)[np.abs(off) < NEAR_PLANE_M]] = True
     if on_road.sum() < LEAST_POINTS:
         return None
-    return _field(points[on_road])
+    return _height_field(points[on_road])
 
 
 def _spaced(eyes: Array) -> Sequence[Array]:
@@ -145,7 +145,7 @@ def _plane(points: Array, eye: Array) -> Array | None:
     return np.asarray(plane)
 
 
-def _field(points: Array) -> Road:
+def _height_field(points: Array) -> Road:
     corner = points[:, :2].min(axis=0) - 2.0 * CELL_M
     size = np.ceil((points[:, :2].max(axis=0) - corner) / CELL_M).astype(int) + 3
     cells = np.rint((points[:, :2] - corner) / CELL_M).astype(int)
@@ -162,7 +162,7 @@ def _field(points: Array) -> Road:
 
 
 @kernel
-def _height(heights: Any, slopes: Any, corner: Any, x: float, y: float) -> Any:
+def _interpolate_height(heights: Any, slopes: Any, corner: Any, x: float, y: float) -> Any:
     """Height and slopes at a place; NaN beyond the road."""
     u, v = (x - corner[0]) / CELL_M, (y - corner[1]) / CELL_M
     i, j = int(np.floor(u)), int(np.floor(v))
@@ -183,12 +183,12 @@ def _height(heights: Any, slopes: Any, corner: Any, x: float, y: float) -> Any:
 def _above(means: Any, heights: Any, slopes: Any, corner: Any) -> Any:
     out = np.empty(means.shape[0])
     for i in range(means.shape[0]):
-        z, _, _ = _height(heights, slopes, corner, means[i, 0], means[i, 1])
+        z, _, _ = _interpolate_height(heights, slopes, corner, means[i, 0], means[i, 1])
         out[i] = means[i, 2] - z
     return out
 
 
-def above_road(means: FloatArray, road: Road) -> Array:
+def height_above_road(means: FloatArray, road: Road) -> Array:
     """How far points (N, 3) lie above the road [m]; NaN beyond it."""
     return np.asarray(_above(means, road.heights, road.slopes, road.corner))
 
@@ -207,7 +207,7 @@ def _lay(
 ) -> None:
     for k in range(rows.shape[0]):
         i = rows[k]
-        z, sx, sy = _height(heights, slopes, corner, means[i, 0], means[i, 1])
+        z, sx, sy = _interpolate_height(heights, slopes, corner, means[i, 0], means[i, 1])
         if z != z:
             continue
         means[i, 2] = min(max(means[i, 2], z - SLACK_M), z + SLACK_M)
@@ -252,7 +252,7 @@ class FitState:
     """
 
     iteration: int
-    learned: dict[str, Learned]  # SHAPES: (N, C); WORLD: see below
+    learned: dict[str, AdamArray]  # SHAPES: (N, C); WORLD: see below
     owner: ShortInts  # (N,) ascending: BACKGROUND or row of a track
     road: Bools  # (N,) lies on the road
     nearest: F32  # (N,) [m] depth in the nearest photo so far; inf: not seen yet
@@ -268,7 +268,7 @@ class FitState:
         means, quats, log_scales, logits, colours = (self.learned[name].values for name in SHAPES)
         return Gaussians(means, quats, log_scales, opacities_of(logits[:, 0]), colours)
 
-    def seen(self, rows: Ints, depths: F32, screen: F32) -> F32:
+    def record_view(self, rows: Ints, depths: F32, screen: F32) -> F32:
         """Notes what a photo says of `rows` (M,): their depths (M,) in it, their derivatives (M, 2) by the place on it.
 
         Returns the nearest depths (M,) so far.
@@ -290,9 +290,9 @@ class FitState:
         log_scales, owned = self.learned["log_scales"].values, self.owner[rows] != BACKGROUND
         for most, mine in ((background, rows[~owned & ~self.road[rows]]), (boxes, rows[owned])):
             if most > 0.0 and len(mine):
-                log_scales[mine] = rounded(log_scales[mine], most)
+                log_scales[mine] = limit_stretch(log_scales[mine], most)
 
-    def note(self) -> None:
+    def add_to_average(self) -> None:
         """Takes what is learned now into its average. Rows must not be moved from the first time on."""
         self.noted += 1
         for name, learned in self.learned.items():
@@ -302,7 +302,7 @@ class FitState:
                 values = np.where((average * values).sum(axis=1, keepdims=True) < 0.0, -values, values)
             average += (values - average) / np.float32(self.noted)
 
-    def settle(self, road: Road | None) -> None:
+    def apply_average(self, road: Road | None) -> None:
         """Puts everything where it was on average, on the road as well."""
         for name, average in self.averages.items():
             self.learned[name].values[:] = average
@@ -314,7 +314,7 @@ class FitState:
         out: dict[str, NDArray[np.generic]] = {
             f"{name}.{each.name}": getattr(learned, each.name)
             for name, learned in self.learned.items()
-            for each in fields(Learned)
+            for each in fields(AdamArray)
         }
         out |= {f"{name}.average": average for name, average in self.averages.items()}
         out |= {name: np.array(getattr(self, name)) for name in COUNTS}
@@ -324,7 +324,7 @@ class FitState:
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "FitState":
         """The state that `arrays` gave, as a copy of its own. Raises KeyError where one is missing."""
         learned = {
-            name: Learned(*(np.array(arrays[f"{name}.{each.name}"]) for each in fields(Learned)))
+            name: AdamArray(*(np.array(arrays[f"{name}.{each.name}"]) for each in fields(AdamArray)))
             for name in SHAPES + WORLD
         }
         owner, road, nearest, wanted = (np.array(arrays[name]) for name in PER_GAUSSIAN)
@@ -332,7 +332,7 @@ class FitState:
         averages = {name: np.array(arrays[f"{name}.average"], np.float32) for name in (learned if noted else ())}
         return cls(iteration, learned, owner, road, nearest, wanted, averages, noted)
 
-    def rows(self, rows: Ints) -> None:
+    def keep_rows(self, rows: Ints) -> None:
         """Keeps these Gaussians, in this order; one may be named again and again."""
         for name in SHAPES:
             self.learned[name] = self.learned[name].take(rows)
@@ -340,7 +340,7 @@ class FitState:
             setattr(self, name, getattr(self, name)[rows])
 
 
-def rounded(log_scales: F32, most: float) -> F32:
+def limit_stretch(log_scales: F32, most: float) -> F32:
     """Logarithms (M, 3) of sizes, the shorter ones raised to the longest over `most`."""
     return np.maximum(log_scales, log_scales.max(axis=1, keepdims=True) - np.float32(np.log(most)))
 
@@ -366,7 +366,7 @@ DEAD_OPACITY = 0.01  # below which a Gaussian is moved elsewhere
 JITTER = 0.5  # how far from its source a copy is put, in standard deviations of it
 
 
-def refine(state: FitState, settings: FitSettings) -> None:
+def relocate_and_grow(state: FitState, settings: FitSettings) -> None:
     """Relocates and grows, in place; a function of seed and iteration alone."""
     rng = np.random.Generator(np.random.Philox(key=[settings.seed, 2**32 + state.iteration]))
     opacities = opacities_of(state.learned["logits"].values[:, 0]).astype(np.float64)
@@ -377,30 +377,30 @@ def refine(state: FitState, settings: FitSettings) -> None:
         target = min(settings.most_gaussians, int(len(state) * (1.0 + settings.growth)))
         n_new = max(target - len(state), 0)
         sources = rng.choice(len(state), len(free) + n_new, p=weight / weight.sum())
-        _copy(state, np.concatenate([free, np.arange(len(state), len(state) + n_new)]), sources, rng)
+        _copy_gaussians(state, np.concatenate([free, np.arange(len(state), len(state) + n_new)]), sources, rng)
     state.wanted = np.zeros(len(state), np.float32)
 
 
-def _copy(state: FitState, targets: Ints, sources: Ints, rng: np.random.Generator) -> None:
+def _copy_gaussians(state: FitState, targets: Ints, sources: Ints, rng: np.random.Generator) -> None:
     """Puts copies of `sources` at the rows `targets` (M,), where rows beyond the last are new."""
     if len(targets) == 0:
         return
     named, counts = np.unique(sources, return_counts=True)
     logits, log_scales = state.learned["logits"].values, state.learned["log_scales"].values
-    opacities, shrink = shared(opacities_of(logits[named, 0]).astype(np.float64), counts + 1)
+    opacities, shrink = split_opacity(opacities_of(logits[named, 0]).astype(np.float64), counts + 1)
     logits[named, 0] = logits_of(np.maximum(opacities, LEAST_OPACITY))
     log_scales[named] += np.log(shrink)[:, None].astype(np.float32)
     rows = np.arange(max(len(state), int(targets.max()) + 1))
     rows[targets] = sources
-    state.rows(rows)
+    state.keep_rows(rows)
     means = state.learned["means"].values
-    means[targets] += JITTER * _within(state, targets, rng)
+    means[targets] += JITTER * _random_offsets(state, targets, rng)
     for name in SHAPES:
         state.learned[name].forget(np.concatenate([named, targets]))
-    state.rows(np.argsort(state.owner, kind="stable"))
+    state.keep_rows(np.argsort(state.owner, kind="stable"))
 
 
-def _within(state: FitState, rows: Ints, rng: np.random.Generator) -> F32:
+def _random_offsets(state: FitState, rows: Ints, rng: np.random.Generator) -> F32:
     """Random offsets (M, 3) as far as the Gaussians at `rows` reach."""
     quats = state.learned["quats"].values[rows]
     turns = rotations_of(quats / np.linalg.norm(quats, axis=1, keepdims=True))
@@ -420,7 +420,7 @@ def _shrink(opacity: float, shared_opacity: float, n: int) -> float:
 
 
 @kernel
-def shared(opacities: Array, counts: Ints) -> tuple[Array, Array]:
+def split_opacity(opacities: Array, counts: Ints) -> tuple[Array, Array]:
     """Opacity and factor of the scales, (N,) each, of each of `counts` Gaussians that together show what one did."""
     out, shrink = np.empty(len(opacities)), np.empty(len(opacities))
     for i in range(len(opacities)):

@@ -21,7 +21,7 @@ INSTANT_S = 0.05  # photos no further apart were taken at once, by one pose of t
 
 
 @dataclass(frozen=True)
-class Shots:
+class RigPhotos:
     """Where the photos of a block come from, as given; one row each."""
 
     camera_of: Ints  # (V,) row of the cameras
@@ -39,9 +39,9 @@ class Rig:
     stamps: Array  # (C,) [s] that a camera's photos were taken later than said
     corrections: Array  # (T, 4, 4) of each instant: world_from_ego @ correction is where the ego was
 
-    def ego_poses(self, shots: Shots, after_s: Array | float = 0.0) -> Array:
+    def ego_poses(self, shots: RigPhotos, after_s: Array | float = 0.0) -> Array:
         """(V, 4, 4) corrected world_from_ego of the photos, `after_s` (V,) after their middle row was read."""
-        late = motions((self.stamps[shots.camera_of] + after_s)[:, None] * shots.twists)
+        late = motions_of_twists((self.stamps[shots.camera_of] + after_s)[:, None] * shots.twists)
         return np.asarray(shots.world_from_ego @ late @ self.corrections[shots.instant_of])
 
     def moved(self, step: Array) -> "Rig":
@@ -49,10 +49,10 @@ class Rig:
         n = 6 * len(self.corrections)
         of_camera = step[n:].reshape(len(self.lenses), -1)
         return Rig(
-            self.ego_from_camera @ motions(of_camera[:, :6]),
+            self.ego_from_camera @ motions_of_twists(of_camera[:, :6]),
             self.lenses + of_camera[:, 6:15],
             self.stamps + of_camera[:, 15],
-            self.corrections @ motions(step[:n].reshape(-1, 6)),
+            self.corrections @ motions_of_twists(step[:n].reshape(-1, 6)),
         )
 
     def away_from(self, given: "Rig") -> Array:
@@ -64,7 +64,7 @@ class Rig:
         return np.concatenate([of_instant.ravel(), of_camera.ravel()])
 
 
-def given_rig(cameras: Sequence[Camera], files: Sequence[SensorFile]) -> tuple[Rig, Shots]:
+def initial_rig(cameras: Sequence[Camera], files: Sequence[SensorFile]) -> tuple[Rig, RigPhotos]:
     """The rig as it is said to be. The files are of these cameras."""
     row = {camera.name: i for i, camera in enumerate(cameras)}
     camera_of = np.array([row[file.sensor] for file in files])
@@ -78,10 +78,10 @@ def given_rig(cameras: Sequence[Camera], files: Sequence[SensorFile]) -> tuple[R
         np.tile(np.eye(4), (instant_of.max() + 1, 1, 1)),
     )
     poses = np.stack([file.world_from_ego for file in files])
-    return rig, Shots(camera_of, instant_of, poses, _twists(poses, np.array([file.time_s for file in files])))
+    return rig, RigPhotos(camera_of, instant_of, poses, _twists(poses, np.array([file.time_s for file in files])))
 
 
-def camera_of_rig(camera: Camera, rig: Rig, row: int) -> Camera:
+def adjusted_camera(camera: Camera, rig: Rig, row: int) -> Camera:
     """The camera as the rig has it."""
     fx, fy, cx, cy = rig.lenses[row, :4]
     intrinsics = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -90,7 +90,7 @@ def camera_of_rig(camera: Camera, rig: Rig, row: int) -> Camera:
     )
 
 
-def motions(twists: Array) -> Array:
+def motions_of_twists(twists: Array) -> Array:
     """(M, 4, 4): x' = R(turn) x + shift of rows (M, 6) shift [m], turn [rad]."""
     out = np.tile(np.eye(4), (len(twists), 1, 1))
     out[:, :3, :3] = Rotation.from_rotvec(twists[:, 3:]).as_matrix()
@@ -146,7 +146,7 @@ NEAR_M = 0.3
 
 
 @kernel
-def _see(point: Any, ego_from_world: Any, camera_from_ego: Any, lens: Any, out: Any) -> None:
+def _project_point(point: Any, ego_from_world: Any, camera_from_ego: Any, lens: Any, out: Any) -> None:
     """Fills out (8,) with the pixel, the point in the ego's and in the camera's frame; not ahead: NaN for the pixel."""
     for r in range(3):
         e = ego_from_world
@@ -165,7 +165,7 @@ def _see(point: Any, ego_from_world: Any, camera_from_ego: Any, lens: Any, out: 
 
 
 @kernel
-def residuals(
+def reprojection_residuals(
     points: Any, point_of: Any, view_of: Any, at: Any, camera_of: Any, ego_from_world: Any, camera_from_ego: Any,
     lenses: Any,
 ) -> Any:  # fmt: skip
@@ -174,17 +174,17 @@ def residuals(
     for i in range(point_of.shape[0]):
         v = view_of[i]
         c = camera_of[v]
-        _see(points[point_of[i]], ego_from_world[v], camera_from_ego[c], lenses[c], seen)
+        _project_point(points[point_of[i]], ego_from_world[v], camera_from_ego[c], lenses[c], seen)
         for k in range(2):
             out[i, k] = seen[k] - at[i, k] if seen[0] == seen[0] else np.inf
     return out
 
 
 @kernel
-def _slopes(
+def _projection_jacobian(
     seen: Any, camera_from_ego: Any, world_to_camera: Any, lens: Any, twist: Any, by_rig: Any, by_point: Any
 ) -> None:
-    """Derivatives of a pixel by the 22 parameters (2, 22) and by the point (2, 3), of what `_see` filled in."""
+    """Derivatives of a pixel by the 22 parameters (2, 22) and by the point (2, 3), of what `_project_point` found."""
     x, y, z = seen[5] / seen[7], seen[6] / seen[7], seen[7]
     fx, fy, k1, k2, p1, p2, k3 = lens[0], lens[1], lens[4], lens[5], lens[6], lens[7], lens[8]
     r2 = x * x + y * y
@@ -247,13 +247,13 @@ def normal_equations(
             if w == 0.0:
                 continue
             c = camera_of[v]
-            _see(points[p], ego_from_world[v], camera_from_ego[c], lenses[c], seen)
+            _project_point(points[p], ego_from_world[v], camera_from_ego[c], lenses[c], seen)
             for r in range(3):
                 for k in range(3):
                     turn[r, k] = 0.0
                     for m in range(3):
                         turn[r, k] += camera_from_ego[c, r, m] * ego_from_world[v, m, k]
-            _slopes(seen, camera_from_ego[c], turn, lenses[c], twists[v], by_rig, by_point)
+            _projection_jacobian(seen, camera_from_ego[c], turn, lenses[c], twists[v], by_rig, by_point)
             off_x, off_y = at[i, 0] - seen[0], at[i, 1] - seen[1]
             for k in range(N_CORNER):
                 gx, gy = w * by_rig[0, k], w * by_rig[1, k]
@@ -266,7 +266,7 @@ def normal_equations(
                 sides[p, k] += w * (by_point[0, k] * off_x + by_point[1, k] * off_y)
                 for m in range(3):
                     block[k, m] += w * (by_point[0, k] * by_point[0, m] + by_point[1, k] * by_point[1, m])
-        inverses[p] = _inverse(block, damping)
+        inverses[p] = _damped_inverse(block, damping)
         inverse, side = inverses[p], sides[p]
         for a in range(starts[p], starts[p + 1]):
             if weights[a] == 0.0:
@@ -292,7 +292,7 @@ def normal_equations(
 
 
 @kernel
-def _inverse(block: Any, damping: float) -> Any:
+def _damped_inverse(block: Any, damping: float) -> Any:
     """Of a damped symmetric (3, 3); zeros where it is singular."""
     a, b, c = block[0, 0] * (1.0 + damping), block[1, 1] * (1.0 + damping), block[2, 2] * (1.0 + damping)
     d, e, f = block[0, 1], block[0, 2], block[1, 2]
@@ -308,7 +308,7 @@ def _inverse(block: Any, damping: float) -> Any:
 
 
 @kernel
-def solved(matrix: Any, right: Any) -> Any:
+def cholesky_solve(matrix: Any, right: Any) -> Any:
     """x (n,) of a symmetric positive definite matrix (n, n) x = right, by Cholesky; NaN where it is not.
 
     Here and not in LAPACK, whose sums change with the number of its threads.
@@ -348,7 +348,7 @@ FARTHEST_M = 300.0
 
 
 @dataclass(frozen=True)
-class Matched:
+class CornerTracks:
     """Corners that show one point each, ordered by point."""
 
     starts: Ints  # (P + 1,) rows of the corners of point p: starts[p] to starts[p + 1]
@@ -364,7 +364,7 @@ class Matched:
 
 
 @dataclass(frozen=True)
-class Bundle:
+class AdjustedRig:
     """A rig and its points, and which corners agree with them."""
 
     rig: Rig
@@ -372,44 +372,46 @@ class Bundle:
     used: Bools  # (N,)
 
 
-def adjusted(
+def bundle_adjust(
     rig: Rig,
-    shots: Shots,
-    matched: Matched,
+    shots: RigPhotos,
+    matched: CornerTracks,
     sigmas: Array,
     start: Rig | None = None,
     widths: Sequence[float] = WIDTHS_PX,
-) -> Bundle:
+) -> AdjustedRig:
     """The rig that explains the corners best without leaving the given one by many `sigmas` (n,); 0 holds.
 
     `start`: where to begin, by default at the given one.
     """
     now, points = start or rig, np.zeros((len(matched.starts) - 1, 3))
     for width in widths:
-        points, there = triangulated(now, shots, matched)
-        off = offsets(now, shots, matched, points)
-        used = with_company((off < OUT * width) & there[matched.point_of], matched)
-        now, points = _settled(rig, now, shots, matched, points, used, width, sigmas)
-    points, there = triangulated(now, shots, matched)
-    last = offsets(now, shots, matched, points)
-    return Bundle(now, points, with_company((last < OUT * WIDTHS_PX[-1]) & there[matched.point_of], matched))
+        points, there = triangulate_points(now, shots, matched)
+        off = reprojection_errors(now, shots, matched, points)
+        used = drop_lone_corners((off < OUT * width) & there[matched.point_of], matched)
+        now, points = _levenberg_marquardt(rig, now, shots, matched, points, used, width, sigmas)
+    points, there = triangulate_points(now, shots, matched)
+    last = reprojection_errors(now, shots, matched, points)
+    return AdjustedRig(now, points, drop_lone_corners((last < OUT * WIDTHS_PX[-1]) & there[matched.point_of], matched))
 
 
-def without(matched: Matched, views: Array) -> Matched:
+def without_views(matched: CornerTracks, views: Array) -> CornerTracks:
     """Without the corners of some photos, and without points that then have fewer than two."""
-    return part_of(matched, ~np.isin(matched.view_of, views))
+    return select_corners(matched, ~np.isin(matched.view_of, views))
 
 
-def part_of(matched: Matched, keep: Bools) -> Matched:
+def select_corners(matched: CornerTracks, keep: Bools) -> CornerTracks:
     """The corners (N,) to keep, but for those whose point then has fewer than two."""
     count = np.bincount(matched.point_of, keep, len(matched.starts) - 1)
     keep = keep & (count >= 2)[matched.point_of]
     ends = np.cumsum(count[count >= 2]).astype(np.int64)
     after_s = None if matched.after_s is None else matched.after_s[keep]
-    return Matched(np.concatenate([[0], ends]), matched.view_of[keep], matched.at[keep], matched.pixel[keep], after_s)
+    return CornerTracks(
+        np.concatenate([[0], ends]), matched.view_of[keep], matched.at[keep], matched.pixel[keep], after_s
+    )
 
 
-def read_after_s(matched: Matched, shots: Shots, readouts_s: Array, heights: Array) -> Array | None:
+def readout_delays_s(matched: CornerTracks, shots: RigPhotos, readouts_s: Array, heights: Array) -> Array | None:
     """(N,) how long after the middle row of its photo each corner was read; None where no camera (C,) reads by rows."""
     if not readouts_s.any():
         return None
@@ -417,37 +419,39 @@ def read_after_s(matched: Matched, shots: Shots, readouts_s: Array, heights: Arr
     return np.asarray(readouts_s[camera_of] * (matched.at[:, 1] / heights[camera_of] - 0.5))
 
 
-def with_company(used: Bools, matched: Matched) -> Bools:
+def drop_lone_corners(used: Bools, matched: CornerTracks) -> Bools:
     """Without corners whose point has no second one."""
     count = np.bincount(matched.point_of, used, len(matched.starts) - 1)
     return np.asarray(used & (count[matched.point_of] >= 2))
 
 
-def offsets(rig: Rig, shots: Shots, matched: Matched, points: Array) -> Array:
+def reprojection_errors(rig: Rig, shots: RigPhotos, matched: CornerTracks, points: Array) -> Array:
     """(N,) distance of each corner from where its point falls, in pixels of the picture it was looked for in."""
     return np.asarray(np.hypot(*_residuals(rig, shots, matched, points).T) / matched.pixel)
 
 
-def _residuals(rig: Rig, shots: Shots, matched: Matched, points: Array) -> Array:
-    view_of, seen = _seen(shots, matched)
-    ego_from_world = np.linalg.inv(rig.ego_poses(seen, _after(matched)))
+def _residuals(rig: Rig, shots: RigPhotos, matched: CornerTracks, points: Array) -> Array:
+    view_of, seen = _views_of_corners(shots, matched)
+    ego_from_world = np.linalg.inv(rig.ego_poses(seen, _delays_or_zero(matched)))
     of_photo = view_of, matched.at, seen.camera_of, ego_from_world, np.linalg.inv(rig.ego_from_camera), rig.lenses
-    return np.asarray(residuals(points, matched.point_of, *of_photo))
+    return np.asarray(reprojection_residuals(points, matched.point_of, *of_photo))
 
 
-def _seen(shots: Shots, matched: Matched) -> tuple[Ints, Shots]:
+def _views_of_corners(shots: RigPhotos, matched: CornerTracks) -> tuple[Ints, RigPhotos]:
     """The photos and which a corner (N,) is of; where rows are read one after the other, each corner as its own."""
     if matched.after_s is None:
         return matched.view_of, shots
     v = matched.view_of
-    return np.arange(len(v)), Shots(shots.camera_of[v], shots.instant_of[v], shots.world_from_ego[v], shots.twists[v])
+    return np.arange(len(v)), RigPhotos(
+        shots.camera_of[v], shots.instant_of[v], shots.world_from_ego[v], shots.twists[v]
+    )
 
 
-def _after(matched: Matched) -> Array | float:
+def _delays_or_zero(matched: CornerTracks) -> Array | float:
     return 0.0 if matched.after_s is None else matched.after_s
 
 
-def rays(rig: Rig, shots: Shots, matched: Matched) -> tuple[Array, Array]:
+def corner_rays(rig: Rig, shots: RigPhotos, matched: CornerTracks) -> tuple[Array, Array]:
     """Eyes (N, 3) and unit directions (N, 3) in the world of the corners."""
     camera_of = shots.camera_of[matched.view_of]
     lens = rig.lenses[camera_of].T
@@ -461,15 +465,17 @@ def rays(rig: Rig, shots: Shots, matched: Matched) -> tuple[Array, Array]:
             (seen[0] - 2.0 * p1 * x * y - p2 * (r2 + 2.0 * x * x)) / s,
             (seen[1] - p1 * (r2 + 2.0 * y * y) - 2.0 * p2 * x * y) / s,
         )
-    view_of, seen_by = _seen(shots, matched)
-    pose = (rig.ego_poses(seen_by, _after(matched)) @ rig.ego_from_camera[seen_by.camera_of])[view_of]
+    view_of, seen_by = _views_of_corners(shots, matched)
+    pose = (rig.ego_poses(seen_by, _delays_or_zero(matched)) @ rig.ego_from_camera[seen_by.camera_of])[view_of]
     way = np.einsum("nij,nj->ni", pose[:, :3, :3], np.column_stack([x, y, np.ones(len(x))]))
     return pose[:, :3, 3], way / np.linalg.norm(way, axis=1, keepdims=True)
 
 
-def triangulated(rig: Rig, shots: Shots, matched: Matched, used: Bools | None = None) -> tuple[Array, Bools]:
+def triangulate_points(
+    rig: Rig, shots: RigPhotos, matched: CornerTracks, used: Bools | None = None
+) -> tuple[Array, Bools]:
     """Points (P, 3) nearest to their corners' rays, and which of them are there: with parallax, ahead, not too far."""
-    eyes, ways = rays(rig, shots, matched)
+    eyes, ways = corner_rays(rig, shots, matched)
     weight = np.ones(len(eyes)) if used is None else used.astype(np.float64)
     first = matched.starts[:-1]
     across = weight[:, None, None] * (np.eye(3) - ways[:, :, None] * ways[:, None, :])
@@ -488,14 +494,21 @@ def triangulated(rig: Rig, shots: Shots, matched: Matched, used: Bools | None = 
     return points, there
 
 
-def _settled(
-    given: Rig, rig: Rig, shots: Shots, matched: Matched, points: Array, used: Bools, width: float, sigmas: Array
+def _levenberg_marquardt(
+    given: Rig,
+    rig: Rig,
+    shots: RigPhotos,
+    matched: CornerTracks,
+    points: Array,
+    used: Bools,
+    width: float,
+    sigmas: Array,
 ) -> tuple[Rig, Array]:
     """Rig and points after some steps of Levenberg-Marquardt."""
     free = sigmas > 0.0
     trust = np.where(free, 1.0 / np.where(free, sigmas, 1.0) ** 2, 0.0)
-    places = _places(rig, shots, matched)
-    view_of, seen = _seen(shots, matched)
+    places = _parameter_rows(rig, shots, matched)
+    view_of, seen = _views_of_corners(shots, matched)
     damping = DAMPING[0]
     width_px = width * matched.pixel
 
@@ -509,7 +522,7 @@ def _settled(
 
     cost, weights = cost_of(rig, points)
     for _ in range(STEPS):
-        ego_from_world = np.linalg.inv(rig.ego_poses(seen, _after(matched)))
+        ego_from_world = np.linalg.inv(rig.ego_poses(seen, _delays_or_zero(matched)))
         matrix, right, inverses, sides, mixed = normal_equations(
             points, matched.starts, view_of, matched.at, weights, damping, seen.camera_of, places,
             ego_from_world, np.linalg.inv(rig.ego_from_camera), rig.lenses, seen.twists, len(sigmas),
@@ -518,7 +531,7 @@ def _settled(
         matrix[np.diag_indices(len(sigmas))] = np.diag(matrix) * (1.0 + damping) + trust
         matrix[~free], matrix[:, ~free], right[~free] = 0.0, 0.0, 0.0
         matrix[~free, ~free] = 1.0
-        step = solved(matrix, right)
+        step = cholesky_solve(matrix, right)
         if np.isfinite(step).all():
             moved = np.einsum("nkm,nk->nm", mixed, step[places])
             by_point = np.add.reduceat(moved, matched.starts[:-1])
@@ -540,7 +553,7 @@ def _settled(
     return rig, points
 
 
-def _places(rig: Rig, shots: Shots, matched: Matched) -> Ints:
+def _parameter_rows(rig: Rig, shots: RigPhotos, matched: CornerTracks) -> Ints:
     """(N, 22) rows of the parameters that a corner depends on."""
     n = 6 * len(rig.corrections)
     of_instant = 6 * shots.instant_of[matched.view_of, None] + np.arange(MOUNT)

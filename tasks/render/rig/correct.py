@@ -14,20 +14,20 @@ from scipy.spatial.transform import Rotation, Slerp
 from tasks.render.rig.adjust import (
     N_CAMERA,
     STAMP,
-    Bundle,
-    Matched,
+    AdjustedRig,
+    CornerTracks,
     Rig,
-    Shots,
-    adjusted,
-    camera_of_rig,
-    given_rig,
-    offsets,
-    part_of,
-    rays,
-    read_after_s,
-    triangulated,
+    RigPhotos,
+    adjusted_camera,
+    bundle_adjust,
+    corner_rays,
+    initial_rig,
+    readout_delays_s,
+    reprojection_errors,
+    select_corners,
+    triangulate_points,
     twists_of,
-    without,
+    without_views,
 )
 from tasks.render.scene.features import WIDE_M, driven_roads
 from tasks.render.scene.movers import behind_boxes
@@ -48,7 +48,7 @@ LEAST_MATCHES = 12  # that agree with one geometry of two photos
 
 
 @dataclass(frozen=True)
-class Corners:
+class PhotoCorners:
     """What is remembered of one photo."""
 
     at: Array  # (K, 2) pixels of the photo as it was taken, the centre of the first at (0.5, 0.5)
@@ -56,7 +56,7 @@ class Corners:
     pixel: float  # pixels of the photo per pixel of the picture that was looked at
 
 
-def corners_of(rgb: Bytes, hidden: Bools | None = None) -> Corners:
+def detect_corners(rgb: Bytes, hidden: Bools | None = None) -> PhotoCorners:
     """The corners of a photo (H, W, 3), none where it is `hidden` (h, w), a mask of any size."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     scale = max(1.0, rgb.shape[1] / CORNERS_WIDTH_PX)
@@ -69,17 +69,17 @@ def corners_of(rgb: Bytes, hidden: Bools | None = None) -> Corners:
     sift = cv2.SIFT_create(nfeatures=MOST_CORNERS, contrastThreshold=CONTRAST)  # type: ignore[attr-defined]
     found, descriptors = sift.detectAndCompute(grey, mask)
     if descriptors is None:
-        return Corners(np.zeros((0, 2)), np.zeros((0, 128), np.float32), scale)
+        return PhotoCorners(np.zeros((0, 2)), np.zeros((0, 128), np.float32), scale)
     at = (np.array([corner.pt for corner in found], np.float64) + 0.5) * [
         rgb.shape[1] / size[0],
         rgb.shape[0] / size[1],
     ]
     # One corner may be found with several orientations; distances of square roots compare better (Arandjelovic 2012).
     share = descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1.0)
-    return Corners(at, np.rint(UNIT * np.sqrt(share)).astype(np.float32), scale)
+    return PhotoCorners(at, np.rint(UNIT * np.sqrt(share)).astype(np.float32), scale)
 
 
-def matches(a: Corners, b: Corners) -> tuple[Indices, Indices]:
+def match_corners(a: PhotoCorners, b: PhotoCorners) -> tuple[Indices, Indices]:
     """Rows of corners that are each other's best by far and agree with one geometry; none where too few do."""
     nobody = np.zeros(0, np.intp), np.zeros(0, np.intp)
     if min(len(a.at), len(b.at)) < LEAST_MATCHES:
@@ -116,12 +116,12 @@ BASELINES_M = (0.3, 20.0)  # less: no parallax; more: nothing looks the same
 BEST_M = (1.0, 3.0, 8.0)  # baselines that partners of the same camera are chosen near; a gap in one is filled by others
 
 
-def pairs(rig: Rig, shots: Shots, cameras: Sequence[Camera]) -> list[tuple[int, int]]:
+def choose_photo_pairs(rig: Rig, shots: RigPhotos, cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     """Rows of the photos that are compared: of each camera up to PARTNERS of those that show the same place."""
     poses = shots.world_from_ego @ rig.ego_from_camera[shots.camera_of]
     found = set()
     for i in range(len(poses)):
-        share = _shared(i, poses, rig, shots, cameras)
+        share = _shared_view(i, poses, rig, shots, cameras)
         away = np.linalg.norm(poses[:, :3, 3] - poses[i, :3, 3], axis=1)
         for c in range(len(cameras)):
             mine = c == shots.camera_of[i]
@@ -139,7 +139,7 @@ def pairs(rig: Rig, shots: Shots, cameras: Sequence[Camera]) -> list[tuple[int, 
     return sorted(found)
 
 
-def _shared(i: int, poses: Array, rig: Rig, shots: Shots, cameras: Sequence[Camera]) -> Array:
+def _shared_view(i: int, poses: Array, rig: Rig, shots: RigPhotos, cameras: Sequence[Camera]) -> Array:
     """(V,) share of photo i that each photo shows, were all of it at DEPTHS_M."""
     camera, lens = cameras[shots.camera_of[i]], rig.lenses[shots.camera_of[i]]
     u, v = np.meshgrid((np.arange(GRID[0]) + 0.5) / GRID[0], (np.arange(GRID[1]) + 0.5) / GRID[1])
@@ -155,20 +155,22 @@ def _shared(i: int, poses: Array, rig: Rig, shots: Shots, cameras: Sequence[Came
     return np.asarray(inside.mean(axis=1))
 
 
-def _likely(rig: Rig, shots: Shots, views: tuple[int, int], at_a: Array, at_b: Array) -> float:
+def _explained_share(rig: Rig, shots: RigPhotos, views: tuple[int, int], at_a: Array, at_b: Array) -> float:
     """Share of two photos' matches (M, 2) that the rig as given explains but for some degrees."""
     n = len(at_a)
     at = np.stack([at_a, at_b], axis=1).reshape(-1, 2)
     focal = rig.lenses[shots.camera_of[list(views)], 0]
-    pair = Matched(2 * np.arange(n + 1), np.tile(views, n), at, np.tile(focal, n))
-    points, there = triangulated(rig, shots, pair)
-    _, ways = rays(rig, shots, pair)
-    near = np.nan_to_num(offsets(rig, shots, pair, points).reshape(-1, 2).max(axis=1), nan=np.inf) < LIKELY
+    pair = CornerTracks(2 * np.arange(n + 1), np.tile(views, n), at, np.tile(focal, n))
+    points, there = triangulate_points(rig, shots, pair)
+    _, ways = corner_rays(rig, shots, pair)
+    near = np.nan_to_num(reprojection_errors(rig, shots, pair, points).reshape(-1, 2).max(axis=1), nan=np.inf) < LIKELY
     far = np.linalg.norm(ways[0::2] - ways[1::2], axis=1) < LIKELY
     return float(((near & there) | far).mean())
 
 
-def matched_corners(rig: Rig, shots: Shots, corners: Sequence[Corners], compared: Sequence[tuple[int, int]]) -> Matched:
+def matched_corners(
+    rig: Rig, shots: RigPhotos, corners: Sequence[PhotoCorners], compared: Sequence[tuple[int, int]]
+) -> CornerTracks:
     """Matches of all pairs of photos, joined where they share a corner; without what has two corners in one photo.
 
     A pair of photos most of whose matches lie far from where the rig as given has them is left out: one of the two is
@@ -177,8 +179,8 @@ def matched_corners(rig: Rig, shots: Shots, corners: Sequence[Corners], compared
     starts = np.concatenate([[0], np.cumsum([len(c.at) for c in corners])]).astype(np.int64)
     first, second = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for i, j in compared:
-        a, b = matches(corners[i], corners[j])
-        if len(a) and _likely(rig, shots, (i, j), corners[i].at[a], corners[j].at[b]) >= LIKELY_SHARE:
+        a, b = match_corners(corners[i], corners[j])
+        if len(a) and _explained_share(rig, shots, (i, j), corners[i].at[a], corners[j].at[b]) >= LIKELY_SHARE:
             first.append(starts[i] + a)
             second.append(starts[j] + b)
     edges = np.concatenate(first), np.concatenate(second)
@@ -197,7 +199,7 @@ def matched_corners(rig: Rig, shots: Shots, corners: Sequence[Corners], compared
     at = np.concatenate([c.at for c in corners])
     pixel = np.array([c.pixel for c in corners])
     ends = np.flatnonzero(np.diff(label[rows], append=-1)) + 1
-    return Matched(np.concatenate([[0], ends]).astype(np.int64), view[rows], at[rows], pixel[view[rows]])
+    return CornerTracks(np.concatenate([[0], ends]).astype(np.int64), view[rows], at[rows], pixel[view[rows]])
 
 
 # Which cameras took their photos later than their stamps say, where photos can tell.
@@ -216,7 +218,7 @@ WIDTHS_PX = (8.0, 4.0, 2.0, 1.0)
 
 
 @dataclass(frozen=True)
-class Delays:
+class CameraDelays:
     """What photos say of their cameras' stamps."""
 
     late_s: Array  # (C,) that photos are taken later than said, were it so
@@ -225,23 +227,25 @@ class Delays:
     believed: Bools  # (C,)
 
 
-def delays(given: Rig, shots: Shots, matched: Matched, held: Bundle, sigmas: Array) -> Delays:
+def estimate_delays(
+    given: Rig, shots: RigPhotos, matched: CornerTracks, held: AdjustedRig, sigmas: Array
+) -> CameraDelays:
     """Whose delay explains what nothing else does; `held` is what `sigmas` (n,), no delays, came to."""
     every = np.ones(len(given.stamps), np.bool_)
-    fitted, measured = (part_of(matched, matched.point_of % EVERY == k) for k in (0, 1))
-    late = adjusted(given, shots, fitted, with_stamps(sigmas, every), held.rig, WIDTHS_PX).rig
+    fitted, measured = (select_corners(matched, matched.point_of % EVERY == k) for k in (0, 1))
+    late = bundle_adjust(given, shots, fitted, free_stamps(sigmas, every), held.rig, WIDTHS_PX).rig
     found = np.abs(late.stamps) >= LEAST_LATE_S
     if not found.any():
-        return Delays(late.stamps, 0.0, 0.0, found)
-    on_time = adjusted(given, shots, fitted, sigmas, held.rig, WIDTHS_PX).rig
-    gained, off = _gained(on_time, late, shots, measured)
+        return CameraDelays(late.stamps, 0.0, 0.0, found)
+    on_time = bundle_adjust(given, shots, fitted, sigmas, held.rig, WIDTHS_PX).rig
+    gained, off = _error_gain(on_time, late, shots, measured)
     if len(gained) < 2 or off == 0.0:
-        return Delays(late.stamps, 0.0, 0.0, ~every)
+        return CameraDelays(late.stamps, 0.0, 0.0, ~every)
     gain, sure = gained.mean() / off, gained.mean() / (gained.std() / np.sqrt(len(gained)) + 1e-12)
-    return Delays(late.stamps, float(gain), float(sure), found & bool(gain > LEAST_GAIN and sure > SURE))
+    return CameraDelays(late.stamps, float(gain), float(sure), found & bool(gain > LEAST_GAIN and sure > SURE))
 
 
-def with_stamps(sigmas: Array, cameras: Bools) -> Array:
+def free_stamps(sigmas: Array, cameras: Bools) -> Array:
     """(n,) the same, the stamps of some cameras (C,) free."""
     out = sigmas.copy()
     of_camera = out[len(out) - N_CAMERA * len(cameras) :].reshape(-1, N_CAMERA)
@@ -249,12 +253,12 @@ def with_stamps(sigmas: Array, cameras: Bools) -> Array:
     return out
 
 
-def _gained(one: Rig, other: Rig, shots: Shots, matched: Matched) -> tuple[Array, float]:
+def _error_gain(one: Rig, other: Rig, shots: RigPhotos, matched: CornerTracks) -> tuple[Array, float]:
     """(P',) by how much less each point is off with the other rig, and how much all are on average with the first."""
     costs, there = [], np.ones(len(matched.starts) - 1, np.bool_)
     for rig in (one, other):
-        points, seen = triangulated(rig, shots, matched)
-        off = np.where(seen[matched.point_of], offsets(rig, shots, matched, points), 0.0)
+        points, seen = triangulate_points(rig, shots, matched)
+        off = np.where(seen[matched.point_of], reprojection_errors(rig, shots, matched, points), 0.0)
         costs.append(np.add.reduceat(np.log1p(np.minimum(off, 1e3) ** 2), matched.starts[:-1]))
         there &= seen
     return (costs[0] - costs[1])[there], float(costs[0][there].mean()) if there.any() else 0.0
@@ -287,7 +291,7 @@ class CameraChange:
 
 
 @dataclass(frozen=True)
-class Correction:
+class RigCorrection:
     """A block's cameras and photos after correction, in the order they came in."""
 
     cameras: tuple[Camera, ...]
@@ -299,40 +303,42 @@ class Correction:
     strangers: tuple[int, ...] = ()  # rows of files that do not show what those before and after and beside them do
 
 
-def corrected(cameras: Sequence[Camera], files: Sequence[SensorFile], corners: Sequence[Corners]) -> Correction | None:
+def correct_rig(
+    cameras: Sequence[Camera], files: Sequence[SensorFile], corners: Sequence[PhotoCorners]
+) -> RigCorrection | None:
     """Cameras and poses that make the photos' corners meet; None where too few do to say anything.
 
     `corners` of the files' photos, in their order; a file without any takes the correction of the times around it.
     """
-    rig, shots = given_rig(cameras, files)
+    rig, shots = initial_rig(cameras, files)
     shift = shots.world_from_ego[0, :3, 3].round()
     local = shots.world_from_ego.copy()
     local[:, :3, 3] -= shift
     shots = replace(shots, world_from_ego=local)
-    matched = matched_corners(rig, shots, corners, pairs(rig, shots, cameras))
+    matched = matched_corners(rig, shots, corners, choose_photo_pairs(rig, shots, cameras))
     if len(matched.starts) <= LEAST_POINTS:
         return None
     readouts_s, heights = (np.array([getattr(c, name) for c in cameras]) for name in ("readout_s", "height"))
-    matched = replace(matched, after_s=read_after_s(matched, shots, readouts_s, heights))
-    sigmas = sigmas_of(cameras, len(rig.corrections))
-    bundle = adjusted(rig, shots, matched, sigmas)
-    strangers = _strangers(bundle, shots, matched, corners)
+    matched = replace(matched, after_s=readout_delays_s(matched, shots, readouts_s, heights))
+    sigmas = parameter_sigmas(cameras, len(rig.corrections))
+    bundle = bundle_adjust(rig, shots, matched, sigmas)
+    strangers = _inconsistent_photos(bundle, shots, matched, corners)
     if strangers:
-        matched = without(matched, np.array(strangers))
+        matched = without_views(matched, np.array(strangers))
         if len(matched.starts) <= LEAST_POINTS:
             return None
-        bundle = adjusted(rig, shots, matched, sigmas)
-    believed = delays(rig, shots, matched, bundle, sigmas).believed
+        bundle = bundle_adjust(rig, shots, matched, sigmas)
+    believed = estimate_delays(rig, shots, matched, bundle, sigmas).believed
     if believed.any():
-        bundle = adjusted(rig, shots, matched, with_stamps(sigmas, believed))
+        bundle = bundle_adjust(rig, shots, matched, free_stamps(sigmas, believed))
     points = bundle.points[np.bincount(matched.point_of, bundle.used, len(bundle.points)) > 0]
     if len(points) < LEAST_POINTS:
         return None
     times = np.array([file.time_s for file in files])
-    end = replace(bundle.rig, corrections=_between(bundle, shots, matched, times))
+    end = replace(bundle.rig, corrections=_interpolate_corrections(bundle, shots, matched, times))
     poses = end.ego_poses(shots)
     start = replace(end, corrections=rig.corrections).ego_poses(shots)
-    middle, scale = poses[:, :3, 3].mean(axis=0), _scale(poses[:, :3, 3], start[:, :3, 3])
+    middle, scale = poses[:, :3, 3].mean(axis=0), _drive_scale(poses[:, :3, 3], start[:, :3, 3])
     mounts = end.ego_from_camera.copy()
     mounts[:, :3, 3] *= scale
     end = replace(end, ego_from_camera=mounts)
@@ -341,7 +347,7 @@ def corrected(cameras: Sequence[Camera], files: Sequence[SensorFile], corners: S
     of_pose = twists_of(np.linalg.inv(start) @ poses)
     of_camera = end.away_from(rig)[6 * len(rig.corrections) :].reshape(-1, N_CAMERA)
     poses[:, :3, 3] += shift
-    before, after = _before_and_after(rig, bundle, shots, matched)
+    before, after = _errors_before_and_after(rig, bundle, shots, matched)
     camera_of = shots.camera_of[matched.view_of]
     changes = []
     for k, camera in enumerate(cameras):
@@ -359,8 +365,8 @@ def corrected(cameras: Sequence[Camera], files: Sequence[SensorFile], corners: S
                 float(np.median(after[mine])) if mine.any() else float("nan"),
             )
         )
-    return Correction(
-        tuple(camera_of_rig(camera, end, k) for k, camera in enumerate(cameras)),
+    return RigCorrection(
+        tuple(adjusted_camera(camera, end, k) for k, camera in enumerate(cameras)),
         tuple(
             replace(file, world_from_ego=pose, late_s=float(late))
             for file, pose, late in zip(files, poses, end.stamps[shots.camera_of])
@@ -373,14 +379,14 @@ def corrected(cameras: Sequence[Camera], files: Sequence[SensorFile], corners: S
     )
 
 
-def _scale(places: Array, given: Array) -> float:
+def _drive_scale(places: Array, given: Array) -> float:
     """By what places (V, 3) spread less than those given: photos tell no scale, the drive as logged does."""
     off, wanted = places - places.mean(axis=0), given - given.mean(axis=0)
     spread = float((off * off).sum())
     return float((off * wanted).sum()) / spread if spread > 1.0 else 1.0
 
 
-def sigmas_of(cameras: Sequence[Camera], n_instants: int) -> Array:
+def parameter_sigmas(cameras: Sequence[Camera], n_instants: int) -> Array:
     """(n,) what each parameter of a rig may be off by, in the order of `Rig.away_from`; stamps: nothing."""
     of_instant = np.repeat([POSE_SHIFT_M, np.radians(POSE_TURN_DEG)], 3)
     # Poses are off together, bit by bit along the drive: all of them weigh as much as one camera does.
@@ -393,7 +399,7 @@ def sigmas_of(cameras: Sequence[Camera], n_instants: int) -> Array:
     return np.concatenate(rows)
 
 
-def _between(bundle: Bundle, shots: Shots, matched: Matched, times: Array) -> Array:
+def _interpolate_corrections(bundle: AdjustedRig, shots: RigPhotos, matched: CornerTracks, times: Array) -> Array:
     """(T, 4, 4) corrections; of instants with few corners those between the instants before and after."""
     corrections = bundle.rig.corrections
     count = np.bincount(shots.instant_of[matched.view_of], bundle.used, len(corrections))
@@ -413,7 +419,9 @@ def _between(bundle: Bundle, shots: Shots, matched: Matched, times: Array) -> Ar
     return out
 
 
-def _strangers(bundle: Bundle, shots: Shots, matched: Matched, corners: Sequence[Corners]) -> tuple[int, ...]:
+def _inconsistent_photos(
+    bundle: AdjustedRig, shots: RigPhotos, matched: CornerTracks, corners: Sequence[PhotoCorners]
+) -> tuple[int, ...]:
     """Photos of whose corners far fewer agree than is usual for their camera, or but where the ego cannot have been."""
     away = twists_of(bundle.rig.corrections)[shots.instant_of]
     elsewhere = np.linalg.norm(away[:, :3], axis=1) > TOO_FAR * POSE_SHIFT_M
@@ -428,12 +436,14 @@ def _strangers(bundle: Bundle, shots: Shots, matched: Matched, corners: Sequence
     return tuple(sorted(out))
 
 
-def _before_and_after(rig: Rig, bundle: Bundle, shots: Shots, matched: Matched) -> tuple[Array, Array]:
+def _errors_before_and_after(
+    rig: Rig, bundle: AdjustedRig, shots: RigPhotos, matched: CornerTracks
+) -> tuple[Array, Array]:
     """(N,) how far corners are from points triangulated from them, through the rig as given and as it is now."""
     out = []
     for one in (rig, bundle.rig):
-        points, _ = triangulated(one, shots, matched, bundle.used)
-        out.append(offsets(one, shots, matched, points) * matched.pixel)
+        points, _ = triangulate_points(one, shots, matched, bundle.used)
+        out.append(reprojection_errors(one, shots, matched, points) * matched.pixel)
     return out[0], out[1]
 
 
@@ -455,7 +465,7 @@ LEAST_WINDOWS = 500
 LEAST_LIKENESS = 0.3  # correlation at the best height, below which none is right
 
 
-def ground_below(photos: Sequence[Photo], world_from_ego: Array) -> float | None:
+def estimate_ground_height(photos: Sequence[Photo], world_from_ego: Array) -> float | None:
     """z [m] of the road in the frame of the ego, poses (V, 4, 4) of the photos; None where photos do not tell."""
     order = np.argsort([photo.time_s for photo in photos], kind="stable")
     times_s = np.array([photo.time_s for photo in photos])
@@ -468,8 +478,8 @@ def ground_below(photos: Sequence[Photo], world_from_ego: Array) -> float | None
     for k, height in enumerate(HEIGHTS_M):
         points = driven_roads(world_from_ego, times_s, float(height), ACROSS_M)
         across = round(2.0 * WIDE_M / ACROSS_M) + 1
-        laid = [_laid(photo, grey, points, across) for photo, grey in zip(photos, greys)]
-        found = [_correlations(*laid[a], *laid[b]) for a, b in pairs]
+        laid = [_rectify_on_road(photo, grey, points, across) for photo, grey in zip(photos, greys)]
+        found = [_window_correlations(*laid[a], *laid[b]) for a, b in pairs]
         every = np.concatenate(found) if found else np.zeros(0)
         if len(every) >= LEAST_WINDOWS:
             likeness[k] = every.mean()
@@ -481,7 +491,7 @@ def ground_below(photos: Sequence[Photo], world_from_ego: Array) -> float | None
     return float(HEIGHTS_M[best] + part * (HEIGHTS_M[1] - HEIGHTS_M[0]))
 
 
-def _laid(photo: Photo, grey: F32, points: Array, across: int) -> tuple[F32, Bools]:
+def _rectify_on_road(photo: Photo, grey: F32, points: Array, across: int) -> tuple[F32, Bools]:
     """The photo's grey (A, across) on the road's points, and where it shows them near enough."""
     camera_from_world = np.linalg.inv(photo.world_from_camera)
     x, y, z = photo.intrinsics @ (points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]).T
@@ -495,7 +505,7 @@ def _laid(photo: Photo, grey: F32, points: Array, across: int) -> tuple[F32, Boo
     return np.asarray(picture, np.float32), seen.reshape(-1, across)
 
 
-def _correlations(a: F32, in_a: Bools, b: F32, in_b: Bools) -> Array:
+def _window_correlations(a: F32, in_a: Bools, b: F32, in_b: Bools) -> Array:
     """(M,) of the windows that both show and that have grain in both."""
     both = in_a & in_b
     rows = np.flatnonzero(both.any(axis=1))
@@ -517,7 +527,7 @@ WIDTH = 240  # pixels of the mask
 LARGER_M = 0.6  # than the box: calibration and poses are what is not known yet
 
 
-def hidden_by(
+def movable_mask(
     agents: AgentTracks | None, camera: Camera, file: SensorFile, own_body: Bools | None = None
 ) -> Bools | None:
     """(h, w) pixels where something movable may be, or of the `own_body` (H, W); None where nothing is."""

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.scene.movers import NO_SHIFTS, BoxShifts, lifted, world_from_boxes
+from tasks.render.scene.movers import NO_SHIFTS, BoxShifts, lift_tracks, world_from_boxes
 from tasks.render.scene.sky import SkyMap
 from tasks.render.scene.surfels import box_gaussians
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
@@ -135,8 +135,8 @@ class RenderAsset:
 
     def lifted(self, agents: AgentTracks, first_s: float) -> AgentTracks:
         """Tracks whose first step is at `first_s` of the block, as high above the scene's road as they were logged."""
-        times, rises = rises_of(self.taken)
-        return lifted(agents, times - first_s, rises)
+        times, rises = photo_rises(self.taken)
+        return lift_tracks(agents, times - first_s, rises)
 
     def settled(self, agents: AgentTracks, first_s: float) -> AgentTracks:
         """The log's own tracks, whose first step is at `first_s` of the block, where its photos show them."""
@@ -161,7 +161,7 @@ class RenderAsset:
         return np.asarray(first.affine + share * (last.affine - first.affine), np.float32)
 
 
-def rises_of(taken: Sequence[TakenFrom]) -> tuple[Array, Array]:
+def photo_rises(taken: Sequence[TakenFrom]) -> tuple[Array, Array]:
     """Times (T,) of photos, ascending, and how much higher (T,) [m] they were taken than the log has it."""
     rows = np.array(sorted((photo.time_s, photo.rise_m) for photo in taken)).reshape(-1, 2)
     return rows[:, 0], rows[:, 1]
@@ -188,12 +188,14 @@ def psnr(a: NDArray[np.generic], b: NDArray[np.generic]) -> float:
     return float("inf") if error == 0.0 else 10.0 * float(np.log10(peak**2 / error))
 
 
-def developed(rgb: F32, affine: F32) -> F32:
+def apply_affine(rgb: F32, affine: F32) -> F32:
     """A picture (H, W, 3) of the scene's light as a camera with `affine` (3, 4) shows it."""
     return np.asarray(rgb @ affine[:, :3].T + affine[:, 3], np.float32)
 
 
-def scene_at(asset: RenderAsset, track_ids: Sequence[str], kinds: Sequence[AgentKind], boxes: Array) -> Gaussians:
+def compose_gaussians(
+    asset: RenderAsset, track_ids: Sequence[str], kinds: Sequence[AgentKind], boxes: Array
+) -> Gaussians:
     """Background and the named tracks at `boxes` (N, 7) x, y, z, heading, length, width, height in the world.
 
     A track without Gaussians of its own is a plain shaded box: nobody is invisible.

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from tasks.kernels.compiled import kernel
-from tasks.render.scene.depth import SHALLOW, STREET, Seen
+from tasks.render.scene.depth import SHALLOW, STREET, PhotoDepth
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.render.scene.sky import directions
 from tasks.render.splatting.gaussians import Gaussians
@@ -31,23 +31,23 @@ REACH_M = 40.0  # farther off boxes are not drawn as well as that
 BEFORE_M = 1.0  # what two photos saw so much nearer stands before the vehicle
 
 
-def on_bodies(photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> list[Seen]:
+def with_body_depths(photos: Sequence[Photo], seen: Sequence[PhotoDepth], tracks: Tracks) -> list[PhotoDepth]:
     """The same, pixels that look at a vehicle which drives at the depth of its body.
 
-    Not those that look at a parked one before it, at what other photos confirmed to stand there (`with_confirmed`), or
+    Not those that look at a parked one before it, at what other photos confirmed to stand there (`label_confirmed`), or
     at the own body.
     """
-    return [_on_bodies(photo, sight, tracks) for photo, sight in zip(photos, seen)]
+    return [_with_body_depth(photo, sight, tracks) for photo, sight in zip(photos, seen)]
 
 
-def _on_bodies(photo: Photo, sight: Seen, tracks: Tracks) -> Seen:
+def _with_body_depth(photo: Photo, sight: PhotoDepth, tracks: Tracks) -> PhotoDepth:
     eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
     bodies, driving = bodies_near(*tracks.at(photo.taken_s), tracks, eye)
     if not driving.any():
         return sight
     height, width = sight.depth.shape
     rays = directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3)
-    depth, first = nearest_box(rays, eye, bodies)
+    depth, first = nearest_box_along_rays(rays, eye, bodies)
     drives = (first >= 0) & driving[first]
     depth, drives = depth.reshape(height, width), drives.reshape(height, width)
     hidden = (sight.label == STREET) & (sight.depth > 0.0) & (sight.depth < depth - BEFORE_M)
@@ -84,7 +84,7 @@ def body_boxes(box: Array) -> list[Array]:
 
 
 @kernel
-def nearest_box(rays: Any, eye: Any, boxes: Any) -> Any:
+def nearest_box_along_rays(rays: Any, eye: Any, boxes: Any) -> Any:
     """How many lengths of rays (M, 3) from `eye` (3,) the first of boxes (N, 7) is away (M,), and which it is (M,).
 
     Infinite, and -1, where a ray meets none. A box around the eye is not met.
@@ -116,7 +116,7 @@ def nearest_box(rays: Any, eye: Any, boxes: Any) -> Any:
     return along, which
 
 
-def unseen_body(seen: Gaussians, size: Array) -> Gaussians:
+def unseen_body_gaussians(seen: Gaussians, size: Array) -> Gaussians:
     """What no photo shows of a vehicle, so that it is not hollow: Gaussians (M,) in the frame of its box of `size` (3,)
     [m], coloured like the nearest of what was seen.
 

@@ -11,19 +11,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from tasks.render.scene.asset import RenderAsset, ViewQuality, mean_psnr_db, psnr, scene_at
-from tasks.render.scene.body import on_bodies
-from tasks.render.scene.depth import SHALLOW, Seen, see, with_confirmed
+from tasks.render.scene.asset import RenderAsset, ViewQuality, compose_gaussians, mean_psnr_db, psnr
+from tasks.render.scene.body import with_body_depths
+from tasks.render.scene.depth import SHALLOW, PhotoDepth, estimate_photo_depth, label_confirmed
 from tasks.render.scene.engine import Vehicles, render
-from tasks.render.scene.features import NOTHING_KNOWN, Known, Points, known_without_lidar
-from tasks.render.scene.movers import owners, world_from_boxes
-from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, shifted
+from tasks.render.scene.features import NOTHING_KNOWN, KnownPoints, SurfacePoints, points_without_lidar
+from tasks.render.scene.movers import box_of_points, world_from_boxes
+from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse_sweeps, shift_pose
 from tasks.render.scene.sky import SkyMap, directions, sky_of_views
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.scene.surfels import (
     BACKGROUND,
-    Look,
-    choose,
+    PhotoDiscs,
+    choose_discs,
     count_free_space,
     discs_of_photo,
     gaussians_of,
@@ -32,7 +32,7 @@ from tasks.render.scene.surfels import (
 from tasks.render.settings import AssetSettings
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
 from tasks.render.splatting.project import OF_DISCS
-from tasks.render.splatting.raster import gather, shade, splat
+from tasks.render.splatting.raster import backproject, project_and_sort, shade
 from tasks.world.arrays import F32, Array, Bools
 from tasks.world.clip import AgentKind, AgentTracks, Pinhole, of_other_log
 
@@ -46,7 +46,7 @@ def build_asset(
     sweeps: Sequence[Sweep],
     agents: AgentTracks | None,
     settings: AssetSettings,
-    known: Known = NOTHING_KNOWN,
+    known: KnownPoints = NOTHING_KNOWN,
 ) -> RenderAsset:
     """The scene of one block. `agents`: 10 Hz tracks whose first step is time 0 of photos and sweeps.
 
@@ -56,22 +56,22 @@ def build_asset(
     if not photos:
         raise ValueError("build_asset: no photos")
     origin = np.round(photos[0].world_from_camera[:3, 3])
-    photos = [replace(p, world_from_camera=shifted(p.world_from_camera, -origin)) for p in photos]
-    sweeps = [replace(s, world_from_ego=shifted(s.world_from_ego, -origin)) for s in sweeps]
+    photos = [replace(p, world_from_camera=shift_pose(p.world_from_camera, -origin)) for p in photos]
+    sweeps = [replace(s, world_from_ego=shift_pose(s.world_from_ego, -origin)) for s in sweeps]
     held_out = held_out_rows(photos, settings.hold_out_every)
     train = [p for i, p in enumerate(photos) if i not in held_out]
     tracks = Tracks(agents, origin)
-    static, per_track = fuse(sweeps, tracks)
-    points = Points(static) if sweeps else known_without_lidar(train, tracks, known.shifted(-origin))
-    seen = [see(p, train, points, per_track, tracks, settings.stereo_photos) for p in train]
+    static, per_track = fuse_sweeps(sweeps, tracks)
+    points = SurfacePoints(static) if sweeps else points_without_lidar(train, tracks, known.shifted(-origin))
+    seen = [estimate_photo_depth(p, train, points, per_track, tracks, settings.stereo_photos) for p in train]
     if points.corners is not None:
-        seen = with_confirmed(train, seen)
+        seen = label_confirmed(train, seen)
     if not sweeps:
-        seen = on_bodies(train, seen, tracks)
-    background, nodes = surfaces(train, seen, tracks)
-    sky = sky_of(train, seen)
+        seen = with_body_depths(train, seen, tracks)
+    background, nodes = build_surfaces(train, seen, tracks)
+    sky = build_sky(train, seen)
     asset = RenderAsset(origin, background, nodes, sky, float("nan"), screen=OF_DISCS)
-    asset = _refit(asset, train, seen, tracks)
+    asset = _refit_colours(asset, train, seen, tracks)
     if not held_out:
         return asset
     views = tuple(_measured(asset, photos[i], tracks) for i in sorted(held_out))
@@ -95,7 +95,9 @@ def held_out_rows(photos: Sequence[Photo], every: int) -> frozenset[int]:
     return frozenset(out)
 
 
-def surfaces(photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> tuple[Gaussians, dict[str, Gaussians]]:
+def build_surfaces(
+    photos: Sequence[Photo], seen: Sequence[PhotoDepth], tracks: Tracks
+) -> tuple[Gaussians, dict[str, Gaussians]]:
     """Discs of all photos, carved, dealt to background and tracks, the closest looks kept."""
     # Only what lidar or the sky says may carve: a guess must not drill holes.
     carvers = [np.where(s.sky, FAR_M, np.where(s.label == SHALLOW, 0.0, s.depth)).astype(np.float32) for s in seen]
@@ -104,14 +106,14 @@ def surfaces(photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> t
         discs = discs_of_photo(photo.light, sight.depth, sight.label, photo.intrinsics, photo.world_from_camera)
         boxes, valid = tracks.at(photo.taken_s)
         poses = world_from_boxes(boxes)
-        owner = owners(discs.points, boxes, valid)
+        owner = box_of_points(discs.points, boxes, valid)
         at = (discs.pixels[:, 0], discs.pixels[:, 1])
         label, guessed = sight.label[at], sight.label[at] == SHALLOW
         street = (owner < 0) & (label < 0) & ~sight.passing[at]
-        street[street] = _witnessed(discs.points[street], guessed[street], photos, carvers)
+        street[street] = _confirmed_by_photos(discs.points[street], guessed[street], photos, carvers)
         keep = np.flatnonzero(street | (owner >= 0))
         looks.append(
-            Look(
+            PhotoDiscs(
                 discs.take(keep),
                 owner[keep],
                 guessed[keep],
@@ -121,7 +123,7 @@ def surfaces(photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> t
                 {int(j): poses[j] for j in np.flatnonzero(valid)},
             )
         )
-    kept = choose(looks)
+    kept = choose_discs(looks)
     nodes = {}
     for j, discs in kept.items():
         if j == BACKGROUND or len(discs.points) < MIN_NODE_DISCS:
@@ -131,7 +133,7 @@ def surfaces(photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> t
     return gaussians_of(kept[BACKGROUND]) if BACKGROUND in kept else EMPTY, nodes
 
 
-def _witnessed(points: Array, guessed: Bools, photos: Sequence[Photo], carvers: Sequence[F32]) -> Bools:
+def _confirmed_by_photos(points: Array, guessed: Bools, photos: Sequence[Photo], carvers: Sequence[F32]) -> Bools:
     """Which points (M, 3) not more photos look through than see; one that lidar saw is lost to two at least."""
     in_front, agreeing = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for photo, depth in zip(photos, carvers):
@@ -140,7 +142,7 @@ def _witnessed(points: Array, guessed: Bools, photos: Sequence[Photo], carvers: 
     return np.asarray((in_front <= agreeing) | ((in_front < 2) & ~guessed))
 
 
-def sky_of(photos: Sequence[Photo], seen: Sequence[Seen]) -> SkyMap:
+def build_sky(photos: Sequence[Photo], seen: Sequence[PhotoDepth]) -> SkyMap:
     """What the photos show of the sky."""
 
     def views() -> Iterator[tuple[Array, F32, Bools]]:  # one at a time: together they are 0.1 GB and more
@@ -153,7 +155,7 @@ def sky_of(photos: Sequence[Photo], seen: Sequence[Seen]) -> SkyMap:
     return sky_of_views(views())
 
 
-def _members(asset: RenderAsset, tracks: Tracks, time_s: float) -> tuple[list[int], Array]:
+def _present_tracks(asset: RenderAsset, tracks: Tracks, time_s: float) -> tuple[list[int], Array]:
     """Tracks that are there at a time, and all boxes in the world."""
     boxes, valid = tracks.at(time_s)
     boxes = boxes + np.concatenate([asset.origin, np.zeros(4)])
@@ -162,10 +164,10 @@ def _members(asset: RenderAsset, tracks: Tracks, time_s: float) -> tuple[list[in
 
 def _picture(asset: RenderAsset, photo: Photo, tracks: Tracks) -> F32:
     """The rendering of a photo (pose local) as the scene was at its time."""
-    rows, boxes = _members(asset, tracks, photo.taken_s)
+    rows, boxes = _present_tracks(asset, tracks, photo.taken_s)
     present = Vehicles(tuple(tracks.ids[j] for j in rows), tuple(tracks.kinds[j] for j in rows), boxes[rows])
     height, width = photo.rgb.shape[:2]
-    camera = Pinhole(photo.intrinsics, shifted(photo.world_from_camera, asset.origin), width, height)
+    camera = Pinhole(photo.intrinsics, shift_pose(photo.world_from_camera, asset.origin), width, height)
     return render(asset, [camera], present)[0].rgb
 
 
@@ -174,7 +176,9 @@ def _measured(asset: RenderAsset, photo: Photo, tracks: Tracks) -> ViewQuality:
     return ViewQuality(photo.camera, photo.time_s, of, float("nan"), held_out=True)
 
 
-def _refit(asset: RenderAsset, photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> RenderAsset:
+def _refit_colours(
+    asset: RenderAsset, photos: Sequence[Photo], seen: Sequence[PhotoDepth], tracks: Tracks
+) -> RenderAsset:
     """The same scene with colours that make the photos come out: one sweep of SART over the blending weights.
 
     With fixed geometry a picture is linear in the Gaussians' colours. Each photo's residual is carried back with the
@@ -188,16 +192,18 @@ def _refit(asset: RenderAsset, photos: Sequence[Photo], seen: Sequence[Seen], tr
     for photo, sight in zip(photos, seen):
         height, width = photo.rgb.shape[:2]
         camera = photo.intrinsics, photo.world_from_camera, width, height
-        there, boxes = _members(asset, tracks, photo.taken_s)
+        there, boxes = _present_tracks(asset, tracks, photo.taken_s)
         there = [j for j in there if tracks.ids[j] in place]
         ids = [tracks.ids[j] for j in there]
-        splats = splat(scene_at(asset, ids, [AgentKind.VEHICLE] * len(ids), boxes[there]), *camera, screen=asset.screen)
+        splats = project_and_sort(
+            compose_gaussians(asset, ids, [AgentKind.VEHICLE] * len(ids), boxes[there]), *camera, screen=asset.screen
+        )
         spans = [0, *(place[name] for name in ids)]
         rows = np.concatenate([np.arange(starts[k], starts[k + 1]) for k in spans])[splats.index]
         drawn = shade(splats, colours[rows], asset.sky.seen_by(*camera)).rgb
         # The background must not learn the colour of a car that drives by.
         residual = photo.rgb.astype(np.float32) / 255.0 - drawn
-        sums, weights = gather(splats, residual, sight.passing, len(asset.background))
+        sums, weights = backproject(splats, residual, sight.passing, len(asset.background))
         step = RELAXATION * sums / (weights + PRIOR_WEIGHT)[:, None]
         colours[rows] = np.clip(colours[rows] + step, 0.0, 1.0)
     fitted = [replace(p, colours=colours[starts[k] : starts[k + 1]]) for k, p in enumerate(parts)]

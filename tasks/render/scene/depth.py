@@ -12,11 +12,19 @@ from typing import Any
 import numpy as np
 
 from tasks.kernels.compiled import kernel
-from tasks.render.scene.features import Points, road_depth
+from tasks.render.scene.features import SurfacePoints, road_depth
 from tasks.render.scene.movers import behind_boxes, world_from_boxes
 from tasks.render.scene.sensed import Photo, Tracks
-from tasks.render.scene.sky import directions, may_be_sky, no_worse
-from tasks.render.scene.stereo import FAR_M, MAX_BASELINE_M, MIN_BASELINE_M, Compared, partners, sweep_depth, wide_depth
+from tasks.render.scene.sky import directions, may_be_sky, sky_agrees
+from tasks.render.scene.stereo import (
+    FAR_M,
+    MAX_BASELINE_M,
+    MIN_BASELINE_M,
+    Compared,
+    choose_partners,
+    plane_sweep_depth,
+    wide_baseline_depth,
+)
 from tasks.world.arrays import F32, Array, Bools, ShortInts
 
 NEAR_M = 0.5
@@ -40,7 +48,7 @@ def sparse_depth(
     depth, label = _zbuffer(
         points, labels, np.ascontiguousarray(np.linalg.inv(world_from_camera)), intrinsics, width, height
     )
-    hidden = _hidden(depth)
+    hidden = _occluded(depth)
     depth[hidden], label[hidden] = 0.0, -2
     return depth, label
 
@@ -91,7 +99,7 @@ def _nearer(depth: Any, y: int, x: int, dy: int, dx: int, limit: float) -> bool:
 
 
 @kernel
-def _hidden(depth: Any) -> Any:
+def _occluded(depth: Any) -> Any:
     """Returns with nearer ones on opposite sides. One side alone is a depth edge, or the road further down."""
     height, width = depth.shape
     hidden = np.zeros((height, width), np.bool_)
@@ -187,7 +195,7 @@ SHALLOW = -2  # label of a pixel without lidar
 
 
 @dataclass(frozen=True)
-class Seen:
+class PhotoDepth:
     """What a photo shows, (H, W) each."""
 
     depth: F32  # [m]; 0: nothing known
@@ -196,15 +204,15 @@ class Seen:
     passing: Bools  # pixels at or behind something that drives, or of the own body: no witnesses of the street
 
 
-def see(
+def estimate_photo_depth(
     photo: Photo,
     others: Sequence[Photo],
-    known: Points,
+    known: SurfacePoints,
     per_track: dict[int, Array],
     tracks: Tracks,
     stereo_photos: int,
-) -> Seen:
-    """A photo's depth from the fused lidar (`fuse`), completed from the `others` it is compared with."""
+) -> PhotoDepth:
+    """A photo's depth from the fused lidar (`fuse_sweeps`), completed from the `others` it is compared with."""
     height, width = photo.rgb.shape[:2]
     rgb = photo.rgb.astype(np.float32) / 255.0
     boxes, valid = tracks.at(photo.taken_s)
@@ -231,24 +239,24 @@ def see(
     depth = np.where(own, np.float32(0.0), depth)
     unknown = (depth == 0.0) & ~own
     bright = may_be_sky(rgb)
-    hints, camera = _hints(depth), (photo.intrinsics, photo.world_from_camera)
+    hints, camera = _nearest_known_depths(depth), (photo.intrinsics, photo.world_from_camera)
     if known.corners is None:
-        neighbours, sweep = _neighbours(photo, others, stereo_photos), partial(sweep_depth, rgb, hints)
+        neighbours, sweep = _stereo_neighbours(photo, others, stereo_photos), partial(plane_sweep_depth, rgb, hints)
     else:
         anchors, _ = sparse_depth(known.corners, np.zeros(len(known.corners), np.int32), *camera, width, height)
-        neighbours = partners(photo, others, stereo_photos)
-        sweep = partial(wide_depth, rgb, anchors, road_depth(known.dense, eye, rays))
+        neighbours = choose_partners(photo, others, stereo_photos)
+        sweep = partial(wide_baseline_depth, rgb, anchors, road_depth(known.dense, eye, rays))
     if neighbours:
         guess, cost, sky_cost = sweep(neighbours, *camera, unknown)
-        sky = unknown & ((bright & no_worse(sky_cost, cost)) | (guess >= FAR_M))
+        sky = unknown & ((bright & sky_agrees(sky_cost, cost)) | (guess >= FAR_M))
     else:
         guess, sky = hints[0], unknown & (bright | (hints[0] == 0.0))
     depth = np.where(unknown & ~sky, guess, depth).astype(np.float32)
     passing = behind(np.where(depth > 0, depth, np.float32(FAR_M)), boxes[valid & tracks.driving]) | own
-    return Seen(depth, label, sky, passing)
+    return PhotoDepth(depth, label, sky, passing)
 
 
-def _hints(depth: F32) -> F32:
+def _nearest_known_depths(depth: F32) -> F32:
     """(3, H, W) depths of the nearest known pixel below, to the left and to the right; 0 where there is none.
 
     A facade or a tree goes on above the last lidar return with the depth of that return.
@@ -268,7 +276,7 @@ def _hints(depth: F32) -> F32:
     ).astype(np.float32)
 
 
-def _neighbours(photo: Photo, others: Sequence[Photo], n: int) -> list[Compared]:
+def _stereo_neighbours(photo: Photo, others: Sequence[Photo], n: int) -> list[Compared]:
     """The n photos whose baseline is closest to 1 m and that look the same way."""
     candidates = []
     for i, other in enumerate(others):
@@ -287,17 +295,17 @@ ALIKE, ALIKE_PER_M = 0.03, 0.001  # two depths are one within this share, and th
 NEAREST_M = 0.5
 
 
-def with_confirmed(photos: Sequence[Photo], seen: Sequence[Seen]) -> list[Seen]:
+def label_confirmed(photos: Sequence[Photo], seen: Sequence[PhotoDepth]) -> list[PhotoDepth]:
     """The same, guesses that another photo confirms labelled as what is known."""
     depths = [np.where(s.sky | (s.depth >= FAR_M), np.float32(0.0), s.depth) for s in seen]
-    agreed = confirmed(photos, depths)
+    agreed = confirm_depths(photos, depths)
     return [
         replace(s, label=np.where(sure & (s.label == SHALLOW), np.int32(STREET), s.label))
         for s, sure in zip(seen, agreed)
     ]
 
 
-def confirmed(photos: Sequence[Photo], depths: Sequence[F32]) -> list[Bools]:
+def confirm_depths(photos: Sequence[Photo], depths: Sequence[F32]) -> list[Bools]:
     """Of each photo the pixels (H, W) whose depth [m] (H, W) is another photo's there as well; 0: nothing known."""
     from_world = [np.linalg.inv(photo.world_from_camera) for photo in photos]
     out = []

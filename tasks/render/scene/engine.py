@@ -13,9 +13,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from tasks.render.scene.asset import RenderAsset, developed, scene_at
+from tasks.render.scene.asset import RenderAsset, apply_affine, compose_gaussians
 from tasks.render.scene.movers import boxes_at
-from tasks.render.scene.sensed import shifted
+from tasks.render.scene.sensed import shift_pose
 from tasks.render.settings import Backend
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.project import ScreenFilter
@@ -62,16 +62,18 @@ def render(
     never a black one. `threads` are the CPU backend's and change no byte. Raises BackendMissing where the backend
     cannot work on this machine.
     """
-    scene = scene_at(asset, vehicles.track_ids, vehicles.kinds, vehicles.boxes)
-    local = [replace(camera, world_from_camera=shifted(camera.world_from_camera, -asset.origin)) for camera in cameras]
+    scene = compose_gaussians(asset, vehicles.track_ids, vehicles.kinds, vehicles.boxes)
+    local = [
+        replace(camera, world_from_camera=shift_pose(camera.world_from_camera, -asset.origin)) for camera in cameras
+    ]
     backdrops = [asset.sky.seen_by(c.intrinsics, c.world_from_camera, c.width, c.height, threads) for c in local]
     views = RASTERISERS[backend](scene, local, backdrops, threads, asset.screen)
     if affines is not None:
-        views = [replace(view, rgb=developed(view.rgb, affine)) for view, affine in zip(views, affines, strict=True)]
+        views = [replace(view, rgb=apply_affine(view.rgb, affine)) for view, affine in zip(views, affines, strict=True)]
     return [replace(view, rgb=np.clip(view.rgb, 0.0, 1.0)) for view in views]
 
 
-def check(backend: Backend) -> None:
+def require_backend(backend: Backend) -> None:
     """Raises BackendMissing where the backend cannot work on this machine, with how to fix it."""
     if backend.on_gpu:
         from tasks.render.splatting.gsplat_backend import require

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from tasks.render.scene.movers import owners
+from tasks.render.scene.movers import box_of_points
 from tasks.render.scene.sensed import Photo, Tracks, voxel_rows
 from tasks.render.scene.stereo import FAR_M, MAX_BASELINE_M, MIN_BASELINE_M
 from tasks.world.arrays import F32, Array, Indices
@@ -86,7 +86,7 @@ def road_depth(road: Array, eye: Array, rays: Array) -> F32:
     return np.where(rays[..., 2] < 0.0, depth, 0.0).astype(np.float32)
 
 
-def beside_road(points: Array, road: Array) -> Array:
+def drop_below_road(points: Array, road: Array) -> Array:
     """Those of `points` (N, 3) that stand above the road (M, 3) or are beside it, not below."""
     away, nearest = cKDTree(road[:, :2]).query(points[:, :2])
     above = points[:, 2] - road[nearest, 2]
@@ -103,22 +103,22 @@ FARTHEST_M = 80.0
 
 
 @dataclass(frozen=True)
-class Known:
+class KnownPoints:
     """Points of a block that are known without lidar."""
 
     road: Array | None = None  # (K, 3) where the ego drove
     corners: Array | None = None  # (M, 3) of the rig's adjustment; None: photos of one camera are matched in pairs
 
-    def shifted(self, by: Array) -> "Known":
+    def shifted(self, by: Array) -> "KnownPoints":
         """Moved by (3,)."""
-        return Known(*(None if points is None else points + by for points in (self.road, self.corners)))
+        return KnownPoints(*(None if points is None else points + by for points in (self.road, self.corners)))
 
 
-NOTHING_KNOWN = Known()
+NOTHING_KNOWN = KnownPoints()
 
 
 @dataclass(frozen=True)
-class Points:
+class SurfacePoints:
     """Where surfaces are, for sure."""
 
     dense: Array  # (M, 3) between which surfaces go on
@@ -130,16 +130,16 @@ class Points:
         return self.dense if self.corners is None else np.concatenate([self.corners, self.dense])
 
 
-def known_without_lidar(photos: Sequence[Photo], tracks: Tracks, known: Known) -> Points:
+def points_without_lidar(photos: Sequence[Photo], tracks: Tracks, known: KnownPoints) -> SurfacePoints:
     """What is known of a block without lidar, in the photos' frame."""
-    corners = triangulated(photos, tracks) if known.corners is None else known.corners
+    corners = triangulate_matches(photos, tracks) if known.corners is None else known.corners
     road = np.zeros((0, 3)) if known.road is None else known.road
     if len(road):
-        corners = beside_road(corners, road)
-    return Points(np.concatenate([corners, road])) if known.corners is None else Points(road, corners)
+        corners = drop_below_road(corners, road)
+    return SurfacePoints(np.concatenate([corners, road])) if known.corners is None else SurfacePoints(road, corners)
 
 
-def triangulated(photos: Sequence[Photo], tracks: Tracks) -> Array:
+def triangulate_matches(photos: Sequence[Photo], tracks: Tracks) -> Array:
     """Points (M, 3) that stay, in the photos' frame: SIFT corners matched between photos of one camera.
 
     A match counts where the rays meet: at least LEAST_PARALLAX_DEG apart, in front of both cameras, OFF_PX off at most,
@@ -152,10 +152,10 @@ def triangulated(photos: Sequence[Photo], tracks: Tracks) -> Array:
     for i, photo in enumerate(photos):
         for j in _partners(photos, i):
             first, second = _matches(found[i][1], found[j][1])
-            points = _meeting(photo, photos[j], corners[i][first], corners[j][second])
+            points = _intersect_rays(photo, photos[j], corners[i][first], corners[j][second])
             for time_s in (photo.taken_s, photos[j].taken_s):
                 boxes, valid = tracks.at(time_s)
-                points = points[owners(points, boxes, valid) < 0]
+                points = points[box_of_points(points, boxes, valid) < 0]
             parts.append(points)
     every = np.concatenate(parts)
     return every[voxel_rows(every)] if len(every) else every
@@ -183,7 +183,7 @@ def _matches(first: F32 | None, second: F32 | None) -> tuple[Indices, Indices]:
     return rows[:, 0], rows[:, 1]
 
 
-def _meeting(a: Photo, b: Photo, at_a: Array, at_b: Array) -> Array:
+def _intersect_rays(a: Photo, b: Photo, at_a: Array, at_b: Array) -> Array:
     """Where the rays of matched pixels (M, 2) meet; only those that do (K, 3)."""
     if len(at_a) == 0:
         return np.zeros((0, 3))

@@ -38,7 +38,7 @@ def boxes_at(agents: AgentTracks, time_s: float) -> tuple[Array, Bools]:
     return boxes, agents.valid[before] & agents.valid[after]
 
 
-def lifted(agents: AgentTracks, times_s: Array, rises_m: Array) -> AgentTracks:
+def lift_tracks(agents: AgentTracks, times_s: Array, rises_m: Array) -> AgentTracks:
     """The tracks moved up by `rises_m` (T,) at `times_s` (T,), ascending, in seconds since their first step.
 
     A box is logged as high as its sensor saw it above the ego's own road; where photos say that this lies higher or
@@ -64,10 +64,10 @@ class BoxShifts:
         out = np.zeros((len(track_ids), SHIFT_SIZE), np.float32)
         mine = [m for m, name in enumerate(track_ids) if name in known]
         if mine:
-            out[mine] = at_knots(self.rows[[known[track_ids[m]] for m in mine]], time_s)
+            out[mine] = interpolate_knots(self.rows[[known[track_ids[m]] for m in mine]], time_s)
         return out
 
-    def of(self, track_ids: Sequence[str]) -> "BoxShifts":
+    def select(self, track_ids: Sequence[str]) -> "BoxShifts":
         """Of these tracks alone."""
         rows = [self.track_ids.index(name) for name in track_ids]
         return BoxShifts(tuple(track_ids), self.rows[rows])
@@ -79,7 +79,7 @@ class BoxShifts:
         boxes, center_z = agents.boxes.copy(), agents.center_z.copy()
         for k in range(agents.n_steps):
             at = np.column_stack([boxes[k, :, :2], center_z[k], boxes[k, :, 2], boxes[k, :, 3:], agents.heights])
-            there = shifted_boxes(at, self.at(first_s + k * STEP_S, agents.track_ids))
+            there = shift_boxes(at, self.at(first_s + k * STEP_S, agents.track_ids))
             boxes[k, :, :2], center_z[k], boxes[k, :, 2] = there[:, :2], there[:, 2], there[:, 3]
         return replace(agents, boxes=boxes, center_z=center_z)
 
@@ -94,14 +94,14 @@ def knots_at(time_s: float, n_knots: int) -> tuple[int, float]:
     return before, at - before
 
 
-def at_knots(rows: F32, time_s: float) -> F32:
+def interpolate_knots(rows: F32, time_s: float) -> F32:
     """(N, C) of rows (N, K, C) at a time."""
     before, share = knots_at(time_s, rows.shape[1])
     after = min(before + 1, rows.shape[1] - 1)
     return np.asarray((1.0 - share) * rows[:, before] + share * rows[:, after], np.float32)
 
 
-def shifted_boxes(boxes: Array, by: FloatArray) -> Array:
+def shift_boxes(boxes: Array, by: FloatArray) -> Array:
     """Boxes (N, 7) turned, then moved in their own axes, by rows (N, SHIFT_SIZE)."""
     out = boxes.copy()
     out[:, 3] += by[:, 3]
@@ -119,7 +119,7 @@ def world_from_boxes(boxes: Array) -> Array:
     return poses
 
 
-def driving(agents: AgentTracks) -> Bools:
+def is_driving(agents: AgentTracks) -> Bools:
     """(N,) tracks that leave their place at some time; the others may be taken for part of the street."""
     first = np.argmax(agents.valid, axis=0)
     start = agents.boxes[first, np.arange(len(agents)), :2]
@@ -169,7 +169,7 @@ def behind_boxes(points: Any, eye: Any, boxes: Any) -> Any:
 
 
 @kernel
-def owners(points: Any, boxes: Any, movable: Any) -> Any:
+def box_of_points(points: Any, boxes: Any, movable: Any) -> Any:
     """Row of the box each point (M, 3) lies in, -1 for none; the box with the nearest centre wins.
 
     `boxes` (N, 7), `movable` (N,) False: box is not looked at.

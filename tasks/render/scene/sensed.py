@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from tasks.render.scene.asset import OwnBody, developed
-from tasks.render.scene.movers import GROUND_CLEARANCE_M, KNOT_S, boxes_at, driving, owners, world_from_boxes
+from tasks.render.scene.asset import OwnBody, apply_affine
+from tasks.render.scene.movers import GROUND_CLEARANCE_M, KNOT_S, box_of_points, boxes_at, is_driving, world_from_boxes
 from tasks.world.arrays import F32, Array, Bools, Bytes, Indices
 from tasks.world.clip import MOVING_KINDS, STEP_S, AgentTracks
 from tasks.world.frames import PACIFICA
@@ -35,7 +35,7 @@ class Photo:
         """(H, W, 3) its colours in the common exposure, else as they are: from 0 on, and above 1 where a dark photo
         shows what is brighter than white is there."""
         rgb = self.rgb.astype(np.float32) / np.float32(255.0)
-        return rgb if self.to_common is None else np.maximum(developed(rgb, self.to_common), np.float32(0.0))
+        return rgb if self.to_common is None else np.maximum(apply_affine(rgb, self.to_common), np.float32(0.0))
 
     @property
     def taken_s(self) -> float:
@@ -43,7 +43,7 @@ class Photo:
         return self.time_s + self.late_s
 
 
-def reduced(photo: Photo, width: int) -> Photo:
+def resize_photo(photo: Photo, width: int) -> Photo:
     """The photo, `width` pixels across at most."""
     rows, columns = photo.rgb.shape[:2]
     if columns <= width:
@@ -57,7 +57,7 @@ def reduced(photo: Photo, width: int) -> Photo:
     return replace(photo, rgb=rgb, intrinsics=scale @ photo.intrinsics, own_body=body)
 
 
-def own_bodies(photos: Sequence[Photo]) -> tuple[OwnBody, ...]:
+def median_own_bodies(photos: Sequence[Photo]) -> tuple[OwnBody, ...]:
     """What each camera sees of the car that carries it: the colours that its pixels mostly have."""
     masks = {photo.camera: photo.own_body for photo in photos if photo.own_body is not None}
     found = []
@@ -77,7 +77,7 @@ class Sweep:
     world_from_ego: Array  # (4, 4)
 
 
-def shifted(pose: Array, by: Array) -> Array:
+def shift_pose(pose: Array, by: Array) -> Array:
     """A pose (4, 4) moved by (3,)."""
     out = pose.copy()
     out[:3, 3] += by
@@ -91,7 +91,7 @@ class Tracks:
         self._agents, self._origin = agents, origin
         self.ids = agents.track_ids if agents is not None else ()
         self.kinds = agents.kinds if agents is not None else ()
-        self.driving = driving(agents) if agents is not None else np.zeros(0, bool)
+        self.driving = is_driving(agents) if agents is not None else np.zeros(0, bool)
         self._movable = np.array([kind in MOVING_KINDS for kind in self.kinds], bool)
 
     @property
@@ -109,14 +109,14 @@ class Tracks:
         return boxes, valid & self._movable
 
 
-def fuse(sweeps: Sequence[Sweep], tracks: Tracks) -> tuple[Array, dict[int, Array]]:
+def fuse_sweeps(sweeps: Sequence[Sweep], tracks: Tracks) -> tuple[Array, dict[int, Array]]:
     """Lidar points that stay (M, 3) local, and those of each track in its box's frame; both thinned by voxels."""
     static, moving = [np.zeros((0, 3))], dict[int, list[Array]]()
     for sweep in sweeps:
-        outside = sweep.points[~on_ego(sweep.points)]
+        outside = sweep.points[~is_on_ego(sweep.points)]
         points = outside.astype(np.float64) @ sweep.world_from_ego[:3, :3].T + sweep.world_from_ego[:3, 3]
         boxes, valid = tracks.at(sweep.time_s)
-        owner = owners(points, boxes, valid)
+        owner = box_of_points(points, boxes, valid)
         static.append(_voxels(points[owner < 0]))
         poses = world_from_boxes(boxes)
         for j in np.unique(owner[owner >= 0]):
@@ -125,7 +125,7 @@ def fuse(sweeps: Sequence[Sweep], tracks: Tracks) -> tuple[Array, dict[int, Arra
     return _voxels(np.concatenate(static)), {j: _voxels(np.concatenate(parts)) for j, parts in sorted(moving.items())}
 
 
-def on_ego(points: F32) -> Bools:
+def is_on_ego(points: F32) -> Bools:
     """Returns from the ego's own body (M,): left in, they would hang over the road as a trail."""
     x, y = points[:, 0], points[:, 1]
     along = (x > -PACIFICA.rear_length - EGO_MARGIN_M) & (x < PACIFICA.front_length + EGO_MARGIN_M)

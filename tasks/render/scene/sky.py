@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from tasks.kernels.compiled import kernel
-from tasks.kernels.threads import in_chunks
+from tasks.kernels.threads import run_in_chunks
 from tasks.world.arrays import F32, Array, Bools, ShortInts
 
 # Where in the sky map each pixel of a camera looks, and what it sees there.
@@ -31,7 +31,7 @@ def sky_cells(intrinsics: Array, scene_from_camera: Array, width: int, height: i
     """Where a camera looks when nothing is in the way."""
     found = SkyCells(np.empty((height, width, 3), np.int32), np.empty((height, width, 2)))
     camera = np.array(intrinsics, np.float64), np.array(scene_from_camera, np.float64)
-    in_chunks(partial(_find, *camera, found.corners, found.shares), height, ROWS_CHUNK, threads)
+    run_in_chunks(partial(_find, *camera, found.corners, found.shares), height, ROWS_CHUNK, threads)
     return found
 
 
@@ -53,10 +53,10 @@ def _find(k: Any, turn: Any, corners: Any, shares: Any, first: int, last: int) -
             shares[row, column, 1] = min(max(v - v0, 0.0), 1.0)
 
 
-def backdrop(cells: F32, where: SkyCells, threads: int = 1) -> F32:
+def look_up_sky(cells: F32, where: SkyCells, threads: int = 1) -> F32:
     """The sky (H, W, 3), linear between its `cells` (ROWS * COLUMNS, 3)."""
     out = np.empty(where.corners.shape, np.float32)
-    in_chunks(partial(_look_up, cells, where.corners, where.shares, out), len(out), ROWS_CHUNK, threads)
+    run_in_chunks(partial(_look_up, cells, where.corners, where.shares, out), len(out), ROWS_CHUNK, threads)
     return out
 
 
@@ -90,7 +90,7 @@ class SkyMap:
             raise ValueError(f"sky: {self.rgb.shape}, expected ({ROWS}, {COLUMNS}, 3)")
         where = sky_cells(intrinsics, world_from_camera, width, height, threads)
         cells = np.require(self.rgb, np.float32, ["C", "W"])  # kernels compile once more for read-only arrays
-        return backdrop(cells.reshape(-1, 3), where, threads)
+        return look_up_sky(cells.reshape(-1, 3), where, threads)
 
 
 SKY_RGB, HAZE_RGB = (0.72, 0.78, 0.85), (0.30, 0.30, 0.31)  # above and below the horizon
@@ -109,7 +109,7 @@ def may_be_sky(rgb: F32) -> Bools:
     return np.asarray((grey > 0.6) | ((rgb[..., 2] > rgb[..., 0] + 0.04) & (grey > 0.4)))
 
 
-def no_worse(sky_cost: F32, cost: F32) -> Bools:
+def sky_agrees(sky_cost: F32, cost: F32) -> Bools:
     """Where the sky agrees with other photos about as well as the best depth does: (H, W)."""
     return np.asarray(sky_cost < 1.3 * cost + 0.03)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from tasks.kernels.compiled import kernel
 from tasks.render.scene.sensed import Photo
-from tasks.render.scene.sky import may_be_sky, no_worse, smooth_around
+from tasks.render.scene.sky import may_be_sky, sky_agrees, smooth_around
 from tasks.world.arrays import F32, Array, Bools
 
 FAR_M = 1.0e4  # stands for the sky
@@ -23,7 +23,7 @@ Compared = tuple[F32, Array, Array]  # a photo's rgb (H, W, 3) in [0, 1], intrin
 UNSEEN_COST = 0.25  # of a pixel whose hypothesis lies outside the other photo
 
 
-def sweep_depth(
+def plane_sweep_depth(
     rgb: F32,
     hints: F32,
     others: Sequence[Compared],
@@ -41,7 +41,7 @@ def sweep_depth(
     sky_cost = best_cost
     for hypothesis in (*hints, *LEVELS_M):
         depth = np.broadcast_to(np.asarray(hypothesis, np.float32), (height, width))
-        cost = with_cost(rgb, others, intrinsics, world_from_camera, depth, wanted, WINDOW_PX)
+        cost = smoothed_cost(rgb, others, intrinsics, world_from_camera, depth, wanted, WINDOW_PX)
         better = cost < best_cost
         best, best_cost = np.where(better, depth, best), np.where(better, cost, best_cost)
         if isinstance(hypothesis, float) and hypothesis == FAR_M:
@@ -49,7 +49,7 @@ def sweep_depth(
     return best, best_cost, sky_cost
 
 
-def with_cost(
+def smoothed_cost(
     rgb: F32,
     others: Sequence[Compared],
     intrinsics: Array,
@@ -60,11 +60,11 @@ def with_cost(
 ) -> F32:
     """(H, W) disagreement over a window of pixels where these are as deep as `depth` (H, W); infinite where it is 0."""
     around = cv2.dilate(wanted.astype(np.uint8), np.ones((window, window), np.uint8)).astype(np.bool_)
-    raw = disagreement(rgb, others, intrinsics, world_from_camera, depth, around)
+    raw = matching_cost(rgb, others, intrinsics, world_from_camera, depth, around)
     return np.asarray(np.where(depth > 0, cv2.blur(raw, (window, window)), np.float32(np.inf)))
 
 
-def disagreement(
+def matching_cost(
     rgb: F32,
     others: Sequence[Compared],
     intrinsics: Array,
@@ -149,7 +149,7 @@ GAP_M = 12.0  # a bright pixel that far away or farther may be a gap through whi
 FINER = (-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75)  # of a level
 
 
-def wide_depth(
+def wide_baseline_depth(
     rgb: F32,
     anchors: F32,
     floor: F32,
@@ -158,7 +158,7 @@ def wide_depth(
     pose: Array,
     wanted: Bools,
 ) -> tuple[F32, F32, F32]:
-    """As `sweep_depth`: best depth (H, W) [m], its cost, and 0 where the sky is seen, infinity elsewhere.
+    """As `plane_sweep_depth`: best depth (H, W) [m], its cost, and 0 where the sky is seen, infinity elsewhere.
 
     `anchors` (H, W): depths that are known, 0 elsewhere; `floor` (H, W): depths of the road, below which nothing is,
     0 above the horizon, where alone there may be sky.
@@ -171,7 +171,7 @@ def wide_depth(
     volume = np.empty((LEVELS, *shape), np.float32)
     for level, z in enumerate((*(1.0 / inverse[:-1]), FAR_M)):
         depth = np.full(shape, z, np.float32)
-        raw = disagreement(small[0], few, small[1], pose, depth, everywhere)
+        raw = matching_cost(small[0], few, small[1], pose, depth, everywhere)
         volume[level] = cv2.blur(np.minimum(raw, COST_MAX), (COARSE_PX, COARSE_PX))
     step = float(inverse[0] - inverse[1])
     _anchor(volume, anchors, float(inverse[0]), step)
@@ -181,7 +181,7 @@ def wide_depth(
     favour = BRIGHT_SKY * np.where(bright, 1.0, -1.0) + SMOOTH_SKY * smooth
     volume[-1] -= favour[::2, ::2][: shape[0], : shape[1]].astype(np.float32)
     guide = cv2.resize(rgb, shape[::-1], interpolation=cv2.INTER_AREA)
-    chosen = _chosen(np.ascontiguousarray(volume.transpose(1, 2, 0)), guide)
+    chosen = _semi_global_matching(np.ascontiguousarray(volume.transpose(1, 2, 0)), guide)
     height, width = rgb.shape[:2]
     level, solid = (cv2.resize(c.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST) for c in chosen)
     level = np.where(bright, level, solid)  # wires are thinner than what is looked at together
@@ -189,16 +189,16 @@ def wide_depth(
     finer = [np.where(at > 0.0, 1.0 / np.maximum(at + part * step, 1.0 / FAR_M), FAR_M) for part in FINER]
     sky = np.full((height, width), FAR_M, np.float32)
     depths = [d.astype(np.float32) for d in finer] + [sky]
-    costs = [with_cost(here, there, intrinsics, pose, d, wanted, FINE_PX) for d in depths]
+    costs = [smoothed_cost(here, there, intrinsics, pose, d, wanted, FINE_PX) for d in depths]
     best = np.argmin(np.stack(costs[:-1]), axis=0)
     depth = np.take_along_axis(np.stack(depths[:-1]), best[None], axis=0)[0]
     cost = np.min(np.stack(costs[:-1]), axis=0)
-    gaps = bright & (depth > GAP_M) & no_worse(costs[-1], cost)
+    gaps = bright & (depth > GAP_M) & sky_agrees(costs[-1], cost)
     open_sky = smooth | gaps | (level == LEVELS - 1)
     return depth, cost, np.where(open_sky, np.float32(0.0), np.float32(np.inf))
 
 
-def partners(photo: Photo, others: Sequence[Photo], n: int) -> list[Compared]:
+def choose_partners(photo: Photo, others: Sequence[Photo], n: int) -> list[Compared]:
     """Up to n photos that together show as much of this one as can be, from directions that tell depth.
 
     First of its own camera, then one after the other the one that adds most; what is shown already counts for less.
@@ -278,7 +278,7 @@ def _stand_on(volume: Any, floor: Any, first: float, step: float, more: float, s
 
 
 @kernel
-def _chosen(volume: Any, guide: Any) -> Any:
+def _semi_global_matching(volume: Any, guide: Any) -> Any:
     """Level (2, H, W) of least cost (H, W, L) summed over paths from eight sides, of all and of all but the last.
 
     A jump costs less at an edge.

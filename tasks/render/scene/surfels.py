@@ -237,7 +237,7 @@ BACKGROUND = -1
 
 
 @dataclass(frozen=True)
-class Look:
+class PhotoDiscs:
     """One photo's discs, before choosing."""
 
     discs: Discs  # in the scene
@@ -249,7 +249,7 @@ class Look:
     scene_from_box: Mapping[int, Array]  # poses of the tracks that are there
 
 
-def choose(looks: Sequence[Look]) -> dict[int, Discs]:
+def choose_discs(looks: Sequence[PhotoDiscs]) -> dict[int, Discs]:
     """Kept discs by owner: the background's in the scene, a track's in its box's frame."""
     kept: dict[int, list[Discs]] = {}
     for band in range(len(BANDS_M) + 2):
@@ -265,7 +265,7 @@ def choose(looks: Sequence[Look]) -> dict[int, Discs]:
                     continue
                 photo = np.ascontiguousarray(np.linalg.inv(look.scene_from_camera) @ pose), look.intrinsics, look.depth
                 for part in parts:
-                    _cover(part.points, part.across, part.down, part.spacing, *photo, covered)
+                    _mark_covered(part.points, part.across, part.down, part.spacing, *photo, covered)
             rows, columns = look.discs.pixels.T
             new = np.flatnonzero(mine & ~covered[rows, columns])
             for owner in np.unique(look.owner[new]):
@@ -291,7 +291,7 @@ def with_mirror_image(discs: Discs) -> Discs:
 
 
 @kernel
-def _cover(
+def _mark_covered(
     points: Any, across: Any, down: Any, spacing: Any, camera_from_scene: Any, k: Any, depth: Any, covered: Any
 ) -> None:
     """Marks the pixels (H, W) whose surface a disc shows about as finely as the photo does."""

@@ -384,9 +384,9 @@ def _node(part: _StoredPart, name: str) -> Gaussians:
 def _gaussians(part: _StoredPart, name: str, traversal: int | None) -> Gaussians:
     """The part's Gaussians as they are stored; directions of light are the world's. Raises ValueError."""
     params = part.params
-    means = np.asarray(_taken(params, "means", name), np.float32)
+    means = np.asarray(_required_parameter(params, "means", name), np.float32)
     n = len(means)
-    scales = np.asarray(_taken(params, "scales", name), np.float32).reshape(n, -1)
+    scales = np.asarray(_required_parameter(params, "scales", name), np.float32).reshape(n, -1)
     quats = np.asarray(params["quats"], np.float64) if "quats" in params else np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     constant, rest = _colours(part, name, traversal)
@@ -394,7 +394,9 @@ def _gaussians(part: _StoredPart, name: str, traversal: int | None) -> Gaussians
         means=means,
         quats=(quats / length).astype(np.float32),
         log_scales=np.repeat(scales, 3, axis=1) if scales.shape[1] == 1 else scales,
-        opacities=np.clip(_sigmoid(_taken(params, "opacities", name)).reshape(n), LEAST, MOST).astype(np.float32),
+        opacities=np.clip(_sigmoid(_required_parameter(params, "opacities", name)).reshape(n), LEAST, MOST).astype(
+            np.float32
+        ),
         colours=(0.5 + sh.C0 * constant if rest.shape[1] else _sigmoid(constant)).astype(np.float32),
         sh_rest=rest,
     )
@@ -406,8 +408,8 @@ def _gaussians(part: _StoredPart, name: str, traversal: int | None) -> Gaussians
 
 def _colours(part: _StoredPart, name: str, traversal: int | None) -> tuple[Array, F32]:
     """Constant (N, 3) and other coefficients (N, K, 3), one value of what the part has several of."""
-    constant = np.asarray(_taken(part.params, "features_dc", name), np.float64)
-    rest = np.asarray(_taken(part.params, "features_rest", name), np.float32)
+    constant = np.asarray(_required_parameter(part.params, "features_dc", name), np.float64)
+    rest = np.asarray(_required_parameter(part.params, "features_rest", name), np.float32)
     if constant.ndim == 3:
         constant = np.einsum("nfc,f->nc", constant, _mean_wave(constant.shape[1], part.config))
     if "features_adapters" in part.params:
@@ -437,7 +439,7 @@ def _check_traversal(traversal: int | None, n: int, name: str) -> None:
         raise ValueError(f"checkpoint: {name}: traversal {traversal} of {n}, counted from 0")
 
 
-def _taken(params: Params, parameter: str, name: str) -> Array:
+def _required_parameter(params: Params, parameter: str, name: str) -> Array:
     if parameter not in params:
         raise ValueError(f"checkpoint: {name}: {parameter} is absent")
     return np.asarray(params[parameter])

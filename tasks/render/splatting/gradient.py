@@ -11,8 +11,18 @@ from typing import Any
 import numpy as np
 
 from tasks.kernels.compiled import inlined, kernel
-from tasks.kernels.simd import LANES, fill, fused, larger, load, smaller, store, sums, where_below
-from tasks.kernels.threads import in_chunks
+from tasks.kernels.simd import (
+    LANES,
+    fill,
+    fma,
+    larger,
+    load,
+    smaller,
+    store,
+    sums,
+    where_below,
+)
+from tasks.kernels.threads import run_in_chunks
 from tasks.render.splatting.gaussians import Gaussians, quats_of, turned_quats
 from tasks.render.splatting.project import (
     BLOCK_SIZE,
@@ -57,7 +67,7 @@ from tasks.render.splatting.raster import (
     NOTHING,
     TILES_CHUNK,
     ForwardPass,
-    aligned,
+    aligned_memory,
     alpha_at,
     exponent,
     fetch_ahead,
@@ -133,7 +143,7 @@ def blend_gradient(
     """
     width = alpha.shape[1]
     tiles_x = (width + TILE - 1) // TILE
-    buffer = aligned(TILE * CHANNELS * TILE)
+    buffer = aligned_memory(TILE * CHANNELS * TILE)
     for t in range(first_tile, last_tile):
         tx, ty = t % tiles_x, t // tiles_x
         x0, y0 = tx * TILE, ty * TILE
@@ -145,29 +155,38 @@ def blend_gradient(
             for j in range(batch, following):
                 i = np.uint64(tile_splats[j])
                 dx, steep, slope, level = exponent(projected, i, x0)
-                red, green, blue = fill(projected[i, RED]), fill(projected[i, GREEN]), fill(projected[i, BLUE])
+                red, green, blue = (
+                    fill(projected[i, RED]),
+                    fill(projected[i, GREEN]),
+                    fill(projected[i, BLUE]),
+                )
                 z = fill(projected[i, DEPTH])
                 first, last = max(0, int(projected[i, TOP]) - y0), min(TILE, int(projected[i, BOTTOM]) - y0)
                 dy = fill(np.float32(y0 + first) + np.float32(0.5) - projected[i, V])
                 at = np.uint64(first) * ROW
                 q, q_y, q_yy = fill(NOTHING), fill(NOTHING), fill(NOTHING)
-                w_depth, w_red, w_green, w_blue = fill(NOTHING), fill(NOTHING), fill(NOTHING), fill(NOTHING)
+                w_depth, w_red, w_green, w_blue = (
+                    fill(NOTHING),
+                    fill(NOTHING),
+                    fill(NOTHING),
+                    fill(NOTHING),
+                )
                 for _ in range(first, last):
-                    opaque = alpha_at(fused(fused(dy, steep, slope), dy, level))
+                    opaque = alpha_at(fma(fma(dy, steep, slope), dy, level))
                     light = load(buffer, at)
                     w = opaque * light
                     store(buffer, at, light - w)
                     by_red, by_green = load(buffer, at + RED_AT), load(buffer, at + GREEN_AT)
                     by_blue, by_depth = load(buffer, at + BLUE_AT), load(buffer, at + DEPTH_AT)
-                    share = fused(z, by_depth, load(buffer, at + WEIGHT_AT))
-                    seen = w * fused(red, by_red, fused(green, by_green, fused(blue, by_blue, share)))
+                    share = fma(z, by_depth, load(buffer, at + WEIGHT_AT))
+                    seen = w * fma(red, by_red, fma(green, by_green, fma(blue, by_blue, share)))
                     behind = load(buffer, at + REST_AT) - seen
                     store(buffer, at + REST_AT, behind)
                     here = _log_alpha_gradient(opaque, seen, behind)
                     here_y = here * dy
-                    q, q_y, q_yy = q + here, q_y + here_y, fused(here_y, dy, q_yy)
-                    w_depth, w_red = fused(w, by_depth, w_depth), fused(w, by_red, w_red)
-                    w_green, w_blue = fused(w, by_green, w_green), fused(w, by_blue, w_blue)
+                    q, q_y, q_yy = q + here, q_y + here_y, fma(here_y, dy, q_yy)
+                    w_depth, w_red = fma(w, by_depth, w_depth), fma(w, by_red, w_red)
+                    w_green, w_blue = fma(w, by_green, w_green), fma(w, by_blue, w_blue)
                     at += ROW
                     dy = dy + fill(ALL)
                 q_x = q * dx
@@ -299,7 +318,11 @@ def _pulled_back(block: Any, rows: Any, centre: Any, fx: Any, fy: Any, limits: A
 @inlined
 def _both(a: Any, s: Any, b: Any, t: Any) -> Any:
     """s a + t b of triples a and b."""
-    return fused(a[0], s, b[0] * t), fused(a[1], s, b[1] * t), fused(a[2], s, b[2] * t)
+    return (
+        fma(a[0], s, b[0] * t),
+        fma(a[1], s, b[1] * t),
+        fma(a[2], s, b[2] * t),
+    )
 
 
 @inlined
@@ -422,7 +445,7 @@ def backward(
         project_gradient(*scene, splats.index, splats.projected, sums, first, last, *shapes, camera)
         return camera
 
-    camera = np.sum([np.zeros(6), *in_chunks(run, n, GAUSSIANS_CHUNK, threads)], axis=0)
+    camera = np.sum([np.zeros(6), *run_in_chunks(run, n, GAUSSIANS_CHUNK, threads)], axis=0)
     colours = np.where(gaussians.colours[splats.index] >= 0.0, sums[:, W_RED : W_BLUE + 1], np.float32(0.0))
     return Gradients(splats.index, means, quats, log_scales, logits, colours, screen, camera)
 
@@ -441,7 +464,7 @@ def _pairs(
     dealt = (splats.projected, splats.tiles, splats.tile_start, splats.tile_splats)
     out = np.empty((len(splats.tile_splats), SUMS_SIZE), np.float32)
     run = partial(blend_gradient, *dealt, forward.tile_end, pair_start, *upstream, *seen, out)
-    in_chunks(run, len(forward.tile_end), TILES_CHUNK, threads)
+    run_in_chunks(run, len(forward.tile_end), TILES_CHUNK, threads)
     return out
 
 

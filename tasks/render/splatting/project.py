@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tasks.kernels.compiled import inlined, kernel
-from tasks.kernels.simd import LANES, fill, fused, larger, load, root, smaller, store
+from tasks.kernels.simd import LANES, fill, fma, larger, load, smaller, sqrt, store
 
 NEAR_M = 0.3  # closer ones would cover the picture
 MIN_ALPHA = 1.0 / 255.0  # a weaker contribution is not visible in 8 bits
@@ -49,7 +49,19 @@ F0, F1, F2, F3, F4, F5 = (np.float32(1.0 / math.factorial(k)) for k in range(6))
 def exponential(x: Any) -> Any:
     """exp of Lanes; that of LEAST_LOG or MOST_LOG beyond them."""
     x = smaller(larger(x, fill(LEAST_LOG)), fill(MOST_LOG)) * fill(np.float32(1.0 / 64.0))
-    e = fused(fused(fused(fused(fused(fill(F5), x, fill(F4)), x, fill(F3)), x, fill(F2)), x, fill(F1)), x, fill(F0))
+    e = fma(
+        fma(
+            fma(
+                fma(fma(fill(F5), x, fill(F4)), x, fill(F3)),
+                x,
+                fill(F2),
+            ),
+            x,
+            fill(F1),
+        ),
+        x,
+        fill(F0),
+    )
     for _ in range(6):
         e = e * e
     return e
@@ -58,7 +70,7 @@ def exponential(x: Any) -> Any:
 @inlined
 def dot(a: Any, b: Any) -> Any:
     """Of two triples of Lanes."""
-    return fused(a[0], b[0], fused(a[1], b[1], a[2] * b[2]))
+    return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2]))
 
 
 @inlined
@@ -104,7 +116,7 @@ def seen_from(rows: Any, centre: Any, block: Any) -> Any:
 def axes_of(block: Any) -> Any:
     """A block's unit quaternions w, x, y, z; the factors that made them unit; principal axes, three triples."""
     w, x, y, z = load(block, QW), load(block, QX), load(block, QY), load(block, QZ)
-    shorten = fill(np.float32(1.0)) / root(w * w + x * x + y * y + z * z)
+    shorten = fill(np.float32(1.0)) / sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * shorten, x * shorten, y * shorten, z * shorten
     one, two = fill(np.float32(1.0)), fill(np.float32(2.0))
     axes = (
@@ -153,14 +165,14 @@ def _ellipses(
     area = area_of(du, dv)
     inverse = fill(np.float32(1.0)) / (area + dilation * (xx + yy + dilation))  # of the determinant
     xx, yy = xx + dilation, yy + dilation
-    store(block, X, fused(fx, tx, cx))
-    store(block, Y, fused(fy, ty, cy))
+    store(block, X, fma(fx, tx, cx))
+    store(block, Y, fma(fy, ty, cy))
     store(block, Z, z)
     store(block, QW, yy * inverse)
     store(block, QX, fill(np.float32(0.0)) - xy * inverse)
     store(block, QY, xx * inverse)
-    store(block, HALF_U, root(xx))
-    store(block, HALF_V, root(yy))
+    store(block, HALF_U, sqrt(xx))
+    store(block, HALF_V, sqrt(yy))
     store(block, SHARE, area * inverse)
 
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from tasks.kernels.compiled import inlined, kernel
 from tasks.kernels.simd import (
-    columns,
     fill,
-    fused,
+    fma,
     greatest,
+    lane_indices,
     larger,
     load,
     prefetch,
@@ -25,7 +25,7 @@ from tasks.kernels.simd import (
     sums,
     where_at_least,
 )
-from tasks.kernels.threads import in_chunks
+from tasks.kernels.threads import run_in_chunks
 from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.project import (
@@ -55,7 +55,7 @@ from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
 CHUNK = 8192  # ellipses a thread deals out at a time
 
 
-def deal(depths: F32, tiles: ShortInts, width: int, height: int, threads: int) -> tuple[Ints, ShortInts]:
+def assign_tiles(depths: F32, tiles: ShortInts, width: int, height: int, threads: int) -> tuple[Ints, ShortInts]:
     """Start of each tile (tiles + 1,), row by row, in the list (pairs,) of the ellipses that touch it, nearest first.
 
     `depths` (M,) positive, `tiles` (M, 4) as from tasks.render.splatting.project.
@@ -67,7 +67,7 @@ def deal(depths: F32, tiles: ShortInts, width: int, height: int, threads: int) -
     def mark(first: int, last: int) -> None:
         _mark_corners(tiles, order, first, last, corners[first // CHUNK])
 
-    in_chunks(mark, len(order), CHUNK, threads)
+    run_in_chunks(mark, len(order), CHUNK, threads)
     counts = corners.cumsum(axis=1).cumsum(axis=2)[:, :-1, :-1].reshape(len(corners), tiles_x * tiles_y)
     start = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
     before = np.cumsum(counts, axis=0) - counts  # a tile's ellipses of the nearer chunks come first
@@ -77,7 +77,7 @@ def deal(depths: F32, tiles: ShortInts, width: int, height: int, threads: int) -
     def fill(first: int, last: int) -> None:
         _fill(tiles, order, tiles_x, first, last, places[first // CHUNK], pairs)
 
-    in_chunks(fill, len(order), CHUNK, threads)
+    run_in_chunks(fill, len(order), CHUNK, threads)
     return start, pairs
 
 
@@ -153,11 +153,13 @@ FAINTEST = np.float32(np.log(MIN_ALPHA) / 8.0)
 def exponent(projected: Any, i: Any, x0: Any) -> Any:
     """What a Gaussian's log(alpha) / 8 on a tile is made of: on the row at dy from its centre, in the columns `dx`,
     (dy * steep + slope) * dy + level. Returns dx, steep, slope, level."""
-    dx = columns() - fill(projected[i, U] - np.float32(x0 + 0.5))
+    dx = lane_indices() - fill(projected[i, U] - np.float32(x0 + 0.5))
     steep = fill(np.float32(-0.5) * EIGHTH * projected[i, CONIC_YY])
     slope = fill(-EIGHTH * projected[i, CONIC_XY]) * dx
-    level = fused(
-        fill(np.float32(-0.5) * EIGHTH * projected[i, CONIC_XX]) * dx, dx, fill(EIGHTH * projected[i, LOG_OPACITY])
+    level = fma(
+        fill(np.float32(-0.5) * EIGHTH * projected[i, CONIC_XX]) * dx,
+        dx,
+        fill(EIGHTH * projected[i, LOG_OPACITY]),
     )
     return dx, steep, slope, level
 
@@ -165,14 +167,18 @@ def exponent(projected: Any, i: Any, x0: Any) -> Any:
 @inlined
 def alpha_at(x: Any) -> Any:
     """Alpha where its logarithm is 8 x; 0 where that is below MIN_ALPHA."""
-    e = fused(fused(fused(fused(fill(E4), x, fill(E3)), x, fill(E2)), x, fill(E1)), x, fill(E0))
+    e = fma(
+        fma(fma(fma(fill(E4), x, fill(E3)), x, fill(E2)), x, fill(E1)),
+        x,
+        fill(E0),
+    )
     e = e * e
     e = e * e
     return where_at_least(x, fill(FAINTEST), smaller(e * e, fill(MAX_ALPHA)))
 
 
 @kernel
-def aligned(n: int) -> Any:
+def aligned_memory(n: int) -> Any:
     """Memory for n float32, at the start of a cache line."""
     memory = np.empty(n + 16, np.float32)
     first = (-memory.ctypes.data % 64) // 4
@@ -211,7 +217,7 @@ def blend(
     """Fills rgb (H, W, 3), depth and alpha (H, W) on some tiles, and where in `tile_splats` each was opaque."""
     height, width = alpha.shape
     tiles_x = (width + TILE - 1) // TILE
-    buffer = aligned(TILE * 5 * TILE)  # by row: light that still passes; sums of red, green, blue, depth
+    buffer = aligned_memory(TILE * 5 * TILE)  # by row: light that still passes; sums of red, green, blue, depth
     for t in range(first_tile, last_tile):
         x0, y0 = (t % tiles_x) * TILE, (t // tiles_x) * TILE
         rows, across = min(TILE, height - y0), min(TILE, width - x0)
@@ -228,20 +234,24 @@ def blend(
             for j in range(batch, following):
                 i = np.uint64(tile_splats[j])
                 _, steep, slope, level = exponent(projected, i, x0)
-                red, green, blue = fill(projected[i, RED]), fill(projected[i, GREEN]), fill(projected[i, BLUE])
+                red, green, blue = (
+                    fill(projected[i, RED]),
+                    fill(projected[i, GREEN]),
+                    fill(projected[i, BLUE]),
+                )
                 z = fill(projected[i, DEPTH])
                 first, last = max(0, int(projected[i, TOP]) - y0), min(TILE, int(projected[i, BOTTOM]) - y0)
                 dy = fill(np.float32(y0 + first) + np.float32(0.5) - projected[i, V])
                 at = np.uint64(first * 5 * TILE)
                 for _ in range(first, last):
-                    opaque = alpha_at(fused(fused(dy, steep, slope), dy, level))
+                    opaque = alpha_at(fma(fma(dy, steep, slope), dy, level))
                     light = load(buffer, at)
                     w = opaque * light
                     store(buffer, at, light - w)
-                    store(buffer, at + np.uint64(16), fused(w, red, load(buffer, at + np.uint64(16))))
-                    store(buffer, at + np.uint64(32), fused(w, green, load(buffer, at + np.uint64(32))))
-                    store(buffer, at + np.uint64(48), fused(w, blue, load(buffer, at + np.uint64(48))))
-                    store(buffer, at + np.uint64(64), fused(w, z, load(buffer, at + np.uint64(64))))
+                    store(buffer, at + np.uint64(16), fma(w, red, load(buffer, at + np.uint64(16))))
+                    store(buffer, at + np.uint64(32), fma(w, green, load(buffer, at + np.uint64(32))))
+                    store(buffer, at + np.uint64(48), fma(w, blue, load(buffer, at + np.uint64(48))))
+                    store(buffer, at + np.uint64(64), fma(w, z, load(buffer, at + np.uint64(64))))
                     at += np.uint64(80)
                     dy = dy + fill(ALL)
             if most_light(buffer, 5) <= OPAQUE:
@@ -260,13 +270,13 @@ def blend(
 
 
 @kernel
-def carry_back(projected: Any, tile_start: Any, tile_splats: Any, image: Any, is_masked: Any) -> Any:
+def backproject_tiles(projected: Any, tile_start: Any, tile_splats: Any, image: Any, is_masked: Any) -> Any:
     """Sums (M, 3) of weight times image and (M,) of weight; `image` (H, W, 4), the last being 0 where masked."""
     height, width = image.shape[:2]
     tiles_x = (width + TILE - 1) // TILE
     totals = np.zeros((projected.shape[0], 4), np.float32)
     added = np.empty(TILE, np.float32)
-    buffer = aligned(TILE * 5 * TILE)  # by row: light that still passes; the image
+    buffer = aligned_memory(TILE * 5 * TILE)  # by row: light that still passes; the image
     for t in range(tile_start.shape[0] - 1):
         x0, y0 = (t % tiles_x) * TILE, (t // tiles_x) * TILE
         buffer[:] = NOTHING  # pixels outside the image carry no weight
@@ -283,16 +293,21 @@ def carry_back(projected: Any, tile_start: Any, tile_splats: Any, image: Any, is
                 ignores_mask = fill(NOTHING if is_masked[i] else ALL)
                 first, last = max(0, int(projected[i, TOP]) - y0), min(TILE, int(projected[i, BOTTOM]) - y0)
                 dy = fill(np.float32(y0 + first) + np.float32(0.5) - projected[i, V])
-                red, green, blue, weight = fill(NOTHING), fill(NOTHING), fill(NOTHING), fill(NOTHING)
+                red, green, blue, weight = (
+                    fill(NOTHING),
+                    fill(NOTHING),
+                    fill(NOTHING),
+                    fill(NOTHING),
+                )
                 at = np.uint64(first * 5 * TILE)
                 for _ in range(first, last):
                     light = load(buffer, at)
-                    w = light * alpha_at(fused(fused(dy, steep, slope), dy, level))
+                    w = light * alpha_at(fma(fma(dy, steep, slope), dy, level))
                     store(buffer, at, light - w)
                     w = w * larger(load(buffer, at + np.uint64(4 * TILE)), ignores_mask)
-                    red = fused(w, load(buffer, at + np.uint64(TILE)), red)
-                    green = fused(w, load(buffer, at + np.uint64(2 * TILE)), green)
-                    blue = fused(w, load(buffer, at + np.uint64(3 * TILE)), blue)
+                    red = fma(w, load(buffer, at + np.uint64(TILE)), red)
+                    green = fma(w, load(buffer, at + np.uint64(2 * TILE)), green)
+                    blue = fma(w, load(buffer, at + np.uint64(3 * TILE)), blue)
                     weight = weight + w
                     at += np.uint64(5 * TILE)
                     dy = dy + fill(ALL)
@@ -341,7 +356,7 @@ class ForwardPass:
     tile_end: Ints  # (tiles,) how far into `tile_splats` each tile was blended before it was opaque
 
 
-def splat(
+def project_and_sort(
     gaussians: Gaussians,
     intrinsics: Array,
     scene_from_camera: Array,
@@ -356,7 +371,7 @@ def splat(
     intrinsics = np.array(intrinsics, np.float64)  # a copy: kernels compile once more for read-only arrays
 
     project_some = partial(project, *scene, camera_from_scene, intrinsics, width, height, *screen)
-    parts = in_chunks(project_some, len(gaussians), GAUSSIANS_CHUNK, threads)
+    parts = run_in_chunks(project_some, len(gaussians), GAUSSIANS_CHUNK, threads)
     start = np.cumsum([0, *(len(part[0]) for part in parts)])
     index, projected = np.empty(start[-1], np.int64), _cache_lines(start[-1])
     tiles = np.empty((start[-1], 4), np.int32)
@@ -366,8 +381,8 @@ def splat(
             for whole, part in zip((index, projected, tiles), parts[k]):
                 whole[start[k] : start[k + 1]] = part
 
-    in_chunks(place, len(parts), 1, threads)
-    tile_start, tile_splats = deal(projected[:, DEPTH], tiles, width, height, threads)
+    run_in_chunks(place, len(parts), 1, threads)
+    tile_start, tile_splats = assign_tiles(projected[:, DEPTH], tiles, width, height, threads)
     return Splats(
         index, projected, tiles, tile_start, tile_splats, intrinsics, camera_from_scene, width, height, screen
     )
@@ -375,7 +390,7 @@ def splat(
 
 def _cache_lines(n: int) -> F32:
     """Memory for projected rows (n, 16), each of which is one line of the processor's cache (64 bytes)."""
-    memory: F32 = aligned(n * PROJECTED_SIZE)
+    memory: F32 = aligned_memory(n * PROJECTED_SIZE)
     return memory.reshape(n, PROJECTED_SIZE)
 
 
@@ -395,7 +410,7 @@ def forward(
     y down, z forward; `background` (3,) or (H, W, 3) rgb behind everything. Kerbl et al. 2023, with per-Gaussian depth
     order.
     """
-    splats = splat(gaussians, intrinsics, scene_from_camera, width, height, threads, screen)
+    splats = project_and_sort(gaussians, intrinsics, scene_from_camera, width, height, threads, screen)
     splats.projected[:, RED : BLUE + 1] = colours_seen(gaussians, scene_from_camera[:3, 3], splats.index, threads)
     view, tile_end = _shade(splats, background, threads)
     return ForwardPass(view, splats, tile_end)
@@ -405,7 +420,7 @@ def colours_seen(gaussians: Gaussians, camera_center: Array, index: Ints, thread
     """rgb (M, 3) of the Gaussians at `index` (M,), as seen from `camera_center` (3,) in their frame; never negative."""
     center, out = np.ascontiguousarray(camera_center, np.float64), np.empty((len(index), 3), np.float32)
     see = partial(sh.seen, gaussians.means, gaussians.colours, gaussians.sh_rest, center, index, out)
-    in_chunks(see, len(index), GAUSSIANS_CHUNK, threads)
+    run_in_chunks(see, len(index), GAUSSIANS_CHUNK, threads)
     return out
 
 
@@ -425,11 +440,11 @@ def _shade(splats: Splats, background: F32, threads: int) -> tuple[View, Ints]:
     ends = np.empty(len(splats.tile_start) - 1, np.int64)
 
     blend_some = partial(blend, *dealt, behind, view.rgb, view.depth, view.alpha, ends)
-    in_chunks(blend_some, len(ends), TILES_CHUNK, threads)
+    run_in_chunks(blend_some, len(ends), TILES_CHUNK, threads)
     return view, ends
 
 
-def gather(splats: Splats, image: F32, masked: Bools | None = None, n_masked: int = 0) -> tuple[F32, F32]:
+def backproject(splats: Splats, image: F32, masked: Bools | None = None, n_masked: int = 0) -> tuple[F32, F32]:
     """Carries an image back to the Gaussians at `splats.index`: (sum of weight * image (M, 3), sum of weight (M,))
     with the weights that `shade` blends with.
 
@@ -438,5 +453,7 @@ def gather(splats: Splats, image: F32, masked: Bools | None = None, n_masked: in
     pixels = np.empty((*image.shape[:2], 4), np.float32)
     pixels[..., :3] = image
     pixels[..., 3] = 1.0 if masked is None else ~masked
-    sums, weights = carry_back(splats.projected, splats.tile_start, splats.tile_splats, pixels, splats.index < n_masked)
+    sums, weights = backproject_tiles(
+        splats.projected, splats.tile_start, splats.tile_splats, pixels, splats.index < n_masked
+    )
     return sums, weights

@@ -10,8 +10,8 @@ from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.town.town import log_name, plan_log, write_log
 from factory.readers.logs import DrivenPath, OtherDrive, Traversal, joined, path_of, traversals
 from factory.readers.settings import LogClips, TownSettings
-from factory.stages.assets import asset_for, block_id
-from factory.stages.sensors import block_cameras, block_of, chosen_cameras, load_photos
+from factory.stages.assets import block_id, load_or_build_scene
+from factory.stages.sensors import block_cameras, block_of, choose_cameras, load_photos
 from tasks.render.scene.build import held_out_rows
 from tasks.render.settings import PsnrGate, RenderSettings, SceneFrom
 from tasks.world.clip import (
@@ -167,7 +167,7 @@ def test_a_scene_of_two_drives_keeps_what_is_of_the_street_and_of_its_own_log(lo
     settings = RenderSettings(
         width=64, height=36, scene=SceneFrom.DISCS, psnr_min=0.0, camera_psnr_min=0.0, psnr_gate=PsnrGate.MARK
     )
-    alone, both = (asset_for(clip_and_ref(logs, n)[2], settings, tmp_path / str(n)) for n in (0, 1))
+    alone, both = (load_or_build_scene(clip_and_ref(logs, n)[2], settings, tmp_path / str(n)) for n in (0, 1))
     assert alone is not None and both is not None
     assert len(both.background) > len(alone.background)
     assert not [name for name in both.nodes if of_other_log(name)]
@@ -181,7 +181,7 @@ def test_a_scene_of_two_drives_keeps_what_is_of_the_street_and_of_its_own_log(lo
 def test_photos_of_other_drives_are_never_held_out(logs: Path) -> None:
     clip = clip_and_ref(logs, 1)[2]
     block = block_of(clip)
-    cameras = block_cameras(block, chosen_cameras(clip.cameras, ()))
+    cameras = block_cameras(block, choose_cameras(clip.cameras, ()))
     photos = load_photos(block.images, cameras, 64, 36)
     assert sum(of_other_log(photo.camera) for photo in photos) > 8
     held_out = held_out_rows(photos, 4)

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tasks.render.rig.adjust import motions
+from tasks.render.rig.adjust import motions_of_twists
 from tasks.world.clip import AgentTracks, Block, Camera, SensorFile
 
 WIDTH, HEIGHT, FOCAL, WALL_M, ROAD_M, CELL_M = 400, 224, 260.0, 6.0, -0.3, 0.03
@@ -59,7 +59,7 @@ def picture(pose: np.ndarray, sheets: list[np.ndarray]) -> np.ndarray:
 
 
 def ego(k: int) -> np.ndarray:
-    return motions(np.array([[1.2 * k, 0.02 * k * k, 0.0, 0.0, 0.0, 0.03 * k]]))[0]
+    return motions_of_twists(np.array([[1.2 * k, 0.02 * k * k, 0.0, 0.0, 0.0, 0.03 * k]]))[0]
 
 
 def photographed(folder: Path) -> Block:

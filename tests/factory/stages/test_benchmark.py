@@ -17,7 +17,7 @@ from factory.pipeline import BenchmarkWork, FactoryWork
 from factory.readers.base import ClipRef
 from factory.readers.settings import TownSettings
 from factory.setup.settings import assemble, identity_of
-from factory.stages.benchmark import benchmark_of, write_benchmark
+from factory.stages.benchmark import describe_benchmark, write_benchmark
 from factory.store.location import BadCacheFile, Location, SceneFiles
 from factory.store.samples import Store
 from tasks.stages import Rejected
@@ -126,7 +126,7 @@ def test_scenes_rebuild_what_the_rows_were_made_from(store: Store, refs: Sequenc
 def test_the_document_names_what_counts_and_what_does_not(
     store: Store, work: FactoryWork, refs: Sequence[ClipRef]
 ) -> None:
-    few = benchmark_of(store, refs, work.identity, 3, BenchmarkSettings(min_follow_ups=8))
+    few = describe_benchmark(store, refs, work.identity, 3, BenchmarkSettings(min_follow_ups=8))
     assert [(clip["start_ms"], clip["why"], clip["follow_ups"]) for clip in few["left_out"]] == [
         (0, "clip.no_earlier_frame", 0),
         (1000, "few_follow_ups", 3),
@@ -141,7 +141,7 @@ def test_the_document_names_what_counts_and_what_does_not(
         assert clip["follow_ups"] == sorted(rows[clip["clip_id"], "follow_up"])
     assert document["settings_hash"] == work.identity.settings_hash
     other = replace(work.identity, settings={"seed": 1})
-    assert {clip["why"] for clip in benchmark_of(store, refs, other, 3, BenchmarkSettings(3))["left_out"]} == {
+    assert {clip["why"] for clip in describe_benchmark(store, refs, other, 3, BenchmarkSettings(3))["left_out"]} == {
         "clip.no_earlier_frame",
         "no_logged_frames",
     }

@@ -11,9 +11,9 @@ import pytest
 from printed_street import CAMERAS, ROAD_M, WIDTH, photographed
 
 from factory.readers.base import BadClip
-from factory.stages.assets import SAID, corrected_rig, said_again, wanted
-from tasks.render.rig.adjust import motions, twists_of
-from tasks.render.rig.correct import ground_below
+from factory.stages.assets import RIG_SUFFIX, correct_block_rig, is_rig_corrected, rewrite_damaged_rig_file
+from tasks.render.rig.adjust import motions_of_twists, twists_of
+from tasks.render.rig.correct import estimate_ground_height
 from tasks.render.scene.asset import RenderAsset, TakenFrom
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky import SkyMap
@@ -28,7 +28,7 @@ def block(tmp_path_factory: pytest.TempPathFactory) -> Block:
 
 
 def turned(one: Camera, turn_deg: tuple[float, float, float]) -> Camera:
-    motion = motions(np.array([[0.0, 0.0, 0.0, *np.radians(turn_deg)]]))[0]
+    motion = motions_of_twists(np.array([[0.0, 0.0, 0.0, *np.radians(turn_deg)]]))[0]
     return replace(one, ego_from_camera=one.ego_from_camera @ motion)
 
 
@@ -38,21 +38,21 @@ def test_a_turned_camera_is_put_right_told_and_drawn_with(
 ) -> None:
     said = (CAMERAS[0], turned(CAMERAS[1], (1.0, -1.5, 0.8)))
     with caplog.at_level(logging.INFO):
-        same, found, correction = corrected_rig(tmp_path / "block-1.safetensors", block, said)
+        same, found, correction = correct_block_rig(tmp_path / "block-1.safetensors", block, said)
     assert correction is not None and len(same.images) == len(block.images)
     # What both cameras are turned by is the ego's frame as well, which photos do not know.
     true, now = (np.linalg.inv(rig[0].ego_from_camera) @ rig[1].ego_from_camera for rig in (CAMERAS, found))
     (twist,) = twists_of((np.linalg.inv(true) @ now)[None])
     assert np.degrees(np.linalg.norm(twist[3:])) < 0.35  # 0.30
-    told = json.loads((tmp_path / f"block-1{SAID}").read_text())
+    told = json.loads((tmp_path / f"block-1{RIG_SUFFIX}").read_text())
     by_name = {row["camera"]: row for row in told["cameras"]}
     assert by_name["left"]["after_px"] < 0.5 < by_name["left"]["before_px"]
     assert told["used"][1]["ego_from_camera"] == found[1].ego_from_camera.tolist()
     assert "left: moved" in caplog.text
-    path = tmp_path / f"block-1{SAID}"
+    path = tmp_path / f"block-1{RIG_SUFFIX}"
     whole = path.read_bytes()
     path.write_bytes(whole.replace(b"after_px", b"aftfr_px", 1))
-    said_again(tmp_path / "block-1.safetensors", block, said)
+    rewrite_damaged_rig_file(tmp_path / "block-1.safetensors", block, said)
     assert path.read_bytes() == whole and f"{path}: its checksum" in caplog.text and "written again" in caplog.text
     asset = RenderAsset(np.zeros(3), EMPTY, {}, SkyMap(np.zeros((2, 2, 3), np.float32)), 30.0, rig=found)
     assert asset.as_corrected([said[1]]) == (found[1],)
@@ -79,7 +79,7 @@ def test_swapped_files_are_left_out_and_named(block: Block, tmp_path: Path, capl
     a, b = 6, 7  # both cameras at one instant
     images[a], images[b] = replace(images[a], uri=images[b].uri), replace(images[b], uri=images[a].uri)
     swapped = replace(block, images=tuple(images))
-    kept, _, correction = corrected_rig(tmp_path / "block-2.safetensors", swapped, CAMERAS)
+    kept, _, correction = correct_block_rig(tmp_path / "block-2.safetensors", swapped, CAMERAS)
     assert correction is not None and correction.strangers == (a, b)
     assert len(kept.images) == len(images) - 2 and images[a].uri in caplog.text
 
@@ -87,15 +87,17 @@ def test_swapped_files_are_left_out_and_named(block: Block, tmp_path: Path, capl
 def test_a_photo_of_another_size_than_its_camera_s_is_named(block: Block, tmp_path: Path) -> None:
     said = (replace(CAMERAS[0], width=WIDTH + 8), CAMERAS[1])
     with pytest.raises(BadClip, match=r"front_0\.png"):
-        corrected_rig(tmp_path / "block-3.safetensors", block, said)
+        correct_block_rig(tmp_path / "block-3.safetensors", block, said)
 
 
 def test_by_default_blocks_without_lidar_are_corrected(block: Block) -> None:
     sweep = SensorFile("lidar", "0.feather", 0.0, np.eye(4))
     with_lidar = replace(block, sweeps=(sweep,))
-    assert wanted(block, RigSettings()) and not wanted(with_lidar, RigSettings())
-    assert wanted(with_lidar, RigSettings(adjust=Adjust.ON)) and not wanted(block, RigSettings(adjust=Adjust.OFF))
-    assert not wanted(replace(block, images=()), RigSettings(adjust=Adjust.ON))
+    assert is_rig_corrected(block, RigSettings()) and not is_rig_corrected(with_lidar, RigSettings())
+    assert is_rig_corrected(with_lidar, RigSettings(adjust=Adjust.ON)) and not is_rig_corrected(
+        block, RigSettings(adjust=Adjust.OFF)
+    )
+    assert not is_rig_corrected(replace(block, images=()), RigSettings(adjust=Adjust.ON))
 
 
 @pytest.mark.slow
@@ -107,6 +109,6 @@ def test_the_road_is_found_where_it_is(block: Block) -> None:
         for file in block.images
     ]  # fmt: skip
     poses = np.stack([file.world_from_ego for file in block.images])
-    assert ground_below(photos, poses) == pytest.approx(ROAD_M, abs=0.03)
+    assert estimate_ground_height(photos, poses) == pytest.approx(ROAD_M, abs=0.03)
     grey = [replace(photo, rgb=np.full_like(photo.rgb, 90)) for photo in photos]
-    assert ground_below(grey, poses) is None
+    assert estimate_ground_height(grey, poses) is None

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from printed_street import CAMERAS, photographed
 
-from factory.stages.assets import SAID, UsedRig, taken_from, used_rig
-from factory.stages.imaging import Imaging, heights
+from factory.stages.assets import RIG_SUFFIX, CorrectedRig, photo_poses, read_or_correct_rig
+from factory.stages.imaging import Imaging, height_columns
 from factory.stages.sensors import load_photos
 from factory.store.reader import decode_stored_image
 from tasks.attempt import Judged, human_sample
 from tasks.caches import unsealed_json
 from tasks.experts.protocol import Human
 from tasks.perturb import Candidate
-from tasks.render.rig.adjust import motions, twists_of
+from tasks.render.rig.adjust import motions_of_twists, twists_of
 from tasks.render.settings import Adjust, RenderSettings, RigSettings, SceneFrom
 from tasks.settings import PdmSettings
 from tasks.world.clip import NOW, STEP_S, Camera, Clip, SensorFile, scene_of_clip
@@ -31,7 +31,7 @@ SETTINGS = RenderSettings(width=200, height=112, scene=SceneFrom.DISCS, jpeg_qua
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
     """A window of a printed street whose left camera is said to look 2 degrees elsewhere, with a lens it has not."""
     block = photographed(tmp_path_factory.mktemp("photos"))
-    motion = motions(np.array([[0.0, 0.0, 0.0, *np.radians([1.0, -1.5, 0.8])]]))[0]
+    motion = motions_of_twists(np.array([[0.0, 0.0, 0.0, *np.radians([1.0, -1.5, 0.8])]]))[0]
     left = replace(CAMERAS[1], ego_from_camera=CAMERAS[1].ego_from_camera @ motion)
     street = street_clip()
     images = tuple(replace(file, time_s=file.time_s - LATER_S) for file in block.images if file.time_s >= LATER_S)
@@ -76,7 +76,7 @@ def test_photos_are_cut_by_the_camera_and_stand_at_the_poses_that_the_rig_s_file
     clip: Clip, judged: Judged, tmp_path: Path
 ) -> None:
     row = Imaging(SETTINGS, str(tmp_path)).pictures(clip, None, judged)
-    (said,) = tmp_path.glob(f"block-*{SAID}")
+    (said,) = tmp_path.glob(f"block-*{RIG_SUFFIX}")
     told = unsealed_json(said.read_bytes())
     used = {one["name"]: {key: np.array(value) for key, value in one.items() if key != "name"} for one in told["used"]}
     cameras = [replace(camera, **used[camera.name]) for camera in clip.cameras]  # type: ignore[arg-type]
@@ -114,8 +114,8 @@ def test_ego_and_agents_rise_together_with_the_road_that_photos_show() -> None:
         higher = file.world_from_ego.copy()
         higher[2, 3] += 0.3 + 0.02 * k
         used.append(replace(file, world_from_ego=higher))
-    rig = UsedRig((), taken_from(given, used))
-    found = heights(scene, rig.on_road(), rig.lifted(scene.agents, 0.0))
+    rig = CorrectedRig((), photo_poses(given, used))
+    found = height_columns(scene, rig.on_road(), rig.lifted(scene.agents, 0.0))
     place, z = np.asarray(found["world_from_ego"]), np.asarray(found["agent_center_z"])
     now = scene.clip.world_from_ego[NOW]
     rise = place[2, 3] - now[2, 3]
@@ -136,6 +136,6 @@ def test_what_photos_say_of_a_rig_is_found_once_also_where_it_is_nothing(clip: C
     assert block is not None
     alone = replace(block, images=block.images[:1])  # nothing to compare it with
     path = tmp_path / "block-1.safetensors"
-    assert used_rig(path, alone, clip.cameras) is None
+    assert read_or_correct_rig(path, alone, clip.cameras) is None
     gone = replace(block, images=(replace(block.images[0], uri=str(tmp_path / "gone.png")),))
-    assert used_rig(path, gone, clip.cameras) is None, "the photo is not opened again"
+    assert read_or_correct_rig(path, gone, clip.cameras) is None, "the photo is not opened again"

@@ -16,7 +16,7 @@ from factory.readers.settings import TownSettings
 from factory.readers.whole_folder import SUMS
 from factory.setup.settings import _table_of
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table, save_vocabulary
-from factory.stages.assets import SAID, _resumed, _say, damaged_blocks, told_of
+from factory.stages.assets import RIG_SUFFIX, _resumed, _write_rig_file, damaged_blocks, read_rig_file
 from factory.stages.scene_file import BadScene, read_scene, write_scene
 from factory.stages.warm import _is_compiled, marker, tiny_clip
 from factory.store.location import BadCacheFile, Location, SceneFiles, encode_tree
@@ -270,17 +270,17 @@ def test_a_kept_block_under_another_s_name_is_refused(tmp_path: Path) -> None:
     for name in ("1", "2"):
         path = tmp_path / f"cache/block-{name}.safetensors"
         write_scene(path, scene())
-        _say(path, {"used": [], "taken": []})
+        _write_rig_file(path, {"used": [], "taken": []})
     assert not damaged_blocks(Location(str(tmp_path)))
-    for suffix in (".safetensors", SAID):
+    for suffix in (".safetensors", RIG_SUFFIX):
         (tmp_path / f"cache/block-1{suffix}").rename(tmp_path / f"cache/block-2{suffix}")
     other = tmp_path / "cache/block-2.safetensors"
     with pytest.raises(BadScene, match=f"{other}: it is of another block, written as block-1"):
         read_scene(other, other.stem)
     assert read_scene(other).digest
     with pytest.raises(Damaged, match="of another block"):
-        told_of(other.with_suffix(SAID))
-    assert damaged_blocks(Location(str(tmp_path))).keys() == {f"cache/block-2{s}" for s in (".safetensors", SAID)}
+        read_rig_file(other.with_suffix(RIG_SUFFIX))
+    assert damaged_blocks(Location(str(tmp_path))).keys() == {f"cache/block-2{s}" for s in (".safetensors", RIG_SUFFIX)}
 
 
 def test_damage_is_damage() -> None:

@@ -14,7 +14,7 @@ from factory.pipeline import FactoryWork
 from factory.readers.base import BadClip
 from factory.readers.settings import TownSettings
 from factory.setup.settings import assemble
-from factory.stages.imaging import in_time_of, photo_at, scene_lookups
+from factory.stages.imaging import nearest_photo, scene_cache_counts, scene_in_clip_time
 from factory.stages.sensors import block_of
 from tasks.render.scene.asset import Exposure, RenderAsset
 from tasks.render.scene.sky import SkyMap
@@ -77,7 +77,7 @@ def test_a_missing_photo_is_a_bad_clip_that_names_camera_and_time(town: Path, tm
     root = tmp_path / "logs"
     shutil.copytree(town, root)
     clip = clip_of(root, tmp_path)
-    Path(photo_at(clip, "ring_front_left", 1.0).uri).unlink()
+    Path(nearest_photo(clip, "ring_front_left", 1.0).uri).unlink()
     message = (
         rf"camera ring_front_left: no photo within 0\.06 s of {clip.start_s + 1:.2f} s .* restore the missing file"
     )
@@ -90,7 +90,7 @@ def test_of_many_photos_the_nearest_is_taken(town: Path, tmp_path: Path) -> None
     clip = clip_of(town, tmp_path)
     first = clip.images[0]
     often = replace(clip, images=tuple(replace(first, time_s=0.05 * k + 0.02) for k in range(100)))
-    assert photo_at(often, first.sensor, 1.0).time_s == pytest.approx(1.02)
+    assert nearest_photo(often, first.sensor, 1.0).time_s == pytest.approx(1.02)
 
 
 def test_a_clip_is_drawn_with_what_its_cameras_made_of_the_light_in_its_own_time(town: Path, tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_a_clip_is_drawn_with_what_its_cameras_made_of_the_light_in_its_own_time
         Exposure("front", time_s, np.float32(gain * np.eye(3, 4))) for time_s, gain in ((2.0, 1.5), (3.0, 0.5))
     )
     asset = RenderAsset(np.zeros(3), EMPTY, {}, SkyMap(np.zeros((2, 4, 3), np.float32)), 30.0, exposures=gains)
-    scene = in_time_of(replace(clip, block=block), asset)
+    scene = scene_in_clip_time(replace(clip, block=block), asset)
     assert [float(scene.affine_of("front", time_s)[0, 0]) for time_s in (0.0, 0.5, 1.0)] == [1.5, 1.0, 0.5]
 
 
@@ -111,10 +111,10 @@ def test_a_worker_reads_a_block_s_scene_once_for_all_its_clips(tmp_path: Path) -
     town.index()
     overrides = ["clips=av2", f"clips.root={town.root}", f"out={tmp_path / 'out'}", *SIZE]
     work = assemble(load_config(overrides)).work
-    before = scene_lookups()
+    before = scene_cache_counts()
     refs = work.reader.index().refs
     for ref in refs:
         assert work.imaging.block_verdict(work.reader.read(ref)) is None
-    hits, misses = scene_lookups()
+    hits, misses = scene_cache_counts()
     assert len(refs) == 3
     assert (hits - before[0], misses - before[1]) == (2, 1)

@@ -9,7 +9,7 @@ import pytest
 
 from factory.stages.scene_file import read_scene, write_scene
 from factory.stages.sensors import masks_digest, read_masks, refuse_unknown_masks, resized_mask
-from tasks.render.rig.correct import hidden_by
+from tasks.render.rig.correct import movable_mask
 from tasks.render.scene.asset import OwnBody, RenderAsset
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.gaussians import EMPTY
@@ -68,7 +68,7 @@ def test_another_mask_is_another_scene(folder: Path) -> None:
 
 def test_no_corner_is_looked_for_on_it(folder: Path) -> None:
     mask = read_masks(str(folder), [CAMERA])["back"]
-    hidden = hidden_by(None, CAMERA, SensorFile("back", "", 0.0, np.eye(4)), mask)
+    hidden = movable_mask(None, CAMERA, SensorFile("back", "", 0.0, np.eye(4)), mask)
     assert hidden is not None and (hidden == mask).all()
 
 

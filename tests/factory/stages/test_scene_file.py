@@ -16,8 +16,8 @@ from factory.stages.scene_file import (
     BadScene,
     described_by,
     digest_of,
+    read_dtype,
     read_scene,
-    stored_dtype,
     tensors_of,
     write_scene,
 )
@@ -97,7 +97,7 @@ def test_in_16_bits_places_stay_and_all_else_is_the_nearest_number_of_11_bits(tm
     written = write_scene(path, whole, SceneDtype.FLOAT16)
     back = read_scene(path)
     write_scene(plain, whole)
-    assert (stored_dtype(path), stored_dtype(plain)) == (SceneDtype.FLOAT16, SceneDtype.FLOAT32)
+    assert (read_dtype(path), read_dtype(plain)) == (SceneDtype.FLOAT16, SceneDtype.FLOAT32)
     assert path.stat().st_size < 0.56 * plain.stat().st_size  # 124 of 236 bytes a Gaussian, and the rest
     for name, array in tensors_of(whole).items():
         first, second = tensors_of(written)[name], tensors_of(back)[name]

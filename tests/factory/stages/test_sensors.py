@@ -15,9 +15,9 @@ import pytest
 from factory.graph.steps import StopCheck, TaskStopped
 from factory.readers.base import BadClip
 from factory.stages import assets
-from factory.stages.assets import Sensing, asset_for, block_id, sensing
-from factory.stages.scene_file import stored_dtype
-from factory.stages.sensors import block_of, chosen_cameras, decode_image, encode_jpeg, load_sensors
+from factory.stages.assets import Sensing, block_id, block_sensing, load_or_build_scene
+from factory.stages.scene_file import read_dtype
+from factory.stages.sensors import block_of, choose_cameras, decode_image, encode_jpeg, load_sensors
 from tasks.render.fit import reconstruct
 from tasks.render.scene.build import AssetSettings, psnr
 from tasks.render.settings import Backend, FitSettings, RenderSettings, SceneDtype, SceneFrom
@@ -99,7 +99,7 @@ def test_jpeg_keeps_colours_and_their_order() -> None:
 
 def test_a_missing_camera_is_named_with_those_there_are(clip: Clip) -> None:
     with pytest.raises(ValueError, match="no camera rear; this rig has front"):
-        chosen_cameras(clip.cameras, ["rear"])
+        choose_cameras(clip.cameras, ["rear"])
 
 
 WHOLE = encode_jpeg(smooth_image(0), 90)
@@ -149,11 +149,11 @@ def test_a_broken_sweep_is_a_bad_clip_that_names_file_and_column(clip: Clip) -> 
 
 
 def test_a_block_is_built_once_and_read_back_the_same(clip: Clip, tmp_path: Path) -> None:
-    first = asset_for(clip, SETTINGS, tmp_path / "cache")
+    first = load_or_build_scene(clip, SETTINGS, tmp_path / "cache")
     assert first is not None and len(first.background) > 100 and len(first.digest) == 16
     for file in clip.images:
         Path(file.uri).write_bytes(bytes(Path(file.uri).stat().st_size))  # a second build would fail
-    again = asset_for(clip, SETTINGS, tmp_path / "cache")
+    again = load_or_build_scene(clip, SETTINGS, tmp_path / "cache")
     assert again is not None and again.digest == first.digest
     assert again.background.colours.tobytes() == first.background.colours.tobytes()
 
@@ -163,12 +163,12 @@ def test_a_block_in_16_bits_is_kept_apart_and_drawn_the_same_when_it_is_built_an
 ) -> None:
     half, in_32 = (replace(SETTINGS, scene_dtype=dtype) for dtype in (SceneDtype.FLOAT16, SceneDtype.FLOAT32))
     assert block_id(clip, half) != block_id(clip, in_32)
-    built, whole = asset_for(clip, half, tmp_path), asset_for(clip, in_32, tmp_path)
-    read = asset_for(clip, half, tmp_path)
+    built, whole = load_or_build_scene(clip, half, tmp_path), load_or_build_scene(clip, in_32, tmp_path)
+    read = load_or_build_scene(clip, half, tmp_path)
     assert built is not None and whole is not None and read is not None
     assert read.background.colours.tobytes() == built.background.colours.tobytes()
     assert read.background.colours.tobytes() != whole.background.colours.tobytes()
-    assert stored_dtype(tmp_path / f"block-{block_id(clip, half)}.safetensors") is SceneDtype.FLOAT16
+    assert read_dtype(tmp_path / f"block-{block_id(clip, half)}.safetensors") is SceneDtype.FLOAT16
 
 
 def test_a_photo_of_another_size_makes_another_block(clip: Clip, tmp_path: Path) -> None:
@@ -176,7 +176,7 @@ def test_a_photo_of_another_size_makes_another_block(clip: Clip, tmp_path: Path)
     Path(clip.images[0].uri).write_bytes(b"junk")
     assert block_id(clip, SETTINGS) != before
     with pytest.raises(BadClip, match=re.escape(clip.images[0].uri)):
-        asset_for(clip, SETTINGS, tmp_path)
+        load_or_build_scene(clip, SETTINGS, tmp_path)
 
 
 def test_a_scene_fitted_by_another_backend_is_kept_apart(
@@ -190,11 +190,11 @@ def test_a_scene_fitted_by_another_backend_is_kept_apart(
     assert block_id(clip, replace(fit, backend=Backend.GSPLAT_DENSE)) == block_id(clip, on_gpu)  # the same fit
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(BackendMissing, match="needs torch and gsplat"):
-        asset_for(clip, on_gpu, tmp_path)
+        load_or_build_scene(clip, on_gpu, tmp_path)
 
 
 def test_a_scene_says_which_stretch_of_driving_it_stands_for(clip: Clip, tmp_path: Path) -> None:
-    asset = asset_for(clip, SETTINGS, tmp_path)
+    asset = load_or_build_scene(clip, SETTINGS, tmp_path)
     assert asset is not None and asset.block is not None
     assert (asset.block.dataset, asset.block.log_id) == ("test", "log")
     assert (asset.block.start_s, asset.block.end_s) == (0.0, 1.0)
@@ -202,8 +202,8 @@ def test_a_scene_says_which_stretch_of_driving_it_stands_for(clip: Clip, tmp_pat
 
 
 def test_a_clip_without_lidar_or_without_a_rig_has_no_scene(clip: Clip, tmp_path: Path) -> None:
-    assert asset_for(replace(clip, images=(), sweeps=()), SETTINGS, tmp_path) is None
-    assert asset_for(replace(clip, cameras=(), images=()), SETTINGS, tmp_path) is None
+    assert load_or_build_scene(replace(clip, images=(), sweeps=()), SETTINGS, tmp_path) is None
+    assert load_or_build_scene(replace(clip, cameras=(), images=()), SETTINGS, tmp_path) is None
 
 
 def test_photos_without_lidar_are_a_scene_where_they_lie_close_enough_for_parallax(clip: Clip) -> None:
@@ -214,19 +214,21 @@ def test_photos_without_lidar_are_a_scene_where_they_lie_close_enough_for_parall
         images = tuple(replace(file, world_from_ego=pose) for file, pose in zip(clip.images, poses))
         return replace(clip, images=images, sweeps=())
 
-    made_of = {metres: sensing(spaced(metres), SETTINGS) for metres in (0.0, 2.0, 7.0)}
+    made_of = {metres: block_sensing(spaced(metres), SETTINGS) for metres in (0.0, 2.0, 7.0)}
     assert made_of == {0.0: Sensing.NOTHING, 2.0: Sensing.PHOTOS_ONLY, 7.0: Sensing.NOTHING}
 
 
 def test_a_clip_with_photos_alone_has_a_scene(clip: Clip, tmp_path: Path) -> None:
-    asset = asset_for(replace(clip, sweeps=()), replace(SETTINGS, asset=AssetSettings(hold_out_every=3)), tmp_path)
+    asset = load_or_build_scene(
+        replace(clip, sweeps=()), replace(SETTINGS, asset=AssetSettings(hold_out_every=3)), tmp_path
+    )
     assert asset is not None and asset.n_held_out == 1 and np.isfinite(asset.psnr_db) and len(asset.digest) == 16
 
 
 def test_a_clip_with_lidar_alone_has_no_scene(clip: Clip, tmp_path: Path) -> None:
     unseen = replace(clip, images=())
-    assert sensing(unseen, SETTINGS) is Sensing.NOTHING and sensing(clip, SETTINGS) is Sensing.PHOTOS
-    assert asset_for(unseen, SETTINGS, tmp_path) is None
+    assert block_sensing(unseen, SETTINGS) is Sensing.NOTHING and block_sensing(clip, SETTINGS) is Sensing.PHOTOS
+    assert load_or_build_scene(unseen, SETTINGS, tmp_path) is None
 
 
 def test_another_size_or_window_is_another_block(clip: Clip) -> None:
@@ -249,7 +251,7 @@ def test_a_killed_fit_goes_on_to_the_same_bytes(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    undisturbed = asset_for(clip, FITTED, tmp_path / "one")
+    undisturbed = load_or_build_scene(clip, FITTED, tmp_path / "one")
     assert undisturbed is not None and np.isfinite(undisturbed.psnr_db) and undisturbed.n_held_out > 0
 
     monkeypatch.setattr(assets, "STRETCH", 8)
@@ -259,26 +261,26 @@ def test_a_killed_fit_goes_on_to_the_same_bytes(
     def killed_at_16(problem, state, *rest):  # type: ignore[no-untyped-def]
         starts.append(state.iteration)
         if starts == [0, 8, 16]:
-            said.extend(assets.fits_going_on(tmp_path / "two"))
+            said.extend(assets.running_fits(tmp_path / "two"))
             raise KeyboardInterrupt
         advance(problem, state, *rest)
 
     monkeypatch.setattr(assets, "advance", killed_at_16)
     with pytest.raises(KeyboardInterrupt):
-        asset_for(clip, FITTED, tmp_path / "two")
+        load_or_build_scene(clip, FITTED, tmp_path / "two")
     begun = tmp_path / "two" / f"block-{block_id(clip, FITTED)}.fit.npz"
     assert begun.exists()
-    again = asset_for(clip, FITTED, tmp_path / "two")
+    again = load_or_build_scene(clip, FITTED, tmp_path / "two")
     assert again is not None and again.digest == undisturbed.digest
     assert starts == [0, 8, 16, 16] and not begun.exists()
     assert len(said) == 1 and said[0].startswith("fit 10/20, "), "how far it is can be asked from outside"
-    assert assets.fits_going_on(tmp_path / "two") == [], "what has ended is not going on"
+    assert assets.running_fits(tmp_path / "two") == [], "what has ended is not going on"
 
 
 def test_a_fit_that_is_asked_to_stop_keeps_every_iteration_and_goes_on_to_the_same_bytes(
     clip: Clip, tmp_path: Path
 ) -> None:
-    undisturbed = asset_for(clip, FITTED, tmp_path / "one")
+    undisturbed = load_or_build_scene(clip, FITTED, tmp_path / "one")
     begun = tmp_path / "two" / f"block-{block_id(clip, FITTED)}.fit.npz"
 
     def after(n: int) -> StopCheck:
@@ -288,11 +290,13 @@ def test_a_fit_that_is_asked_to_stop_keeps_every_iteration_and_goes_on_to_the_sa
 
     for n, done in ((7, 7), (5, 12)):
         with pytest.raises(TaskStopped, match=f"{done} of 20 iterations are done"):
-            asset_for(clip, FITTED, tmp_path / "two", stopped=after(n))
+            load_or_build_scene(clip, FITTED, tmp_path / "two", stopped=after(n))
         with np.load(begun) as arrays:
             assert arrays["iteration"] == done
-        assert assets.fits_going_on(tmp_path / "two") == []
-    again = asset_for(clip, FITTED, tmp_path / "two", stopped=after(8))  # the last iteration is done: nothing to leave
+        assert assets.running_fits(tmp_path / "two") == []
+    again = load_or_build_scene(
+        clip, FITTED, tmp_path / "two", stopped=after(8)
+    )  # the last iteration is done: nothing to leave
     assert undisturbed is not None and again is not None and again.digest == undisturbed.digest
     assert not begun.exists()
 

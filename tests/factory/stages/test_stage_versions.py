@@ -22,7 +22,7 @@ from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.experts.protocol import Human, Plan
 from tasks.experts.recovery import Recovery, RecoveryTable
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
-from tasks.render.gate import composed, likeness_to_photo, measures
+from tasks.render.gate import compose_near, likeness_to_photo, measure_views
 from tasks.render.scene.build import AssetSettings, build_asset
 from tasks.render.scene.engine import NOBODY, render
 from tasks.render.views import draw_map_views, pinhole, render_views
@@ -180,8 +180,8 @@ def pictures() -> dict[str, object]:
     pose[:, 2, 3] = 0.0
     drawn = draw_map_views(clip.road_map, [pinhole("front", 0.0, 70.0)], pose, clip.agents, [NOW], 128, 72)
     eye = Pinhole(front.intrinsics, aside[0] @ front.ego_from_camera, street.WIDTH, street.HEIGHT)
-    near = composed(asset, NOBODY, aside[0, :3, 3], 30.0)
-    (found,) = measures(near, [eye], render(near, [eye]), aside[0])
+    near = compose_near(asset, NOBODY, aside[0, :3, 3], 30.0)
+    (found,) = measure_views(near, [eye], render(near, [eye]), aside[0])
     alike = likeness_to_photo(asset, photos[2], street.tracks(), ["car"])
     return {"rendered": blocks(seen), "drawn": blocks(drawn), "gate": astuple(found), "likeness": [alike["car"]]}
 

@@ -7,10 +7,10 @@ import pytest
 
 from tasks.kernels.compiled import kernel
 from tasks.kernels.simd import (
-    columns,
     fill,
-    fused,
+    fma,
     greatest,
+    lane_indices,
     larger,
     load,
     smaller,
@@ -32,13 +32,13 @@ def _all(a: Any, b: Any, c: Any, out: Any) -> Any:
         x - y,
         x * y,
         x / y,
-        fused(x, y, z),
+        fma(x, y, z),
         smaller(x, y),
         larger(x, y),
         where_at_least(x, y, z),
         where_below(x, y, z),
         fill(a[3]),
-        columns(),
+        lane_indices(),
         sums((x, y, z, x, y)),
     )
     for k, result in enumerate(results):

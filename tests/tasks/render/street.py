@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.fit.backend import compose, forward_pass
-from tasks.render.fit.corrections import corrected, exposed
-from tasks.render.fit.reconstruct import boxes_off, corrections_at
-from tasks.render.fit.start import Problem
+from tasks.render.fit.backend import compose_scene, draw_with_sky
+from tasks.render.fit.corrections import apply_exposure, corrected_pose
+from tasks.render.fit.reconstruct import interpolated_corrections, learned_box_shifts
+from tasks.render.fit.start import FitProblem
 from tasks.render.fit.state import FitState
 from tasks.render.scene.sensed import Photo, Sweep
 from tasks.world.clip import AgentKind, AgentTracks
@@ -99,9 +99,9 @@ def drive(n: int = 8, with_car: bool = True) -> tuple[list[Photo], list[Sweep]]:
     return photos, sweeps
 
 
-def picture_of(problem: Problem, state: FitState, photo: Photo) -> F32:
+def picture_of(problem: FitProblem, state: FitState, photo: Photo) -> F32:
     """What the fit itself makes of a photo of the block (pose local), by the corrections of its camera's neighbours."""
-    row_pose, row_colour = corrections_at(problem, state, photo.camera, photo.time_s)
-    scene, _ = compose(problem, state, boxes_off(problem, state), photo)
-    seen, _ = forward_pass(state, scene, photo, corrected(photo.world_from_camera, row_pose), 1)
-    return np.clip(exposed(seen.view.rgb, row_colour), 0.0, 1.0)
+    row_pose, row_colour = interpolated_corrections(problem, state, photo.camera, photo.time_s)
+    scene, _ = compose_scene(problem, state, learned_box_shifts(problem, state), photo)
+    seen, _ = draw_with_sky(state, scene, photo, corrected_pose(photo.world_from_camera, row_pose), 1)
+    return np.clip(apply_exposure(seen.view.rgb, row_colour), 0.0, 1.0)

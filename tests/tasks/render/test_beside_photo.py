@@ -11,15 +11,15 @@ from tasks.render.gate import (
     BEHIND_BOX_M,
     BESIDE_GAP,
     BESIDE_RAD,
-    Album,
     GateSettings,
     Sightings,
     VehiclePhoto,
-    beside_photo,
-    eye_in_box,
-    on_box,
-    seen_beside,
-    unlike,
+    VehiclePhotos,
+    intersect_box,
+    likeness_beside_photo,
+    likeness_to_nearest_photo,
+    to_box_frame,
+    vehicle_fault,
 )
 from tasks.render.scene.engine import Vehicles
 from tasks.render.scene.sensed import Photo
@@ -47,7 +47,7 @@ def rays_of(eye: Pinhole) -> Array:
 
 
 def marched(box: Array, eye: Array, rays: Array) -> Array:
-    """Slow twin of `on_box`: the first of many places along each ray (N, 3) that lies in the box; inf for none."""
+    """Slow twin of `intersect_box`: the first of many places along each ray (N, 3) in the box; inf for none."""
     c, s = np.cos(box[3]), np.sin(box[3])
     found = np.full(len(rays), np.inf)
     for along in np.arange(20.0, 0.0, -0.01):
@@ -62,7 +62,7 @@ def painted(eye: Pinhole, boxes: Array, phase: float = 0.0) -> NDArray[np.float3
     rays, nearest = rays_of(eye), np.full(WIDTH * HEIGHT, np.inf)
     rgb = np.full((WIDTH * HEIGHT, 3), 0.5)
     for number, box in enumerate(boxes):
-        points, _, _, along = on_box(box, eye.world_from_camera[:3, 3], rays)
+        points, _, _, along = intersect_box(box, eye.world_from_camera[:3, 3], rays)
         front = along < nearest
         pattern = (
             0.5
@@ -83,7 +83,7 @@ def test_rays_meet_a_box_where_a_walk_along_them_first_enters_it() -> None:
     eye = eye_at(1.0, -0.5)
     rays = rays_of(eye)[::7]
     place = eye.world_from_camera[:3, 3]
-    points, axis, side, along = on_box(BOX, place, rays)
+    points, axis, side, along = intersect_box(BOX, place, rays)
     slow = marched(BOX, place, rays)
     grazed = np.isfinite(slow) != np.isfinite(along)
     assert grazed.sum() <= 3 and np.isfinite(along).sum() > 50  # through a corner of less than a step
@@ -96,13 +96,13 @@ def test_rays_meet_a_box_where_a_walk_along_them_first_enters_it() -> None:
 def test_a_vehicle_whole_from_elsewhere_is_like_its_photo_and_one_torn_is_not() -> None:
     here, taken = eye_at(1.5, -0.8), vehicle_photo(eye_at(0.0))
     whole = painted(here, BOX[None])
-    alike, share = beside_photo(whole, here, BOX, NOBODY, taken)
+    alike, share = likeness_beside_photo(whole, here, BOX, NOBODY, taken)
     assert alike > 0.93 and share > 0.9
     rng = np.random.default_rng(0)
     rows = np.clip(np.arange(HEIGHT)[:, None] + rng.integers(-6, 7, (HEIGHT, WIDTH)), 0, HEIGHT - 1)
     torn = whole[rows, np.arange(WIDTH)]
-    assert beside_photo(torn, here, BOX, NOBODY, taken)[0] < 0.68
-    assert beside_photo(painted(here, BOX[None], phase=2.5), here, BOX, NOBODY, taken)[0] < 0.7
+    assert likeness_beside_photo(torn, here, BOX, NOBODY, taken)[0] < 0.68
+    assert likeness_beside_photo(painted(here, BOX[None], phase=2.5), here, BOX, NOBODY, taken)[0] < 0.7
 
 
 def test_it_does_not_matter_where_in_the_world_both_are() -> None:
@@ -113,24 +113,26 @@ def test_it_does_not_matter_where_in_the_world_both_are() -> None:
     move[:2, :2], move[:3, 3] = [[c, -s], [s, c]], (30.0, -4.0, 1.0)
     elsewhere = np.concatenate([move[:3, :3] @ BOX[:3] + move[:3, 3], [BOX[3] + 0.7], BOX[4:]])
     there = replace(here, world_from_camera=move @ here.world_from_camera)
-    assert beside_photo(whole, there, elsewhere, NOBODY, taken) == pytest.approx(
-        beside_photo(whole, here, BOX, NOBODY, taken), abs=0.02
+    assert likeness_beside_photo(whole, there, elsewhere, NOBODY, taken) == pytest.approx(
+        likeness_beside_photo(whole, here, BOX, NOBODY, taken), abs=0.02
     )
 
 
 def test_a_pixel_or_two_off_is_forgiven() -> None:
     here, taken = eye_at(0.0), vehicle_photo(eye_at(0.0))
     moved = np.roll(painted(here, BOX[None]), (1, 2), axis=(0, 1))
-    assert beside_photo(moved, here, BOX, NOBODY, taken)[0] > 0.97
+    assert likeness_beside_photo(moved, here, BOX, NOBODY, taken)[0] > 0.97
 
 
 def test_faces_that_the_photo_does_not_show_say_nothing() -> None:
     behind, beside = eye_at(0.0, 1.0), eye_at(10.0 - 3.0, -7.0)
     straight = BOX * [1, 1, 1, 0, 1, 1, 1]
-    _, share = beside_photo(painted(beside, straight[None]), beside, straight, NOBODY, vehicle_photo(behind, straight))
+    _, share = likeness_beside_photo(
+        painted(beside, straight[None]), beside, straight, NOBODY, vehicle_photo(behind, straight)
+    )
     assert share == 0.0  # of the side from the side: from behind there is the back alone
     ahead = eye_at(30.0)
-    assert beside_photo(painted(ahead, BOX[None]), ahead, BOX, NOBODY, vehicle_photo(behind)) == (0.0, 0.0)
+    assert likeness_beside_photo(painted(ahead, BOX[None]), ahead, BOX, NOBODY, vehicle_photo(behind)) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("hidden", ["here", "in the photo"])
@@ -139,10 +141,10 @@ def test_what_others_hide_says_nothing(hidden: str) -> None:
     other = np.array([[5.0, 0.0, 0.6, 0.0, 1.0, 1.2, 1.2]])
     mine, theirs = (other, NOBODY) if hidden == "here" else (NOBODY, other)
     picture = painted(here, np.concatenate([BOX[None], mine]))
-    alike, share = beside_photo(picture, here, BOX, mine, vehicle_photo(then, BOX, theirs))
+    alike, share = likeness_beside_photo(picture, here, BOX, mine, vehicle_photo(then, BOX, theirs))
     assert 0.2 < share < 0.9 and alike > 0.9
     assert (
-        beside_photo(
+        likeness_beside_photo(
             picture, here, BOX, NOBODY, vehicle_photo(then, BOX, theirs) if len(mine) else vehicle_photo(then)
         )[1]
         > share
@@ -155,19 +157,21 @@ def test_only_a_photo_from_near_enough_is_held_beside() -> None:
     wrong = painted(here, BOX[None], phase=2.5)
     view = View(wrong, np.full((HEIGHT, WIDTH), 20.0, np.float32), np.ones((HEIGHT, WIDTH), np.float32))
 
-    def album(eye: Array) -> Album:
-        return Album({"car": Sightings(np.array([0]), eye[None])}, lambda *_: 1.0, taken=lambda *_: vehicle_photo(then))
+    def album(eye: Array) -> VehiclePhotos:
+        return VehiclePhotos(
+            {"car": Sightings(np.array([0]), eye[None])}, lambda *_: 1.0, taken=lambda *_: vehicle_photo(then)
+        )
 
-    near = eye_in_box(then.world_from_camera[:3, 3], BOX)
-    assert seen_beside(album(near), there, 0, here, view) < 0.7
+    near = to_box_frame(then.world_from_camera[:3, 3], BOX)
+    assert likeness_to_nearest_photo(album(near), there, 0, here, view) < 0.7
     settings = GateSettings(vehicle_share=0.03)
-    found = unlike(album(near), there, here, view, settings)
+    found = vehicle_fault(album(near), there, here, view, settings)
     assert found is not None and found[0] == "unlike_photos" and "beside a photo" in found[1]
-    assert unlike(album(near), there, here, view, replace(settings, beside_min=0.0)) is None
-    for eye, inner in ((eye, eye_in_box(eye.world_from_camera[:3, 3], BOX)) for eye in (here, eye_at(6.0, -0.3))):
+    assert vehicle_fault(album(near), there, here, view, replace(settings, beside_min=0.0)) is None
+    for eye, inner in ((eye, to_box_frame(eye.world_from_camera[:3, 3], BOX)) for eye in (here, eye_at(6.0, -0.3))):
         most = min(BESIDE_GAP, BESIDE_RAD * float(np.linalg.norm(inner)) / BEHIND_BOX_M)
-        assert seen_beside(album(inner * (1.0 + 0.99 * most)), there, 0, eye, view) < 1.0
-        assert seen_beside(album(inner * (1.0 + 1.01 * most)), there, 0, eye, view) == 1.0
+        assert likeness_to_nearest_photo(album(inner * (1.0 + 0.99 * most)), there, 0, eye, view) < 1.0
+        assert likeness_to_nearest_photo(album(inner * (1.0 + 1.01 * most)), there, 0, eye, view) == 1.0
     assert most < BESIDE_GAP
-    assert seen_beside(replace(album(near), sightings={}), there, 0, here, view) == 1.0
-    assert seen_beside(replace(album(near), taken=None), there, 0, here, view) == 1.0
+    assert likeness_to_nearest_photo(replace(album(near), sightings={}), there, 0, here, view) == 1.0
+    assert likeness_to_nearest_photo(replace(album(near), taken=None), there, 0, here, view) == 1.0

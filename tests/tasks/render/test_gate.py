@@ -10,13 +10,13 @@ from scipy.ndimage import gaussian_filter
 from tasks.render.gate import (
     DETAIL_MIN,
     GateSettings,
-    Measures,
-    composed,
-    fault_of,
-    measured,
-    measures,
+    PictureMeasures,
+    check_drive_pictures,
+    compose_near,
+    measure_view,
+    measure_views,
     meets_road,
-    unfit,
+    picture_fault,
 )
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import NOBODY, render
@@ -32,7 +32,7 @@ SIZE = (street.WIDTH, street.HEIGHT)
 
 
 def reason_at(asset: RenderAsset, pose: np.ndarray, step: int = 8) -> str | None:
-    found = unfit(asset, [FRONT], pose[None], street.tracks(), [step], SIZE, SETTINGS)
+    found = check_drive_pictures(asset, [FRONT], pose[None], street.tracks(), [step], SIZE, SETTINGS)
     assert found is None or (found.stage == "render" and "front at step" in found.detail)
     return None if found is None else found.reason
 
@@ -44,10 +44,10 @@ def turned(x: float, y: float, degrees: float) -> np.ndarray:
     return pose
 
 
-def measured_at(asset: RenderAsset, pose: np.ndarray) -> Measures:
+def measured_at(asset: RenderAsset, pose: np.ndarray) -> PictureMeasures:
     eye = Pinhole(FRONT.intrinsics, pose @ FRONT.ego_from_camera, *SIZE)
-    scene = composed(asset, NOBODY, pose[:3, 3], SETTINGS.reach_m)
-    return measures(scene, [eye], render(scene, [eye]), pose)[0]
+    scene = compose_near(asset, NOBODY, pose[:3, 3], SETTINGS.reach_m)
+    return measure_views(scene, [eye], render(scene, [eye]), pose)[0]
 
 
 def blob(x: float, y: float, z: float, sigma_m: float) -> Gaussians:
@@ -114,9 +114,9 @@ def test_a_blurred_picture_is_told_from_a_sharp_one() -> None:
     rgb = street.photo(3.0, 0.0, 0.8).rgb.astype(np.float32) / 255.0
     solid = np.ones(rgb.shape[:2], np.float32)
     road = np.ones(rgb.shape[:2], bool)
-    assert fault_of(measured(View(rgb, solid, solid), road), SETTINGS) is None
+    assert picture_fault(measure_view(View(rgb, solid, solid), road), SETTINGS) is None
     soft = gaussian_filter(rgb, (2.0, 2.0, 0.0))
-    found = fault_of(measured(View(soft, solid, solid), road), SETTINGS)
+    found = picture_fault(measure_view(View(soft, solid, solid), road), SETTINGS)
     assert found is not None and found[0] == "blurred"
 
 
@@ -135,17 +135,17 @@ def test_only_rays_that_come_down_on_the_road_in_reach_are_asked_for() -> None:
 
 def test_the_first_fault_in_time_is_told(street_asset: RenderAsset) -> None:
     poses = np.stack([street.ego_pose(3.0), street.ego_pose(4.0, 20.0), street.ego_pose(4.0, 30.0)])
-    found = unfit(street_asset, [FRONT], poses, street.tracks(), [8, 80, 85], SIZE, SETTINGS)
+    found = check_drive_pictures(street_asset, [FRONT], poses, street.tracks(), [8, 80, 85], SIZE, SETTINGS)
     assert found is not None and found.detail.startswith("front at step 80: ")
 
 
 def test_every_fault_is_a_reason_of_the_render_stage() -> None:
-    bad = Measures(holes=1.0, lens=1.0, contrast=0.0, detail=0.0)
-    good = Measures(holes=0.0, lens=0.0, contrast=0.2, detail=0.2)
+    bad = PictureMeasures(holes=1.0, lens=1.0, contrast=0.0, detail=0.0)
+    good = PictureMeasures(holes=0.0, lens=0.0, contrast=0.2, detail=0.2)
     told = {
         fault[0]
         for name in ("holes", "lens", "contrast", "detail")
-        if (fault := fault_of(replace(good, **{name: getattr(bad, name)}), SETTINGS)) is not None
+        if (fault := picture_fault(replace(good, **{name: getattr(bad, name)}), SETTINGS)) is not None
     }
     assert told | {"unlike_photos"} == set(PICTURE_FAULTS)
     assert set(PICTURE_FAULTS) <= set(next(stage.reasons for stage in STAGES if stage.name == "render"))

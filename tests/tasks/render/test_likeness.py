@@ -11,18 +11,18 @@ from tasks.render.gate import (
     FADING,
     LEAST_HELD_OUT,
     OTHERS_WAY,
-    Album,
     GateSettings,
     Sightings,
-    expected,
-    eye_in_box,
-    fading_of,
+    VehiclePhotos,
+    box_outline,
+    check_drive_pictures,
+    estimate_fading,
+    expected_likeness,
+    find_sightings,
     large_vehicles,
     likeness_to_photo,
-    outline_of,
-    sightings,
-    similarity,
-    unfit,
+    ssim_map,
+    to_box_frame,
 )
 from tasks.render.scene.asset import Exposure, RenderAsset
 from tasks.render.scene.engine import Vehicles, render, vehicles_at
@@ -40,18 +40,18 @@ CAR_AT_STEP_4 = street.car_box(0.4)
 BEHIND_IT = street.ego_pose(CAR_AT_STEP_4[0] - 9.0, 0.5)  # 5.8 m from the lens to its back
 
 
-def album_of(asset: RenderAsset) -> Album:
+def album_of(asset: RenderAsset) -> VehiclePhotos:
     def likeness(track_id: str, row: int) -> float:
         shown = street.photo(1.0 * row, 0.0, 0.25 * row)
         return likeness_to_photo(asset, shown, street.tracks(), [track_id])[track_id]
 
-    return Album(sightings(FILES, [FRONT], street.tracks()), likeness)
+    return VehiclePhotos(find_sightings(FILES, [FRONT], street.tracks()), likeness)
 
 
 def fault_at(
     asset: RenderAsset, pose: NDArray[np.float64], step: int = 4, settings: GateSettings = SETTINGS
 ) -> Rejected | None:
-    return unfit(
+    return check_drive_pictures(
         asset, [FRONT], pose[None], street.tracks(), [step], SIZE, settings, album=album_of(asset), stored=[step]
     )
 
@@ -111,14 +111,14 @@ def test_no_vehicle_is_looked_at_without_an_album_or_where_no_picture_is_stored_
 ) -> None:
     poor = torn(street_asset)
     args = ([FRONT], BEHIND_IT[None], street.tracks(), [4], SIZE)
-    assert unfit(poor, *args, SETTINGS, stored=[4]) is None
-    assert unfit(poor, *args, SETTINGS, album=album_of(poor), stored=[3, 5]) is None
+    assert check_drive_pictures(poor, *args, SETTINGS, stored=[4]) is None
+    assert check_drive_pictures(poor, *args, SETTINGS, album=album_of(poor), stored=[3, 5]) is None
     assert fault_at(poor, BEHIND_IT, settings=replace(SETTINGS, vehicle_min=0.0)) is None
 
 
 def test_a_track_that_no_photo_shows_is_like_nothing(street_asset: RenderAsset) -> None:
-    unseen = Album({}, lambda _track, _row: 1.0)
-    found = unfit(
+    unseen = VehiclePhotos({}, lambda _track, _row: 1.0)
+    found = check_drive_pictures(
         street_asset, [FRONT], BEHIND_IT[None], street.tracks(), [4], SIZE, SETTINGS, album=unseen, stored=[4]
     )
     assert found is not None and found.detail.endswith("expected likeness 0.00")
@@ -126,10 +126,14 @@ def test_a_track_that_no_photo_shows_is_like_nothing(street_asset: RenderAsset) 
 
 def test_likeness_fades_with_the_way_from_the_nearest_photo() -> None:
     seen = Sightings(np.array([7, 3]), np.array([[-10.0, 0.0, 0.0], [0.0, 5.0, 0.0]]))
-    album = Album({"car": seen}, lambda _track, row: {7: 0.9, 3: 0.5}[row])
-    assert expected(album, "car", np.array([-10.0, 0.0, 0.0])) == pytest.approx(0.9)
-    assert expected(album, "car", np.array([-8.0, 0.0, 0.0])) == pytest.approx(0.9 * np.exp(-FADING * 2.0 / 8.0))
-    assert expected(album, "car", np.array([0.0, 4.0, 0.0])) == pytest.approx(0.5 * np.exp(-FADING * 1.0 / 4.0))
+    album = VehiclePhotos({"car": seen}, lambda _track, row: {7: 0.9, 3: 0.5}[row])
+    assert expected_likeness(album, "car", np.array([-10.0, 0.0, 0.0])) == pytest.approx(0.9)
+    assert expected_likeness(album, "car", np.array([-8.0, 0.0, 0.0])) == pytest.approx(
+        0.9 * np.exp(-FADING * 2.0 / 8.0)
+    )
+    assert expected_likeness(album, "car", np.array([0.0, 4.0, 0.0])) == pytest.approx(
+        0.5 * np.exp(-FADING * 1.0 / 4.0)
+    )
 
 
 def looks(n: int, of: str) -> dict[str, Sightings]:
@@ -146,30 +150,30 @@ def test_fading_is_what_photos_held_out_lose_by_the_way_to_the_nearest_other() -
         return 0.9 if row < 100 else float(alike[track_id[:4]])
 
     held_out = range(100, 200)
-    found = fading_of(poor, likeness, held_out)
+    found = estimate_fading(poor, likeness, held_out)
     assert found == pytest.approx(dict.fromkeys(poor, 1.5))
     # Half of them lose nothing: each is between itself and what all lose, 0.75, which weighs as much as OTHERS_WAY.
-    both = fading_of(
+    both = estimate_fading(
         {**poor, **fine, "unseen": Sightings(np.array([0]), np.array([[-9.0, 0.0, 0.0]]))}, likeness, held_out
     )
     assert both["poor0"] == pytest.approx((1.5 * 0.25 + 0.75 * OTHERS_WAY) / (0.25 + OTHERS_WAY))
     assert both["fine3"] == pytest.approx(0.75 * OTHERS_WAY / (0.25 + OTHERS_WAY))
     assert both["unseen"] == pytest.approx(0.75)
-    assert fading_of(fine, likeness, held_out) == pytest.approx(dict.fromkeys(fine, FADING))
+    assert estimate_fading(fine, likeness, held_out) == pytest.approx(dict.fromkeys(fine, FADING))
 
 
 def test_too_few_or_too_near_looks_say_nothing_of_fading() -> None:
     few = looks(LEAST_HELD_OUT - 1, "poor")
-    assert fading_of(few, lambda _track, row: 0.9 if row < 100 else 0.1, range(100, 200)) == {}
+    assert estimate_fading(few, lambda _track, row: 0.9 if row < 100 else 0.1, range(100, 200)) == {}
     near = {name: replace(mine, eyes=mine.eyes * [[1.0], [1.2]]) for name, mine in looks(40, "poor").items()}
-    assert fading_of(near, lambda _track, row: 0.9 if row < 100 else 0.1, range(100, 200)) == {}
-    assert fading_of(looks(40, "poor"), lambda _track, row: 0.9 if row < 100 else 0.1, ()) == {}
+    assert estimate_fading(near, lambda _track, row: 0.9 if row < 100 else 0.1, range(100, 200)) == {}
+    assert estimate_fading(looks(40, "poor"), lambda _track, row: 0.9 if row < 100 else 0.1, ()) == {}
 
 
 def test_a_vehicle_is_expected_to_fade_as_its_album_says() -> None:
     seen = Sightings(np.array([7]), np.array([[-10.0, 0.0, 0.0]]))
-    album = Album({"car": seen}, lambda _track, _row: 0.9, lambda: {"car": 1.1})
-    assert expected(album, "car", np.array([-8.0, 0.0, 0.0])) == pytest.approx(0.9 * np.exp(-1.1 * 2.0 / 8.0))
+    album = VehiclePhotos({"car": seen}, lambda _track, _row: 0.9, lambda: {"car": 1.1})
+    assert expected_likeness(album, "car", np.array([-8.0, 0.0, 0.0])) == pytest.approx(0.9 * np.exp(-1.1 * 2.0 / 8.0))
 
 
 def test_an_eye_in_box_coordinates_stays_where_both_move_and_turn() -> None:
@@ -178,19 +182,19 @@ def test_an_eye_in_box_coordinates_stays_where_both_move_and_turn() -> None:
     c, s = np.cos(1.1), np.sin(1.1)
     turn, shift = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([50.0, -7.0, 2.0])
     there = np.concatenate([turn @ box[:3] + shift, [box[3] + 1.1], box[4:]])
-    np.testing.assert_allclose(eye_in_box(turn @ eye + shift, there), eye_in_box(eye, box), atol=1e-12)
+    np.testing.assert_allclose(to_box_frame(turn @ eye + shift, there), to_box_frame(eye, box), atol=1e-12)
     ahead = box[:3] + 7.0 * np.array([np.cos(0.4), np.sin(0.4), 0.0])
-    np.testing.assert_allclose(eye_in_box(ahead, box), [7.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(to_box_frame(ahead, box), [7.0, 0.0, 0.0], atol=1e-12)
 
 
 def test_photos_that_show_the_car_are_found_with_where_they_were_taken_from() -> None:
-    found = sightings(FILES, [FRONT], street.tracks())["car"]
+    found = find_sightings(FILES, [FRONT], street.tracks())["car"]
     assert found.photos.tolist() == list(range(10))  # it drives ahead of the camera all the time
     lens = street.ego_pose(3.0) @ street.EGO_FROM_CAMERA
     np.testing.assert_allclose(found.eyes[3], lens[:3, 3] - street.car_box(0.75)[:3], atol=1e-9)
     turned = replace(FRONT, ego_from_camera=np.diag([-1.0, -1.0, 1.0, 1.0]) @ street.EGO_FROM_CAMERA)
-    assert sightings(FILES, [turned], street.tracks()) == {}  # looks back
-    assert sightings(FILES, [replace(FRONT, name="rear")], street.tracks()) == {}  # took none of them
+    assert find_sightings(FILES, [turned], street.tracks()) == {}  # looks back
+    assert find_sightings(FILES, [replace(FRONT, name="rear")], street.tracks()) == {}  # took none of them
 
 
 def ahead(*distances_m: float) -> tuple[Vehicles, Pinhole]:
@@ -212,7 +216,7 @@ def test_a_vehicle_s_share_is_that_of_its_outline() -> None:
     ((j, share),) = large_vehicles(there, eye, empty_view(), 0.01)
     side = 100.0 * (2.0 + 2.0 * BEYOND_M) / (8.0 - BEYOND_M)  # px, of its back
     assert j == 0 and share == pytest.approx(side**2 / (street.WIDTH * street.HEIGHT), rel=0.06)
-    assert outline_of(there.boxes[0], eye).mean() == pytest.approx(share)
+    assert box_outline(there.boxes[0], eye).mean() == pytest.approx(share)
     assert list(large_vehicles(there, eye, empty_view(), 2.0 * share)) == []
 
 
@@ -232,17 +236,17 @@ def test_a_vehicle_beside_the_camera_counts_though_part_of_it_lies_behind() -> N
     there, eye = ahead(-1.0)
     boxes = there.boxes + np.array([[0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
     ((_, share),) = large_vehicles(replace(there, boxes=boxes), eye, empty_view(), 0.03)
-    assert share == pytest.approx(float(outline_of(boxes[0], eye).mean())) and share > 0.03
+    assert share == pytest.approx(float(box_outline(boxes[0], eye).mean())) and share > 0.03
 
 
 def test_similarity_is_one_for_the_same_and_forgives_blur_more_than_streaks() -> None:
     truth = street.photo(3.0, 0.0, 0.8).rgb.astype(np.float32) / np.float32(255.0)
-    np.testing.assert_allclose(similarity(truth, truth), 1.0, atol=1e-5)
+    np.testing.assert_allclose(ssim_map(truth, truth), 1.0, atol=1e-5)
     blurred = (truth + np.roll(truth, 1, 0) + np.roll(truth, 1, 1) + np.roll(truth, 1, (0, 1))) / np.float32(4.0)
     streaks = truth.copy()
     streaks[:, ::4] = np.roll(truth, 31, 1)[:, ::4]
-    assert similarity(streaks, truth).mean() < similarity(blurred, truth).mean() - 0.1
-    assert similarity(truth, np.flip(truth, 0)).mean() < 0.5
+    assert ssim_map(streaks, truth).mean() < ssim_map(blurred, truth).mean() - 0.1
+    assert ssim_map(truth, np.flip(truth, 0)).mean() < 0.5
 
 
 def test_a_photo_of_another_exposure_is_told_by_what_was_learned_of_it(street_asset: RenderAsset) -> None:
@@ -261,4 +265,4 @@ def test_a_vehicle_outside_the_photo_has_no_likeness(street_asset: RenderAsset) 
     away = replace(street.photo(2.0, 0.0, 0.5), world_from_camera=street.ego_pose(60.0) @ street.EGO_FROM_CAMERA)
     assert likeness_to_photo(street_asset, away, street.tracks(), there.track_ids) == {"car": 0.0}
     eye = Pinhole(FRONT.intrinsics, away.world_from_camera, *SIZE)
-    assert not outline_of(there.boxes[0], eye).any() and render(street_asset, [eye], there)
+    assert not box_outline(there.boxes[0], eye).any() and render(street_asset, [eye], there)

@@ -13,7 +13,7 @@ from factory.__main__ import main
 from factory.datasets.scenarionet.nuscenes_cameras import CHUNK, import_cameras, on_scenarionet_clock, rows_of
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import BadClip
-from factory.stages.assets import Sensing, sensing
+from factory.stages.assets import Sensing, block_sensing
 from factory.stages.sensors import block_of, encode_jpeg, load_sensors
 from tasks.render.settings import RenderSettings
 from tests.factory.datasets.scenarionet import scenarionet_scenarios as town
@@ -96,7 +96,7 @@ def test_a_clip_has_twelve_photos_a_second_each_where_it_was_taken_and_on_the_lo
     log = town.save(town.nuscenes(), tmp_path / "logs", "sd_nuscenes_v1.0-mini_scene-0001.pkl")
     reader = ScenarioNetReader(log, cameras=tmp_path / "photos", sensor_root=nuscenes)
     clip = reader.read(reader.index().refs[0])
-    assert sensing(clip, RenderSettings()) is Sensing.PHOTOS
+    assert block_sensing(clip, RenderSettings()) is Sensing.PHOTOS
     front = [image for image in clip.images if image.sensor == "CAM_FRONT"]
     assert 110 < len(front) < 125  # of 9.5 s
     for image in front:

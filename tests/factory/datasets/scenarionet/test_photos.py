@@ -17,7 +17,7 @@ from factory.datasets.scenarionet.photos import read_photographs
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import BadClip
 from factory.readers.pictures import file_and_frame, frame_uri, video_frames
-from factory.stages.assets import Sensing, block_id, sensing
+from factory.stages.assets import Sensing, block_id, block_sensing
 from factory.stages.scene_file import read_scene, write_scene
 from factory.stages.sensors import block_of, encode_jpeg, load_photos, load_sensors
 from factory.store.location import ClipCache, Location
@@ -94,7 +94,7 @@ def test_a_clip_has_the_photos_of_its_window_where_and_when_its_sidecar_says(log
     assert [Path(image.uri).stem for image in front] == [f"{k:03d}" for k in range(2, 22)]
     for image in front:
         np.testing.assert_allclose(image.world_from_ego, pose_at(1.0 + image.time_s))
-    assert sensing(clip, RenderSettings()) is Sensing.PHOTOS_ONLY
+    assert block_sensing(clip, RenderSettings()) is Sensing.PHOTOS_ONLY
     # Where the ego drove, 0.2 m up as its poses say.
     road = load_sensors(block_of(clip), clip.cameras, *SIZE).known.road
     assert road is not None and np.abs(road[:, 2] - 0.2).max() < 1e-9
@@ -192,7 +192,7 @@ def test_sweeps_lie_in_the_lidar_s_frame_and_come_out_in_the_ego_s(log: Path, tm
         (folder / f"lidar/{k}.pcd.bin").write_bytes(rows.tobytes())
     reader = ScenarioNetReader(log, cameras=folder)
     clip = reader.read(reader.index().refs[0])
-    assert sensing(clip, RenderSettings()) is Sensing.PHOTOS
+    assert block_sensing(clip, RenderSettings()) is Sensing.PHOTOS
     swept = load_sensors(block_of(clip), clip.cameras, *SIZE).sweeps
     np.testing.assert_allclose(swept[1].points, [[11.9, 0.0, 0.0], [20.9, 5.0, 2.0]], atol=1e-5)
     assert swept[1].world_from_ego.tolist() == pose_at(0.5)

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from tasks.render.fit.state import Learned
+from tasks.render.fit.state import AdamArray
 
 
 def test_rows_move_as_by_plain_adam_over_the_steps_they_were_in() -> None:
     rng = np.random.default_rng(0)
     start = rng.normal(size=(6, 3)).astype(np.float32)
-    learned = Learned.of(start)
+    learned = AdamArray.unstepped(start)
     values, first, second, steps = start.astype(np.float64), np.zeros((6, 3)), np.zeros((6, 3)), np.zeros((6, 1))
     for t in range(40):
         rows = np.flatnonzero(rng.uniform(size=6) < 0.6)
@@ -24,7 +24,7 @@ def test_rows_move_as_by_plain_adam_over_the_steps_they_were_in() -> None:
 
 
 def test_what_is_forgotten_starts_like_new() -> None:
-    learned, fresh = Learned.of(np.ones((2, 2))), Learned.of(np.ones((2, 2)))
+    learned, fresh = AdamArray.unstepped(np.ones((2, 2))), AdamArray.unstepped(np.ones((2, 2)))
     rows, gradient = np.arange(2), np.full((2, 2), 0.3, np.float32)
     learned.step(rows, -gradient, 0.0)
     learned.forget(rows)

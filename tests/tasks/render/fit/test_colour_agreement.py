@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.render.fit.corrections import aligned, brightness, exposed, inverse, shared
+from tasks.render.fit.corrections import (
+    align_cameras,
+    apply_exposure,
+    invert_exposure,
+    relative_brightness,
+    shared_colours,
+)
 
 RNG = np.random.default_rng(7)
 POINTS = 4000
@@ -21,7 +27,7 @@ def row_of(gain: float, offset: float = 0.0) -> F32:
 
 
 def found(colours: NDArray[np.float64], seen: NDArray[np.bool_] | None = None) -> F32:
-    return aligned(shared(colours, np.ones(colours.shape[:2], bool) if seen is None else seen))
+    return align_cameras(shared_colours(colours, np.ones(colours.shape[:2], bool) if seen is None else seen))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.1])
@@ -34,10 +40,10 @@ def test_equal_cameras_with_noise_keep_their_contrast(noise: float) -> None:
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_a_camera_s_gain_and_offset_are_found_through_noise_on_both_sides(noise: float) -> None:
     seen = (street() + noise * RNG.standard_normal((2, POINTS, 3))).astype(np.float32)
-    taken = seen[0], exposed(seen[1], row_of(0.6, 0.05))
+    taken = seen[0], apply_exposure(seen[1], row_of(0.6, 0.05))
     rows = found(np.stack(taken).astype(np.float64))
     np.testing.assert_allclose((1.0 + rows[1][[0, 4, 8]]) / (1.0 + rows[0][[0, 4, 8]]), 1.0 / 0.6, rtol=0.05)
-    now = [exposed(colours, row) for colours, row in zip(taken, rows)]
+    now = [apply_exposure(colours, row) for colours, row in zip(taken, rows)]
     np.testing.assert_allclose(now[0].mean(axis=0), now[1].mean(axis=0), atol=1e-4)
     np.testing.assert_allclose(now[0].std(axis=0), now[1].std(axis=0), rtol=0.02)
 
@@ -46,8 +52,8 @@ def test_the_common_colours_are_those_of_photos_on_average() -> None:
     """Way back to photos: gains 0.8 and 1.2 about the same light, whichever camera comes first."""
     light = street().astype(np.float32)
     for gains in ((0.8, 1.2), (1.2, 0.8)):
-        rows = found(np.stack([exposed(light, row_of(gain)) for gain in gains]).astype(np.float64))
-        back = [inverse(row) for row in rows]
+        rows = found(np.stack([apply_exposure(light, row_of(gain)) for gain in gains]).astype(np.float64))
+        back = [invert_exposure(row) for row in rows]
         np.testing.assert_allclose([1.0 + row[[0, 4, 8]].mean() for row in back], gains, atol=0.01)
         np.testing.assert_allclose(np.mean(back, axis=0), np.zeros(12), atol=1e-5)
 
@@ -72,15 +78,15 @@ def test_groups_of_cameras_that_share_nothing_with_each_other_keep_their_own_bri
     colours = np.array([0.5, 0.7, 1.0, 1.4])[:, None, None] * light
     seen = np.zeros((4, POINTS), bool)
     seen[:2, :2000], seen[2:, 2000:] = True, True
-    back = [1.0 + inverse(row)[[0, 4, 8]].mean() for row in found(colours, seen)]
+    back = [1.0 + invert_exposure(row)[[0, 4, 8]].mean() for row in found(colours, seen)]
     assert np.mean(back[:2]) == pytest.approx(1.0, abs=0.01) and np.mean(back[2:]) == pytest.approx(1.0, abs=0.01)
 
 
 def test_moments_of_two_sets_of_points_add_up_to_those_of_both() -> None:
     colours, seen = RNG.uniform(0, 1, (3, 50, 3)), RNG.uniform(size=(3, 50)) < 0.6
-    both = shared(colours[:, :20], seen[:, :20]) + shared(colours[:, 20:], seen[:, 20:])
+    both = shared_colours(colours[:, :20], seen[:, :20]) + shared_colours(colours[:, 20:], seen[:, 20:])
     for name in ("count", "first", "second"):
-        np.testing.assert_allclose(getattr(both, name), getattr(shared(colours, seen), name))
+        np.testing.assert_allclose(getattr(both, name), getattr(shared_colours(colours, seen), name))
     c, d = 0, 2
     mine = colours[c, seen[c] & seen[d]]
     assert both.count[c, d] == len(mine) and not both.count.diagonal().any()
@@ -105,7 +111,7 @@ def test_how_bright_photos_are_comes_out_whatever_is_seen_where_and_some_points_
     seen = np.abs(np.linspace(0, 1, 3000) - np.linspace(0, 1, 8)[:, None]) < 0.25  # a drive: none sees all
     wrong = rng.uniform(size=seen.shape) < 0.15
     grey[wrong] = rng.uniform(0.05, 1.0, wrong.sum())
-    logs = brightness(grey, seen)
+    logs = relative_brightness(grey, seen)
     np.testing.assert_allclose(logs, np.log(gains) - np.log(gains).mean(), atol=0.03)
     assert logs.mean() == pytest.approx(0.0, abs=1e-12)
 
@@ -114,5 +120,5 @@ def test_a_photo_that_shares_nothing_is_as_bright_as_the_mean() -> None:
     seen = np.ones((3, 50), bool)
     seen[2] = False
     grey = np.float32([[0.4] * 50, [0.2] * 50, [0.9] * 50])
-    np.testing.assert_allclose(brightness(grey, seen), [0.3466, -0.3466, 0.0], atol=0.01)
-    assert not brightness(grey, np.zeros((3, 50), bool)).any()
+    np.testing.assert_allclose(relative_brightness(grey, seen), [0.3466, -0.3466, 0.0], atol=0.01)
+    assert not relative_brightness(grey, np.zeros((3, 50), bool)).any()

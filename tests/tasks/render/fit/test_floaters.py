@@ -8,8 +8,8 @@ import pytest
 import street
 
 from tasks.render.fit.backend import FitBackend
-from tasks.render.fit.corrections import corrected, exposed
-from tasks.render.fit.on_torch import OnTorch
+from tasks.render.fit.corrections import apply_exposure, corrected_pose
+from tasks.render.fit.on_torch import TorchBackend
 from tasks.render.fit.reconstruct import (
     ALIKE,
     FARTHER,
@@ -18,15 +18,15 @@ from tasks.render.fit.reconstruct import (
     NEAREST_M,
     REFINE_UNTIL,
     SHOWN_BY,
-    advance,
     clear_floaters,
-    floaters,
+    find_floaters,
+    run_iterations,
 )
-from tasks.render.fit.start import Problem, prepare
+from tasks.render.fit.start import FitProblem, prepare_fit
 from tasks.render.fit.state import BACKGROUND, FitState, logits_of, opacities_of
-from tasks.render.gate import on_box
+from tasks.render.gate import intersect_box
 from tasks.render.scene.body import BEFORE_M, REACH_M, body_boxes
-from tasks.render.scene.movers import SHIFT_SIZE, at_knots, shifted_boxes
+from tasks.render.scene.movers import SHIFT_SIZE, interpolate_knots, shift_boxes
 from tasks.render.settings import FitSettings
 from tasks.world.arrays import Array
 from tasks.world.clip import AgentTracks
@@ -37,7 +37,7 @@ N = 5  # photos, every 0.25 s: the car 8 to 12 m before the camera, a little to 
 SETTINGS = FitSettings(iterations=30, start_gaussians=800, most_gaussians=800, refine_every=5, refine_from=5)
 RAG = np.array([0.9, 0.1, 0.9])  # a colour that nothing in the street has
 POST, GREEN = np.array([4.9, 0.9, 1.2]), np.array([0.1, 0.8, 0.1])  # before the car in the first photo alone
-Prepared = tuple[Problem, FitState]
+Prepared = tuple[FitProblem, FitState]
 
 
 def before_the_car(k: int, share: float = 0.5) -> Array:
@@ -57,7 +57,7 @@ def begun(tracks: AgentTracks, post: Array | None = None) -> Prepared:
             if depth > NEAREST_M:
                 on = np.hypot(columns - u, rows - v) < 0.4 * photo.intrinsics[0, 0] / depth
                 photo.rgb[on] = np.rint(255.0 * GREEN)
-    return prepare(photos, sweeps, tracks, SETTINGS, held_out=[])
+    return prepare_fit(photos, sweeps, tracks, SETTINGS, held_out=[])
 
 
 def pixel_of(world_from_camera: Array, k: Array, point: Array) -> tuple[float, float, float]:
@@ -86,7 +86,7 @@ def with_post() -> Prepared:
     return begun(street.tracks(), POST)
 
 
-def put(problem: Problem, state: FitState, point: Array, colour: Array, row: int = 0, opacity: float = 0.9) -> None:
+def put(problem: FitProblem, state: FitState, point: Array, colour: Array, row: int = 0, opacity: float = 0.9) -> None:
     """A Gaussian of the street in place of what is at `row`."""
     state.learned["means"].values[row] = point - problem.origin
     state.learned["colours"].values[row] = colour
@@ -94,7 +94,7 @@ def put(problem: Problem, state: FitState, point: Array, colour: Array, row: int
     state.road[row] = False
 
 
-def alone(prepared: Prepared, point: Array, colour: Array, opacity: float = 0.9) -> tuple[Problem, FitState]:
+def alone(prepared: Prepared, point: Array, colour: Array, opacity: float = 0.9) -> tuple[FitProblem, FitState]:
     """The state with such a Gaussian at row 0, and all others of the street transparent."""
     problem, state = prepared[0], fresh(prepared[1])
     state.learned["logits"].values[state.owner == BACKGROUND] = GONE_LOGIT
@@ -102,14 +102,14 @@ def alone(prepared: Prepared, point: Array, colour: Array, opacity: float = 0.9)
     return problem, state
 
 
-def slow_floaters(problem: Problem, state: FitState) -> list[int]:
+def slow_floaters(problem: FitProblem, state: FitState) -> list[int]:
     """Gaussian by Gaussian, photo by photo."""
     views, found = [], []
     for i, shot in enumerate(problem.train):
         boxes, valid = problem.tracks.at(shot.photo.taken_s)
         off = state.learned["boxes"].values.reshape(len(boxes), -1, SHIFT_SIZE)
-        boxes = shifted_boxes(boxes, at_knots(off, shot.photo.taken_s))
-        camera = corrected(shot.photo.world_from_camera, state.learned["poses"].values[i])
+        boxes = shift_boxes(boxes, interpolate_knots(off, shot.photo.taken_s))
+        camera = corrected_pose(shot.photo.world_from_camera, state.learned["poses"].values[i])
         near = [j for j in range(len(boxes)) if valid[j] and np.hypot(*(boxes[j, :2] - camera[:2, 3])) < REACH_M]
         views.append((shot, camera, [(part, problem.tracks.driving[j]) for j in near for part in body_boxes(boxes[j])]))
     for row in range(len(state)):
@@ -123,7 +123,7 @@ def slow_floaters(problem: Problem, state: FitState) -> list[int]:
             if depth <= NEAREST_M or not (0.0 <= u < street.WIDTH and 0.0 <= v < street.HEIGHT):
                 continue
             ray = mean - camera[:3, 3]
-            along = [float(on_box(body, camera[:3, 3], ray[None])[3][0]) for body, _ in bodies]
+            along = [float(intersect_box(body, camera[:3, 3], ray[None])[3][0]) for body, _ in bodies]
             first = int(np.argmin(along)) if along else -1
             if first >= 0 and np.isfinite(along[first]) and bodies[first][1]:
                 if (along[first] - 1.0) * np.linalg.norm(ray) > BEFORE_M:
@@ -137,7 +137,7 @@ def slow_floaters(problem: Problem, state: FitState) -> list[int]:
             near_enough = [(i, rgb) for i, depth, rgb in others if depth < FARTHER * nearest]
             mine = state.learned["colours"].values[row]
             like = [
-                np.abs(np.clip(exposed(mine, state.learned["exposure"].values[i]), 0.0, 1.0) - rgb).max() < ALIKE
+                np.abs(np.clip(apply_exposure(mine, state.learned["exposure"].values[i]), 0.0, 1.0) - rgb).max() < ALIKE
                 for i, rgb in near_enough
             ]
             if sum(like) <= SHOWN_BY * len(like):
@@ -167,18 +167,18 @@ def test_they_are_those_found_one_by_one() -> None:
     state.road[street_rows] = rng.random(len(street_rows)) < 0.1
     expected = slow_floaters(problem, state)
     assert 50 < len(expected) < 0.7 * len(street_rows)
-    np.testing.assert_array_equal(floaters(problem, state), expected)
+    np.testing.assert_array_equal(find_floaters(problem, state), expected)
 
 
 def test_a_rag_before_the_car_is_one_and_what_other_photos_show_there_is_not(with_post: Prepared) -> None:
     for colour, expected in ((RAG, [0]), (GREEN, [])):
         problem, state = alone(with_post, POST, colour)
-        np.testing.assert_array_equal(floaters(problem, state), expected)
+        np.testing.assert_array_equal(find_floaters(problem, state), expected)
 
 
 def test_a_rag_that_only_photos_show_in_which_it_hides_the_car_is_one(prepared: Prepared) -> None:
     problem, state = alone(prepared, before_the_car(0, 0.15), RAG)
-    np.testing.assert_array_equal(floaters(problem, state), [0])
+    np.testing.assert_array_equal(find_floaters(problem, state), [0])
 
 
 @pytest.mark.parametrize(
@@ -189,22 +189,22 @@ def test_a_rag_that_only_photos_show_in_which_it_hides_the_car_is_one(prepared: 
 def test_what_hides_no_body_stays(prepared: Prepared, share: float, opacity: float, road: bool) -> None:
     problem, state = alone(prepared, before_the_car(0, share), RAG, opacity)
     state.road[0] = road
-    assert len(floaters(problem, state)) == 0
+    assert len(find_floaters(problem, state)) == 0
 
 
 def test_what_hides_a_parked_car_stays() -> None:
     moving = street.tracks()
     parked = replace(moving, boxes=np.repeat(moving.boxes[:1], moving.n_steps, axis=0))
     problem, state = alone(begun(parked), before_the_car(0), RAG)
-    assert len(floaters(problem, state)) == 0
+    assert len(find_floaters(problem, state)) == 0
 
 
 def test_colours_are_compared_as_each_photo_is_exposed(with_post: Prepared) -> None:
     """All photos are half as bright as the scene: the green post is one of twice its colour."""
     problem, state = alone(with_post, POST, 2.0 * GREEN)
-    np.testing.assert_array_equal(floaters(problem, state), [0])
+    np.testing.assert_array_equal(find_floaters(problem, state), [0])
     state.learned["exposure"].values[:, [0, 4, 8]] = -0.5
-    assert len(floaters(problem, state)) == 0
+    assert len(find_floaters(problem, state)) == 0
 
 
 def test_floaters_become_transparent_and_forget_how_they_were_moved(prepared: Prepared) -> None:
@@ -212,7 +212,7 @@ def test_floaters_become_transparent_and_forget_how_they_were_moved(prepared: Pr
     before = fresh(state)
     for name in ("first", "second"):
         getattr(state.learned["logits"], name)[:] = 1.0
-    state.note()
+    state.add_to_average()
     assert clear_floaters(problem, state) == 1
     logits = state.learned["logits"]
     assert state.averages["logits"][0] == GONE_LOGIT
@@ -223,7 +223,7 @@ def test_floaters_become_transparent_and_forget_how_they_were_moved(prepared: Pr
 
 @pytest.mark.parametrize(
     ("at", "backend"),
-    [(5, lambda: None), (25, lambda: None), (5, lambda: OnTorch(by_kernels, "cpu"))],
+    [(5, lambda: None), (25, lambda: None), (5, lambda: TorchBackend(by_kernels, "cpu"))],
     ids=["early", "late", "early on torch"],
 )
 def test_the_fit_clears_them_as_long_as_it_goes_on(
@@ -232,9 +232,9 @@ def test_the_fit_clears_them_as_long_as_it_goes_on(
     """Also when Gaussians are no longer put elsewhere: a rag from just before `at` is not there at its end."""
     problem, state = prepared[0], fresh(prepared[1])
     assert 5 < REFINE_UNTIL * SETTINGS.iterations < 25
-    advance(problem, state, SETTINGS, at - 1, backend=backend())
+    run_iterations(problem, state, SETTINGS, at - 1, backend=backend())
     put(problem, state, before_the_car(0), RAG)
-    advance(problem, state, SETTINGS, at, backend=backend())
+    run_iterations(problem, state, SETTINGS, at, backend=backend())
     away = np.linalg.norm(state.learned["colours"].values - RAG, axis=1)
     opacities = opacities_of(state.learned["logits"].values[:, 0])
     assert not (opacities[away < 0.1] > LEAST_OPACITY).any()
@@ -243,7 +243,7 @@ def test_the_fit_clears_them_as_long_as_it_goes_on(
 def test_the_last_iteration_clears_nothing(prepared: Prepared) -> None:
     """What it leaves behind, no iteration would fill."""
     problem, state = prepared[0], fresh(prepared[1])
-    advance(problem, state, SETTINGS, SETTINGS.iterations - 1)
+    run_iterations(problem, state, SETTINGS, SETTINGS.iterations - 1)
     put(problem, state, before_the_car(0), RAG)
-    advance(problem, state, SETTINGS, SETTINGS.iterations)
+    run_iterations(problem, state, SETTINGS, SETTINGS.iterations)
     assert opacities_of(state.learned["logits"].values[0])[0] > 0.5

@@ -8,11 +8,11 @@ import street
 from numpy.typing import NDArray
 
 from factory.stages.scene_file import read_scene, write_scene
-from tasks.render.fit.corrections import exposed, reference
-from tasks.render.fit.reconstruct import advance, finish
-from tasks.render.fit.start import Problem, prepare
+from tasks.render.fit.corrections import apply_exposure, mean_exposure
+from tasks.render.fit.reconstruct import finish_scene, run_iterations
+from tasks.render.fit.start import FitProblem, prepare_fit
 from tasks.render.fit.state import FitState
-from tasks.render.gate import unfit
+from tasks.render.gate import check_drive_pictures
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.sensed import Photo
 from tasks.render.settings import FitSettings, GateSettings, RenderSettings
@@ -34,25 +34,25 @@ def taken(camera: str, x: float, y: float, time_s: float) -> Photo:
     """What a camera shows of the street from there: darker than it is, or brighter, with grain."""
     photo = street.photo(x, y + SIDE_M[camera], time_s, with_car=False)
     row = np.concatenate([np.diag(GAINS[camera]).ravel() - np.eye(3).ravel(), np.full(3, -0.03)]).astype(np.float32)
-    rgb = exposed(photo.rgb.astype(np.float32) / 255.0, row)
+    rgb = apply_exposure(photo.rgb.astype(np.float32) / 255.0, row)
     rgb = rgb + 0.03 * np.random.default_rng(round(100 * x)).standard_normal(rgb.shape)
     return replace(photo, camera=camera, rgb=np.rint(255.0 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8))
 
 
 @pytest.fixture(scope="module")
-def fitted() -> tuple[Problem, FitState, RenderAsset]:
+def fitted() -> tuple[FitProblem, FitState, RenderAsset]:
     photos = [taken(camera, 1.0 * k, 0.0, 0.25 * k) for k in range(5) for camera in GAINS]
     sweeps = [street.sweep(0.5 * k, 0.125 * k, with_car=False) for k in range(10)]
-    problem, state = prepare(photos, sweeps, None, SETTINGS, held_out=[])
-    advance(problem, state, SETTINGS, SETTINGS.iterations)
-    return problem, state, finish(problem, state)
+    problem, state = prepare_fit(photos, sweeps, None, SETTINGS, held_out=[])
+    run_iterations(problem, state, SETTINGS, SETTINGS.iterations)
+    return problem, state, finish_scene(problem, state)
 
 
 @dataclass(frozen=True)
 class WhiteSky:
     """A fit of two cameras whose photos are white wherever they show sky, and the scene as a worker reads it."""
 
-    problem: Problem
+    problem: FitProblem
     state: FitState
     finished: RenderAsset
     stored: RenderAsset
@@ -77,9 +77,9 @@ def white_sky(tmp_path_factory: pytest.TempPathFactory) -> WhiteSky:
                 skies[camera] = np.isinf(distance).reshape(u.shape) & alone
         sweeps = [street.sweep(0.5 * k, 0.25 * k, with_car=False) for k in range(8)]
         settings = replace(SETTINGS, iterations=60, start_gaussians=3000)
-        problem, state = prepare(photos, sweeps, None, settings, held_out=[])
-        advance(problem, state, settings, settings.iterations)
-    finished, path = finish(problem, state), tmp_path_factory.mktemp("white") / "block-0.safetensors"
+        problem, state = prepare_fit(photos, sweeps, None, settings, held_out=[])
+        run_iterations(problem, state, settings, settings.iterations)
+    finished, path = finish_scene(problem, state), tmp_path_factory.mktemp("white") / "block-0.safetensors"
     write_scene(path, finished, RenderSettings().scene_dtype)
     return WhiteSky(problem, state, finished, read_scene(path), skies)
 
@@ -106,7 +106,7 @@ def drawn(asset: RenderAsset, poses: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 
 def test_from_a_metre_aside_each_camera_shows_the_street_in_its_own_colours(
-    fitted: tuple[Problem, FitState, RenderAsset],
+    fitted: tuple[FitProblem, FitState, RenderAsset],
 ) -> None:
     images = drawn(fitted[2], street.ego_pose(2.5, 1.0)[None])
     for c, camera in enumerate(GAINS):
@@ -117,7 +117,7 @@ def test_from_a_metre_aside_each_camera_shows_the_street_in_its_own_colours(
         assert 0.9 < contrast < 1.1, camera
 
 
-def test_the_gate_looks_at_pictures_as_they_are_stored(fitted: tuple[Problem, FitState, RenderAsset]) -> None:
+def test_the_gate_looks_at_pictures_as_they_are_stored(fitted: tuple[FitProblem, FitState, RenderAsset]) -> None:
     """A camera that makes hardly anything of the light gives blank pictures, though the scene itself has contrast."""
     asset = fitted[2]
 
@@ -130,7 +130,7 @@ def test_the_gate_looks_at_pictures_as_they_are_stored(fitted: tuple[Problem, Fi
     def found(scene: RenderAsset) -> str | None:
         poses = street.ego_pose(2.0)[None]
         size = street.WIDTH, street.HEIGHT
-        fault = unfit(scene, rig(), poses, NOBODY, [0], size, GateSettings(width=128, vehicle_min=0.0))
+        fault = check_drive_pictures(scene, rig(), poses, NOBODY, [0], size, GateSettings(width=128, vehicle_min=0.0))
         return None if fault is None else f"{fault.reason}: {fault.detail}"
 
     assert found(asset) is None
@@ -142,7 +142,7 @@ def test_the_gate_looks_at_pictures_as_they_are_stored(fitted: tuple[Problem, Fi
 def test_a_sky_brighter_than_white_is_kept_as_it_was_learned(white_sky: WhiteSky) -> None:
     """In the colours of photos on average, and rounded to 16 bits; only below black nothing is kept."""
     rows, cameras = white_sky.state.learned["exposure"].values, [s.photo.camera for s in white_sky.problem.train]
-    learned = exposed(white_sky.state.learned["sky"].values, reference(cameras, rows)).reshape(-1, 3)
+    learned = apply_exposure(white_sky.state.learned["sky"].values, mean_exposure(cameras, rows)).reshape(-1, 3)
     assert learned.max() > 1.2, "the dark camera's white is brighter than white"
     for asset, error in ((white_sky.finished, 0.0), (white_sky.stored, 2.0**-10)):
         np.testing.assert_allclose(asset.sky.rgb.reshape(-1, 3), np.maximum(learned, 0.0), rtol=error, atol=error)

@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 import street
 
-from tasks.render.fit.reconstruct import ROAD_M, advance, away, classes_of, finish, measured
-from tasks.render.fit.start import Problem, Shot, prepare
+from tasks.render.fit.reconstruct import (
+    ROAD_M,
+    distance_to_nearest_m,
+    finish_scene,
+    measure_photo,
+    pixel_classes,
+    run_iterations,
+)
+from tasks.render.fit.start import FitPhoto, FitProblem, prepare_fit
 from tasks.render.fit.state import CELL_M, FitState, Road
 from tasks.render.scene.asset import ClassQuality, ViewQuality
 from tasks.render.settings import FitSettings
@@ -27,7 +34,7 @@ def slope(grade: float) -> Road:
 @pytest.mark.parametrize("grade", [0.0, 0.03])
 def test_road_is_what_meets_its_surface_within_reach(grade: float) -> None:
     photo = street.photo(0.0, 0.0, 0.0)
-    found = classes_of(photo, np.zeros((0, 7)), slope(grade))
+    found = pixel_classes(photo, np.zeros((0, 7)), slope(grade))
     v, u = np.mgrid[:72, :128] + 0.5
     ray = np.stack([np.ones_like(u), -(u - 64.0) / 100.0, -(v - 36.0) / 100.0], axis=-1)  # ego frame, from (1, 0, 1.5)
     with np.errstate(divide="ignore"):
@@ -39,7 +46,7 @@ def test_road_is_what_meets_its_surface_within_reach(grade: float) -> None:
 
 def test_a_vehicle_is_what_looks_at_its_box_whatever_is_behind() -> None:
     photo, nobody = street.photo(0.0, 0.0, 0.5), street.photo(0.0, 0.0, 0.5, with_car=False)
-    found = classes_of(photo, street.car_box(0.5)[None], slope(0.0))
+    found = pixel_classes(photo, street.car_box(0.5)[None], slope(0.0))
     shown = (photo.rgb != nobody.rgb).any(axis=-1)
     assert shown.sum() > 100 and found["vehicles"][shown].all()
     assert found["vehicles"].sum() < 2.0 * shown.sum(), "the box is a little larger than the car"
@@ -49,17 +56,17 @@ def test_a_vehicle_is_what_looks_at_its_box_whatever_is_behind() -> None:
 
 def test_how_far_away_the_nearest_photo_is_that_looks_the_same_way() -> None:
     photos = [street.photo(x, 0.0, 0.0) for x in (0.0, 4.0, 10.0)]
-    assert away(street.photo(5.0, 0.0, 0.0), photos) == pytest.approx(1.0)
+    assert distance_to_nearest_m(street.photo(5.0, 0.0, 0.0), photos) == pytest.approx(1.0)
     turned = street.photo(5.0, 0.0, 0.0)
     back = turned.world_from_camera @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    assert away(replace(turned, world_from_camera=back), photos) == np.inf
+    assert distance_to_nearest_m(replace(turned, world_from_camera=back), photos) == np.inf
 
 
 @pytest.fixture(scope="module")
-def fitted() -> tuple[Problem, FitState]:
+def fitted() -> tuple[FitProblem, FitState]:
     photos, sweeps = street.drive(5)
-    problem, state = prepare(photos, sweeps, street.tracks(), SETTINGS, held_out=[2])
-    advance(problem, state, SETTINGS, SETTINGS.iterations)
+    problem, state = prepare_fit(photos, sweeps, street.tracks(), SETTINGS, held_out=[2])
+    run_iterations(problem, state, SETTINGS, SETTINGS.iterations)
     return problem, state
 
 
@@ -68,35 +75,35 @@ def of(view: ViewQuality, name: str) -> ClassQuality:
     return found
 
 
-def test_each_class_is_measured_on_its_own_pixels(fitted: tuple[Problem, FitState]) -> None:
+def test_each_class_is_measured_on_its_own_pixels(fitted: tuple[FitProblem, FitState]) -> None:
     """A vehicle of a wrong colour costs the vehicles, and the road nothing."""
     problem, state = fitted
-    asset = finish(problem, state)
+    asset = finish_scene(problem, state)
     (view,) = asset.views
     assert (view.camera, view.held_out, view.away_m) == ("front", True, pytest.approx(1.0))
     assert {part.name for part in view.classes} == {"road", "vehicles", "rest"}
     assert sum(part.share for part in view.classes) == pytest.approx(1.0)
     green = {name: replace(node, colours=node.colours[:, ::-1].copy()) for name, node in asset.nodes.items()}
     shot = problem.held_out[0]
-    other = measured(replace(asset, nodes=green), problem, shot, shot.photo.world_from_camera)
-    same = measured(asset, problem, shot, shot.photo.world_from_camera)
+    other = measure_photo(replace(asset, nodes=green), problem, shot, shot.photo.world_from_camera)
+    same = measure_photo(asset, problem, shot, shot.photo.world_from_camera)
     assert of(other, "vehicles").psnr_db < of(same, "vehicles").psnr_db - 1.0
     assert of(other, "vehicles").ssim < of(same, "vehicles").ssim
     assert of(other, "road").psnr_db == pytest.approx(of(same, "road").psnr_db, abs=0.3)
     assert same.psnr_db > other.psnr_db
 
 
-def test_pixels_without_weight_are_not_measured(fitted: tuple[Problem, FitState]) -> None:
+def test_pixels_without_weight_are_not_measured(fitted: tuple[FitProblem, FitState]) -> None:
     problem, state = fitted
-    asset, shot = finish(problem, state), problem.held_out[0]
+    asset, shot = finish_scene(problem, state), problem.held_out[0]
     spoilt = shot.photo.rgb.copy()
     spoilt[:20] = 255 - spoilt[:20]
     hidden = np.zeros(spoilt.shape[:2], bool)
     hidden[:20] = True
     pose = shot.photo.world_from_camera
     bad = replace(shot.photo, rgb=spoilt)
-    masked = measured(asset, problem, Shot(bad, hidden), pose)
-    clean = measured(asset, problem, Shot(shot.photo, hidden), pose)
+    masked = measure_photo(asset, problem, FitPhoto(bad, hidden), pose)
+    clean = measure_photo(asset, problem, FitPhoto(shot.photo, hidden), pose)
     assert masked.psnr_db == clean.psnr_db and of(masked, "rest").psnr_db == of(clean, "rest").psnr_db
-    seen = measured(asset, problem, Shot(bad, None), pose)
+    seen = measure_photo(asset, problem, FitPhoto(bad, None), pose)
     assert seen.psnr_db < masked.psnr_db - 3.0

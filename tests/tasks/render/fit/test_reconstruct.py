@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from tasks.render.fit import start
 from tasks.render.fit.reconstruct import (
     REFINE_UNTIL,
-    advance,
-    corrections_at,
-    drawn,
-    finish,
-    photo_at,
+    draw_photo,
+    finish_scene,
+    interpolated_corrections,
+    photo_of_iteration,
+    run_iterations,
 )
-from tasks.render.fit.start import Problem, prepare
-from tasks.render.fit.state import BETA1, SHAPES, SLACK_M, FitState, above_road
+from tasks.render.fit.start import FitProblem, prepare_fit
+from tasks.render.fit.state import BETA1, SHAPES, SLACK_M, FitState, height_above_road
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.engine import Vehicles, render
 from tasks.render.scene.sensed import Photo, Sweep, Tracks
@@ -46,9 +46,9 @@ def few() -> tuple[list[Photo], list[Sweep]]:
 
 
 @pytest.fixture(scope="module")
-def prepared() -> tuple[Problem, FitState]:
+def prepared() -> tuple[FitProblem, FitState]:
     photos, sweeps = few()
-    return prepare(photos, sweeps, street.tracks(), SETTINGS, held_out=[2])
+    return prepare_fit(photos, sweeps, street.tracks(), SETTINGS, held_out=[2])
 
 
 def fresh(state: FitState) -> FitState:
@@ -56,65 +56,65 @@ def fresh(state: FitState) -> FitState:
 
 
 def test_what_of_the_photos_does_not_fit_into_memory_is_made_anew_each_time(
-    prepared: tuple[Problem, FitState], monkeypatch: pytest.MonkeyPatch
+    prepared: tuple[FitProblem, FitState], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(start, "KEPT_BYTES", 2 * start.COMPARED_BYTES * few()[0][0].rgb[..., 0].size)
     photos, sweeps = few()
-    problem, state = prepare(photos, sweeps, street.tracks(), SETTINGS, held_out=[2])
+    problem, state = prepare_fit(photos, sweeps, street.tracks(), SETTINGS, held_out=[2])
     assert [shot.kept is None for shot in prepared[0].train] == [False] * 4
     assert [shot.kept is None for shot in problem.train] == [False, False, True, True]
     other = fresh(prepared[1])
-    advance(problem, state, SETTINGS, 8)
-    advance(prepared[0], other, SETTINGS, 8)
+    run_iterations(problem, state, SETTINGS, 8)
+    run_iterations(prepared[0], other, SETTINGS, 8)
     for name, array in state.arrays().items():
         np.testing.assert_array_equal(array, other.arrays()[name], err_msg=name)
 
 
-def test_what_is_kept_of_a_pixel_is_counted(prepared: tuple[Problem, FitState]) -> None:
+def test_what_is_kept_of_a_pixel_is_counted(prepared: tuple[FitProblem, FitState]) -> None:
     kept = prepared[0].train[0].compared
     arrays = (kept.target.rgb, kept.target.mean, kept.target.variance, kept.target.weight, kept.ground)
     assert sum(a.nbytes for a in arrays) == start.COMPARED_BYTES * kept.ground.size
 
 
-def test_a_held_out_photo_comes_out_better_with_every_round(prepared: tuple[Problem, FitState]) -> None:
+def test_a_held_out_photo_comes_out_better_with_every_round(prepared: tuple[FitProblem, FitState]) -> None:
     problem, state = prepared[0], fresh(prepared[1])
     shot = problem.held_out[0]
     scores = []
     for until in (0, 8, 24):
-        advance(problem, state, SETTINGS, until)
+        run_iterations(problem, state, SETTINGS, until)
         scores.append(psnr(street.picture_of(problem, state, shot.photo), shot.compared.target.rgb))
     assert scores[1] > scores[0] + 1.0
     assert scores[2] > scores[1]
     assert len(state) > len(prepared[1])
-    assert finish(problem, state).psnr_db == pytest.approx(scores[2], abs=0.02)  # the camera's mean colours
+    assert finish_scene(problem, state).psnr_db == pytest.approx(scores[2], abs=0.02)  # the camera's mean colours
 
 
 def test_a_fit_that_was_stored_and_resumed_equals_the_uninterrupted_one_bit_for_bit(
-    prepared: tuple[Problem, FitState],
+    prepared: tuple[FitProblem, FitState],
 ) -> None:
     problem = prepared[0]
     straight, broken = fresh(prepared[1]), fresh(prepared[1])
-    advance(problem, straight, SETTINGS, SETTINGS.iterations)
+    run_iterations(problem, straight, SETTINGS, SETTINGS.iterations)
     for until in (1, 7, 15, 21, SETTINGS.iterations):
         broken = FitState.from_arrays(broken.arrays())
-        advance(problem, broken, SETTINGS, until)
+        run_iterations(problem, broken, SETTINGS, until)
     assert straight.arrays().keys() == broken.arrays().keys()
     for name, array in straight.arrays().items():
         np.testing.assert_array_equal(array, broken.arrays()[name], err_msg=name)
 
 
 def test_the_scene_is_the_mean_of_what_was_learned_once_nothing_is_relocated(
-    prepared: tuple[Problem, FitState], monkeypatch: pytest.MonkeyPatch
+    prepared: tuple[FitProblem, FitState], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Noted every hundredth of the fit, here after each iteration: all that is learned, of the last fifth."""
     problem, state = prepared[0], fresh(prepared[1])
     settled = fresh(state)
-    advance(problem, settled, SETTINGS, SETTINGS.iterations)
-    monkeypatch.setattr(FitState, "settle", lambda self, road: None)
+    run_iterations(problem, settled, SETTINGS, SETTINGS.iterations)
+    monkeypatch.setattr(FitState, "apply_average", lambda self, road: None)
     noted: dict[str, list[NDArray[np.float32]]] = {name: [] for name in state.learned}
     first = math.floor(REFINE_UNTIL * SETTINGS.iterations) + 1
     for until in range(first, SETTINGS.iterations + 1):
-        advance(problem, state, SETTINGS, until)
+        run_iterations(problem, state, SETTINGS, until)
         for name, values in noted.items():
             values.append(state.learned[name].values.copy())
     assert len(noted["sky"]) == 5
@@ -125,28 +125,28 @@ def test_the_scene_is_the_mean_of_what_was_learned_once_nothing_is_relocated(
         )
 
 
-def test_a_turn_and_its_negative_are_one_on_average(prepared: tuple[Problem, FitState]) -> None:
+def test_a_turn_and_its_negative_are_one_on_average(prepared: tuple[FitProblem, FitState]) -> None:
     state = fresh(prepared[1])
     before = state.learned["quats"].values.copy()
-    state.note()
+    state.add_to_average()
     state.learned["quats"].values[::2] *= -1.0
-    state.note()
-    state.settle(None)
+    state.add_to_average()
+    state.apply_average(None)
     np.testing.assert_allclose(state.learned["quats"].values, before, rtol=1e-6)
 
 
-def test_what_lies_on_the_road_lies_on_it_on_average(prepared: tuple[Problem, FitState]) -> None:
+def test_what_lies_on_the_road_lies_on_it_on_average(prepared: tuple[FitProblem, FitState]) -> None:
     problem, state = prepared[0], fresh(prepared[1])
-    state.note()
+    state.add_to_average()
     state.averages["means"][state.road, 2] += 0.5
-    state.settle(problem.road)
+    state.apply_average(problem.road)
     assert problem.road is not None and state.road.sum() > 100
-    away = above_road(state.learned["means"].values[state.road].astype(np.float64), problem.road)
+    away = height_above_road(state.learned["means"].values[state.road].astype(np.float64), problem.road)
     assert np.nanmax(np.abs(away)) < SLACK_M + 1e-4
 
 
 def test_a_picture_is_shown_with_the_exposure_that_was_learned_for_its_camera(
-    prepared: tuple[Problem, FitState],
+    prepared: tuple[FitProblem, FitState],
 ) -> None:
     """Twice as bright, and a little blue added."""
     problem, state = prepared[0], fresh(prepared[1])
@@ -157,7 +157,7 @@ def test_a_picture_is_shown_with_the_exposure_that_was_learned_for_its_camera(
     state.learned["exposure"].values[:] = row
     expected = np.clip(2.0 * plain + np.array([0.0, 0.0, 0.05], np.float32), 0.0, 1.0)
     np.testing.assert_allclose(street.picture_of(problem, state, photo), expected, atol=1e-5)
-    asset = finish(problem, state)
+    asset = finish_scene(problem, state)
     exposures = asset.exposures
     assert len(exposures) == len(problem.train)
     for exposure, shot in zip(exposures, problem.train):
@@ -168,7 +168,7 @@ def test_a_picture_is_shown_with_the_exposure_that_was_learned_for_its_camera(
 
 
 def test_the_scene_s_own_colours_are_those_of_photos_and_each_camera_keeps_its_mean_difference(
-    prepared: tuple[Problem, FitState],
+    prepared: tuple[FitProblem, FitState],
 ) -> None:
     """Two cameras about one light: whatever common gain was learned, each shows its photos' colours of that time."""
     problem, state = prepared[0], fresh(prepared[1])
@@ -180,18 +180,18 @@ def test_the_scene_s_own_colours_are_those_of_photos_and_each_camera_keeps_its_m
     rows[:] = 0.0
     for gain, row in zip((3.3, 2.6, 2.8, 3.3), rows):
         row[[0, 4, 8]] = gain - 1.0
-    asset = finish(problem, state)
+    asset = finish_scene(problem, state)
     (first, second) = (shot.photo.time_s for shot in problem.train if shot.photo.camera == "b")
     gains = [asset.affine_of("b", time_s)[0, 0] for time_s in (first, 0.5 * (first + second), second)]
     np.testing.assert_allclose(gains, [2.6 / 3.0, 0.9, 2.8 / 3.0], atol=1e-3)
     assert asset.affine_of("a", first)[0, 0] == pytest.approx(1.1, abs=1e-3)
     for shot in problem.train:
         photo = shot.photo
-        shown = drawn(asset, problem, photo, photo.world_from_camera)
+        shown = draw_photo(asset, problem, photo, photo.world_from_camera)
         np.testing.assert_allclose(shown, street.picture_of(problem, state, photo), atol=2e-3)
 
 
-def test_a_photo_takes_the_corrections_of_its_own_camera(prepared: tuple[Problem, FitState]) -> None:
+def test_a_photo_takes_the_corrections_of_its_own_camera(prepared: tuple[FitProblem, FitState]) -> None:
     """Of four photos the second and the third are another camera's; between its own, a correction is their mean."""
     problem, state = prepared[0], fresh(prepared[1])
     named = [replace(shot, photo=replace(shot.photo, camera=name)) for shot, name in zip(problem.train, "abba")]
@@ -200,36 +200,36 @@ def test_a_photo_takes_the_corrections_of_its_own_camera(prepared: tuple[Problem
         state.learned[learned].values[:] = np.array([[1.0], [2.0], [4.0], [8.0]])
     mixed = replace(problem, train=tuple(named))
     for camera, time_s, expected in (("a", times[0], 1.0), ("b", times[1], 2.0), ("a", (times[0] + times[3]) / 2, 4.5)):
-        for row in corrections_at(mixed, state, camera, time_s):
+        for row in interpolated_corrections(mixed, state, camera, time_s):
             np.testing.assert_allclose(row, expected, rtol=1e-6)
-    assert not np.concatenate(corrections_at(mixed, state, "nobody's", times[0])).any()
+    assert not np.concatenate(interpolated_corrections(mixed, state, "nobody's", times[0])).any()
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_an_exposure_that_is_off_is_corrected_and_only_the_photo_s_that_was_looked_at(
-    prepared: tuple[Problem, FitState], sign: float
+    prepared: tuple[FitProblem, FitState], sign: float
 ) -> None:
     """Too bright: darker, and the other way round; by the rate, as Adam's first step is."""
     problem, state = prepared[0], fresh(prepared[1])
-    row = photo_at(0, len(problem.train), SETTINGS.seed)
+    row = photo_of_iteration(0, len(problem.train), SETTINGS.seed)
     offsets = state.learned["exposure"].values[:, 9:]
     offsets[:] = 0.3 * sign
     before = offsets.copy()
-    advance(problem, state, SETTINGS, 1)
+    run_iterations(problem, state, SETTINGS, 1)
     np.testing.assert_allclose(offsets[row] - before[row], -sign * SETTINGS.exposure_rate, rtol=1e-3)
     others = np.arange(len(offsets)) != row
     assert np.array_equal(offsets[others], before[others])
 
 
 def test_a_camera_keeps_its_pose_until_pose_from_and_then_shifts_and_turns_at_rates_of_their_own(
-    prepared: tuple[Problem, FitState],
+    prepared: tuple[FitProblem, FitState],
 ) -> None:
     problem, state = prepared[0], fresh(prepared[1])
     poses = state.learned["poses"].values
-    advance(problem, state, SETTINGS, SETTINGS.pose_from)
+    run_iterations(problem, state, SETTINGS, SETTINGS.pose_from)
     assert not poses.any()
-    row = photo_at(SETTINGS.pose_from, len(problem.train), SETTINGS.seed)
-    advance(problem, state, SETTINGS, SETTINGS.pose_from + 1)
+    row = photo_of_iteration(SETTINGS.pose_from, len(problem.train), SETTINGS.seed)
+    run_iterations(problem, state, SETTINGS, SETTINGS.pose_from + 1)
     fall = SETTINGS.rate_end ** (SETTINGS.pose_from / SETTINGS.iterations)
     rates = fall * np.repeat([SETTINGS.shift_rate, SETTINGS.turn_rate], 3)
     np.testing.assert_allclose(np.abs(poses[row]), rates, rtol=1e-3)
@@ -237,23 +237,23 @@ def test_a_camera_keeps_its_pose_until_pose_from_and_then_shifts_and_turns_at_ra
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_camera_that_was_turned_away_turns_back(prepared: tuple[Problem, FitState], sign: float) -> None:
+def test_a_camera_that_was_turned_away_turns_back(prepared: tuple[FitProblem, FitState], sign: float) -> None:
     """By 2 degrees to either side, of a scene that is fitted so far."""
     problem, state = prepared[0], fresh(prepared[1])
-    advance(problem, state, replace(SETTINGS, pose_from=100), 20)
-    row = photo_at(20, len(problem.train), SETTINGS.seed)
+    run_iterations(problem, state, replace(SETTINGS, pose_from=100), 20)
+    row = photo_of_iteration(20, len(problem.train), SETTINGS.seed)
     poses = state.learned["poses"].values
     poses[row, 4] = sign * np.radians(2.0)
-    advance(problem, state, replace(SETTINGS, pose_from=20), 21)
+    run_iterations(problem, state, replace(SETTINGS, pose_from=20), 21)
     assert np.sign(poses[row, 4] - sign * np.radians(2.0)) == -sign
 
 
-def test_a_car_is_learned_in_its_own_box_and_can_be_put_elsewhere(prepared: tuple[Problem, FitState]) -> None:
+def test_a_car_is_learned_in_its_own_box_and_can_be_put_elsewhere(prepared: tuple[FitProblem, FitState]) -> None:
     problem, state = prepared[0], fresh(prepared[1])
     start = state.learned["colours"].values[state.owner == 0].copy()
-    advance(problem, state, replace(SETTINGS, refine_from=1000), 12)
+    run_iterations(problem, state, replace(SETTINGS, refine_from=1000), 12)
     assert not np.array_equal(start, state.learned["colours"].values[state.owner == 0])
-    asset = finish(problem, state)
+    asset = finish_scene(problem, state)
     box = street.car_box(0.0)
     box[:2] = 14.0, -2.0
     photo = problem.train[0].photo
@@ -266,7 +266,7 @@ def test_a_car_is_learned_in_its_own_box_and_can_be_put_elsewhere(prepared: tupl
     assert red > 2.0 * green
 
 
-def test_a_vehicle_s_gradients_are_turned_into_its_own_frame(prepared: tuple[Problem, FitState]) -> None:
+def test_a_vehicle_s_gradients_are_turned_into_its_own_frame(prepared: tuple[FitProblem, FitState]) -> None:
     """The same car in the same place, held in a box that is turned: its gradients turn against the box.
 
     With x = R y the chain rule is dL/dy = R^T dL/dx, and for a quaternion likewise. Adam's first moment after one step
@@ -285,11 +285,11 @@ def test_a_vehicle_s_gradients_are_turned_into_its_own_frame(prepared: tuple[Pro
     for name, values in (("means", in_box.means), ("quats", in_box.quats)):
         turned_car.learned[name].values[mine] = values.reshape(len(mine), -1)
 
-    def gradients(problem: Problem, state: FitState) -> dict[str, NDArray[np.float64]]:
+    def gradients(problem: FitProblem, state: FitState) -> dict[str, NDArray[np.float64]]:
         stepped = fresh(state)
         for name in SHAPES:
             stepped.learned[name].forget(np.arange(len(state)))
-        advance(problem, stepped, SETTINGS, state.iteration + 1)
+        run_iterations(problem, stepped, SETTINGS, state.iteration + 1)
         return {name: stepped.learned[name].first.astype(float) / (1.0 - BETA1) for name in SHAPES}
 
     own, turned = gradients(problem, state), gradients(turned_box, turned_car)
@@ -308,7 +308,7 @@ def test_a_vehicle_s_gradients_are_turned_into_its_own_frame(prepared: tuple[Pro
 
 def test_progress_is_told_and_photos_are_needed() -> None:
     with pytest.raises(ValueError, match="none to learn from"):
-        prepare([], [], None, SETTINGS)
+        prepare_fit([], [], None, SETTINGS)
     with pytest.raises(ValueError, match="iterations"):
         FitSettings(iterations=0)
 
@@ -316,7 +316,7 @@ def test_progress_is_told_and_photos_are_needed() -> None:
 def test_a_plain_road_can_start_with_fewer_and_larger_gaussians() -> None:
     photos, sweeps = few()
     sparse, usual = (
-        prepare(photos, sweeps, street.tracks(), replace(SETTINGS, road_share=share), held_out=[2])[1]
+        prepare_fit(photos, sweeps, street.tracks(), replace(SETTINGS, road_share=share), held_out=[2])[1]
         for share in (0.25, 1.0)
     )
     assert len(sparse) == len(usual)
@@ -329,19 +329,19 @@ def test_a_plain_road_can_start_with_fewer_and_larger_gaussians() -> None:
 
 def test_without_lidar_the_street_is_fitted_from_parallax_alone() -> None:
     photos, _ = few()
-    problem, state = prepare(photos, [], street.tracks(), SETTINGS, held_out=[2])
-    started = finish(problem, state).psnr_db
-    advance(problem, state, SETTINGS, SETTINGS.iterations)
-    fitted = finish(problem, state).psnr_db
+    problem, state = prepare_fit(photos, [], street.tracks(), SETTINGS, held_out=[2])
+    started = finish_scene(problem, state).psnr_db
+    run_iterations(problem, state, SETTINGS, SETTINGS.iterations)
+    fitted = finish_scene(problem, state).psnr_db
     assert fitted > started + 0.5 and fitted > 18.0
 
 
-def test_gaussians_in_boxes_end_no_longer_than_asked_for(prepared: tuple[Problem, FitState]) -> None:
+def test_gaussians_in_boxes_end_no_longer_than_asked_for(prepared: tuple[FitProblem, FitState]) -> None:
     """Those that a photo has shown; what lies on the road stays thin."""
     problem = prepared[0]
     for most in (2.0, 0.0):
         state = fresh(prepared[1])
-        advance(problem, state, replace(SETTINGS, box_stretch=most), SETTINGS.iterations)
+        run_iterations(problem, state, replace(SETTINGS, box_stretch=most), SETTINGS.iterations)
         stretch = np.exp(np.ptp(state.learned["log_scales"].values, axis=1))
         shown = np.isfinite(state.nearest) & (state.owner >= 0)
         assert shown.sum() > 100

@@ -10,8 +10,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.rig.adjust import Rig, given_rig, motions, residuals
-from tasks.render.rig.correct import UNIT, Corners
+from tasks.render.rig.adjust import Rig, initial_rig, motions_of_twists, reprojection_residuals
+from tasks.render.rig.correct import UNIT, PhotoCorners
 from tasks.world.clip import Camera, SensorFile
 
 Array = NDArray[np.float64]
@@ -43,14 +43,13 @@ def ego_pose(time_s: float) -> Array:
     heading = 0.02 * times**2
     speed = 4.0 + times
     step = np.diff(times, prepend=0.0)
-    pose = motions(np.array([[np.sum(speed * np.cos(heading) * step), np.sum(speed * np.sin(heading) * step), 0, 0, 0,
-                              heading[-1]]]))  # fmt: skip
-    return np.asarray(pose[0])
+    along, across = np.sum(speed * np.cos(heading) * step), np.sum(speed * np.sin(heading) * step)
+    return np.asarray(motions_of_twists(np.array([[along, across, 0, 0, 0, heading[-1]]]))[0])
 
 
 def straight_on(time_s: float, speed_mps: float = 8.0) -> Array:
     """(4, 4) along the street at one speed, where a delay is no other than a shifted mount."""
-    return np.asarray(motions(np.array([[speed_mps * time_s, 0.0, 0.0, 0.0, 0.0, 0.0]]))[0])
+    return np.asarray(motions_of_twists(np.array([[speed_mps * time_s, 0.0, 0.0, 0.0, 0.0, 0.0]]))[0])
 
 
 def files(names: list[str], drive: Callable[[float], Array] = ego_pose, apart_s: float = 0.5) -> list[SensorFile]:
@@ -71,7 +70,7 @@ def corners_seen(
     late_s: Callable[[str], float] = lambda name: 0.0,
     seed: int = 0,
     drive: Callable[[float], Array] = ego_pose,
-) -> list[Corners]:
+) -> list[PhotoCorners]:
     """Of each file what its camera saw, `late_s` after its stamp: points on both sides of the street, with noise.
 
     A camera that reads row by row sees each point from where it was as it read the point's row.
@@ -82,7 +81,7 @@ def corners_seen(
     looks = np.rint(UNIT * np.sqrt(looks / looks.sum(axis=1, keepdims=True))).astype(np.float32)
     row = {camera.name: k for k, camera in enumerate(rig)}
     late = [replace(file, world_from_ego=drive(file.time_s + late_s(file.sensor))) for file in taken]
-    known, shots = given_rig(rig, late)
+    known, shots = initial_rig(rig, late)
     out = []
     for i, file in enumerate(taken):
         at = _off(known, points, row[file.sensor], shots.world_from_ego[i])
@@ -95,7 +94,7 @@ def corners_seen(
         x, y = (((points - pose[:3, 3]) @ pose[:3, k])[seen] / ahead[seen] for k in range(2))
         rows = np.flatnonzero(seen)[np.hypot(x, y) < 1.0]  # beyond, the lens folds
         noise = rng.normal(size=(len(rows), 2)) * NOISE_PX
-        out.append(Corners(at[rows] + noise, looks[rows], 1.0))
+        out.append(PhotoCorners(at[rows] + noise, looks[rows], 1.0))
     return out
 
 
@@ -126,4 +125,4 @@ def _off(rig: Rig, points: Array, camera: int, world_from_ego: Array) -> Array:
     n = len(points)
     views, at = np.zeros(n, np.int64), np.zeros((n, 2))
     poses = np.linalg.inv(world_from_ego)[None], np.linalg.inv(rig.ego_from_camera)
-    return np.asarray(residuals(points, np.arange(n), views, at, np.array([camera]), *poses, rig.lenses))
+    return np.asarray(reprojection_residuals(points, np.arange(n), views, at, np.array([camera]), *poses, rig.lenses))

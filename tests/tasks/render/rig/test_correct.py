@@ -9,8 +9,8 @@ import pytest
 from drawn_rig import cameras, corners_seen, files, straight_on
 from scipy.spatial import KDTree
 
-from tasks.render.rig.adjust import motions, twists_of
-from tasks.render.rig.correct import Correction, corrected
+from tasks.render.rig.adjust import motions_of_twists, twists_of
+from tasks.render.rig.correct import RigCorrection, correct_rig
 from tasks.world.clip import Camera
 
 pytestmark = pytest.mark.slow
@@ -33,23 +33,23 @@ def beside(rig: Sequence[Camera]) -> np.ndarray:
 
 
 def turned(camera: Camera, turn_deg: tuple[float, ...], shift_m: tuple[float, ...]) -> Camera:
-    motion = motions(np.array([[*shift_m, *np.radians(turn_deg)]]))[0]
+    motion = motions_of_twists(np.array([[*shift_m, *np.radians(turn_deg)]]))[0]
     return replace(camera, ego_from_camera=camera.ego_from_camera @ motion)
 
 
-def correct(said: list[Camera], **late: float) -> Correction:
+def correct(said: list[Camera], **late: float) -> RigCorrection:
     true, taken = cameras(), files(NAMES)
-    found = corrected(said, taken, corners_seen(true, taken, lambda name: late.get(name, 0.0)))
+    found = correct_rig(said, taken, corners_seen(true, taken, lambda name: late.get(name, 0.0)))
     assert found is not None
     return found
 
 
 @pytest.fixture(scope="module")
-def as_said() -> Correction:
+def as_said() -> RigCorrection:
     return correct(cameras())
 
 
-def test_a_rig_that_is_right_stays(as_said: Correction) -> None:
+def test_a_rig_that_is_right_stays(as_said: RigCorrection) -> None:
     for found, true in zip(as_said.cameras, cameras()):
         metres, degrees = off_by(found, true)
         assert metres < 0.01 and degrees < 0.05, (found.name, metres, degrees)
@@ -88,11 +88,11 @@ def test_a_camera_stamped_100_ms_early_is_found_where_the_ego_turns_and_accelera
     assert found.changes[3].after_px < 0.5 < found.changes[3].before_px
 
 
-def test_no_delay_is_made_up_where_there_is_none_or_a_shifted_mount_says_the_same(as_said: Correction) -> None:
+def test_no_delay_is_made_up_where_there_is_none_or_a_shifted_mount_says_the_same(as_said: RigCorrection) -> None:
     assert [change.late_s for change in as_said.changes] == [0.0] * 4
     true, steady = cameras(), files(NAMES, straight_on)
     said = [turned(c, (0.0, 0.0, 0.0), (-0.08, 0.0, 0.0)) if c.name == "right" else c for c in true]
-    found = corrected(said, steady, corners_seen(true, steady, drive=straight_on))
+    found = correct_rig(said, steady, corners_seen(true, steady, drive=straight_on))
     assert found is not None and [change.late_s for change in found.changes] == [0.0] * 4
     assert apart(true[3].ego_from_camera, found.cameras[3].ego_from_camera)[0] < 0.05
 
@@ -105,7 +105,7 @@ def test_rows_that_are_read_one_after_the_other_are_put_where_the_ego_was() -> N
     tree = KDTree(drawn_rig.street_points(np.random.Generator(np.random.Philox(key=[0, 7]))))
     off_m = []
     for readout_s in (0.03, 0.0):
-        found = corrected([replace(c, readout_s=readout_s) for c in true], taken, corners)
+        found = correct_rig([replace(c, readout_s=readout_s) for c in true], taken, corners)
         assert found is not None and all(change.after_px < 0.35 for change in found.changes)
         near = np.linalg.norm(found.points[:, :2] - taken[6].world_from_ego[:2, 3], axis=1) < 15.0
         off_m.append(float(np.median(tree.query(found.points[near])[0])))
@@ -122,11 +122,11 @@ def test_swapped_files_are_named() -> None:
     corners = corners_seen(true, taken)
     a, b = (i for i, file in enumerate(taken) if file.time_s == 2.5 and file.sensor in ("front", "back"))
     corners[a], corners[b] = corners[b], corners[a]
-    found = corrected(true, taken, corners)
+    found = correct_rig(true, taken, corners)
     assert found is not None and found.strangers == (a, b)
 
 
-def test_the_same_corners_give_the_same_bytes(as_said: Correction) -> None:
+def test_the_same_corners_give_the_same_bytes(as_said: RigCorrection) -> None:
     again = correct(cameras())
     assert again.points.tobytes() == as_said.points.tobytes()
     assert all((a.world_from_ego == b.world_from_ego).all() for a, b in zip(again.files, as_said.files))
@@ -135,4 +135,4 @@ def test_the_same_corners_give_the_same_bytes(as_said: Correction) -> None:
 def test_photos_that_share_nothing_correct_nothing() -> None:
     taken = files(NAMES)[:12]
     corners = [corners_seen(cameras(), [file], seed=i)[0] for i, file in enumerate(taken)]
-    assert corrected(cameras(), taken, corners) is None
+    assert correct_rig(cameras(), taken, corners) is None

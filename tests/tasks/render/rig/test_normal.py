@@ -9,38 +9,40 @@ from drawn_rig import cameras, files
 
 from tasks.render.rig.adjust import (
     N_CAMERA,
-    Matched,
+    CornerTracks,
     Rig,
-    Shots,
-    given_rig,
-    motions,
+    RigPhotos,
+    cholesky_solve,
+    corner_rays,
+    initial_rig,
+    motions_of_twists,
     normal_equations,
-    rays,
-    residuals,
-    solved,
-    triangulated,
+    reprojection_residuals,
+    triangulate_points,
     twists_of,
 )
 
 STEP = 1e-6
 
 
-def drawn() -> tuple[Rig, Shots, Matched, np.ndarray]:
+def drawn() -> tuple[Rig, RigPhotos, CornerTracks, np.ndarray]:
     """Two cameras at three instants that both see five points, on which the rig does not quite agree."""
-    rig, shots = given_rig(cameras()[:2], files(list(drawn_rig.YAWS_DEG)[:2])[:6])
+    rig, shots = initial_rig(cameras()[:2], files(list(drawn_rig.YAWS_DEG)[:2])[:6])
     rng = np.random.default_rng(3)
     points = np.column_stack([rng.uniform(8, 14, 5), rng.uniform(4, 8, 5), rng.uniform(0, 3, 5)])
     starts, view_of = np.arange(0, 31, 6), np.tile(np.arange(6), 5)
-    matched = Matched(starts, view_of, np.zeros((30, 2)), np.ones(30))
+    matched = CornerTracks(starts, view_of, np.zeros((30, 2)), np.ones(30))
     matched = replace(matched, at=off(rig, shots, matched, points) + rng.normal(size=(30, 2)))
     step = rng.normal(size=6 * 3 + 2 * N_CAMERA) * 1e-3
     step[:18] = step[18 + 15 :: N_CAMERA] = 0.0  # elsewhere the slope by a stamp is that of a neighbour
     return rig.moved(step), shots, matched, points
 
 
-def off(rig: Rig, shots: Shots, matched: Matched, points: np.ndarray) -> np.ndarray:
+def off(rig: Rig, shots: RigPhotos, matched: CornerTracks, points: np.ndarray) -> np.ndarray:
     poses = np.linalg.inv(rig.ego_poses(shots)), np.linalg.inv(rig.ego_from_camera)
-    return residuals(points, matched.point_of, matched.view_of, matched.at, shots.camera_of, *poses, rig.lenses)
+    return reprojection_residuals(
+        points, matched.point_of, matched.view_of, matched.at, shots.camera_of, *poses, rig.lenses
+    )
 
 
 def test_the_points_are_eliminated_as_a_dense_solver_would() -> None:
@@ -79,23 +81,23 @@ def test_cholesky_solves_what_numpy_solves_and_says_where_there_is_nothing_to_so
     rng = np.random.default_rng(0)
     half = rng.normal(size=(12, 9))
     matrix, right = half.T @ half, rng.normal(size=9)
-    np.testing.assert_allclose(solved(matrix, right), np.linalg.solve(matrix, right), rtol=1e-9)
-    assert np.isnan(solved(-matrix, right)).all()
+    np.testing.assert_allclose(cholesky_solve(matrix, right), np.linalg.solve(matrix, right), rtol=1e-9)
+    assert np.isnan(cholesky_solve(-matrix, right)).all()
 
 
 def test_rays_meet_where_the_points_are() -> None:
-    rig, shots = given_rig(cameras()[:2], files(list(drawn_rig.YAWS_DEG)[:2])[:6])
+    rig, shots = initial_rig(cameras()[:2], files(list(drawn_rig.YAWS_DEG)[:2])[:6])
     points = np.array([[9.0, 5.0, 1.0], [12.0, 7.0, 2.5]])
-    matched = Matched(np.array([0, 6, 12]), np.tile(np.arange(6), 2), np.zeros((12, 2)), np.ones(12))
+    matched = CornerTracks(np.array([0, 6, 12]), np.tile(np.arange(6), 2), np.zeros((12, 2)), np.ones(12))
     matched = replace(matched, at=off(rig, shots, matched, points))
-    found, there = triangulated(rig, shots, matched)
+    found, there = triangulate_points(rig, shots, matched)
     assert there.all()
     np.testing.assert_allclose(found, points, atol=1e-6)
-    eyes, ways = rays(rig, shots, matched)
+    eyes, ways = corner_rays(rig, shots, matched)
     assert np.linalg.norm(np.cross(points[matched.point_of] - eyes, ways), axis=1).max() < 1e-6
 
 
 def test_a_motion_and_its_twist_are_each_other_s_opposite() -> None:
     rows = np.random.default_rng(0).normal(size=(20, 6)) * 0.5
-    np.testing.assert_allclose(twists_of(motions(rows)), rows, atol=1e-12)
-    assert motions(np.zeros((1, 6)))[0] == pytest.approx(np.eye(4))
+    np.testing.assert_allclose(twists_of(motions_of_twists(rows)), rows, atol=1e-12)
+    assert motions_of_twists(np.zeros((1, 6)))[0] == pytest.approx(np.eye(4))

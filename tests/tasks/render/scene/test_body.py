@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import street
 
-from tasks.render.fit.start import prepare
-from tasks.render.gate import on_box
+from tasks.render.fit.start import prepare_fit
+from tasks.render.gate import intersect_box
 from tasks.render.scene import body
-from tasks.render.scene.body import FAR_M, body_boxes, nearest_box, on_bodies, unseen_body
-from tasks.render.scene.depth import SHALLOW, STREET, Seen
+from tasks.render.scene.body import FAR_M, body_boxes, nearest_box_along_rays, unseen_body_gaussians, with_body_depths
+from tasks.render.scene.depth import SHALLOW, STREET, PhotoDepth
 from tasks.render.scene.sensed import Tracks
 from tasks.render.scene.sky import directions
 from tasks.render.settings import FitSettings
@@ -33,7 +33,7 @@ def rear(size: np.ndarray) -> Gaussians:
 @pytest.mark.parametrize("size", [np.array([4.4, 1.9, 1.6]), np.array([10.5, 2.5, 3.0])])
 def test_a_body_fills_the_box_where_nothing_was_seen(size: np.ndarray) -> None:
     seen = rear(size)
-    body = unseen_body(seen, size)
+    body = unseen_body_gaussians(seen, size)
     assert (np.abs(body.means) <= size / 2).all()
     away = np.linalg.norm(body.means[:, None] - seen.means[None], axis=-1).min(axis=1)
     assert (away > FAR_M).all()
@@ -45,8 +45,8 @@ def test_a_body_fills_the_box_where_nothing_was_seen(size: np.ndarray) -> None:
 
 def test_what_was_seen_all_around_needs_no_body() -> None:
     size = np.array([4.4, 1.9, 1.6])
-    whole = unseen_body(rear(size), size)
-    assert len(whole) > 100 and len(unseen_body(whole, size)) < 0.1 * len(whole)
+    whole = unseen_body_gaussians(rear(size), size)
+    assert len(whole) > 100 and len(unseen_body_gaussians(whole, size)) < 0.1 * len(whole)
 
 
 def test_the_nearest_box_is_the_nearest_of_all_boxes_one_by_one() -> None:
@@ -61,8 +61,8 @@ def test_the_nearest_box_is_the_nearest_of_all_boxes_one_by_one() -> None:
     inside = (np.abs(np.column_stack([along, across, local[:, 2]])) < boxes[:, 4:] / 2).all(axis=1)
     boxes = boxes[~inside]
     rays = rng.normal(size=(4000, 3)) * rng.uniform(0.2, 3.0, (4000, 1))
-    each = np.stack([on_box(box, eye, rays)[3] for box in boxes])
-    found, which = nearest_box(rays, eye, boxes)
+    each = np.stack([intersect_box(box, eye, rays)[3] for box in boxes])
+    found, which = nearest_box_along_rays(rays, eye, boxes)
     np.testing.assert_allclose(found, each.min(axis=0), rtol=1e-9)
     met = np.isfinite(found)
     assert 500 < met.sum() < 3500
@@ -72,7 +72,7 @@ def test_the_nearest_box_is_the_nearest_of_all_boxes_one_by_one() -> None:
 
 def test_a_box_around_the_eye_is_not_met() -> None:
     around = np.array([[0.0, 0.0, 1.0, 0.3, 4.0, 2.0, 2.0]])
-    found, which = nearest_box(np.eye(3), np.array([0.1, 0.0, 1.0]), around)
+    found, which = nearest_box_along_rays(np.eye(3), np.array([0.1, 0.0, 1.0]), around)
     assert np.isinf(found).all() and (which == -1).all()
 
 
@@ -87,15 +87,17 @@ def test_the_boxes_of_a_body_lie_in_the_vehicle_s_own(height: float, n: int) -> 
         assert box[2] - box[6] / 2 < part[2] - part[6] / 2 and part[2] + part[6] / 2 < box[2] + box[6] / 2
 
 
-def sighted(agents: AgentTracks, label: int = SHALLOW, depth_m: float = 30.0) -> tuple[Seen, Seen, np.ndarray]:
+def sighted(
+    agents: AgentTracks, label: int = SHALLOW, depth_m: float = 30.0
+) -> tuple[PhotoDepth, PhotoDepth, np.ndarray]:
     """A photo of the street whose every pixel is sky at one depth, as found and on bodies; and how far the car is."""
     photo = street.photo(2.0, 0.0, AT_S)
     shape = photo.rgb.shape[:2]
     flat = np.full(shape, depth_m, np.float32)
-    seen = Seen(flat, np.full(shape, label, np.int32), np.ones(shape, bool), np.zeros(shape, bool))
-    (found,) = on_bodies([photo], [seen], Tracks(agents, np.zeros(3)))
+    seen = PhotoDepth(flat, np.full(shape, label, np.int32), np.ones(shape, bool), np.zeros(shape, bool))
+    (found,) = with_body_depths([photo], [seen], Tracks(agents, np.zeros(3)))
     rays = directions(photo.intrinsics, photo.world_from_camera, *shape[::-1]).reshape(-1, 3)
-    away, _ = nearest_box(rays, photo.world_from_camera[:3, 3], np.stack(body_boxes(street.car_box(AT_S))))
+    away, _ = nearest_box_along_rays(rays, photo.world_from_camera[:3, 3], np.stack(body_boxes(street.car_box(AT_S))))
     return seen, found, away.reshape(shape)
 
 
@@ -170,7 +172,7 @@ def test_without_lidar_the_rear_of_a_car_that_drives_is_where_photos_show_it(mon
     on_rear = []
     for reach in (0.0, body.REACH_M):
         monkeypatch.setattr(body, "REACH_M", reach)
-        _, state = prepare(photos, [], street.tracks(), settings)
+        _, state = prepare_fit(photos, [], street.tracks(), settings)
         seen = (state.owner == 0) & (state.learned["logits"].values[:, 0] == 0.0)  # the body begins more opaque
         x = state.learned["means"].values[seen, 0]
         on_rear.append(int((np.abs(x + body.LOWER[0] * street.CAR[0] / 2) < 0.05).sum()))

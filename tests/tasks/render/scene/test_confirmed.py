@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tasks.render.scene.depth import ALIKE, ALIKE_PER_M, SHALLOW, Seen, confirmed, with_confirmed
+from tasks.render.scene.depth import ALIKE, ALIKE_PER_M, SHALLOW, PhotoDepth, confirm_depths, label_confirmed
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.stereo import FAR_M
 
@@ -43,7 +43,7 @@ def slowly(photos: list[Photo], depths: list[np.ndarray]) -> list[np.ndarray]:
 def test_a_wall_seen_from_two_places_is_confirmed_and_a_wrong_patch_is_not() -> None:
     photos, depths = [photo(0.0), photo(1.0, 2.0)], [wall(), wall(2.0)]
     depths[0][10:20, 30:40] = 6.0
-    here, there = confirmed(photos, depths)
+    here, there = confirm_depths(photos, depths)
     assert not here[10:20, 30:40].any() and not here[:, :3].any(), "wrong, and not in the other picture"
     assert here[25:35, 20:40].all() and there.mean() > 0.8
 
@@ -53,7 +53,7 @@ def test_as_pixel_by_pixel() -> None:
     photos = [photo(0.0), photo(1.5), photo(0.3, 3.0)]
     depths = [(wall(p.world_from_camera[2, 3]) * rng.uniform(0.93, 1.07, (HEIGHT, WIDTH))) for p in photos]
     depths = [np.where(rng.uniform(size=d.shape) < 0.1, 0.0, d).astype(np.float32) for d in depths]
-    for fast, slow in zip(confirmed(photos, depths), slowly(photos, depths)):
+    for fast, slow in zip(confirm_depths(photos, depths), slowly(photos, depths)):
         assert (fast == slow).all() and 0.3 < fast.mean() < 0.95
 
 
@@ -65,6 +65,6 @@ def test_only_guesses_are_labelled_anew_and_the_sky_confirms_nothing() -> None:
     sky[30:] = True
     depth = np.where(sky, np.float32(FAR_M), wall())
     photos = [photo(0.0), photo(0.5)]
-    seen = with_confirmed(photos, [Seen(depth, label, sky, nothing)] * 2)
+    seen = label_confirmed(photos, [PhotoDepth(depth, label, sky, nothing)] * 2)
     assert (seen[0].label[:5] == 3).all()
     assert (seen[0].label[8:28, 10:] == -1).all() and (seen[0].label[30:] == SHALLOW).all()

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.stages.assets import taken_from
+from factory.stages.assets import photo_poses
 from factory.stages.scene_file import read_scene, write_scene
-from tasks.render.scene.asset import RenderAsset, rises_of
-from tasks.render.scene.movers import lifted
+from tasks.render.scene.asset import RenderAsset, photo_rises
+from tasks.render.scene.movers import lift_tracks
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.gaussians import EMPTY
 from tasks.world.clip import AgentKind, AgentTracks, SensorFile
@@ -34,7 +34,7 @@ def climbing() -> RenderAsset:
     given = [SensorFile("front", "", float(k), pose(5.0 * k, 0.0)) for k in range(3)]
     used = [replace(file, world_from_ego=pose(5.0 * k, 0.4 * k)) for k, file in enumerate(given)]
     sky = SkyMap(np.zeros((ROWS, COLUMNS, 3), np.float32))
-    return RenderAsset(np.zeros(3), EMPTY, {}, sky, 30.0, taken=taken_from(given, [used[2], used[0], used[1]]))
+    return RenderAsset(np.zeros(3), EMPTY, {}, sky, 30.0, taken=photo_poses(given, [used[2], used[0], used[1]]))
 
 
 def test_a_drive_beside_the_log_s_is_as_high_as_the_photos_were() -> None:
@@ -51,7 +51,7 @@ def test_boxes_rise_with_the_road_and_stay_where_they_are() -> None:
     assert (higher.boxes == PARKED.boxes).all()
     later = climbing().lifted(PARKED, first_s=1.0)
     assert later.center_z[:, 0] == pytest.approx(np.minimum(0.8 + 0.4 + 0.04 * np.arange(STEPS), 1.6))
-    assert lifted(PARKED, *rises_of(())) is PARKED
+    assert lift_tracks(PARKED, *photo_rises(())) is PARKED
 
 
 def test_a_scene_file_keeps_how_much(tmp_path: Path) -> None:

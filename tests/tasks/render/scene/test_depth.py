@@ -6,7 +6,7 @@ from slow_raster import covariances_of
 
 from tasks.render.scene.depth import dense_depth, sparse_depth
 from tasks.render.scene.sky import directions, sky_of_views
-from tasks.render.scene.surfels import BACKGROUND, Look, choose, discs_of_photo, gaussians_of
+from tasks.render.scene.surfels import BACKGROUND, PhotoDiscs, choose_discs, discs_of_photo, gaussians_of
 
 INTRINSICS = np.array([[80.0, 0.0, 40.0], [0.0, 80.0, 30.0], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 80, 60
@@ -60,20 +60,20 @@ def test_a_point_seen_through_a_nearer_surface_is_removed() -> None:
     assert depth[30, 70] == pytest.approx(20.0) and label[30, 70] == len(points) - 1
 
 
-def look(colour: tuple[float, float, float], depth: float, ahead: float) -> Look:
+def look(colour: tuple[float, float, float], depth: float, ahead: float) -> PhotoDiscs:
     """A wall that faces a camera `ahead` metres down the road."""
     zs, pose = np.full((HEIGHT, WIDTH), depth, np.float32), np.eye(4)
     pose[2, 3] = ahead
     rgb = np.broadcast_to(np.array(colour, np.float32), (HEIGHT, WIDTH, 3))
     discs = discs_of_photo(rgb, zs, np.full((HEIGHT, WIDTH), -1, np.int32), INTRINSICS, pose)
     n = len(discs.points)
-    return Look(discs, np.full(n, BACKGROUND, np.int32), np.zeros(n, bool), zs, INTRINSICS, pose, {})
+    return PhotoDiscs(discs, np.full(n, BACKGROUND, np.int32), np.zeros(n, bool), zs, INTRINSICS, pose, {})
 
 
 def test_the_closest_look_at_a_surface_is_the_one_that_is_kept() -> None:
     near, far = look((1, 0, 0), 4.0, 12.0), look((0, 0, 1), 16.0, 0.0)  # the same wall at z = 16
     for order in ((near, far), (far, near)):
-        kept = choose(order)[BACKGROUND]
+        kept = choose_discs(order)[BACKGROUND]
         middle = np.abs(kept.points[:, :2]).max(axis=1) < 1.2  # both photos see it
         assert (kept.rgb[middle] == [1, 0, 0]).all()
         outside = np.abs(kept.points[:, 0]) > 3.0
@@ -82,7 +82,7 @@ def test_the_closest_look_at_a_surface_is_the_one_that_is_kept() -> None:
 
 def test_a_second_photo_from_the_same_place_adds_nothing() -> None:
     first = look((0.5, 0.5, 0.5), 9.0, 0.0)
-    assert len(choose([first, first])[BACKGROUND].points) == len(first.discs.points)
+    assert len(choose_discs([first, first])[BACKGROUND].points) == len(first.discs.points)
 
 
 def test_discs_become_flat_gaussians_that_lie_in_their_surface() -> None:

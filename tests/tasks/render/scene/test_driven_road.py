@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tasks.render.fit.state import above_road, find_road
-from tasks.render.scene.features import AHEAD_M, SPACING_M, WIDE_M, Points, beside_road, driven_road
+from tasks.render.fit.state import fit_road, height_above_road
+from tasks.render.scene.features import AHEAD_M, SPACING_M, WIDE_M, SurfacePoints, driven_road, drop_below_road
 from tasks.world.arrays import Array
 
 
@@ -43,7 +43,7 @@ def test_corners_below_the_road_are_mistakes_and_those_above_or_far_beside_are_n
     far = middle + np.array([0.0, 40.0, 0.0])
     kept = [middle + up, beside - 0.1 * up, far - 9.0 * up]
     dropped = [middle - 0.05 * up, middle - 2.0 * up, beside - up]
-    np.testing.assert_allclose(beside_road(np.array(kept + dropped), road), kept)
+    np.testing.assert_allclose(drop_below_road(np.array(kept + dropped), road), kept)
 
 
 def test_the_fit_s_road_is_the_driven_one_whatever_corners_lie_below_the_cameras() -> None:
@@ -52,7 +52,7 @@ def test_the_fit_s_road_is_the_driven_one_whatever_corners_lie_below_the_cameras
     rng = np.random.default_rng(0)
     below = road[rng.integers(0, len(road), 800)] + rng.uniform([-3, -3, -1.5], [3, 3, 0.6], (800, 3))
     eyes = poses[:, :3, 3] + 1.5 * poses[:, :3, 2]
-    surface = find_road(Points(road, beside_road(below, road)).every, eyes)
+    surface = fit_road(SurfacePoints(road, drop_below_road(below, road)).every, eyes)
     assert surface is not None
-    off = above_road(road[: -int(AHEAD_M / SPACING_M) * 31], surface)
+    off = height_above_road(road[: -int(AHEAD_M / SPACING_M) * 31], surface)
     assert np.isfinite(off).all() and np.abs(off).max() < 0.04

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from tasks.render.scene.features import Known, known_without_lidar, triangulated
+from tasks.render.scene.features import KnownPoints, points_without_lidar, triangulate_matches
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.world.clip import AgentKind, AgentTracks
 
@@ -26,19 +26,19 @@ def wall(right_m: float, time_s: float = 0.0, camera: str = "front") -> Photo:
 
 
 def test_points_lie_on_the_wall() -> None:
-    points = triangulated([wall(0.0), wall(1.0, 0.1), wall(2.0, 0.2)], STILL)
+    points = triangulate_matches([wall(0.0), wall(1.0, 0.1), wall(2.0, 0.2)], STILL)
     assert len(points) > 50
     off = np.abs(points[:, 0] - WALL_M)
     assert np.median(off) < 0.1 and np.percentile(off, 95) < 0.5
 
 
 def test_nothing_meets_between_cameras_of_different_names_or_too_near() -> None:
-    assert triangulated([wall(0.0), wall(1.0, 0.1, "left")], STILL).shape == (0, 3)
-    assert triangulated([wall(0.0), wall(0.1, 0.1)], STILL).shape == (0, 3)
+    assert triangulate_matches([wall(0.0), wall(1.0, 0.1, "left")], STILL).shape == (0, 3)
+    assert triangulate_matches([wall(0.0), wall(0.1, 0.1)], STILL).shape == (0, 3)
     blank = [
         Photo("front", 0.1 * k, np.zeros((120, 160, 3), np.uint8), K, wall(1.0 * k).world_from_camera) for k in (0, 1)
     ]
-    assert triangulated(blank, STILL).shape == (0, 3)
+    assert triangulate_matches(blank, STILL).shape == (0, 3)
 
 
 def test_what_can_move_is_left_out() -> None:
@@ -53,7 +53,7 @@ def test_what_can_move_is_left_out() -> None:
         np.array([8.0]),
     )
     photos = [wall(0.0), wall(1.0, 0.1)]
-    everything, without = triangulated(photos, STILL), triangulated(photos, Tracks(car, np.zeros(3)))
+    everything, without = triangulate_matches(photos, STILL), triangulate_matches(photos, Tracks(car, np.zeros(3)))
     inside = np.abs(everything[:, 1] - 2.0) < 1.9
     assert inside.any() and len(without) < len(everything)
     assert not (np.abs(without[:, 1] - 2.0) < 1.9).any()
@@ -61,8 +61,8 @@ def test_what_can_move_is_left_out() -> None:
 
 def test_corners_of_a_rig_are_points_and_corners_of_pairs_are_surfaces() -> None:
     road, corners = np.zeros((4, 3)), np.full((3, 3), 20.0)
-    known = known_without_lidar([], STILL, Known(road, corners).shifted(np.ones(3)))
+    known = points_without_lidar([], STILL, KnownPoints(road, corners).shifted(np.ones(3)))
     assert known.corners is not None and (known.corners == 21.0).all() and (known.dense == 1.0).all()
     assert len(known.every) == 7
-    pairs = known_without_lidar([], STILL, Known(road))
+    pairs = points_without_lidar([], STILL, KnownPoints(road))
     assert pairs.corners is None and len(pairs.dense) == 4

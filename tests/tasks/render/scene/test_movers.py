@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import street
 
-from tasks.render.scene.movers import BEYOND_M, KNOT_S, BoxShifts, behind_boxes, boxes_at, shifted_boxes
+from tasks.render.scene.movers import BEYOND_M, KNOT_S, BoxShifts, behind_boxes, boxes_at, shift_boxes
 
 SAMPLES = 2000  # along a line
 
@@ -54,7 +54,7 @@ def test_without_boxes_every_line_is_free() -> None:
 
 def test_a_box_is_turned_and_then_moved_along_its_new_heading() -> None:
     box = np.array([[10.0, 5.0, 1.0, 0.0, 4.0, 2.0, 1.5]])
-    found = shifted_boxes(box, np.array([[2.0, 0.5, 0.25, np.pi / 2]]))
+    found = shift_boxes(box, np.array([[2.0, 0.5, 0.25, np.pi / 2]]))
     np.testing.assert_allclose(found, [[9.5, 7.0, 1.25, np.pi / 2, 4.0, 2.0, 1.5]], atol=1e-12)
 
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import street
 
-from tasks.render.fit.start import prepare
+from tasks.render.fit.start import prepare_fit
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.build import build_asset
-from tasks.render.scene.sensed import Photo, own_bodies, reduced
+from tasks.render.scene.sensed import Photo, median_own_bodies, resize_photo
 from tasks.render.settings import AssetSettings, FitSettings
 from tasks.render.views import render_views
 from tasks.world.clip import AgentTracks, Camera
@@ -31,7 +31,7 @@ def with_bonnet(photo: Photo, told: bool) -> Photo:
 def scene(told: bool) -> RenderAsset:
     photos, sweeps = street.drive(6, with_car=False)
     shown = [with_bonnet(photo, told) for photo in photos]
-    return replace(build_asset(shown, sweeps, None, SETTINGS), bodies=own_bodies(shown))
+    return replace(build_asset(shown, sweeps, None, SETTINGS), bodies=median_own_bodies(shown))
 
 
 def test_a_new_place_has_the_street_and_the_bonnet_in_front() -> None:
@@ -49,7 +49,7 @@ def test_a_new_place_has_the_street_and_the_bonnet_in_front() -> None:
 def test_the_fit_neither_paints_nor_measures_it() -> None:
     photos, sweeps = street.drive(4, with_car=False)
     shown = [with_bonnet(photo, told=True) for photo in photos]
-    problem, state = prepare(shown, sweeps, None, FitSettings(start_gaussians=4000), held_out=[2])
+    problem, state = prepare_fit(shown, sweeps, None, FitSettings(start_gaussians=4000), held_out=[2])
     for shot in (*problem.train, *problem.held_out):
         assert ((shot.compared.target.weight == 0.0) == BONNET).all()
     assert state.learned["colours"].values.max() < 0.95, "white is the bonnet alone"
@@ -57,6 +57,6 @@ def test_the_fit_neither_paints_nor_measures_it() -> None:
 
 def test_a_photo_shrunk_keeps_its_mask() -> None:
     (photo, *_), _ = street.drive(1, with_car=False)
-    small = reduced(with_bonnet(photo, told=True), 64)
+    small = resize_photo(with_bonnet(photo, told=True), 64)
     assert small.own_body is not None and small.own_body.shape == (36, 64)
     assert abs(small.own_body.mean() - BONNET.mean()) < 0.02

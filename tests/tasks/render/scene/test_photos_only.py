@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tasks.render.scene.depth import see
-from tasks.render.scene.features import Points
+from tasks.render.scene.depth import estimate_photo_depth
+from tasks.render.scene.features import SurfacePoints
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.world.clip import AgentKind, AgentTracks
 
@@ -21,8 +21,10 @@ def test_a_road_that_is_known_lies_behind_a_car_and_not_on_it() -> None:
         ("car",), (AgentKind.VEHICLE,), box, np.zeros((1, 1, 2)), np.ones((1, 1), bool), np.full((1, 1), 0.8),
         np.array([1.6]),
     )  # fmt: skip
-    known = Points(road)
-    free, hidden = (see(photo, [], known, {}, Tracks(agents, np.zeros(3)), 0).depth for agents in (None, car))
+    known = SurfacePoints(road)
+    free, hidden = (
+        estimate_photo_depth(photo, [], known, {}, Tracks(agents, np.zeros(3)), 0).depth for agents in (None, car)
+    )
     assert free[38, 48] == pytest.approx(1.5 * 60.0 / 6.5, rel=0.1)  # 14 m, the road there
     assert hidden[38, 48] != pytest.approx(free[38, 48], rel=0.2)
     assert hidden[60, 48] == pytest.approx(free[60, 48], rel=1e-6)  # in front of the car nothing changes

@@ -8,7 +8,7 @@ import pytest
 import street
 
 from factory.stages.scene_file import read_scene, write_scene
-from tasks.render.scene.asset import RenderAsset, psnr, scene_at
+from tasks.render.scene.asset import RenderAsset, compose_gaussians, psnr
 from tasks.render.scene.engine import render, vehicles_at
 from tasks.render.settings import SceneDtype
 from tasks.render.splatting.gsplat_backend import arguments
@@ -36,6 +36,6 @@ def test_pictures_of_a_scene_in_16_bits_are_those_of_the_whole_one(
 def test_gsplat_is_given_float32_for_its_kernels_take_no_less(halved: RenderAsset) -> None:
     """gsplat 1.5.3 composites float (RasterizeToPixels3DGSFwd.cu) and projects float or double, no other type."""
     there = vehicles_at(street.tracks(), 0.8)
-    given = arguments(scene_at(halved, there.track_ids, there.kinds, there.boxes), [FRONT])
+    given = arguments(compose_gaussians(halved, there.track_ids, there.kinds, there.boxes), [FRONT])
     arrays = [value for value in given.values() if isinstance(value, np.ndarray)]
     assert len(arrays) == 7 and all(array.dtype == np.float32 for array in arrays)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tasks.render.scene.sensed import Photo, reduced
+from tasks.render.scene.sensed import Photo, resize_photo
 
 K = np.array([[900.0, 0.0, 650.0], [0.0, 900.0, 350.0], [0.0, 0.0, 1.0]])
 
@@ -14,7 +14,7 @@ def ramp() -> Photo:
 
 
 def test_a_reduced_photo_shows_the_same_in_the_same_direction() -> None:
-    photo, small = ramp(), reduced(ramp(), 640)
+    photo, small = ramp(), resize_photo(ramp(), 640)
     assert small.rgb.shape == (360, 640, 3)
     point = np.array([0.4, -0.2, 1.0])
     for p in (photo, small):
@@ -25,4 +25,4 @@ def test_a_reduced_photo_shows_the_same_in_the_same_direction() -> None:
 
 def test_a_small_photo_is_left_as_it_is() -> None:
     photo = ramp()
-    assert reduced(photo, 1280) is photo
+    assert resize_photo(photo, 1280) is photo

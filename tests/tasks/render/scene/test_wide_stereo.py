@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from tasks.render.scene.sensed import Photo
-from tasks.render.scene.stereo import locally_normalised, partners, wide_depth
+from tasks.render.scene.stereo import choose_partners, locally_normalised, wide_baseline_depth
 
 WIDTH, HEIGHT, FOCAL, WALL_M, BOX_M = 240, 160, 180.0, 12.0, 6.0
 K = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
@@ -40,10 +40,10 @@ def swept(gain: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     (here, depth), others = photo(2.0), [photo(at)[0] for at in (0.0, 4.0)]
     brighter = [replace(o, rgb=np.rint(gain * o.rgb).astype(np.uint8)) for o in others]
     rgb = here.rgb.astype(np.float32) / 255.0
-    compared = partners(here, brighter, 4)
+    compared = choose_partners(here, brighter, 4)
     assert len(compared) == 2
     camera = here.intrinsics, here.world_from_camera
-    found, cost, sky_cost = wide_depth(rgb, NOTHING, NOTHING, compared, *camera, ALL)
+    found, cost, sky_cost = wide_baseline_depth(rgb, NOTHING, NOTHING, compared, *camera, ALL)
     assert np.isinf(sky_cost).mean() > 0.95 and np.median(cost) < 0.2
     return found, depth
 
@@ -59,12 +59,16 @@ def test_nothing_lies_below_the_road_but_what_may_be_lower_by_a_tenth() -> None:
     """Faint texture that fits best at the wall, 12 m away, where the road is met after 7 m."""
     here, others = photo(2.0)[0], [photo(at)[0] for at in (0.0, 4.0)]
     faint = [replace(p, rgb=np.uint8(90.0 + 0.04 * (p.rgb.astype(float) - 120.0))) for p in (here, *others)]
-    rgb, compared = faint[0].rgb.astype(np.float32) / 255.0, partners(faint[0], faint[1:], 4)
+    rgb, compared = faint[0].rgb.astype(np.float32) / 255.0, choose_partners(faint[0], faint[1:], 4)
     low = (np.arange(HEIGHT)[:, None] >= HEIGHT // 2) & ALL
     camera = K, here.world_from_camera
-    unbounded, _, _ = wide_depth(rgb, NOTHING, NOTHING, compared, *camera, ALL)
-    found, _, _ = wide_depth(rgb, NOTHING, np.where(low, np.float32(7.0), np.float32(0.0)), compared, *camera, ALL)
-    slack, _, _ = wide_depth(rgb, NOTHING, np.where(low, np.float32(11.3), np.float32(0.0)), compared, *camera, ALL)
+    unbounded, _, _ = wide_baseline_depth(rgb, NOTHING, NOTHING, compared, *camera, ALL)
+    found, _, _ = wide_baseline_depth(
+        rgb, NOTHING, np.where(low, np.float32(7.0), np.float32(0.0)), compared, *camera, ALL
+    )
+    slack, _, _ = wide_baseline_depth(
+        rgb, NOTHING, np.where(low, np.float32(11.3), np.float32(0.0)), compared, *camera, ALL
+    )
     assert (unbounded[HEIGHT // 2 + 4 :] > 9.0).mean() > 0.6
     assert found[HEIGHT // 2 + 4 :].max() < 8.5
     assert (slack[HEIGHT // 2 + 4 :] > 11.5).mean() > 0.4
@@ -73,10 +77,10 @@ def test_nothing_lies_below_the_road_but_what_may_be_lower_by_a_tenth() -> None:
 def test_below_the_horizon_there_is_no_sky_however_bright_and_smooth() -> None:
     here, others = photo(2.0)[0], [photo(at)[0] for at in (0.0, 4.0)]
     white = [replace(p, rgb=np.full_like(p.rgb, 220)) for p in (here, *others)]
-    rgb, compared = white[0].rgb.astype(np.float32) / 255.0, partners(white[0], white[1:], 4)
+    rgb, compared = white[0].rgb.astype(np.float32) / 255.0, choose_partners(white[0], white[1:], 4)
     high = (np.arange(HEIGHT)[:, None] < HEIGHT // 2) & ALL
     floor = np.where(high, np.float32(0.0), np.float32(30.0))
-    _, _, sky_cost = wide_depth(rgb, NOTHING, floor, compared, K, here.world_from_camera, ALL)
+    _, _, sky_cost = wide_baseline_depth(rgb, NOTHING, floor, compared, K, here.world_from_camera, ALL)
     assert ((sky_cost == 0.0) == high).all()
 
 
@@ -87,8 +91,8 @@ def test_bright_and_smooth_above_the_horizon_is_sky_whatever_fits_as_well() -> N
         rgb = p.rgb.copy()
         rgb[:40] = 220
         white.append(replace(p, rgb=rgb))
-    rgb, compared = white[0].rgb.astype(np.float32) / 255.0, partners(white[0], white[1:], 4)
-    _, _, sky_cost = wide_depth(rgb, NOTHING, NOTHING, compared, K, here.world_from_camera, ALL)
+    rgb, compared = white[0].rgb.astype(np.float32) / 255.0, choose_partners(white[0], white[1:], 4)
+    _, _, sky_cost = wide_baseline_depth(rgb, NOTHING, NOTHING, compared, K, here.world_from_camera, ALL)
     assert (sky_cost[:34] == 0.0).all() and np.isinf(sky_cost[50:]).mean() > 0.95
 
 
@@ -97,7 +101,7 @@ def test_partners_show_what_no_other_shows_and_never_nothing() -> None:
     away, _ = photo(60.0, "front")
     twin, _ = photo(2.05, "front")  # no parallax
     far, _ = photo(5.0, "front")
-    chosen = partners(here, [away, twin, far], 3)
+    chosen = choose_partners(here, [away, twin, far], 3)
     places = [float(pose[0, 3]) for _, _, pose in chosen]
     assert places[0] == 5.0 and 60.0 not in places
 

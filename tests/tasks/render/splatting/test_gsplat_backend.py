@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import street
 
-from tasks.render.gate import unfit
+from tasks.render.gate import check_drive_pictures
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import Backend, check, render, vehicles_at
+from tasks.render.scene.engine import Backend, render, require_backend, vehicles_at
 from tasks.render.settings import GateSettings
 from tasks.render.splatting import gsplat_backend, sh
 from tasks.render.splatting.gaussians import Gaussians
@@ -121,7 +121,7 @@ def test_the_rig_s_views_of_an_instant_are_asked_for_at_once(
         assert asked == [(2, packed), (2, packed)]
         np.testing.assert_array_equal(pictures, render_views(street_asset, rig, poses, street.tracks(), [4, 9], *size))
         asked.clear()
-        unfit(street_asset, rig, poses[:1], street.tracks(), [4], size, GateSettings(), backend)
+        check_drive_pictures(street_asset, rig, poses[:1], street.tracks(), [4], size, GateSettings(), backend)
         assert asked[0] == (2, packed)
 
 
@@ -134,17 +134,17 @@ def test_an_absent_package_is_named_with_how_to_get_it(
     with pytest.raises(BackendMissing, match=rf"needs torch and gsplat \(import of {name} .*\[gpu\]"):
         render(street_asset, [FRONT], backend=Backend.GSPLAT)
     with pytest.raises(BackendMissing, match="needs torch and gsplat"):
-        check(Backend.GSPLAT_DENSE)
+        require_backend(Backend.GSPLAT_DENSE)
 
 
 def test_the_cpu_needs_nothing_and_a_machine_without_gpu_is_told_so() -> None:
-    check(Backend.CPU)
+    require_backend(Backend.CPU)
     torch = pytest.importorskip("torch")
     pytest.importorskip("gsplat", reason="gsplat is not installed")
     if torch.cuda.is_available():
         pytest.skip("there is a GPU here")
     with pytest.raises(BackendMissing, match=r"needs a CUDA device; torch .* sees none"):
-        check(Backend.GSPLAT)
+        require_backend(Backend.GSPLAT)
 
 
 def test_the_gpu_draws_the_cpu_s_image(street_asset: RenderAsset) -> None:

@@ -13,7 +13,7 @@ from tasks.render.splatting.gaussians import (
     rotations_of,
 )
 from tasks.render.splatting.project import CLASSIC, FITTED, MIN_ALPHA, ScreenFilter
-from tasks.render.splatting.raster import forward, gather, splat
+from tasks.render.splatting.raster import backproject, forward, project_and_sort
 
 INTRINSICS = np.array([[60.0, 0.0, 37.0], [0.0, 58.0, 22.0], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 75, 45  # no multiple of a tile
@@ -118,9 +118,9 @@ def test_quaternions_and_rotations_are_inverse() -> None:
 
 def test_gathering_white_gives_the_blending_weights() -> None:
     scene = cloud(500, seed=8)
-    splats = splat(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT)
+    splats = project_and_sort(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT)
     white = np.ones((HEIGHT, WIDTH, 3), np.float32)
-    sums, weights = gather(splats, white)
+    sums, weights = backproject(splats, white)
     np.testing.assert_allclose(sums, np.repeat(weights[:, None], 3, 1), rtol=1e-5)
     alpha = forward(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).view.alpha
     assert weights.sum() == pytest.approx(alpha.sum(), rel=1e-4)
