@@ -38,7 +38,7 @@ from factory.stages.sensors import (
 )
 from factory.store.location import Location
 from factory.wording import time_text
-from tasks.caches import Damaged, check, seal
+from tasks.caches import Damaged, check, seal, sealed_json, unsealed_json
 from tasks.render.fit.reconstruct import finish_scene, fit_backend, run_iterations
 from tasks.render.fit.start import prepare_fit
 from tasks.render.fit.state import FitState
@@ -50,7 +50,6 @@ from tasks.render.scene.movers import lift_tracks
 from tasks.render.scene.sensed import median_own_bodies
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
 from tasks.render.settings import Adjust, Backend, FitSettings, RenderSettings, RigSettings, SceneDtype, SceneFrom
-from tasks.sealed import Damaged, check, seal, sealed_json, unsealed_json
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import AgentTracks, Block, Camera, Clip, SensorFile, of_other_log, own_name
 
@@ -138,7 +137,7 @@ def correct_block_rig(
 
 def _write_rig_file(path: Path, found: dict[str, object]) -> None:
     text = sealed_json({"block": path.stem, **found})
-    with whole_file(path.with_suffix(RIG_SUFFIX), len(text)) as draft:
+    with atomic_file(path.with_suffix(RIG_SUFFIX), len(text)) as draft:
         draft.write_text(text, encoding="utf-8")
 
 

@@ -46,9 +46,7 @@ from tasks.render.views import MAP_RIG, draw_map_views, render_views
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentTracks, Camera, Clip, Scene, SensorFile
-from tasks.world.frames import HEADING, X, Y
-from tasks.world.frames import pose_on_ground
-from tasks.world.vehicle import HEADING
+from tasks.world.frames import HEADING, pose_on_ground
 
 NO_IMAGES: dict[str, object] = {"cameras": None, "images": None, "image_source": str(ImageSource.NONE)}
 TAG_OF = {

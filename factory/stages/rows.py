@@ -12,9 +12,8 @@ from tasks.reward.label_bytes import VocabularyLabels, encode
 from tasks.subscores import OF_ONE_PLAN, SUBSCORES
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Clip, Scene
-from tasks.world.frames import AX, AY, HEADING, VX, VY, points_to_local, to_local
+from tasks.world.frames import AX, AY, HEADING, VX, VY, points_to_local, pose_on_ground, to_local
 from tasks.world.road_map import driving_command
-from tasks.world.frames import points_to_local, pose_on_ground, to_local
 
 NEAR_M = 30.0  # for the tags
 

@@ -38,9 +38,19 @@ from tasks.reward.labels import Labelling, hit_after_s, reactive_scores, vocabul
 from tasks.rollout.simulate import SeenTraffic, TrafficSettings, prepare_traffic, simulate
 from tasks.settings import PdmSettings
 from tasks.world.arrays import Array
-from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, AgentKind, AgentTracks, Clip, Scene, scene_of_clip
+from tasks.world.clip import (
+    CLIP_STEPS,
+    HORIZON_STEPS,
+    NOW,
+    AgentKind,
+    AgentTracks,
+    Camera,
+    Clip,
+    Scene,
+    SensorFile,
+    scene_of_clip,
+)
 from tasks.world.road_map import Lane, RoadMap, Route
-from tasks.world.camera import Camera, SensorFile
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
 REPLAY = TrafficSettings(mode="replay")

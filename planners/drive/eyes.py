@@ -22,9 +22,8 @@ from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderSetting
 from tasks.render.views import render_views
 from tasks.world.arrays import Array
 from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS, STEP_S, Camera, Clip, Scene
-from tasks.world.frames import HEADING
+from tasks.world.frames import HEADING, pose_on_ground
 from tasks.world.road_map import driving_command
-from tasks.world.frames import pose_on_ground
 
 Images = Sequence[Mapping[str, Any]]  # entries of the column `images`
 DRIVEN = "drive"  # where a sample names its expert

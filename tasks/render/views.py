@@ -9,12 +9,10 @@ import numpy as np
 
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Backend, render, vehicles_at
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bytes
-from tasks.world.clip import STEP_S, AgentTracks, Camera, Fisheye, Pinhole
-from tasks.world.frames import HEADING, X, Y
+from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Camera, Fisheye, Pinhole
 from tasks.world.frames import box_corners
-from tasks.world.lanes import RoadMap
+from tasks.world.road_map import RoadMap
 
 VISIBLE_M = 150.0  # agents further away are not drawn
 

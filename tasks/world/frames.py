@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from tasks.world.arrays import Array
-from tasks.world.vehicle import HEADING, X, Y
 
 
 def wrap_angle(angle: Array) -> Array:

@@ -16,7 +16,6 @@ from factory.stages.scene_file import read_scene
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gradient import backward
 from tasks.render.splatting.raster import forward, project_and_sort
-from tasks.world.clip import Pinhole
 from tests.bench.timing import cpu_milliseconds, milliseconds
 
 WIDTH, HEIGHT = 480, 270

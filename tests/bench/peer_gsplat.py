@@ -28,7 +28,7 @@ from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gsplat_backend import arguments, view_of
 from tasks.render.splatting.raster import View, forward
 from tasks.render.splatting.tensors import Draw, Eye, SceneTensors, splatted
-from tasks.world.camera import Pinhole
+from tasks.world.clip import Pinhole
 from tests.bench.by_kernels import by_kernels
 
 WIDTH, HEIGHT = 33, 25  # no multiples of a tile

@@ -14,8 +14,7 @@ from factory.datasets.navsim.settings import MAP_LOCATIONS, CannotExport, Export
 from factory.store.schema import AGENT_STEPS, NOW_INDEX
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S
-from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, YAW_RATE, to_local, to_world
-from tasks.world.frames import pose_on_ground, to_local, to_world
+from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, YAW_RATE, pose_on_ground, to_local, to_world
 
 # How logs, frames, splits and files are named, so that the public code finds them and tells real from simulated.
 #

@@ -38,9 +38,8 @@ from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import Backend, FitSettings
 from tasks.render.splatting.gaussians import moved
 from tasks.render.splatting.gsplat_backend import require
-from tasks.world.agents import AgentKind
 from tasks.world.arrays import F32, Array, Bools, Ints
-from tasks.world.clip import AgentKind, AgentTracks, Pinhole
+from tasks.world.clip import AgentKind, Pinhole
 
 # How well a scene shows photos that it was not made of: drawn as pictures at new poses are, and held against them.
 #

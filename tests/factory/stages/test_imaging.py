@@ -72,7 +72,6 @@ def test_photos_too_far_apart_for_parallax_give_a_simulated_drive_no_pictures(to
 
 
 @pytest.mark.slow
-        results = (run_attempt(work, prepared, row.index, "pdm_closed") for row in prepared.candidates)
 def test_a_missing_photo_is_a_bad_clip_that_names_camera_and_time(town: Path, tmp_path: Path) -> None:
     root = tmp_path / "logs"
     shutil.copytree(town, root)

@@ -9,8 +9,8 @@ from tasks.render.fit.reconstruct import interpolated_corrections, learned_box_s
 from tasks.render.fit.start import FitProblem
 from tasks.render.fit.state import FitState
 from tasks.render.scene.sensed import Photo, Sweep
-from tasks.world.clip import AgentKind, AgentTracks
 from tasks.world.arrays import F32
+from tasks.world.clip import AgentKind, AgentTracks
 
 WIDTH, HEIGHT = 128, 72
 INTRINSICS = np.array([[100.0, 0.0, 64.0], [0.0, 100.0, 36.0], [0.0, 0.0, 1.0]])

@@ -19,9 +19,8 @@ from tasks.render.views import (
     undistorted,
 )
 from tasks.world.clip import Camera
-from tasks.world.frames import EGO_STATE_SIZE, HEADING, X, Y
+from tasks.world.frames import EGO_STATE_SIZE, HEADING, X, Y, pose_on_ground
 from tasks.world.road_map import Lane, MapLayer, MapPolygon, RoadMap
-from tasks.world.frames import pose_on_ground
 
 
 def states(x: float, y: float, heading: float) -> np.ndarray:

@@ -13,8 +13,7 @@ from tasks.render.scene.movers import lift_tracks
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.gaussians import EMPTY
 from tasks.world.clip import AgentKind, AgentTracks, SensorFile
-from tasks.world.frames import EGO_STATE_SIZE, X
-from tasks.world.frames import pose_on_ground
+from tasks.world.frames import EGO_STATE_SIZE, X, pose_on_ground
 
 STEPS = 21
 PARKED = AgentTracks(
