@@ -26,15 +26,14 @@ class ImageLayout:
     height: int = 512
     rows_cut: float = fixed(28 / 1080)  # share of the height, above and below
     sides_cut: float = fixed(416 / 1920)  # share of the width, on both sides of every camera but the middle one
-    decoding: Literal["reduced", "full"] = "reduced"  # full: as the public code does, see planners.data.images
+    decoding: Literal["reduced", "full"] = fixed("reduced")  # full: public planners', see planners.data.images
 
 
 @dataclass(frozen=True)
 class BevLayout:
     """A raster from above in the ego frame: row 0 is farthest ahead, column 0 farthest left; one class a cell.
 
-    `first="near_right"` turns it by half a turn, as the public code's targets lie: row 0 is nearest, column 0 farthest
-    right.
+    A public planner's lies the other way round: row 0 is nearest, column 0 farthest right.
     """
 
     ahead_m: float = 32.0
@@ -42,8 +41,7 @@ class BevLayout:
     side_m: float = 32.0  # to either side
     cell_m: float = 0.25
     times_s: tuple[float, ...] = (0.0,)  # one raster each, with the agents as they were then; now or before
-    first: Literal["far_left", "near_right"] = "far_left"  # the cell that comes first
-    drawn_as: Literal["ours", "public"] = "ours"  # see planners.data.bev
+    public: bool = fixed(False)  # drawn as the public code's targets, see planners.data.bev
 
     @property
     def shape(self) -> tuple[int, int]:

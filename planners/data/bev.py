@@ -1,9 +1,9 @@
 """A sample seen from above: what lies where in the ego frame at now, as a raster of classes and as boxes.
 
 The classes, their order and the drawing follow the public Latent TransFuser for NAVSIM (TransfuserConfig,
-TransfuserTargetBuilder), but for cyclists, whom it leaves out, and the route, which it does not draw. With
-`drawn_as="public"` they are left out here as well, crossings too, whose class is its walkways', and coordinates are cut
-off at whole cells as there; among the nearest vehicles are then those behind, whom the losses leave out.
+TransfuserTargetBuilder), but for cyclists, whom it leaves out, and the route, which it does not draw. In a `public`
+layout they are left out here as well, crossings too, whose class is its walkways', and coordinates are cut off at whole
+cells as there; among the nearest vehicles are then those behind, whom the losses leave out.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,9 +55,8 @@ def bev_raster(sample: Mapping[str, Any], layout: BevLayout) -> Bytes:
     Raises ValueError for a time to come or before a sample begins.
     """
     steps = [_step(time_s) for time_s in layout.times_s]
-    if layout.drawn_as == "public":
-        rasters = np.stack([_as_public(sample, layout, step) for step in steps])
-        return rasters if layout.first == "near_right" else np.ascontiguousarray(np.flip(rasters, (1, 2)))
+    if layout.public:
+        return np.stack([_as_public(sample, layout, step) for step in steps])
     ground = np.full(layout.shape, BevClass.BACKGROUND, np.uint8)
     for name, what in (
         ("drivable_rings", BevClass.ROAD),
@@ -80,7 +79,7 @@ def bev_raster(sample: Mapping[str, Any], layout: BevLayout) -> Bytes:
         there = there[np.argsort(classes[there], kind="stable")]
         for box, what in zip(_cells(box_corners(boxes[there, step]), layout), classes[there]):
             cv2.fillConvexPoly(raster, box, int(what), cv2.LINE_8, _SHIFT)
-    return np.ascontiguousarray(rasters[:, ::-1, ::-1]) if layout.first == "near_right" else rasters
+    return rasters
 
 
 def _as_public(sample: Mapping[str, Any], layout: BevLayout, step: int) -> Bytes:
@@ -111,14 +110,14 @@ def _as_public(sample: Mapping[str, Any], layout: BevLayout, step: int) -> Bytes
 def nearest_agents(sample: Mapping[str, Any], layout: BevLayout, n: int) -> tuple[F32, Bools]:
     """Vehicles at now whose centre is inside the layout, nearest first: boxes (n, 5) float32 and whether there is one.
 
-    With `drawn_as="public"` those behind too, as far as ahead.
+    In a public layout those behind too, as far as ahead.
 
     Boxes are centre x, y [m], heading [rad], length, width [m] in the frame of the ego at now; zeros where none is.
     """
     boxes, there = _agents(sample)
     now, x, y = boxes[:, NOW_INDEX], boxes[:, NOW_INDEX, 0], boxes[:, NOW_INDEX, 1]
     wanted = there[:, NOW_INDEX] & np.array([kind == AgentKind.VEHICLE for kind in sample["agent_kinds"]], bool)
-    behind_m = layout.ahead_m if layout.drawn_as == "public" else layout.behind_m
+    behind_m = layout.ahead_m if layout.public else layout.behind_m
     wanted &= (-behind_m <= x) & (x <= layout.ahead_m) & (np.abs(y) <= layout.side_m)
     found = np.flatnonzero(wanted)
     found = found[np.argsort(np.hypot(x[found], y[found]), kind="stable")][:n]

@@ -1,9 +1,9 @@
 """One wide picture of a sample: its front cameras at now, cut, decoded and resized side by side.
 
-With `decoding="reduced"` a JPEG is decoded at a half, a quarter or an eighth of its size where that is still as large
-as what is wanted of it. At the paper's setting (three 1920 x 1080 pictures, 2048 x 512 wanted) the halves have the
-wanted size already. With `"full"` the picture is, there, that of the public code to the last bit: decoded in full, cut,
-joined and given to cv2.resize (TransfuserFeatureBuilder), which averages four pixels into one. What either costs:
+A JPEG is decoded at a half, a quarter or an eighth of its size where that is still as large as what is wanted of it. At
+the paper's setting (three 1920 x 1080 pictures, 2048 x 512 wanted) the halves have the wanted size already. With
+`decoding="full"` the picture is, there, that of the public code to the last bit: decoded in full, cut, joined and given
+to cv2.resize (TransfuserFeatureBuilder), which averages four pixels into one. What either costs:
 `python -m tests.bench.bench_decoding`.
 
 libjpeg-turbo decodes by way of simplejpeg, whose pixels are OpenCV's and Pillow's in less than half of OpenCV's time:

@@ -32,8 +32,7 @@ class BackboneSettings:
     """Which network, and where its weights come from."""
 
     name: Literal["resnet34", "vovnet99", "small"] = "resnet34"
-    pretrained: str | None = None  # .safetensors, .pth or .pt under the published names; null: random weights
-    prefix: str = ""  # before the names in that file, such as "img_backbone."; entries without it are not read
+    pretrained: str | None = None  # .safetensors, .pth or .pt under the published names; None: random weights
     widths: tuple[int, ...] = (16, 32, 64, 128)  # of `small`, one residual block each
     pixels: Literal["imagenet", "unit"] = "imagenet"  # 0 .. 255 become ImageNet's mean 0 and deviation 1, or 0 .. 1
     frozen_norm: bool = False  # normalisations keep their statistics in training; scale and shift are learned
@@ -299,7 +298,7 @@ def load_pretrained(model: nn.Module) -> dict[str, str]:
         if isinstance(module, Backbone):
             path = module.settings.pretrained
             if path is not None:
-                _load(module, Path(path), module.settings.prefix)
+                _load(module, Path(path))
             record[name or "backbone"] = "none" if path is None else f"{Path(path).name} {_digest(Path(path))}"
     return record
 
@@ -309,19 +308,17 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _load(backbone: Backbone, path: Path, prefix: str) -> None:
-    weights = _read(path)
-    own = backbone.state_dict()
+def _load(backbone: Backbone, path: Path) -> None:
+    weights, own = _read(path), backbone.state_dict()
+    wanted = {key for key in own if not key.endswith("num_batches_tracked")}  # which older files lack, nothing reads
+    prefix = _prefix(wanted, weights, path)
     named = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
     named = {key: value for key, value in named.items() if key in own or not key.startswith(CLASSIFIERS)}
-    counters = {key for key in own if key.endswith("num_batches_tracked")}  # older files lack them, nothing reads them
-    missing = sorted(set(own) - set(named) - counters)
+    missing, extra = sorted(wanted - set(named)), sorted(set(named) - set(own))
     if missing:
-        hint = _prefix_hint(set(own) - counters, weights)
-        raise ValueError(f"{path} lacks {_listed(missing)} of {backbone.settings.name}{hint}")
-    extra = sorted(set(named) - set(own))
+        raise ValueError(f"{path} lacks {_listed(missing)} of {backbone.settings.name}")
     if extra:
-        raise ValueError(f"{path} has {_listed(extra)}, unknown to {backbone.settings.name}: wrong network or prefix")
+        raise ValueError(f"{path} has {_listed(extra)}, unknown to {backbone.settings.name}: another network's")
     wrong = [f"{k} {tuple(named[k].shape)}, not {tuple(own[k].shape)}" for k in named if named[k].shape != own[k].shape]
     if wrong:
         raise ValueError(f"{path} has other shapes than {backbone.settings.name}: {_listed(wrong)}")
@@ -330,24 +327,30 @@ def _load(backbone: Backbone, path: Path, prefix: str) -> None:
 
 def _read(path: Path) -> Mapping[str, Tensor]:
     if not path.is_file():
-        raise ValueError(f"backbone.pretrained: there is no file {path}")
+        raise ValueError(f"pretrained: there is no file {path}")
     try:
         content: Any = load_file(path) if path.suffix == ".safetensors" else load_tensors(path)
     except Exception as error:  # whatever a damaged file, or an object that is no tensor, raises
-        raise ValueError(f"backbone.pretrained: {path} cannot be read as weights: {one_line(error)}") from error
+        raise ValueError(f"pretrained: {path} cannot be read as weights: {one_line(error)}") from error
     for wrapper in ("state_dict", "model"):  # as trainers wrap their checkpoints
         if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
             content = content[wrapper]
     if not isinstance(content, Mapping):
-        raise ValueError(f"backbone.pretrained: {path} holds a {type(content).__name__}, not named tensors")
+        raise ValueError(f"pretrained: {path} holds a {type(content).__name__}, not named tensors")
     return {key: value for key, value in content.items() if isinstance(value, Tensor)}
 
 
-def _prefix_hint(keys: set[str], weights: Mapping[str, Tensor]) -> str:
+def _prefix(keys: set[str], weights: Mapping[str, Tensor], path: Path) -> str:
+    """What stands before a network's names in a file, such as "img_backbone."; "" where no prefix has all of them.
+
+    Raises ValueError where several have.
+    """
     probe = max(keys, key=len)
-    candidates = [name.removesuffix(probe) for name in weights if name.endswith("." + probe)]
+    candidates = [name.removesuffix(probe) for name in weights if name == probe or name.endswith("." + probe)]
     complete = [prefix for prefix in candidates if all(prefix + key in weights for key in keys)]
-    return f": it has them elsewhere, set backbone.prefix to one of {complete}" if complete else ""
+    if len(complete) > 1:
+        raise ValueError(f"{path} holds such weights under {complete}: keep those of one network in a file")
+    return complete[0] if complete else ""
 
 
 def _listed(names: list[str], most: int = 5) -> str:

@@ -6,20 +6,21 @@ anchors to step 8 and decodes twice, at steps 10 and 0. Constants are those of t
 also OpenDriveLab/SimScale 04cda10, navsim/agents/diffusiondrive: transfuser_model_v2.py, transfuser_config.py,
 modules/multimodal_loss.py), without lidar as in SimScale. The scene comes from LTF's encoder.
 
-Different here: the noise to plan from is drawn once, so that a scene has one plan whatever else is in the batch
-(`planning_noise="drawn"`: for every scene and call, as in the public code). And plans may be offsets from the anchors
-(`offsets_from`) instead of the noisy points. As noise is added to anchors and not to labels, it says nothing about
-the label, and all that offsets from noisy points do with it is take it out again: that a wide network learns in 100
-epochs, a narrow one does not in 30. And a point reads the cell of the raster from above that it lies in
+Different here, but in the variant `public`: the noise to plan from is drawn once, so that a scene has one plan whatever
+else is in the batch, and not for every scene and call. A point reads the cell of the raster from above that it lies in
 (`BevLayout`); the public code reads a raster supervised for 0 .. 32 m ahead as if it reached from -32 to 32 m
-(`points_on="centred"`), and the slowest wave of its noise step is the last of a closed range (`step_waves="closed"`).
+(`centred`). The slowest wave of its noise step is the last of a closed range (`closed`). And plans may be offsets from
+the anchors (`offsets_from`) instead of the noisy points. As noise is added to anchors and not to labels, it says
+nothing about the label, and all that offsets from noisy points do with it is take it out again: that a wide network
+learns in 100 epochs, a narrow one does not in 30.
+
 As there, the feed-forward has no shortcut, every layer starts from the same feature of the noisy plan, and a layer's
 plans lie where the layer before put them.
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -29,7 +30,8 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
+from planners.data.batch import Batch, BevLayout, Needs
+from planners.models.backbones import BackboneSettings
 from planners.models.layers import (
     AgentHead,
     Attention,
@@ -37,12 +39,14 @@ from planners.models.layers import (
     Decoder,
     FusionSettings,
     LatentFusion,
-    Start,
+    NetworkSettings,
+    Sizes,
     auxiliary_losses,
     clone_first,
-    initialise_weights,
+    initialise_as_public,
 )
 from planners.models.planner import Planner, TrainingData, evaluating, read_array
+from tasks.settings import fixed
 from tasks.world.arrays import FloatArray
 
 WAYPOINTS = 8  # 0.5 .. 4.0 s
@@ -118,6 +122,7 @@ def stepped(x_t: Tensor, x0: Tensor, kept_at: Tensor, kept_before: Tensor) -> Te
     return noised(x0.clamp(-1.0, 1.0), noise, kept_before)
 
 
+REFINEMENTS = 2  # layers of the cascade
 POINT_FEATURES = 64  # of a point: sines and cosines of its two coordinates
 RARE = 0.01  # confidence that the classifiers start from
 
@@ -146,9 +151,9 @@ def mlp(*widths: int, normalise: bool = False) -> nn.Sequential:
 class AlongTrajectory(nn.Module):
     """Attention to a map from above at a plan's own points; the plan's feature says how much each point counts."""
 
-    def __init__(self, width: int, dropout: float, layout: BevLayout, points_on: "PointsOn") -> None:
+    def __init__(self, width: int, dropout: float, layout: BevLayout, centred: bool) -> None:
         super().__init__()
-        self.layout, self.points_on = layout, points_on
+        self.layout, self.centred = layout, centred
         self.weights = nn.Linear(width, WAYPOINTS)
         self.value = nn.Sequential(nn.Conv2d(width, width, 3, padding=1), nn.ReLU())
         self.out = nn.Linear(width, width)
@@ -160,21 +165,21 @@ class AlongTrajectory(nn.Module):
 
     def forward(self, feature: Tensor, points: Tensor, above: Tensor) -> Tensor:
         """Features (B, A, width), points (B, A, 8, 2) in m, map (B, width, rows, columns); outside of it is zero."""
-        grid = on_map(points, self.layout, self.points_on)
+        grid = on_map(points, self.layout, self.centred)
         seen = F.grid_sample(self.value(above).float(), grid, align_corners=False)  # (B, width, A, 8)
         seen = torch.einsum("bcap,bap->bac", seen, self.weights(feature).float().softmax(dim=-1))
         return feature + self.drop(self.out(seen))
 
 
-PointsOn = Literal["cell", "centred"]  # the raster's own cells; as if it reached behind as far as ahead
+def on_map(points: Tensor, layout: BevLayout, centred: bool = False) -> Tensor:
+    """Points (..., 2), x ahead and y left in m, as column and row in -1 .. 1 over a raster from above.
 
-
-def on_map(points: Tensor, layout: BevLayout, points_on: PointsOn = "cell") -> Tensor:
-    """Points (..., 2), x ahead and y left in m, as column and row in -1 .. 1 over a raster from above."""
+    centred: as if it reached behind as far as ahead.
+    """
     x, y = points.float().unbind(dim=-1)
-    reach = layout.ahead_m + (layout.ahead_m if points_on == "centred" else layout.behind_m)
+    reach = layout.ahead_m + (layout.ahead_m if centred else layout.behind_m)
     places = torch.stack([-y / layout.side_m, 2.0 * (layout.ahead_m - x) / reach - 1.0], dim=-1)
-    return -places if layout.first == "near_right" else places
+    return -places if layout.public else places
 
 
 class DiffusionLayer(nn.Module):
@@ -182,8 +187,9 @@ class DiffusionLayer(nn.Module):
 
     def __init__(self, settings: "DiffusionDriveSettings") -> None:
         super().__init__()
-        width, heads, hidden, dropout = settings.width, settings.heads, settings.hidden, settings.dropout
-        self.along = AlongTrajectory(width, dropout, settings.bev, settings.points_on)
+        sizes, dropout = settings.network, settings.dropout
+        width, heads, hidden = sizes.width, sizes.heads, sizes.hidden
+        self.along = AlongTrajectory(width, dropout, settings.bev, centred=settings.is_public)
         self.agents, self.ego = Attention(width, heads), Attention(width, heads)
         self.agents_norm, self.ego_norm, self.norm = (nn.LayerNorm(width) for _ in range(3))
         self.feedforward = mlp(width, hidden, width)
@@ -218,12 +224,12 @@ class DiffusionDecoder(nn.Module):
 
     def __init__(self, settings: "DiffusionDriveSettings") -> None:
         super().__init__()
-        self.width, self.closed = (width := settings.width), settings.step_waves == "closed"
+        self.width, self.closed = (width := settings.network.width), settings.is_public
         self.feature = nn.Sequential(
             nn.Linear(WAYPOINTS * POINT_FEATURES, width), nn.ReLU(), nn.LayerNorm(width), nn.Linear(width, width)
         )
         self.step = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
-        self.layers = nn.ModuleList(DiffusionLayer(settings) for _ in range(settings.refinements))
+        self.layers = nn.ModuleList(DiffusionLayer(settings) for _ in range(REFINEMENTS))
 
     def forward(
         self, points: Tensor, base: Tensor, step: Tensor, above: Tensor, agents: Tensor, ego: Tensor
@@ -248,6 +254,7 @@ DENOISED_AT = (10, 0)  # noise steps told to the decoder; each result is taken o
 LOW_M, SPAN_M = (-1.2, -20.0), (56.9, 46.0)  # of x, y, which become -1 .. 1
 FOCAL_ALPHA, FOCAL_GAMMA = 0.25, 2.0
 NOISE_SEED = 0  # of what planning starts from
+ANCHORS_SEED = 0
 STATUS = 8
 
 
@@ -269,34 +276,37 @@ def focal(logits: Tensor, target: Tensor) -> Tensor:
     return balance * wrong**FOCAL_GAMMA * F.binary_cross_entropy_with_logits(logits, target, reduction="none")
 
 
-@dataclass(frozen=True)
-class DiffusionDriveSettings:
-    """The defaults are the paper's size."""
+SMALL = FusionSettings(  # a step of 16 samples takes 0.1 s of a core
+    backbone=BackboneSettings("small", widths=(16, 32, 64, 96)),
+    latent_size=64,
+    image_tokens=(2, 8),
+    latent_tokens=(2, 2),
+    layers=1,
+    expansion=2,
+    dropout=0.0,
+    bev_channels=16,
+)
 
+
+@dataclass(frozen=True)
+class DiffusionDriveSettings(NetworkSettings):
+    """DiffusionDrive's."""
+
+    SIZES: ClassVar[Mapping[str, Sizes]] = {
+        "paper": Sizes(),
+        "public": Sizes(FusionSettings(image_tokens=(8, 32))),
+        "small": Sizes(SMALL, width=48, hidden=96, layers=2, heads=4, agents=10, cell_m=1.0),
+    }
     anchors: str | None = None  # .npy (A, 8, 2); null: clusters of the plans to be trained on
     n_anchors: int = 20  # of them
-    anchors_seed: int = 0
-    image: ImageLayout = field(default_factory=ImageLayout)
-    bev: BevLayout = field(default_factory=BevLayout)
-    fusion: FusionSettings = field(default_factory=FusionSettings)
-    width: int = 256  # of the decoders
-    hidden: int = 1024
-    heads: int = 8
-    layers: int = 3  # of the queries' decoder
-    refinements: int = 2  # layers of the cascade
     dropout: float = 0.1  # in the cascade
-    offsets_from: Literal["noisy", "anchors"] = "noisy"  # what the first refinement's plans are told from
-    points_on: PointsOn = "cell"  # where on the map from above a plan's points look
-    step_waves: Literal["half_open", "closed"] = "half_open"  # frequencies of the noise step, see `waves`
-    agents: int = 30
-    trajectory_weight: float = 12.0  # of all refinements together
+    offsets_from: Literal["noisy", "anchors"] = "noisy"  # what the first refinement's plans are added to
+    trajectory_weight: float = fixed(12.0)  # of all refinements together
     confidence_weight: float = 10.0  # within it
-    regression_weight: float = 8.0
-    agent_class_weight: float = 10.0
-    agent_box_weight: float = 1.0
-    bev_weight: float = 14.0
-    start: Start = "torch"  # whose draw the weights begin with
-    planning_noise: Literal["fixed", "drawn"] = "fixed"  # drawn: for every scene anew, from torch's own generator
+    regression_weight: float = fixed(8.0)
+    agent_class_weight: float = fixed(10.0)
+    agent_box_weight: float = fixed(1.0)
+    bev_weight: float = fixed(14.0)
 
 
 class EncodedScene(NamedTuple):
@@ -313,17 +323,16 @@ class SceneEncoder(nn.Module):
 
     def __init__(self, settings: DiffusionDriveSettings) -> None:
         super().__init__()
-        width = settings.width
-        self.fusion = LatentFusion(settings.fusion)
-        cells = (settings.fusion.latent_size // 32) ** 2
+        sizes, fusion = settings.network, settings.fusion
+        width = sizes.width
+        self.fusion = LatentFusion(fusion)
+        cells = (fusion.latent_size // 32) ** 2
         self.narrow = nn.Conv2d(self.fusion.channels[-1], width, 1)
         self.status = nn.Linear(STATUS, width)
         self.places = nn.Parameter(torch.randn(cells + 1, width))
-        self.queries = nn.Parameter(torch.randn(1 + settings.agents, width))
-        self.decoder = Decoder(width, settings.heads, settings.hidden, settings.layers)
-        self.join = nn.Sequential(
-            nn.Linear(width + settings.fusion.bev_channels, width), nn.ReLU(), nn.LayerNorm(width)
-        )
+        self.queries = nn.Parameter(torch.randn(1 + sizes.agents, width))
+        self.decoder = Decoder(width, sizes.heads, sizes.hidden, sizes.layers)
+        self.join = nn.Sequential(nn.Linear(width + fusion.bev_channels, width), nn.ReLU(), nn.LayerNorm(width))
 
     def forward(self, image: Tensor, status: Tensor) -> EncodedScene:
         """Picture (B, 3, h, w) uint8 and status (B, 8)."""
@@ -354,10 +363,10 @@ class DiffusionDrive(Planner):
         self.encoder = SceneEncoder(settings)
         self.decoder = DiffusionDecoder(settings)
         reach_m = max(settings.bev.ahead_m, settings.bev.side_m)
-        self.agent_head = AgentHead(settings.width, settings.hidden, reach_m)
+        self.agent_head = AgentHead(settings.network.width, settings.network.hidden, reach_m)
         self.bev_head = BevHead(settings.fusion.bev_channels, settings.bev.shape)
-        initialise_weights(self, settings.start)
-        if settings.start == "public":
+        if settings.is_public:
+            initialise_as_public(self)
             clone_first(self.decoder.layers)
 
     @classmethod
@@ -365,15 +374,15 @@ class DiffusionDrive(Planner):
         """`anchors`. Raises ValueError for an unfit file, or fewer distinct plans than anchors."""
         if settings.anchors is not None:
             return {"anchors": checked_anchors(read_array(settings.anchors, "anchors"), settings.anchors)}
-        return {"anchors": cluster_anchors(data.labels_2hz(), settings.n_anchors, settings.anchors_seed)}
+        return {"anchors": cluster_anchors(data.labels_2hz(), settings.n_anchors, ANCHORS_SEED)}
 
     @property
     def needs(self) -> Needs:
-        return Needs(image=self.settings.image, bev=self.settings.bev, n_agents=self.settings.agents)
+        return Needs(self.settings.picture, self.settings.bev, self.settings.network.agents)
 
     @property
     def needs_to_plan(self) -> Needs:
-        return Needs(image=self.settings.image)
+        return Needs(image=self.settings.picture)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """`confidence` and `regression` of all refinements, `agent_class`, `agent_box`, `bev`.
@@ -416,10 +425,10 @@ class DiffusionDrive(Planner):
         return self.decoder(points, base, step, scene.above, scene.agents, scene.ego)
 
     def denoised(self, scene: EncodedScene) -> Tensor:
-        """Plans (B, 8, 3) from the noise that stays the same, or is drawn here."""
+        """Plans (B, 8, 3) from the noise that stays the same, or of a public planner is drawn here."""
         n, levels, anchors = len(scene.ego), self.get_buffer("kept"), self.get_buffer("anchors")
         noise = self.get_buffer("first_noise").expand(n, -1, -1, -1)
-        if self.settings.planning_noise == "drawn":
+        if self.settings.is_public:
             noise = torch.randn((n, *anchors.shape), device=anchors.device)
         at = noised(to_unit(anchors), noise, levels[NOISED_TO])
         for step in DENOISED_AT:

@@ -5,7 +5,7 @@ trajectory would score if it were driven, another how near it is to the label. A
 vocabulary. Constants without another source are those of NVlabs/GTRS and OpenDriveLab/SimScale (04cda10),
 navsim/agents/gtrs_dense: hydra_config.py, hydra_model.py, gtrs_agent.py, with SimScale's gtrs_dense_vov.yaml.
 
-Different here, unless settings say otherwise (conf/planner/gtrs_dense_public.yaml): there is a head for history comfort
+Different here, but in the variant `public`: there is a head for history comfort
 as well (weight 1.0 in the published settings, which have no such head), noise on the velocity is drawn for each sample
 instead of once for a batch, the trajectories' attention to each other has biases, and pictures are shifted. The
 supplement says that inputs get "random spatial shifts"; neither code base shifts the pictures of this model, so how far
@@ -13,8 +13,8 @@ is ours: edge pixels are repeated as in DrQ (Kostrikov et al. 2021), few enough 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, make_dataclass
-from typing import Any, ClassVar, Literal
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -23,9 +23,17 @@ from torch import Tensor, nn
 
 from planners.data.batch import Batch, ImageLayout, Needs
 from planners.models.backbones import STRIDES, BackboneSettings, build_backbone
-from planners.models.layers import Decoder, FusionSettings, LatentFusion, Layer, Start, initialise_weights
+from planners.models.layers import (
+    Decoder,
+    FusionSettings,
+    LatentFusion,
+    Layer,
+    NetworkSettings,
+    Sizes,
+    initialise_as_public,
+)
 from planners.models.planner import Planner, TrainingData, evaluating, read_array
-from tasks.reward.label_bytes import Normalise
+from tasks.settings import fixed
 from tasks.subscores import HALVES, LABELLED
 from tasks.world.arrays import FloatArray
 from tasks.world.vocabulary import Vocabulary
@@ -124,55 +132,43 @@ STATUS = 8
 VELOCITY = slice(4, 6)  # of the status, after the one-hot command
 AT_2HZ = slice(4, None, 5)  # of 40 poses at 10 Hz
 LOSS_WEIGHTS = {"nc": 3.0, "dac": 3.0, "tlc": 3.0, "ttc": 4.0, "lk": 2.0, "ep": 2.0}  # of the others 1
-_Weights: Any = make_dataclass(
-    "_Weights", [(name, float, LOSS_WEIGHTS.get(name, 1.0)) for name in LABELLED], frozen=True
-)
+SIGMA_M2 = 0.5  # of the imitated distribution
+SMALL = BackboneSettings("small")
 
 
 @dataclass(frozen=True)
-class RewardWeights(_Weights):
-    """Of the heads' losses, by sub-score; 0 leaves a head untrained."""
+class GtrsDenseSettings(NetworkSettings):
+    """GTRS-Dense's."""
 
-
-@dataclass(frozen=True)
-class GtrsDenseSettings:
-    """The defaults are the paper's size."""
-
+    SIZES: ClassVar[Mapping[str, Sizes]] = {
+        "paper": Sizes(),
+        "public": Sizes(FusionSettings(latent_channels=4)),
+        "small": Sizes(FusionSettings(SMALL), width=64, hidden=128, layers=2, heads=4, picture=SMALL),
+    }
     vocabulary: str | None = None  # .npy (K, 40, 3): the one whose labels the samples carry
     inference_vocabulary: str | None = None  # .npy of another to choose from; published: 8,192 for navhard
     inference_entries: int | None = None  # or that many of the first, evenly spaced; null for both: all
     weighting: WeightingName = "release"
-    normalise: Normalise = "masked"  # of the labels' EP
-    image: ImageLayout = field(default_factory=ImageLayout)
     encoder: Literal["fused", "picture"] = "fused"  # as published with ResNet-34; with V2-99
-    fusion: FusionSettings = field(default_factory=FusionSettings)  # of the fused encoder
-    backbone: BackboneSettings = field(default_factory=lambda: BackboneSettings("vovnet99"))  # of the other
-    width: int = 256
-    heads: int = 8
-    hidden: int = 1024
-    layers: int = 3
     kept: float = 0.5  # share of the vocabulary in a training step
-    velocity_noise_mps: tuple[float, float] = (1.0, 0.2)  # deviation along and across, in training
-    noise_of: Literal["sample", "batch"] = "sample"  # whom one draw of it is for
-    image_shift: float = 1 / 256  # largest, as a share of the width, in training: 8 of 2048 pixels, half a degree
-    imitation: float = 1.0  # weight of its loss
-    rewards: RewardWeights = field(default_factory=RewardWeights)
-    sigma_m2: float = 0.5  # of the imitated distribution
-    without: tuple[str, ...] = ()  # sub-scores that no head learns
-    among_bias: bool = True  # of the attention in which the vocabulary's trajectories see each other
-    start: Start = "torch"  # whose draw the weights begin with
+    velocity_noise_mps: tuple[float, float] = fixed((1.0, 0.2))  # deviation along and across, in training
+    image_shift: float = fixed(1 / 256)  # largest, as a share of the width, in training: half a degree
 
     def __post_init__(self) -> None:
-        weighting = WEIGHTINGS[self.weighting]
-        for name in self.without:
-            if name not in LABELLED:
-                raise ValueError(f"without={name}: not one of {', '.join(LABELLED)}")
-            if name in weighting.alone or name in weighting.inside:
-                raise ValueError(f"without={name}: weighting={self.weighting} needs it")
         if self.inference_vocabulary is not None and self.inference_entries is not None:
             raise ValueError("inference_vocabulary and inference_entries: give one of them")
         if not 0.0 < self.kept <= 1.0:
             raise ValueError(f"kept={self.kept}: a share of the vocabulary above 0, at most 1")
+
+    @property
+    def backbone(self) -> BackboneSettings:
+        """Of an encoder of the picture alone."""
+        return self.over_pictures(self.network.picture)
+
+    @property
+    def sub_scores(self) -> tuple[str, ...]:
+        """Those that a head learns: the public model has none for history comfort."""
+        return tuple(name for name in LABELLED if not (self.is_public and name == "hc"))
 
 
 class TrajectoryScorer(nn.Module):
@@ -180,16 +176,16 @@ class TrajectoryScorer(nn.Module):
 
     def __init__(self, settings: GtrsDenseSettings) -> None:
         super().__init__()
-        width, hidden = settings.width, settings.hidden
+        sizes = settings.network
+        width, hidden = sizes.width, sizes.hidden
         self.embed = nn.Sequential(nn.Linear(3 * 40, hidden), nn.ReLU(), nn.Linear(hidden, width))
-        self.among = Layer(width, settings.heads, 4 * width, crosses=False, bias=settings.among_bias)
-        self.decoder = Decoder(width, settings.heads, hidden, settings.layers)
+        self.among = Layer(width, sizes.heads, 4 * width, crosses=False, bias=not settings.is_public)
+        self.decoder = Decoder(width, sizes.heads, hidden, sizes.layers)
         self.status = nn.Linear(STATUS, width)
         self.heads = nn.ModuleDict(
             {
                 name: nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, 1))
-                for name in LABELLED
-                if name not in settings.without
+                for name in settings.sub_scores
             }
         )
         self.heads[IMITATION] = nn.Sequential(
@@ -222,11 +218,12 @@ class GtrsDense(Planner):
         self.register_buffer("choices", torch.tensor(choices.trajectories).float(), persistent=False)
         self.tokens: nn.Module
         if settings.encoder == "fused":
-            self.tokens = FusedTokens(settings.fusion, settings.width)
+            self.tokens = FusedTokens(settings.fusion, settings.network.width)
         else:
-            self.tokens = PictureTokens(settings.backbone, settings.image, settings.width)
+            self.tokens = PictureTokens(settings.backbone, settings.image, settings.network.width)
         self.scorer = TrajectoryScorer(settings)
-        initialise_weights(self, settings.start)
+        if settings.is_public:
+            initialise_as_public(self)
 
     @classmethod
     def fixed_arrays(cls, settings: GtrsDenseSettings, data: TrainingData) -> dict[str, FloatArray]:
@@ -249,7 +246,7 @@ class GtrsDense(Planner):
 
     @property
     def needs(self) -> Needs:
-        return Needs(image=self.settings.image, labels=self.label_digest, normalise=self.settings.normalise)
+        return Needs(image=self.settings.picture, labels=self.label_digest)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """`imitation`: cross-entropy with softmax(-d^2 / sigma^2) of the poses at 2 Hz; one binary one per sub-score.
@@ -262,15 +259,14 @@ class GtrsDense(Planner):
         picked = self._picked()
         trajectories = self.get_buffer("trajectories")[picked]
         logits = self.logits(batch, status, trajectories)
-        target = imitated(trajectories[:, AT_2HZ], batch.plan_2hz, batch.imitate, self.settings.sigma_m2)
+        target = imitated(trajectories[:, AT_2HZ], batch.plan_2hz, batch.imitate, SIGMA_M2)
         # masked by a product, also where nothing imitates: a distributed step wants a gradient for every parameter
         apart = -(target * logits[IMITATION].log_softmax(dim=1)).sum(dim=1)
-        terms = {IMITATION: self.settings.imitation * (apart * batch.imitate).sum() / len(batch)}
-        told = {name: weight for name, weight in asdict(self.settings.rewards).items() if name in logits}
-        for name, weight in told.items():
+        terms = {IMITATION: (apart * batch.imitate).sum() / len(batch)}
+        for name in self.settings.sub_scores:
             score = batch.labels[name][:, picked]
             whole = (score == 1.0).float() if name in HALVES else score
-            terms[name] = weight * F.binary_cross_entropy_with_logits(logits[name], whole)
+            terms[name] = LOSS_WEIGHTS.get(name, 1.0) * F.binary_cross_entropy_with_logits(logits[name], whole)
         return terms
 
     def scores(self, batch: Batch) -> dict[str, Tensor]:
@@ -291,16 +287,16 @@ class GtrsDense(Planner):
         if batch.image is None:
             raise ValueError("gtrs_dense: a batch without images")
         image = batch.image
-        if self.training:
+        if self.training and not self.settings.is_public:
             image = shifted(image, round(self.settings.image_shift * image.shape[-1]))
         return self.scorer(trajectories, self.tokens(image), status)
 
     def _noisy(self, status: Tensor) -> Tensor:
         deviation = status.new_tensor(self.settings.velocity_noise_mps)
-        if self.settings.noise_of == "sample":
-            drawn = torch.randn_like(status[:, VELOCITY])
-        else:  # as the public code draws them, one after the other
+        if self.settings.is_public:  # one draw for the batch, as there one number after the other
             drawn = torch.stack([torch.randn((), device=status.device) for _ in deviation])
+        else:
+            drawn = torch.randn_like(status[:, VELOCITY])
         noisy = status.clone()
         noisy[:, VELOCITY] += deviation * drawn
         return noisy

@@ -12,17 +12,19 @@ heads, losses and constants of the public TransfuserModel and transfuser_loss.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 
-from planners.data.batch import Batch
+from planners.data.batch import Batch, BevLayout, ImageLayout
 from planners.data.bev import BevClass
 from planners.models.backbones import STRIDES, BackboneSettings, BasicBlock, build_backbone
+from tasks.settings import fixed
 
 
 class Attention(nn.Module):
@@ -115,6 +117,65 @@ class FusionSettings:
     def __post_init__(self) -> None:
         if self.latent_size % STRIDES[-1]:
             raise ValueError(f"latent_size={self.latent_size}: give a multiple of {STRIDES[-1]}")
+
+
+Variant = Literal["paper", "public", "small"]
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Of a network; the defaults are the paper's and the public code's."""
+
+    fusion: FusionSettings = field(default_factory=FusionSettings)
+    width: int = 256  # of the decoders
+    hidden: int = 1024
+    layers: int = 3
+    heads: int = 8
+    agents: int = 30  # vehicles that are learnt beside planning, the nearest
+    cell_m: float = 0.25  # of the raster from above
+    picture: BackboneSettings = field(default_factory=lambda: BackboneSettings("vovnet99"))  # of an encoder of it alone
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """What planners with a picture have in common."""
+
+    image: ImageLayout = field(default_factory=ImageLayout)
+    variant: Variant = "paper"  # public: as the public code, whose checkpoints it takes; small: for two cores
+    pretrained: str | None = None  # the picture's backbone: .safetensors, .pth or .pt, published names; null: random
+    sizes: Sizes | None = fixed(None)  # in the place of the variant's
+    SIZES: ClassVar[Mapping[str, Sizes]] = {"paper": Sizes(), "public": Sizes()}  # by variant
+
+    @property
+    def is_public(self) -> bool:
+        """Whether everything is as in the public code: pixels, targets, the weights to begin with."""
+        return self.variant == "public"
+
+    @property
+    def network(self) -> Sizes:
+        """The sizes."""
+        return self.sizes or self.SIZES[self.variant]
+
+    @property
+    def picture(self) -> ImageLayout:
+        """The picture, decoded as the variant does."""
+        return replace(self.image, decoding="full") if self.is_public else self.image
+
+    @property
+    def bev(self) -> BevLayout:
+        """The raster that is learnt beside planning."""
+        return BevLayout(cell_m=self.network.cell_m, public=self.is_public)
+
+    @property
+    def fusion(self) -> FusionSettings:
+        """With the weights that the picture's backbone begins with."""
+        return replace(self.network.fusion, backbone=self.over_pictures(self.network.fusion.backbone))
+
+    def over_pictures(self, backbone: BackboneSettings) -> BackboneSettings:
+        """A backbone as the variant has it, with its first weights."""
+        if self.is_public:
+            backbone = replace(backbone, pixels="unit", frozen_norm=backbone.name == "vovnet99")
+        return replace(backbone, pretrained=self.pretrained)
 
 
 class Fused(NamedTuple):
@@ -288,7 +349,7 @@ def _matching(
 
 
 def auxiliary_losses(settings: Any, batch: Batch, bev: Tensor, boxes: Tensor, logits: Tensor) -> dict[str, Tensor]:
-    """The weighted terms of a planner whose settings name their weights, of the outputs of both heads."""
+    """The terms of a planner by the weights of its settings, of the outputs of both heads."""
     if batch.bev is None or batch.agents is None or batch.agents_valid is None:
         raise ValueError("a batch without view from above or agents cannot be learned from")
     weights = settings.agent_class_weight, settings.agent_box_weight
@@ -300,20 +361,17 @@ def auxiliary_losses(settings: Any, batch: Batch, bev: Tensor, boxes: Tensor, lo
     }
 
 
-Start = Literal["torch", "public"]  # whose draw weights are
 GPT_DEVIATION = 0.02
 
 
-def initialise_weights(model: nn.Module, start: Start) -> None:
-    """Draw a planner's weights anew, in place, as the public code draws them, where `start` says so.
+def initialise_as_public(model: nn.Module) -> None:
+    """Draw a planner's weights anew, in place, as the public code draws them.
 
-    Public: navsim/agents/*/transfuser_backbone.py, GPT._init_weights (OpenDriveLab/SimScale @ f51ad64); timm's ResNet
+    That is navsim/agents/*/transfuser_backbone.py, GPT._init_weights (OpenDriveLab/SimScale @ f51ad64); timm's ResNet
     (`zero_init_last`); torch's MultiheadAttention and, for the cascade, nn.TransformerDecoder's and
     transfuser_model_v2's clones of one layer. A backbone over pictures begins from a file there and is drawn as the
     other one until it is read.
     """
-    if start == "torch":
-        return
     for module in model.modules():
         if isinstance(module, Exchange):
             _as_gpt(module)

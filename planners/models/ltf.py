@@ -5,21 +5,23 @@ picture of 2048 x 512: 56 M parameters (SimScale, supplement, table 4).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
+from planners.data.batch import Batch, Needs
+from planners.models.backbones import BackboneSettings
 from planners.models.layers import (
     AgentHead,
     BevHead,
     FusionSettings,
     LatentFusion,
-    Start,
+    NetworkSettings,
+    Sizes,
     auxiliary_losses,
-    initialise_weights,
+    initialise_as_public,
 )
 from planners.models.planner import (
     PlanFrom,
@@ -34,27 +36,33 @@ from planners.models.planner import (
 from tasks.settings import fixed
 from tasks.world.arrays import FloatArray
 
+SMALL = FusionSettings(  # a step of 16 samples takes 0.1 s of a core
+    backbone=BackboneSettings("small"),
+    latent_size=96,
+    image_tokens=(2, 8),
+    latent_tokens=(3, 3),
+    layers=1,
+    expansion=2,
+    dropout=0.0,
+    bev_channels=16,
+)
+
 
 @dataclass(frozen=True)
-class LtfSettings:
-    """Sizes and weights."""
+class LtfSettings(NetworkSettings):
+    """Latent TransFuser's."""
 
-    image: ImageLayout = field(default_factory=ImageLayout)
-    bev: BevLayout = field(default_factory=BevLayout)
-    fusion: FusionSettings = field(default_factory=FusionSettings)
-    width: int = 256  # of the decoder
-    hidden: int = 1024
-    layers: int = 3
-    heads: int = 8
-    dropout: float = fixed(0.0)  # of the decoder; the public code has none
+    SIZES: ClassVar[Mapping[str, Sizes]] = {
+        "paper": Sizes(),
+        "public": Sizes(FusionSettings(image_tokens=(8, 32))),
+        "small": Sizes(SMALL, width=64, hidden=128, layers=2, heads=4, agents=10, cell_m=1.0),
+    }
     plan_from: PlanFrom = "zero"  # what the regressed positions are added to
     status: Status = "all"  # what of the ego's own it sees; speed: no acceleration
-    agents: int = 30
     trajectory_weight: float = fixed(10.0)  # the unit that the others are weighed against
     agent_class_weight: float = 10.0
     agent_box_weight: float = 1.0
     bev_weight: float = 10.0
-    start: Start = "torch"  # whose draw the weights begin with
 
 
 class Ltf(Planner):
@@ -65,27 +73,29 @@ class Ltf(Planner):
 
     def __init__(self, settings: LtfSettings, arrays: Mapping[str, FloatArray]) -> None:
         super().__init__(settings, arrays)
-        width = settings.width
-        self.fusion = LatentFusion(settings.fusion)
-        n_tokens = (settings.fusion.latent_size // 32) ** 2
+        sizes, fusion = settings.network, settings.fusion
+        width = sizes.width
+        self.fusion = LatentFusion(fusion)
+        n_tokens = (fusion.latent_size // 32) ** 2
         self.reduce = nn.Conv2d(self.fusion.channels[-1], width, 1)
         self.status = nn.Linear(8, width)
         self.key_position = nn.Parameter(torch.randn(1, n_tokens + 1, width))
-        self.queries = nn.Parameter(torch.randn(1, 1 + settings.agents, width))
-        layer = nn.TransformerDecoderLayer(width, settings.heads, settings.hidden, settings.dropout, batch_first=True)
-        self.decoder = nn.TransformerDecoder(layer, settings.layers)
-        self.plan_head = nn.Sequential(nn.Linear(width, settings.hidden), nn.ReLU(), nn.Linear(settings.hidden, 24))
-        self.agent_head = AgentHead(width, settings.hidden, max(settings.bev.ahead_m, settings.bev.side_m))
-        self.bev_head = BevHead(settings.fusion.bev_channels, settings.bev.shape)
-        initialise_weights(self, settings.start)
+        self.queries = nn.Parameter(torch.randn(1, 1 + sizes.agents, width))
+        layer = nn.TransformerDecoderLayer(width, sizes.heads, sizes.hidden, dropout=0.0, batch_first=True)
+        self.decoder = nn.TransformerDecoder(layer, sizes.layers)
+        self.plan_head = nn.Sequential(nn.Linear(width, sizes.hidden), nn.ReLU(), nn.Linear(sizes.hidden, 24))
+        self.agent_head = AgentHead(width, sizes.hidden, max(settings.bev.ahead_m, settings.bev.side_m))
+        self.bev_head = BevHead(fusion.bev_channels, settings.bev.shape)
+        if settings.is_public:
+            initialise_as_public(self)
 
     @property
     def needs(self) -> Needs:
-        return Needs(image=self.settings.image, bev=self.settings.bev, n_agents=self.settings.agents)
+        return Needs(self.settings.picture, self.settings.bev, self.settings.network.agents)
 
     @property
     def needs_to_plan(self) -> Needs:
-        return Needs(image=self.settings.image)
+        return Needs(image=self.settings.picture)
 
     def decoded(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
         """Plans (B, 8, 3), queries of agents (B, N, width), features from above (B, C, rows, columns)."""

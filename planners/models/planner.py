@@ -76,7 +76,7 @@ class Planner(nn.Module, ABC):
     def plan(self, batch: Batch) -> Tensor:
         """Plans (B, 8, 3) at 0.5 .. 4.0 s or (B, 40, 3) at 0.1 .. 4.0 s; the same for the same batch, always.
 
-        But for DiffusionDrive's with `planning_noise="drawn"`, which are as random as the public code's.
+        But for those of DiffusionDrive in its variant `public`, which are as random as the public code's.
         """
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:

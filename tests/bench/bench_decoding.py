@@ -4,8 +4,8 @@
 
 The photos are the 1920 x 1080 of a real NAVSIM rig where they are at hand, else made of noise. Three tables: where a
 picture's time goes, on one thread; the loader with 1, 2, ... workers up to all cores, with pictures decoded in full
-(the public code's, `image.decoding=full`), at half their size (`reduced`), and kept on disk (`data.pictures`); and what
-a lossless compression of kept pictures would save and cost. CPU time is this process's, in all its threads; "a core" is
+(the public code's), at half their size (`reduced`), and kept on disk (`data.pictures`); and what a lossless compression
+of kept pictures would save and cost. CPU time is this process's, in all its threads; "a core" is
 samples by CPU second, which other programs' load spares, where samples by the clock are what this machine gave.
 """
 

@@ -7,20 +7,29 @@ import torch
 
 from planners.data.batch import Batch, BevLayout, ImageLayout
 from planners.models.backbones import BackboneSettings
-from planners.models.layers import FusionSettings
+from planners.models.layers import FusionSettings, Sizes
 from tasks.reward.label_bytes import VocabularyLabels
 
 PICTURE = ImageLayout(width=64, height=32)
-FUSION = FusionSettings(
-    backbone=BackboneSettings("small", widths=(16, 32, 64, 64)),
-    latent_size=32,
-    image_tokens=(1, 2),
-    latent_tokens=(1, 1),
+SIZES = Sizes(
+    fusion=FusionSettings(
+        backbone=BackboneSettings("small", widths=(16, 32, 64, 64)),
+        latent_size=32,
+        image_tokens=(1, 2),
+        latent_tokens=(1, 1),
+        layers=1,
+        heads=2,
+        expansion=2,
+        dropout=0.0,
+        bev_channels=8,
+    ),
+    width=48,
+    hidden=96,
     layers=1,
     heads=2,
-    expansion=2,
-    dropout=0.0,
-    bev_channels=8,
+    agents=3,
+    cell_m=8.0,
+    picture=BackboneSettings("small", widths=(8, 16, 16, 32)),
 )
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from factory.config.compose import fill
 from factory.stages.rows import label_columns, score_columns
 from factory.store.funnel import funnel_of_tables
 from factory.store.reader import labels_of
@@ -17,6 +16,7 @@ from factory.views.status import REASON_WORDS
 from planners.data.batch import Needs
 from planners.data.decode import BatchBuffer
 from planners.models.gtrs_dense import GtrsDenseSettings, TrajectoryScorer
+from planners.models.layers import Sizes
 from tasks import subscores
 from tasks.attempt import ExpertGate, verdict
 from tasks.reward.aggregate import COLUMNS, columns_of
@@ -61,9 +61,8 @@ def learned() -> None:
     """A batch's labels, the heads of GTRS-Dense and their weights in its loss."""
     labels = BatchBuffer(1, Needs(labels="v"), 2).batch(["a"], np.zeros(1, bool), np.zeros(1, bool)).labels
     assert labels is not None and labels["sl"].shape == (1, 2)
-    settings = GtrsDenseSettings(width=8, heads=1, hidden=8, layers=1)
-    assert "sl" in TrajectoryScorer(settings).heads and settings.rewards.sl == 1.0
-    assert fill(GtrsDenseSettings, {"rewards": {"sl": 0.5}}, "planner").rewards.sl == 0.5
+    settings = GtrsDenseSettings(sizes=Sizes(width=8, heads=1, hidden=8, layers=1))
+    assert "sl" in TrajectoryScorer(settings).heads and "sl" in settings.sub_scores
 
 
 def told(scores: Scores) -> None:

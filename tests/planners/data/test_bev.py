@@ -1,6 +1,5 @@
 """Where shapes and agents land in a raster, by closed forms."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -55,16 +54,6 @@ def test_a_rectangle_covers_its_cells(name: str) -> None:
     inside = (x > 4) & (x < 10) & (y > -3) & (y < 6)
     near = (x > 3.5) & (x < 10.5) & (y > -3.5) & (y < 6.5)
     covers(raster, BevClass.CROSSING if name == "crossing_rings" else BevClass.ROAD, inside, near)
-
-
-def test_near_right_is_the_same_raster_turned_by_half_a_turn() -> None:
-    sample = scene({AgentKind.VEHICLE: [(20.0, 3.0, 0.3, 4.0, 2.0)]}, lane_polygons=[rectangle(4.0, -3.0, 10.0, 6.0)])
-    ours, turned = bev_raster(sample, LAYOUT), bev_raster(sample, replace(LAYOUT, first="near_right"))
-    assert np.array_equal(turned, ours[:, ::-1, ::-1]) and not np.array_equal(turned, ours)
-    nearest_right = bev_raster(
-        scene(lane_polygons=[rectangle(-8.0, -16.0, -6.0, -14.0)]), replace(LAYOUT, first="near_right")
-    )[0]
-    assert nearest_right[0, 0] == BevClass.ROAD and nearest_right.astype(bool).sum() < 50
 
 
 def test_row_0_is_ahead_and_column_0_is_left() -> None:

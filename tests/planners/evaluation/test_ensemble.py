@@ -36,7 +36,7 @@ def test_members_that_have_nothing_to_average_are_refused_by_name() -> None:
 
 
 def saved(out: Path, seed: int) -> str:
-    model = planner(seed=seed)
+    model = planner(replace(TINY, variant="small", sizes=None), seed=seed)
     save_checkpoint(out, 1, model, {}, {"version": 1})
     return str(out)
 
@@ -55,8 +55,8 @@ def test_only_settings_of_planning_change_after_training(tmp_path: Path) -> None
     few = planner_of(a, "few", {"inference_entries": 3})
     assert few.digest != planner_of(a).digest
     assert len(few.load().choices) == 3
-    with pytest.raises(ConfigError, match="layers of gtrs_dense cannot change after training; free: inference_entries"):
-        load_planner(a, {"layers": 9})
+    with pytest.raises(ConfigError, match="encoder of gtrs_dense cannot change after training; free: inf"):
+        load_planner(a, {"encoder": "fused"})
 
 
 def test_an_ensemble_of_planners_without_scores_is_refused(tmp_path: Path) -> None:

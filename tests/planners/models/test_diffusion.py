@@ -22,6 +22,7 @@ from planners.models.diffusiondrive import (
     to_unit,
     waves,
 )
+from planners.models.layers import Sizes
 from planners.models.planner import read_array
 
 
@@ -105,7 +106,7 @@ def test_points_fall_into_the_same_cells_of_a_raster_that_is_turned() -> None:
     layout = BevLayout(ahead_m=30.0, behind_m=10.0, side_m=20.0, cell_m=10.0)
     points = torch.tensor([[25.0, 15.0], [-5.0, 15.0], [5.0, -5.0]])
     raster = torch.arange(16.0).reshape(1, 1, *layout.shape)
-    there = on_map(points, layout)[None, None], on_map(points, replace(layout, first="near_right"))[None, None]
+    there = on_map(points, layout)[None, None], on_map(points, replace(layout, public=True))[None, None]
     read = torch.nn.functional.grid_sample(raster, there[0], align_corners=False)
     turned = torch.nn.functional.grid_sample(raster.flip(2, 3), there[1], align_corners=False)
     torch.testing.assert_close(read, turned)
@@ -113,9 +114,9 @@ def test_points_fall_into_the_same_cells_of_a_raster_that_is_turned() -> None:
 
 def test_centred_points_look_as_if_the_raster_reached_behind_as_far_as_ahead() -> None:
     """GridSampleCrossBEVAttention: y / 32 is the column, x / 32 the row, over a raster of 0 .. 32 m."""
-    layout = BevLayout(first="near_right")
+    layout = BevLayout(public=True)
     points = torch.randn(5, 2) * 16
-    torch.testing.assert_close(on_map(points, layout, "centred"), points.flip(-1) / 32, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(on_map(points, layout, centred=True), points.flip(-1) / 32, rtol=1e-5, atol=1e-6)
 
 
 def test_closed_waves_end_at_the_slowest() -> None:
@@ -136,7 +137,7 @@ def test_waves_tell_positions_apart_from_a_metre_to_kilometres() -> None:
 
 def test_a_layer_of_a_cascade_starts_where_the_layer_before_put_the_plans() -> None:
     torch.manual_seed(0)
-    decoder = DiffusionDecoder(DiffusionDriveSettings(width=16, heads=2, hidden=32, refinements=2, dropout=0.0))
+    decoder = DiffusionDecoder(DiffusionDriveSettings(sizes=Sizes(width=16, heads=2, hidden=32), dropout=0.0))
     for layer in decoder.layers:
         torch.nn.init.zeros_(layer.offsets[-1].weight)
         torch.nn.init.constant_(layer.offsets[-1].bias, 1.0)

@@ -6,27 +6,18 @@ import numpy as np
 import pytest
 import torch
 
-from planners.data.batch import Batch, BevLayout, ImageLayout
+from planners.data.batch import Batch, ImageLayout
 from planners.models.diffusiondrive import DiffusionDrive, DiffusionDriveSettings, from_unit, to_unit
 from planners.models.planner import TrainingData
 from tests.planners import scenes
 
 WAYS = 4
-TINY = DiffusionDriveSettings(
-    image=scenes.PICTURE,
-    bev=BevLayout(cell_m=8.0),
-    fusion=scenes.FUSION,
-    width=48,
-    hidden=96,
-    heads=2,
-    layers=1,
-    agents=3,
-)
+TINY = DiffusionDriveSettings(image=scenes.PICTURE, sizes=scenes.SIZES)
 
 
 def scene_batch(n: int, image: ImageLayout = TINY.image) -> Batch:
     plans, colours = scenes.four_ways(n)
-    return scenes.with_surroundings(scenes.batch(n, plans, image, colours), TINY.bev, TINY.agents)
+    return scenes.with_surroundings(scenes.batch(n, plans, image, colours), TINY.bev, scenes.SIZES.agents)
 
 
 def planner(settings: DiffusionDriveSettings = TINY, n_anchors: int = WAYS) -> DiffusionDrive:
@@ -48,7 +39,7 @@ def test_a_plan_has_eight_poses_and_is_the_same_every_time_whatever_else_is_in_t
 
 
 def test_noise_that_is_drawn_is_another_for_every_call_and_scene_and_the_seed_s() -> None:
-    batch, model = scene_batch(1), planner(replace(TINY, planning_noise="drawn"))
+    batch, model = scene_batch(1), planner(replace(TINY, variant="public"))
     twice = replace(
         batch,
         attempt_ids=batch.attempt_ids * 2,

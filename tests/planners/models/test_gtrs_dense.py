@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from planners.data.batch import Batch, ImageLayout
-from planners.models.backbones import BackboneSettings
 from planners.models.gtrs_dense import GtrsDense, GtrsDenseSettings, imitated, shifted
 from planners.models.planner import TrainingData
 from tasks.subscores import LABELLED
@@ -15,15 +14,7 @@ from tasks.world.vocabulary import Vocabulary
 from tests.planners import scenes
 
 K = 24
-TINY = GtrsDenseSettings(
-    image=scenes.PICTURE,
-    encoder="picture",
-    backbone=BackboneSettings("small", widths=(8, 16, 16, 32)),
-    width=32,
-    heads=2,
-    hidden=64,
-    layers=1,
-)
+TINY = GtrsDenseSettings(image=scenes.PICTURE, encoder="picture", sizes=scenes.SIZES)
 EXACT = replace(TINY, kept=1.0, velocity_noise_mps=(0.0, 0.0), image_shift=0.0)
 
 
@@ -86,18 +77,6 @@ def test_imitation_is_divided_by_the_whole_batch_and_rewards_count_every_sample(
     assert all(torch.equal(every[name], half[name]) for name in LABELLED)
 
 
-def test_all_parameters_get_a_gradient_with_imitation_and_a_head_switched_off() -> None:
-    batch, _ = labelled(2)
-    model = planner(replace(TINY, imitation=0.0, rewards=replace(TINY.rewards, hc=0.0)))
-    torch.stack(list(model(batch).values())).sum().backward()
-    for name, parameter in model.named_parameters():
-        assert parameter.grad is not None, f"{name}: processes wait for the gradient of every parameter"
-        if name.startswith(("scorer.heads.imitation", "scorer.heads.hc")):
-            assert (parameter.grad == 0.0).all(), f"{name} is switched off"
-    for head in set(LABELLED) - {"hc"}:
-        assert model.scorer.heads[head][0].weight.grad.abs().sum() > 0.0, head
-
-
 def test_a_training_step_sees_half_the_vocabulary_by_torchs_own_dice() -> None:
     model = planner()
     torch.manual_seed(3)
@@ -107,27 +86,24 @@ def test_a_training_step_sees_half_the_vocabulary_by_torchs_own_dice() -> None:
     assert torch.equal(model.eval()._picked(), torch.arange(K))
 
 
-def test_a_sub_score_may_have_no_head() -> None:
+def test_the_public_one_has_no_head_for_history_comfort() -> None:
     batch, _ = labelled(2)
-    model, whole = planner(replace(TINY, without=("hc",))), planner()
+    model, whole = planner(replace(TINY, variant="public")), planner()
     assert set(model(batch)) == set(whole(batch)) - {"hc"}
     assert model.plan(batch).shape == (2, 40, 3)
-    for name, said in (("hc2", "not one of"), ("nc", "weighting=release needs it")):
-        with pytest.raises(ValueError, match=said):
-            replace(TINY, without=(name,))
 
 
 def test_noise_is_one_for_the_batch_or_another_for_each_sample() -> None:
     batch, _ = labelled(4)
-    for noise_of, distinct in (("batch", 1), ("sample", 4)):
-        model = planner(replace(TINY, noise_of=noise_of, velocity_noise_mps=(1.0, 0.2)))
+    for variant, distinct in (("public", 1), ("paper", 4)):
+        model = planner(replace(TINY, variant=variant))
         torch.manual_seed(0)
         off = model._noisy(batch.status) - batch.status
         assert len(off[:, 4].unique()) == len(off[:, 5].unique()) == distinct
         assert not off[:, :4].any() and not off[:, 6:].any()
     torch.manual_seed(0)
     along, across = torch.randn(()), torch.randn(())  # as the public code draws them
-    off = planner(replace(TINY, noise_of="batch", velocity_noise_mps=(1.0, 0.2)))
+    off = planner(replace(TINY, variant="public"))
     torch.manual_seed(0)
     drawn = (off._noisy(torch.zeros(1, 8)))[0, 4:6]
     torch.testing.assert_close(drawn, torch.stack([along, across * 0.2]))

@@ -9,32 +9,15 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from planners.data.batch import Batch, BevLayout, ImageLayout
-from planners.models.backbones import BackboneSettings, load_pretrained
+from planners.data.batch import Batch, ImageLayout
+from planners.models.backbones import load_pretrained
 from planners.models.baselines import ConstantVelocity, ConstantVelocitySettings
-from planners.models.layers import FusionSettings, LatentFusion
+from planners.models.layers import LatentFusion
 from planners.models.ltf import Ltf, LtfSettings
+from tests.planners import scenes
 from tests.planners.made_batch import made_batch
 
-TINY = LtfSettings(
-    image=ImageLayout(width=64, height=32),
-    bev=BevLayout(cell_m=8.0),
-    fusion=FusionSettings(
-        backbone=BackboneSettings(name="small", widths=(16, 32, 64, 64)),
-        latent_size=32,
-        image_tokens=(1, 2),
-        latent_tokens=(1, 1),
-        layers=1,
-        heads=2,
-        expansion=2,
-        bev_channels=8,
-    ),
-    width=64,
-    hidden=256,
-    layers=1,
-    heads=2,
-    agents=3,
-)
+TINY = LtfSettings(image=scenes.PICTURE, sizes=scenes.SIZES)
 
 
 def planner(settings: LtfSettings = TINY) -> Ltf:
@@ -126,7 +109,7 @@ def test_half_precision_gives_finite_losses_close_to_the_full_ones() -> None:
 def test_the_latent_counted_once_is_the_latent_of_every_sample() -> None:
     """Before the first exchange nothing tells samples apart: the mean over copies is the mean over one."""
     torch.manual_seed(0)
-    fusion = LatentFusion(replace(TINY.fusion, dropout=0.0)).train()
+    fusion = LatentFusion(TINY.fusion).train()
     alone = fusion.latent.stage(0, fusion.latent.enter(fusion.picture))
     copies = fusion.latent.stage(0, fusion.latent.enter(fusion.picture.expand(5, -1, -1, -1)))
     torch.testing.assert_close(copies, alone.expand(5, -1, -1, -1), rtol=1e-4, atol=1e-4)
@@ -135,9 +118,8 @@ def test_the_latent_counted_once_is_the_latent_of_every_sample() -> None:
 def test_weights_are_for_the_picture_and_the_latent_starts_at_random(tmp_path: Path) -> None:
     source = planner()
     save_file(dict(source.fusion.image.state_dict()), tmp_path / "w.safetensors")
-    backbone = replace(TINY.fusion.backbone, pretrained=str(tmp_path / "w.safetensors"))
     torch.manual_seed(1)
-    model = Ltf(replace(TINY, fusion=replace(TINY.fusion, backbone=backbone)), {})
+    model = Ltf(replace(TINY, pretrained=str(tmp_path / "w.safetensors")), {})
     record = load_pretrained(model)
     assert record["fusion.image"].startswith("w.safetensors") and record["fusion.latent"] == "none"
     for a, b in zip(model.fusion.image.parameters(), source.fusion.image.parameters()):

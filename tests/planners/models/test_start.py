@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from planners.models.backbones import BackboneSettings
-from planners.models.layers import Attention, Decoder, FusionSettings, LatentFusion, Layer, initialise_weights
+from planners.models.layers import Attention, Decoder, FusionSettings, LatentFusion, Layer, initialise_as_public
 
 
 class Parts(nn.Module):
@@ -30,15 +30,9 @@ def spread(weight: Tensor) -> float:
     return float(weight.detach().std())
 
 
-def test_torch_s_draw_is_left_as_it_is() -> None:
-    model, same = parts(), parts()
-    initialise_weights(model, "torch")
-    assert all(torch.equal(a, b) for a, b in zip(model.state_dict().values(), same.state_dict().values()))
-
-
 def test_blocks_begin_as_their_shortcuts_and_exchanges_small() -> None:
     model = parts()
-    initialise_weights(model, "public")
+    initialise_as_public(model)
     for name, value in model.fusion.named_parameters():
         if name.endswith("bn2.weight"):
             assert not value.any(), name
@@ -51,7 +45,7 @@ def test_blocks_begin_as_their_shortcuts_and_exchanges_small() -> None:
 def test_attention_begins_as_torch_s_own() -> None:
     torch.manual_seed(0)
     torch_s, ours = nn.MultiheadAttention(256, 4), Attention(256, 4)
-    initialise_weights(ours, "public")
+    initialise_as_public(ours)
     whole = torch_s.in_proj_weight.detach()
     for projection in (ours.query, ours.key, ours.value):
         assert float(projection.weight.detach().abs().max()) == pytest.approx(float(whole.abs().max()), rel=1e-3)
@@ -63,14 +57,14 @@ def test_attention_begins_as_torch_s_own() -> None:
 
 def test_attention_without_biases_begins_as_plain_linear_maps() -> None:
     model = parts()
-    initialise_weights(model, "public")
+    initialise_as_public(model)
     for projection in (model.among.own.query, model.among.own.key, model.among.own.value):
         assert float(projection.weight.detach().abs().max()) == pytest.approx(1.0 / math.sqrt(64), rel=0.01)
 
 
 def test_layers_of_a_decoder_begin_as_clones() -> None:
     model = parts()
-    initialise_weights(model, "public")
+    initialise_as_public(model)
     first, *others = (layer.state_dict() for layer in model.decoder.layers)
     for other in others:
         assert all(torch.equal(value, other[name]) for name, value in first.items())

@@ -25,13 +25,7 @@ from tests.planners.published.formula import CELLS, FROZEN, SEED, inputs, weight
 GRADIENTS = "gradients"
 ROUNDING_OF_GRADIENTS = 100.0  # in float32 ours are up to 8e-4 of themselves away from ours in float64 (LTF)
 ROUNDING_OF_BOXES = 10.0  # their metres are 32 times what a head says
-WITHOUT_DROPOUT = {  # generators differ, and dropout with them
-    "ltf": ["planner.settings.fusion.dropout=0.0"],
-    "diffusiondrive": ["planner.settings.fusion.dropout=0.0", "planner.settings.dropout=0.0"],
-    "gtrs_dense": ["planner.settings.fusion.dropout=0.0"],
-    "gtrs_dense_v2_99": [],
-}
-CASES = tuple(WITHOUT_DROPOUT)
+CASES = ("ltf", "diffusiondrive", "gtrs_dense", "gtrs_dense_v2_99")
 TERMS = {  # of the public losses and ours, where both tell them apart
     "trajectory_loss": ("confidence", "regression"),
     "agent_class_loss": ("agent_class",),
@@ -82,9 +76,9 @@ def formula_weights(
 
 
 def preset_entry(case: str, picture: tuple[int, int], *changed: str) -> PlannerEntry:
-    """conf/planner/<case>_public.yaml for pictures of another size, without dropout; words change it."""
+    """conf/planner/<case>_public.yaml for pictures of another size; words change it."""
     size = [f"planner.settings.image.{name}={n}" for name, n in zip(("width", "height"), picture)]
-    words = [f"planner={case}_public", "checkpoint=none", "out=none", *size, *WITHOUT_DROPOUT[case], *changed]
+    words = [f"planner={case}_public", "checkpoint=none", "out=none", *size, *changed]
     return fill(PlannerEntry, compose("import_planner", words)["planner"], "planner")
 
 
@@ -166,13 +160,23 @@ def trained(found: Imported, batch: Batch) -> tuple[dict[str, float], dict[tuple
     return values, norms
 
 
+def without_dropout(planner: Planner) -> Planner:
+    """The same planner: generators differ, and dropout with them."""
+    for module in planner.modules():
+        if isinstance(module, torch.nn.Dropout):
+            module.p = 0.0
+        elif hasattr(module, "dropout") and isinstance(module.dropout, float):
+            module.dropout = 0.0
+    return planner
+
+
 def gradient_norms(found: Imported, batch: Batch) -> dict[tuple[str, ...], float]:
     """Norms of gradients by the public matrices that they belong to; the gradients stay."""
     return _stepped_back(found, batch)[1]
 
 
 def _stepped_back(found: Imported, batch: Batch) -> tuple[dict[str, float], dict[tuple[str, ...], float]]:
-    planner = found.planner.train()
+    planner = without_dropout(found.planner).train()
     losses = planner.losses(batch)
     torch.stack(list(losses.values())).sum().backward()
     squares: dict[tuple[str, ...], float] = {}

@@ -13,7 +13,7 @@ from tasks.world.clip import AgentKind
 from tests.planners.published.formula import AGENTS, street
 from tests.planners.published.ours import Difference
 
-PUBLIC = BevLayout(first="near_right", drawn_as="public")
+PUBLIC = BevLayout(public=True)
 EDGES = 16.0  # cells beside a line that another OpenCV draws otherwise: 4.11 and 5.0 are 5 apart in 32,768
 
 

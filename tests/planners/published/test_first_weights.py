@@ -33,7 +33,7 @@ def test_weights_begin_as_the_public_agent_draws_them(case: str) -> None:
 def test_as_torch_draws_them_they_begin_otherwise() -> None:
     public, _, _ = read_start(RECORDS / "diffusiondrive_start.npz")
     torch.manual_seed(1)
-    ours = start_of(build_planner(preset("diffusiondrive", PICTURE, "planner.settings.start=torch"), ARRAYS))
+    ours = start_of(build_planner(preset("diffusiondrive", PICTURE, "planner.settings.variant=paper"), ARRAYS))
     said = " ".join(apart(public, ours))
     for part in ("latent.layer1.0.bn2.weight", "exchanges.0.blocks.0.project.bias", "own.query.weight", "a copy of"):
         assert part in said, part

@@ -42,7 +42,7 @@ def test_what_does_not_fit_is_one_line(tmp_path: Path, capsys: pytest.CaptureFix
     (tmp_path / "b.ckpt").write_bytes(b"")
     for words, said in (
         ([str(path), f"out={tmp_path / 'out'}", "planner=ltf_publik"], "ltf_public"),
-        ([str(path), f"out={tmp_path / 'out'}", "planner.settings.fusion.image_token=[8,32]"], "image_token"),
+        ([str(path), f"out={tmp_path / 'out'}", "planner.settings.variant=publik"], "publik"),
         ([str(path), f"out={tmp_path / 'out'}"], "lacks _backbone.image_encoder"),
         ([str(path), str(tmp_path / "b.ckpt"), f"out={tmp_path / 'out'}"], "one checkpoint at a time"),
         ([f"checkpoint={tmp_path / 'c.ckpt'}", f"out={tmp_path / 'out'}"], "there is no such file"),

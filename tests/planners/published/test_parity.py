@@ -5,6 +5,7 @@ writes them anew.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from factory.config.compose import ConfigError
+from planners.data.batch import BevLayout
 from planners.models.planner import PlannerChoice
 from planners.published.import_planner import imported
 from tests.planners.published.formula import FROZEN, inputs
@@ -21,7 +23,6 @@ from tests.planners.published.ours import (
     PublicRecord,
     batch_of,
     differences,
-    formula_weights,
     planner_of,
     preset,
     read_recorded,
@@ -73,16 +74,19 @@ def test_latent_transfuser_is_the_public_one_at_the_paper_s_picture() -> None:
 @pytest.mark.parametrize(
     ("case", "changed", "apart_m"),
     [
-        ("ltf", "fusion.backbone.pixels=imagenet", 0.01),
-        ("diffusiondrive", "points_on=cell", 0.01),
-        ("diffusiondrive", "bev.first=far_left", 0.01),
-        ("diffusiondrive", "step_waves=half_open", 0.001),
+        ("ltf", {"shift": torch.full((3, 1, 1), -2.0)}, 0.01),  # of its pixels
+        ("diffusiondrive", {"centred": False}, 0.01),
+        ("diffusiondrive", {"layout": BevLayout()}, 0.01),
+        ("diffusiondrive", {"closed": False}, 0.001),
     ],
 )
-def test_without_what_the_public_code_does_plans_are_others(case: str, changed: str, apart_m: float) -> None:
+def test_without_what_the_public_code_does_plans_are_others(case: str, changed: dict[str, Any], apart_m: float) -> None:
     one = recorded(case)
-    choice = preset(case, one.picture, f"planner.settings.{changed}")
-    found = imported(choice, formula_weights(one.names, inputs(*one.picture)), "it")
+    found = planner_of(one)
+    for module in found.planner.modules():
+        for name, value in changed.items():
+            if hasattr(module, name):
+                setattr(module, name, value)
     plan = found.planner.plan(batch_of(inputs(*one.picture)))
     assert np.abs(plan.numpy() - one.results["eval trajectory"])[..., :2].max() > apart_m
 
