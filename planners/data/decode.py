@@ -29,18 +29,15 @@ Stitch = Callable[[Sequence[Bytes], ImageLayout, Bytes], None]
 class StoredRows:
     """Some rows of one row group."""
 
-    def __init__(
-        self, table: pa.Table, cameras: Sequence[tuple[str, ...]], in_place: bool = False, stitched: Stitch = stitch
-    ) -> None:
-        """cameras: (rows) of each row's picture; none for rows that are not asked for.
+    def __init__(self, table: pa.Table, cameras: Sequence[tuple[str, ...]], stitched: Stitch = stitch) -> None:
+        """cameras: (rows) of each row's picture, whose JPEGs are copied; none for rows that are not asked for.
 
-        in_place: pictures stay in the table, which stays as a whole; else they are copied, and other images can go.
         stitched: how a picture is made of its JPEGs.
         """
         self._stitched = stitched
         self._jpegs: list[tuple[Bytes, ...]] = []
         if "images" in table.column_names:
-            self._jpegs = _jpegs_at_now(_whole(table["images"]), cameras, in_place)
+            self._jpegs = _jpegs_at_now(_whole(table["images"]), cameras)
             table = table.drop_columns(["images"])
         self._values = {name: _values(COLUMNS[name], _whole(table[name])) for name in table.column_names}
         self._rasters: dict[tuple[int, BevLayout], Bytes] = {}
@@ -151,7 +148,7 @@ def _whole(column: pa.ChunkedArray) -> pa.Array:
     return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
 
 
-def _jpegs_at_now(images: pa.ListArray, cameras: Sequence[tuple[str, ...]], in_place: bool) -> list[tuple[Bytes, ...]]:
+def _jpegs_at_now(images: pa.ListArray, cameras: Sequence[tuple[str, ...]]) -> list[tuple[Bytes, ...]]:
     starts, entries = images.offsets.to_numpy(), images.values
     at_now = np.flatnonzero(np.abs(entries.field("time_s").to_numpy()) <= TIME_TOLERANCE_S)
     names = entries.field("camera").take(pa.array(at_now)).to_pylist()
@@ -163,8 +160,7 @@ def _jpegs_at_now(images: pa.ListArray, cameras: Sequence[tuple[str, ...]], in_p
     flat = np.frombuffer(data, np.uint8)
 
     def jpeg_of(entry: int) -> Bytes:
-        stored = flat[ends[entry] : ends[entry + 1]]
-        return stored if in_place else stored.copy()
+        return flat[ends[entry] : ends[entry + 1]].copy()
 
     return [tuple(jpeg_of(found[row, name]) for name in chosen) for row, chosen in enumerate(cameras)]
 

@@ -24,7 +24,7 @@ from factory.store.schema import LABEL_COLUMNS
 from planners.data.batch import ImageLayout, Needs, TrainingData
 from planners.data.files import SampleFile, files_of, group_bytes, leaves, read_all
 from planners.data.images import chosen_cameras
-from planners.data.mix import MixSettings, Samples, check_sides, sample_weights
+from planners.data.mix import MixSettings, Samples, check_sides
 from tasks.settings import fixed
 from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
 
@@ -34,8 +34,6 @@ INDEX_COLUMNS = (
     "clip_id",
     "settings_hash",
     "stage_versions",
-    "candidate_end",
-    "stage2_score",
     "image_source",
     "psnr",
     "label_vocabulary",
@@ -60,7 +58,6 @@ class DataSettings:
     limit_sim: int | None = None  # as many simulated samples, drawn from those that the rest leaves
     seed: int = fixed(0)  # of the two draws; a smaller share or limit is a part of a larger one
     storage_options: dict[str, str] = field(default_factory=dict)  # of object stores, as deltalake calls them
-    copy: str | None = None  # folder of this machine for a compact copy of what is read, see planners.data.files
     pictures: str | None = None  # folder of this machine for decoded pictures, see planners.data.images
     pictures_gb: float = 100.0  # that it takes at most, 10^9 bytes; what is beyond is decoded in every pass
 
@@ -69,10 +66,8 @@ class DataSettings:
             raise ValueError(f"real_share={self.real_share}: must be above 0 and at most 1")
         if self.limit_sim is not None and self.limit_sim < 1:
             raise ValueError(f"limit_sim={self.limit_sim}: must be at least 1; data.sim=[] leaves simulation out")
-        for name in ("copy", "pictures"):
-            folder = getattr(self, name)
-            if folder is not None and "://" in folder:
-                raise ValueError(f"data.{name}={folder}: must be a folder of this machine")
+        if self.pictures is not None and "://" in self.pictures:
+            raise ValueError(f"data.pictures={self.pictures}: must be a folder of this machine")
 
     def tables(self, part: str) -> tuple[str, ...]:
         """The tables of `real`, `sim` or `val`."""
@@ -90,8 +85,6 @@ class SampleRows:
     expert: NDArray[np.str_]
     round: ShortInts
     simulated: Bools
-    perturbation_m: Array  # (n, 2) longitudinal, lateral end in the frame of the log's; NaN human
-    reward: Array  # stage2_score, NaN where there is none
     psnr: Array  # [dB] NaN where there is none
     image_source: NDArray[np.str_]
     vocabulary: NDArray[np.str_]  # digest of the labels' trajectories, empty where there are no labels
@@ -223,12 +216,6 @@ def _index_of(file: SampleFile, number: int, parquet: pq.ParquetFile, table: pa.
     def text(name: str) -> NDArray[np.str_]:
         return np.array(pc.fill_null(table[name], "").to_pylist(), dtype=np.str_)
 
-    def number_or_nan(name: str) -> Array:
-        return pc.fill_null(table[name], float("nan")).to_numpy()
-
-    end = table["candidate_end"].combine_chunks()
-    perturbation_m = np.full((n, 2), np.nan)
-    perturbation_m[end.is_valid().to_numpy(zero_copy_only=False)] = _flat(end).reshape(-1, 4)[:, :2]
     starts = np.cumsum(counts) - counts
     return SampleRows(
         attempt_id=text("attempt_id"),
@@ -237,20 +224,13 @@ def _index_of(file: SampleFile, number: int, parquet: pq.ParquetFile, table: pa.
         expert=np.full(n, file.expert),
         round=np.full(n, file.round, np.int32),
         simulated=np.full(n, file.expert != HUMAN),
-        perturbation_m=perturbation_m,
-        reward=number_or_nan("stage2_score"),
-        psnr=number_or_nan("psnr"),
+        psnr=pc.fill_null(table["psnr"], float("nan")).to_numpy(),
         image_source=text("image_source"),
         vocabulary=text("label_vocabulary"),
         file=np.full(n, number, np.int64),
         group=np.repeat(np.arange(len(counts)), counts),
         place=np.arange(n) - np.repeat(starts, counts),
     )
-
-
-def _flat(lists: pa.ListArray | pa.ChunkedArray) -> Array:
-    arrays = lists.chunks if isinstance(lists, pa.ChunkedArray) else [lists]
-    return np.concatenate([np.zeros(0), *(array.flatten().to_numpy() for array in arrays)])
 
 
 def _kept(settings: DataSettings, rows: SampleRows) -> Ints:
@@ -336,7 +316,6 @@ def open_data(settings: DataSettings, mix: MixSettings | None = None) -> Dataset
     dataset = open_dataset(settings)
     if mix is not None:
         check_sides(mix, dataset.rows.simulated)
-        _weights(dataset, mix)
     return dataset
 
 
@@ -364,16 +343,11 @@ def make_feed(dataset: Dataset, needs: Needs) -> Feed:
     return Feed(dataset, needs, columns, tuple(cameras), size)
 
 
-def mixed_samples(feed: Feed, mix: MixSettings) -> Samples:
-    """What the order of a feed's samples depends on. Raises ValueError for weights that do not fit them."""
+def mixed_samples(feed: Feed) -> Samples:
+    """What the order of a feed's samples depends on."""
     rows = feed.dataset.rows
     group = np.unique(np.stack([rows.file, rows.group]), axis=1, return_inverse=True)[1].reshape(-1)
-    return Samples(rows.simulated, group, feed.size, _weights(feed.dataset, mix))
-
-
-def _weights(dataset: Dataset, mix: MixSettings) -> Array:
-    rows = dataset.rows
-    return sample_weights(mix.weights, rows.simulated, rows.round, rows.expert, rows.perturbation_m, rows.reward)
+    return Samples(rows.simulated, group, feed.size)
 
 
 def _check_index(dataset: Dataset, needs: Needs) -> None:

@@ -9,11 +9,9 @@ decoded pictures fit into the memory for shuffling each picture is decoded once.
 
 Rows in memory: windows are read ahead in the order in which an epoch needs them, two of a side at a time. A row group
 is read once per window, file by file, and of it only the rows that are wanted. A side that fits into one window is read
-once and stays. Rows of a local copy are mapped: they are pages that the system may take back and read again, and count
-as the window's memory all the same.
+once and stays.
 """
 
-import hashlib
 import json
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -30,7 +28,7 @@ import pyarrow as pa
 from factory.store.location import raising_damaged_file
 from planners.data.batch import Batch, Needs
 from planners.data.decode import BatchBuffer, StoredRows, count_labels
-from planners.data.files import COPY_FORMAT, LocalCopy, leaves, read_group
+from planners.data.files import leaves, read_group
 from planners.data.images import GB, DecodedPictures, stitch
 from planners.data.index import Dataset, Feed, make_feed, mixed_samples
 from planners.data.mix import EpochOrder, MixSettings, Side, WindowKey, make_order
@@ -81,22 +79,6 @@ class _Reading:
         return {sample: place for future in self.futures for sample, place in future.result().items()}
 
 
-def copies_of(feed: Feed) -> dict[int, LocalCopy]:
-    """File -> its copy, for every file that the samples stand in; empty without `data.copy`."""
-    settings, rows = feed.dataset.settings, feed.dataset.rows
-    if settings.copy is None:
-        return {}
-    folder = Path(settings.copy).expanduser()
-    copies = {}
-    for number in np.unique(rows.file).tolist():
-        file = feed.dataset.files[number]
-        cameras = sorted({name for i in np.flatnonzero(rows.file == number) for name in feed.cameras[i]})
-        words = (str(COPY_FORMAT), Path(file.path).name, *feed.columns, "", *cameras)
-        digest = hashlib.sha256("\x1f".join(words).encode()).hexdigest()[:32]
-        copies[number] = LocalCopy(folder / f"{digest}.arrow", file, feed.columns, tuple(cameras))
-    return copies
-
-
 def pictures_of(feed: Feed) -> DecodedPictures | None:
     """Those of `data.pictures`, where there are pictures to be kept. Raises ValueError where too few can be."""
     settings, layout = feed.dataset.settings, feed.needs.image
@@ -113,14 +95,13 @@ class Memory:
     def __init__(self, feed: Feed, staying: Mapping[int, Ints]) -> None:
         """staying: side -> its samples, for those that fit into one window."""
         self._feed, self._staying = feed, staying
-        self.copies = copies_of(feed)
         self.pictures = pictures_of(feed)
         self._stay: dict[int, _Reading] = {}
         self._checked: set[tuple[int, int]] = set()  # row groups whose pages were found undamaged
 
     def __getstate__(self) -> dict[str, Any]:
         """For another process, which reads for itself."""
-        lasting = ("_feed", "_staying", "copies", "pictures", "_checked")
+        lasting = ("_feed", "_staying", "pictures", "_checked")
         return {name: self.__dict__[name] for name in lasting} | {"_stay": {}}
 
     def begin(self, windows: Sequence[Window], executor: Executor) -> None:
@@ -177,31 +158,24 @@ class Memory:
         groups = self._feed.dataset.rows.group[samples]
         found: dict[int, Place] = {}
         with raising_damaged_file(file.where):
-            read = self._reader(number, np.unique(groups))
+            checked = all((number, group) in self._checked for group in groups.tolist())
+            stored = file.open(check_pages=not checked)
+            paths = leaves(stored, self._feed.columns)
             for group in np.unique(groups).tolist():
-                found |= self._rows(read(group), samples[groups == group], number in self.copies)
+                found |= self._rows(read_group(stored, group, paths), samples[groups == group])
                 self._checked.add((number, group))
         return found
 
-    def _reader(self, number: int, groups: Ints) -> Callable[[int], pa.Table]:
-        """Row group -> its rows, from the file's copy where there is to be one."""
-        if number in self.copies:
-            return self.copies[number].open().read_row_group
-        checked = all((number, group) in self._checked for group in groups.tolist())
-        parquet = self._feed.dataset.files[number].open(check_pages=not checked)
-        paths = leaves(parquet, self._feed.columns)
-        return lambda group: read_group(parquet, group, paths)
-
-    def _rows(self, table: pa.Table, samples: Ints, mapped: bool) -> dict[int, Place]:
-        """Those of a row group that are wanted. Of one that is mapped nothing needs to be cut: it takes no memory."""
+    def _rows(self, table: pa.Table, samples: Ints) -> dict[int, Place]:
+        """Those of a row group that are wanted."""
         places = self._feed.dataset.rows.place[samples]
-        if len(samples) < table.num_rows and not mapped:
+        if len(samples) < table.num_rows:
             table, places = table.take(places), np.arange(len(samples))
         cameras: list[tuple[str, ...]] = [()] * table.num_rows
         for sample, place in zip(samples.tolist(), places.tolist()):
             cameras[place] = self._feed.cameras[sample]
         stitched = stitch if self.pictures is None else self.pictures.stitch
-        stored = StoredRows(table, cameras, in_place=mapped, stitched=stitched)
+        stored = StoredRows(table, cameras, stitched)
         return {sample: (stored, place) for sample, place in zip(samples.tolist(), places.tolist())}
 
 
@@ -236,7 +210,7 @@ class Loader:
         self.mix, self.batch_size, self.rank, self.world, self.seed = mix, batch_size, rank, world, seed
         self._needs, self._workers, self._pinned = needs, workers, pinned
         self._feed = make_feed(dataset, needs)
-        samples = mixed_samples(self._feed, mix)
+        samples = mixed_samples(self._feed)
         self._order = make_order(samples, mix, batch_size, seed)
         staying = {side.number: side.rows for side in self._order.sides if side.fits}
         self._memory = Memory(self._feed, staying)
@@ -319,10 +293,6 @@ class Loader:
             lines.append(f"{len(side)} samples of {side.size.sum() / 2**20:.1f} MB {held}")
         if self._pictures_bytes:
             lines.append(f"{self._pictures_bytes / 2**20:.1f} MB of pictures stay decoded beside them")
-        if copies := self._memory.copies:
-            there = sum(copy.path.exists() for copy in copies.values())
-            rest = "" if there == len(copies) else ", the others when they are first read"
-            lines.append(f"{there} of {len(copies)} files are copied to {self.dataset.settings.copy}{rest}")
         if pictures := self._memory.pictures:
             held_gb = pictures.held_bytes() / GB
             lines.append(f"decoded pictures: {held_gb:.1f} of at most {pictures.limit_gb:g} GB in {pictures.folder}")

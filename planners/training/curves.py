@@ -1,8 +1,6 @@
-"""What a training writes of itself: CSV files to compare, TensorBoard (and wandb, if it is installed) to watch."""
+"""What a training writes of itself: CSV files to compare, TensorBoard to watch."""
 
 import csv
-import importlib.util
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,6 @@ class Curves:
             VALIDATION: _CsvRows(out / VALIDATION, first_step + 1),
         }
         self._board = SummaryWriter(str(out / "tensorboard"), purge_step=first_step)
-        self._wandb = _wandb_run(out)
 
     def loss(self, step: int, rate: float, terms: Mapping[str, float], more: Mapping[str, float] = {}) -> None:
         """The losses that step `step` began with, and what else is to be known of it."""
@@ -39,15 +36,11 @@ class Curves:
         for rows in self._files.values():
             rows.file.close()
         self._board.close()
-        if self._wandb is not None:
-            self._wandb.finish()
 
     def _write(self, name: str, prefix: str, step: int, row: Mapping[str, float]) -> None:
         self._files[name].write({"step": step, **row})
         for key, value in row.items():
             self._board.add_scalar(f"{prefix}/{key}", value, step)
-        if self._wandb is not None:
-            self._wandb.log({f"{prefix}/{key}": value for key, value in row.items()}, step=step)
 
 
 class _CsvRows:
@@ -69,13 +62,3 @@ class _CsvRows:
             self._writer.writeheader()
         self._writer.writerow({key: repr(value) if isinstance(value, float) else value for key, value in row.items()})
         self.file.flush()
-
-
-def _wandb_run(out: Path) -> Any:
-    """A run that writes offline unless the user's environment says otherwise; None where wandb is not installed."""
-    if importlib.util.find_spec("wandb") is None:
-        return None
-    import wandb
-
-    os.environ.setdefault("WANDB_MODE", "offline")
-    return wandb.init(project="driving-data-factory", name=out.name, dir=str(out), resume="allow", id=out.name)

@@ -23,13 +23,12 @@ from planners.data.batch import Batch
 from planners.models.planner import Planner
 from planners.training.checkpoint import Keep, best, load_training, load_weights, read_record, save_checkpoint
 from planners.training.curves import Curves
-from planners.training.optim import RAW, Averaged, TrainingSettings, build_optimiser, learning_rate, set_rate
-from planners.training.processes import TrainingProcess, synchronise
+from planners.training.optim import TrainingSettings, build_optimiser, learning_rate, set_rate
+from planners.training.processes import TrainingProcess
 
 STATE_VERSION = 1
 Precision = Literal["fp32", "bf16", "fp16"]  # fp16: gradients of a scaled loss, steps that overflow are left out
 AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
-COMPILED = {"fallback_random": True}  # what is random is drawn as without, so that curves are the same to rounding
 SCALER = "scaler"  # in a checkpoint's training state: the scale of the loss and the steps since it changed
 SCALING = ("loss_scale", "skipped")  # columns of an fp16 training's losses: the scale it had, 1 for a step left out
 
@@ -54,7 +53,6 @@ class Loop:
     steps: int  # in all
     accumulate: int = 1  # parts that a batch is computed in, one after the other
     precision: Precision = "fp32"
-    compiled: bool = False  # whether the losses and their gradients are computed by torch.compile
     log_every: int = 20  # steps between looks at the losses, which cost a wait for the device
     checkpoint_every: int = 1000
     validate_every: int = 0  # 0: only after the last step
@@ -79,23 +77,15 @@ def fit(
 ) -> None:
     """Train `planner` in place, from a checkpoint where one is given, to the last step.
 
-    Writes `losses.csv` (every step), `validation.csv`, TensorBoard events and checkpoints under `out`. With
-    `training.ema` those are of the averaged weights, and `planner` ends with the raw ones.
+    Writes `losses.csv` (every step), `validation.csv`, TensorBoard events and checkpoints under `out`.
     Raises Stopped after SIGINT or SIGTERM, with a checkpoint written; FloatingPointError, with the step, where the loss
     is no number.
     """
     planner.to(process.device)
-    if training.sync_batch_norm:
-        synchronise(planner)
     optimiser = build_optimiser(training, planner)
     scaler = torch.amp.GradScaler(process.device.type, enabled=loop.precision == "fp16")
-    first, averages = 0, None
-    if resume_from is not None:
-        first, averages = _resume(resume_from, training, planner, optimiser, scaler, batches)
-    averaged = Averaged(planner, training.ema, averages) if training.ema and process.writes else None
+    first = 0 if resume_from is None else _resume(resume_from, planner, optimiser, scaler, batches)
     model = _wrapped(planner, process)
-    if loop.compiled:
-        model.compile(options=COMPILED)  # in place: weights keep their names, and plans are made as ever
     epoch_steps = batches.n_batches(0)
     curves = Curves(out, first) if process.writes else None
     unlogged: list[Tensor] = []
@@ -111,8 +101,7 @@ def fit(
                 **({SCALER: scaler.state_dict()} if scaler.is_enabled() else {}),
             }
             of_it = {"validation": dict(measured)} if loop.keep.best is not None and measured else {}
-            with _to_be_saved(averaged) as raw:
-                save_checkpoint(out, step, planner, {**record, **of_it}, {**state, **raw}, loop.keep)
+            save_checkpoint(out, step, planner, {**record, **of_it}, state, loop.keep)
         process.wait()
 
     def log(step: int) -> float:
@@ -136,8 +125,7 @@ def fit(
     def check(step: int) -> dict[str, float]:
         if validate is None or curves is None:
             return {}
-        with _to_be_saved(averaged):
-            measured = validate(planner)
+        measured = validate(planner)
         curves.validation(step, measured)
         return measured
 
@@ -151,8 +139,6 @@ def fit(
             names = names or list(terms)
             unlogged.append(torch.stack([*terms.values(), *scaling]))
             step += 1
-            if averaged is not None:
-                averaged.update(step)
             looks = step % loop.log_every == 0 or step == loop.steps
             # Several processes must agree, and ask each other rarely.
             stopping = process.anyone(asked.is_set()) if process.size == 1 or looks else False
@@ -227,36 +213,20 @@ def _endless(batches: Batches, n: int) -> Iterator[Batch]:
     return islice(chain.from_iterable(epochs), n)
 
 
-def _to_be_saved(averaged: Averaged | None) -> AbstractContextManager[dict[str, Any]]:
-    """Inside, the planner is what is validated and saved; gives what going on needs beside it."""
-    return nullcontext({}) if averaged is None else averaged.in_planner()
-
-
 def _resume(
-    folder: Path,
-    training: TrainingSettings,
-    planner: Planner,
-    optimiser: torch.optim.Optimizer,
-    scaler: torch.amp.GradScaler,
-    batches: Batches,
-) -> tuple[int, dict[str, Tensor] | None]:
-    """The steps that are done, and the averaged weights where there are some."""
+    folder: Path, planner: Planner, optimiser: torch.optim.Optimizer, scaler: torch.amp.GradScaler, batches: Batches
+) -> int:
+    """The steps that are done."""
     state = load_training(folder)
     if state.get("version") != STATE_VERSION:
         raise ValueError(f"{folder}: training state {state.get('version')}, this version goes on from {STATE_VERSION}")
-    if (RAW in state) != (training.ema > 0.0):
-        raise ValueError(f"{folder}: trained {'with' if RAW in state else 'without'} ema, not with ema={training.ema}")
     if (SCALER in state) != scaler.is_enabled():
         raise ValueError(f"{folder}: trained {'in' if SCALER in state else 'not in'} fp16: go on in the same precision")
     load_weights(planner, folder)
-    averages = None
-    if RAW in state:
-        averages = {name: value.detach().clone() for name, value in planner.state_dict().items()}
-        planner.load_state_dict(state[RAW])
     optimiser.load_state_dict(state["optimiser"])
     scaler.load_state_dict(state.get(SCALER, {}))
     batches.resume(state["loader"])
-    return int(state["step"]), averages
+    return int(state["step"])
 
 
 def _wrapped(planner: Planner, process: TrainingProcess) -> torch.nn.Module:

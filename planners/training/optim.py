@@ -1,16 +1,13 @@
-"""What a training steps by: its settings, the rate of every step, the optimiser, and the average of its weights."""
+"""What a training steps by: its settings, the rate of every step, the optimiser."""
 
 import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from planners.models.backbones import Backbone
-from planners.models.planner import Planner
 
 
 @dataclass(frozen=True)
@@ -30,8 +27,6 @@ class TrainingSettings:
     backbone_rate: float = 1.0  # factor of the rate for backbones over pictures
     backbone_decay: float | None = None  # their weight decay; None: weight_decay
     gradient_clip: float | None = None  # largest norm of the gradient; None: any
-    ema: float = 0.0  # decay of the averaged weights, which are then what is validated and saved; 0: as they are
-    sync_batch_norm: bool = False  # statistics of a batch are those of all processes' parts together
 
     def __post_init__(self) -> None:
         for name, low in (("epochs", 1), ("batch_size", 1), ("warmup_steps", 0)):
@@ -50,8 +45,6 @@ class TrainingSettings:
                 raise ValueError(f"{name}={getattr(self, name)}: must be a finite share, 0 for none")
         if self.gradient_clip is not None and not self.gradient_clip > 0.0:
             raise ValueError(f"gradient_clip={self.gradient_clip}: must be positive, or null for none")
-        if not 0.0 <= self.ema < 1.0:
-            raise ValueError(f"ema={self.ema}: must be a decay below 1, such as 0.999, or 0 for none")
 
 
 def learning_rate(settings: TrainingSettings, step: int, steps: int, epoch_steps: int = 1) -> float:
@@ -101,41 +94,3 @@ def set_rate(optimiser: torch.optim.Optimizer, rate: float) -> None:
     """The rate of the next step, times the factor of each group."""
     for group in optimiser.param_groups:
         group["lr"] = rate * group.get(FACTOR, 1.0)
-
-
-RAW = "weights"  # in a checkpoint's training state: those that go on, where the averaged ones are the planner's
-
-
-class Averaged:
-    """A planner's weights, averaged: what is validated and saved where `training.ema` is set.
-
-    After each step n = 1, 2, ... a = d a + (1 - d) w, d = min(decay, (1 + n) / (10 + n)).
-
-    It begins with the weights of the start; the bound on d, TensorFlow's (ExponentialMovingAverage, num_updates), lets
-    it forget them in short trainings too. Running statistics are averaged as weights are, counts are the newest.
-    """
-
-    def __init__(self, planner: Planner, decay: float, values: Mapping[str, Tensor] | None = None) -> None:
-        """values: of a training that goes on; None: the planner's as they are."""
-        self._planner, self._decay = planner, decay
-        self._values = {name: value.detach().clone() for name, value in (values or planner.state_dict()).items()}
-
-    def update(self, steps: int) -> None:
-        """Take in the planner's weights after so many steps."""
-        share = 1.0 - min(self._decay, (1 + steps) / (10 + steps))
-        for name, value in self._planner.state_dict().items():
-            if value.is_floating_point():
-                self._values[name].lerp_(value, share)
-            else:
-                self._values[name].copy_(value)
-
-    @contextmanager
-    def in_planner(self) -> Iterator[dict[str, Any]]:
-        """Inside, the planner has the averaged weights; gives the raw ones under RAW, which it has again behind."""
-        with torch.no_grad():
-            raw = {name: value.detach().clone() for name, value in self._planner.state_dict().items()}
-            self._planner.load_state_dict(self._values)
-            try:
-                yield {RAW: raw}
-            finally:
-                self._planner.load_state_dict(raw)

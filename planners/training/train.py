@@ -13,8 +13,6 @@ steps or on another number of processes. Exit codes: 0 complete, 2 bad settings 
 
 import dataclasses
 import json
-import os
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -48,7 +46,7 @@ from planners.training.optim import TrainingSettings
 from planners.training.processes import RaySettings, TrainingProcess, joined
 
 LARGEST_BATCH = 32
-FURTHER = frozenset({"steps", "processes", "accumulate", "compile"})  # what may be another with resume=further
+FURTHER = frozenset({"steps", "processes", "accumulate"})  # what may be another with resume=further
 
 
 def validation(
@@ -59,6 +57,7 @@ def validation(
     Raises ValueError where the tables are not what the planner needs.
     """
     where = {name: getattr(data, name) for name in ("storage_options", "copy", "pictures", "pictures_gb")}
+    where = {name: getattr(data, name) for name in ("storage_options", "format", "pictures", "pictures_gb")}
     dataset = open_data(DataSettings(real=data.tables("val"), **where))
     needs = replace(planner.needs, labels=None)
     size = max(n for n in range(1, LARGEST_BATCH + 1) if len(dataset) % n == 0)  # no sample is left out
@@ -97,12 +96,11 @@ class TrainConfig:
     steps: int | None = None  # optimiser steps in all; null: planner.training.epochs
     seed: int = 0  # of the weights at the start, the order and everything random in a step
     init_from: str | None = None  # folder of a training of the same planner, or a checkpoint: whose weights go on
-    resume: Literal["identical", "further"] = "identical"  # further: other steps, processes, accumulate, compile
+    resume: Literal["identical", "further"] = "identical"  # further: other steps, processes, accumulate
     executor: Literal["process", "ray"] = "process"  # process: alone, or as torchrun starts it; ray: Ray Train
     device: Literal["auto", "cpu", "cuda"] = "auto"
     precision: Literal["auto", "fp32", "bf16", "fp16"] = "auto"  # auto: bf16 on a GPU, fp32 elsewhere
     accumulate: int = 1  # parts that a batch is computed in
-    compile: bool = False  # losses by torch.compile: minutes once, then faster; the curve is the same to rounding
     recompute: bool = False  # backbones over pictures keep no activations: less memory, a forward pass more
     workers: int = 2  # threads that decode
     log_every: int = 20  # steps
@@ -122,8 +120,6 @@ class TrainConfig:
             raise ValueError(
                 f"keep_best={self.keep_best}: name data.val, and validate_every, to have some to choose from"
             )
-        if self.compile and shutil.which(compiler := os.environ.get("CXX", "g++")) is None:
-            raise ValueError(f"compile=true, but there is no {compiler}: install a C++ compiler, or name yours in CXX")
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps={self.steps}: must be at least 1, or null for planner.training.epochs")
 
@@ -213,7 +209,6 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
         steps=steps,
         accumulate=config.accumulate,
         precision=_precision(config, process),
-        compiled=config.compile,
         log_every=config.log_every,
         checkpoint_every=config.checkpoint_every,
         validate_every=config.validate_every,
@@ -281,7 +276,6 @@ def _identity(config: TrainConfig, dataset: Dataset, steps: int, process: Traini
         "seed": config.seed,
         "init_from": None if config.init_from is None else digest(config.init_from),
         "precision": config.precision,
-        "compile": config.compile,
         "accumulate": config.accumulate,
         "processes": process.size,
     }

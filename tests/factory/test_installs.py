@@ -73,7 +73,7 @@ def _modules(node: ast.AST, at_import: bool) -> Iterator[str]:
     [
         ("tasks", ("run", "gpu")),
         ("factory", ("run", "rerun", "view", "gpu", "navsim")),
-        ("planners", ("planners", "wandb")),
+        ("planners", ("planners",)),
     ],
 )
 def test_every_import_is_declared_where_it_belongs(package: str, extras: tuple[str, ...]) -> None:

@@ -19,7 +19,7 @@ from planners.data.files import SampleFile
 from planners.data.images import stitch
 from planners.data.index import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
-from planners.data.mix import MixSettings, Weights, make_order
+from planners.data.mix import MixSettings, make_order
 from tests.factory.store.test_store_s3 import BUCKET, s3
 from tests.planners.samples import FRONT_YAWS, grey_pictures, labels, pictures, sample, write_table
 
@@ -58,8 +58,8 @@ def small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every loader made from here on has windows of about ten samples, and reads them anew."""
 
     def tiny(samples: Any, mix: MixSettings, batch_size: int, seed: int) -> Any:
-        large = type(samples)(samples.simulated, samples.group, samples.size * 0 + 2**19 // 10, samples.weight)
-        return make_order(large, MixSettings(mix.sim_ratio, mix.imitation, 1, mix.weights), batch_size, seed)
+        large = type(samples)(samples.simulated, samples.group, samples.size * 0 + 2**19 // 10)
+        return make_order(large, MixSettings(mix.sim_ratio, mix.imitation, 1), batch_size, seed)
 
     monkeypatch.setattr("planners.data.loader.make_order", tiny)
 
@@ -136,7 +136,7 @@ def test_which_plans_are_labels_is_a_setting(data: Dataset, imitation: Any, real
 
 @pytest.mark.usefixtures("windows")
 def test_a_resumed_loader_goes_on_to_the_byte(data: Dataset) -> None:
-    mix = MixSettings(sim_ratio=0.5, weights=Weights(round={1: 2.0}))
+    mix = MixSettings(sim_ratio=0.5)
     n = Loader(data, NEEDS, mix, BATCH).n_batches(0)
     for stop in (1, n):
         first = Loader(data, NEEDS, mix, BATCH)
@@ -159,7 +159,6 @@ def test_a_resume_with_other_data_or_settings_is_refused_by_name(data: Dataset, 
     state = Loader(data, Needs(), MixSettings(), BATCH).state()
     for other, message in (
         (Loader(data, Needs(), MixSettings(sim_ratio=0.5), BATCH), r"mix\.sim_ratio: natural -> 0\.5"),
-        (Loader(data, Needs(), MixSettings(weights=Weights(round={1: 2.0})), BATCH), r"mix\.weights"),
         (Loader(data, Needs(), MixSettings(), 16), "batch_size: 8 -> 16"),
         (Loader(data, Needs(), MixSettings(), BATCH, seed=1), "seed: 0 -> 1"),
         (Loader(open_data(DataSettings(real=out)), Needs(), MixSettings(), BATCH), "64 then, 20 now"),

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from factory.config.compose import ConfigError, compose, fill
-from planners.data.mix import Bins, MixSettings, Order, Samples, Weights, make_order, sample_weights, stream, systematic
+from planners.data.mix import MixSettings, Order, Samples, make_order, stream
 
 N_REAL, N_SIM = 37, 90
 GROUP_ROWS, ROW_BYTES = 6, 2**18  # four rows are a megabyte
 
 
-def samples(n_real: int = N_REAL, n_sim: int = N_SIM, weight: Any = None, row_bytes: int = ROW_BYTES) -> Samples:
+def samples(n_real: int = N_REAL, n_sim: int = N_SIM) -> Samples:
     """Real and simulated samples take turns by place; row groups hold one kind each."""
     n = n_real + n_sim
     simulated = stream(0, "sides").permutation(np.arange(n) >= n_real)
@@ -22,7 +22,7 @@ def samples(n_real: int = N_REAL, n_sim: int = N_SIM, weight: Any = None, row_by
     for kind in (False, True):
         inside = np.flatnonzero(simulated == kind)
         group[inside] = np.arange(len(inside)) // GROUP_ROWS + 1000 * kind
-    return Samples(simulated, group, np.full(n, row_bytes), np.ones(n) if weight is None else weight)
+    return Samples(simulated, group, np.full(n, ROW_BYTES))
 
 
 def order(mix: MixSettings, batch_size: int = 8, seed: int = 3, **kinds: Any) -> Order:
@@ -56,17 +56,9 @@ def test_row_groups_are_read_in_another_order_in_every_pass() -> None:
     assert len({frozenset(groups) for groups in first}) > 1
 
 
-def test_what_a_weight_leaves_to_chance_is_drawn_anew_in_every_pass() -> None:
-    """Half of the samples weigh half: each is seen in about half of the passes, never always the same ones."""
-    weight = np.where(np.arange(N_REAL + N_SIM) % 2, 1.5, 0.5)
-    one = order(MixSettings(), batch_size=127, weight=weight)
-    seen = [frozenset(one.epoch(epoch).rows.ravel().tolist()) for epoch in range(3)]
-    assert len(set(seen)) == 3
-
-
 def test_with_one_window_the_files_do_not_matter() -> None:
     mine = samples()
-    other = Samples(mine.simulated, stream(0, "groups").permutation(mine.group), mine.size, mine.weight)
+    other = Samples(mine.simulated, stream(0, "groups").permutation(mine.group), mine.size)
     for mix in (MixSettings(), MixSettings(sim_ratio=0.5)):
         a, b = (make_order(s, mix, 8, 3).epoch(0).rows for s in (mine, other))
         assert np.array_equal(a, b)
@@ -137,93 +129,23 @@ def test_slices_of_ranks_are_equally_mixed() -> None:
             assert abs(part.sum() - n / 2) < 5 * np.sqrt(n) / 2
 
 
-def test_weights_make_visits_that_are_right_on_average_and_whole_numbers_around_it() -> None:
-    weight = np.where(np.arange(60) % 3 == 0, 2.5, 0.0) + 1.0
-    weight *= 60 / weight.sum()
-    total = np.zeros(60)
-    for number in range(400):
-        visits = systematic(weight, stream(0, number))
-        assert visits.sum() == 60 and (visits >= np.floor(weight)).all() and (visits <= np.ceil(weight)).all()
-        total += visits
-    assert abs(total / 400 - weight).max() < 5 * 0.5 / np.sqrt(400)
-
-
-@pytest.mark.parametrize("shuffle_mb", [6, 2048])
-def test_weights_are_among_the_samples_of_a_side(shuffle_mb: int) -> None:
-    kind = samples()
-    weight = np.where(kind.simulated, 10.0 * (np.arange(len(kind.simulated)) % 2), 1.0)
-    n_odd = int(kind.simulated[1::2].sum())
-    one = make_order(Samples(kind.simulated, kind.group, kind.size, weight), MixSettings(shuffle_mb=shuffle_mb), 127, 3)
-    rows = one.epoch(0).rows.ravel()
-    visits = np.bincount(rows, minlength=127)
-    assert (visits[~kind.simulated] == 1).all(), "the other side is seen as before"
-    assert visits[kind.simulated].sum() == N_SIM and (visits[kind.simulated & (weight == 0.0)] == 0).all()
-    odd = visits[kind.simulated & (weight > 0.0)]
-    assert odd.min() >= N_SIM // n_odd and odd.max() <= -(-N_SIM // n_odd)
-
-
-def test_weights_by_round_expert_perturbation_and_reward_are_multiplied() -> None:
-    weights = Weights(
-        round={1: 3.0},
-        expert={"recovery": 0.5},
-        longitudinal_m=Bins((5.0,), (1.0, 2.0)),
-        lateral_m=Bins((0.5, 1.0), (1.0, 5.0, 7.0)),
-        reward=Bins((0.9,), (1.0, 11.0)),
-    )
-    nan = float("nan")
-    rows = [  # simulated, round, expert, longitudinal, lateral, reward, weight
-        (False, 1, "human", nan, nan, 0.95, 11.0),
-        (True, 0, "recovery", 4.0, -0.2, 0.5, 0.5),
-        (True, 1, "recovery", -6.0, 0.5, 0.5, 3 * 0.5 * 2 * 5),
-        (True, 0, "pdm_closed", 5.0, -1.5, 0.9, 2 * 7 * 11),
-    ]
-    simulated, round_, expert, longitudinal, lateral, reward, expected = zip(*rows)
-    found = sample_weights(
-        weights,
-        np.array(simulated),
-        np.array(round_, np.int32),
-        expert,
-        np.array([longitudinal, lateral]).T,
-        np.array(reward),
-    )
-    assert found.tolist() == list(expected)
-
-
-def weigh(weights: Weights, reward: float = 0.5) -> None:
-    ends = np.array([[1.0, 1.0]])
-    sample_weights(weights, np.array([True]), np.zeros(1, np.int32), ["recovery"], ends, np.array([reward]))
-
-
 def test_wishes_that_make_no_sense_are_named() -> None:
     with pytest.raises(ValueError, match="sim_ratio=1 leaves no real samples"):
         MixSettings(sim_ratio=1.0)
     with pytest.raises(ValueError, match=r"sim_ratio=1\.5"):
         MixSettings(sim_ratio=1.5)
-    with pytest.raises(ValueError, match="share of real ones is mix"):
-        Weights(expert={"human": 2.0})
-    with pytest.raises(ValueError, match="not negative"):
-        Weights(round={0: -1.0})
-    with pytest.raises(ValueError, match="edges"):
-        Bins((1.0, 0.5), (1.0, 2.0, 3.0))
-    with pytest.raises(ValueError, match=r"no simulated samples of recovry; there are those of \['recovery'\]"):
-        weigh(Weights(expert={"recovry": 2.0}))
-    with pytest.raises(ValueError, match="reward: 1 samples have no such number"):
-        weigh(Weights(reward=Bins((0.5,), (1.0, 2.0))), float("nan"))
     with pytest.raises(ValueError, match="there are no simulated ones"):
         order(MixSettings(sim_ratio=0.5), n_sim=0)
     with pytest.raises(ValueError, match="there are no real ones"):
         order(MixSettings(sim_ratio=0.5), n_real=0)
     with pytest.raises(ValueError, match=r"127 samples are less than one batch of 128 takes"):
         order(MixSettings(), batch_size=128)
-    with pytest.raises(ValueError, match="every simulated sample weighs 0"):
-        order(MixSettings(), weight=np.where(samples().simulated, 0.0, 1.0))
 
 
 @pytest.mark.parametrize("name", ["natural", "half", "rewards_only"])
 def test_the_configuration_files_say_all_there_is(name: str) -> None:
-    mix = fill(MixSettings, compose(f"mix/{name}", ["+mix.weights.round.1=2"])["mix"], "mix")
+    mix = fill(MixSettings, compose(f"mix/{name}", [])["mix"], "mix")
     assert mix.sim_ratio == (0.5 if name == "half" else "natural")
     assert mix.imitation == ("real" if name == "rewards_only" else "all")
-    assert mix.weights == Weights(round={1: 2.0})
     with pytest.raises(ConfigError, match="sim_ratio"):
         fill(MixSettings, {"sim_ratio": "half"}, "mix")

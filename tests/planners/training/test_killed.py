@@ -20,7 +20,6 @@ from torch import Tensor, nn
 from planners.data.batch import Batch
 from planners.training.checkpoint import WEIGHTS, checkpoints, load_training, newest, read_record
 from planners.training.curves import LOSSES
-from planners.training.optim import RAW
 from tests.planners.samples import sample, write_table
 from tests.planners.toy import Toy, ToySettings
 
@@ -66,7 +65,7 @@ def started(processes: int, out: Path, table: Path, notes: Path, *more: str, nap
     arguments = [sys.executable, "-m", "planners", "train", "planner=custom", f"planner.name={Noting.name}"]
     training = ["batch_size=8", "learning_rate=0.001", "optimiser=adamw", "schedule=cosine"]
     arguments += [f"planner.training.{setting}" for setting in training]
-    arguments += ["+planner.training.ema=0.9", f"steps={STEPS}", "checkpoint_every=6", "device=cpu"]
+    arguments += [f"steps={STEPS}", "checkpoint_every=6", "device=cpu"]
     arguments += [f"data.real=[{table}]", f"data.sim=[{table}]", f"out={out}", *more]
     told = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", NOTES: str(notes), NAP_S: str(nap_s)}
     return [
@@ -143,8 +142,6 @@ def test_the_same_number_goes_on_to_the_same_weights_to_the_last_bit(trainings: 
     assert (resumed / LOSSES).read_text() == (whole / LOSSES).read_text()
     assert (newest(resumed) / WEIGHTS).read_bytes() == (newest(whole) / WEIGHTS).read_bytes()
     ours, theirs = (load_training(newest(out)) for out in (resumed, whole))
-    for name, weights in theirs[RAW].items():
-        assert torch.equal(ours[RAW][name], weights), name
     for index, state in theirs["optimiser"]["state"].items():
         for name, value in state.items():
             assert torch.equal(ours["optimiser"]["state"][index][name], value), (index, name)

@@ -56,7 +56,6 @@ def test_by_epoch_the_rates_are_those_of_the_public_scheduler() -> None:
         ("batch_size", 0),
         ("learning_rate", 0.0),
         ("gradient_clip", -1.0),
-        ("ema", 1.0),
         ("warmup_epochs", -1.0),
         ("lowest_rate", 0.6),
         ("backbone_rate", 0.0),
