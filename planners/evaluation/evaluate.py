@@ -15,7 +15,7 @@ row of sub-scores for each frame (frames.parquet, frames.csv), and record.json, 
 planned or scored again unless it, the benchmark or the rules changed; the same command goes on after a kill. All
 planners of a command share what scoring prepares of a frame, so name several at once.
 
-    summary.csv, summary.png      all planners of this command
+    summary.csv                   all planners of this command
     <planner>/navsim_*.csv        of NAVSIM's benchmarks: the tables that its own scripts write, by the score's filter
     one_stage                     the logged frames, as navtest
     stage_one, stage_two, final   as navhard: stage two weighted by how near a follow-up starts to the plan's end,
@@ -56,7 +56,6 @@ from planners.evaluation.scoring import (
     score_clip,
     score_lone,
 )
-from planners.evaluation.tags import TAG_COLUMNS, tags_of
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.rollout.simulate import TrafficSettings, traffic_record
 from tasks.stages import stage_versions
@@ -87,7 +86,7 @@ class EvaluateSettings:
     planners_at_once: int = 8  # in memory, planning from one reading of the samples
     device: str = "cpu"  # or cuda
     limit: int | None = None  # the first so many clips only
-    tables: bool = True  # summary.csv and summary.png of all planners; false where others follow into the same out
+    tables: bool = True  # summary.csv of all planners; false where others follow into the same out
 
     def __post_init__(self) -> None:
         for name in ("batch_size", "planners_at_once", "limit"):
@@ -174,23 +173,23 @@ def _scored(
     """The rows of every planner, clip by clip: what is prepared of a clip serves all and is let go."""
     rows: dict[str, list[FrameRow]] = {one.label: [] for one in who}
     clips = list(dict.fromkeys(key.clip_id for key in keys))
-    tags = {key: tags_of(sample) for key, sample in benchmark.stream(TAG_COLUMNS)}
+    tags = {key: tuple(sample["tags"]) for key, sample in benchmark.stream(["tags"])}
     driven: dict[tuple[str, str | None], Array] = {}  # of the clip before
     spent = 0.0
     with Counter("clips scored", len(clips)) as progress:
         for done, clip_id in enumerate(clips, start=1):
             prepared = _prepared(benchmark, clip_id, rules)
             began = time.perf_counter()
-            last, driven = driven, {}
+            last, driven, log_id = driven, {}, benchmark.log_of(clip_id)
             for one in who:
                 own = plans[one.label] if one.privileged is None else one.privileged(prepared.frames)
                 if isinstance(prepared, LoneFrame):
                     before = last.get((one.label, benchmark.before_of(clip_id)))
-                    row, driven[one.label, clip_id] = score_lone(prepared, own, before, tags)
+                    row, driven[one.label, clip_id] = score_lone(prepared, own, before)
                     scored = [row]
                 else:
-                    scored = score_clip(prepared, own, tags)
-                rows[one.label] += [replace(row, log_id=benchmark.log_of(clip_id)) for row in scored]
+                    scored = score_clip(prepared, own)
+                rows[one.label] += [replace(row, log_id=log_id, tags=tags[row.key]) for row in scored]
             spent += time.perf_counter() - began
             n_rows = sum(map(len, rows.values()))
             progress.show(done, f"{1000.0 * spent / n_rows:.1f} ms a frame and planner")
@@ -255,4 +254,4 @@ def evaluated(settings: EvaluateSettings) -> None:
         print(f"{benchmark.left_out} of its {total} clips are left out: no published number is over so few")
     print("".join(fallback_notes(lines)), end="")
     if settings.tables:
-        print(f"look at {Path(settings.out) / 'summary.png'}")
+        print(f"look at {Path(settings.out) / 'summary.csv'}")

@@ -185,9 +185,7 @@ def pdm_plans(frames: Mapping[FrameKey, PreparedFrame]) -> dict[FrameKey, Array]
     return {key: frame.pdm_poses for key, frame in frames.items()}
 
 
-def score_lone(
-    lone: LoneFrame, plans: Plans, before: Array | None, tags: Mapping[FrameKey, Sequence[str]]
-) -> tuple[FrameRow, Array]:
+def score_lone(lone: LoneFrame, plans: Plans, before: Array | None) -> tuple[FrameRow, Array]:
     """The row of a one-stage benchmark's frame, and the states (41, 11) that its plan was driven to.
 
     before: those of the same planner's plan 0.5 s before; None: there is no such frame, the row has no extended comfort
@@ -203,24 +201,21 @@ def score_lone(
         progress_m=float(driven.scores.ep_raw_m[0]),
         start=start,
         end=to_world(start, poses[-1]),
-        tags=tuple(tags.get(lone.key, ())),
     )
     return row, driven.states
 
 
-def score_clip(clip: ClipFrames, plans: Plans, tags: Mapping[FrameKey, Sequence[str]] | None = None) -> list[FrameRow]:
+def score_clip(clip: ClipFrames, plans: Plans) -> list[FrameRow]:
     """One row a frame: one stage now, stage one now and before, stage two of every follow-up pair.
 
     A follow-up frame without a plan gets a row of NaN. Raises ValueError, naming the frame, for a logged frame
     without a plan and for plans that are not (40, 3) finite numbers.
     """
-    tags = tags or {}
     logged = FrameKey.logged(clip.clip_id)
-    one_stage = _pair_rows("one_stage", logged, clip.alone, plans, tags)[:1]
-    stage_one = _pair_rows("stage_one", logged, clip.logged, plans, tags)
+    one_stage = _pair_rows("one_stage", logged, clip.alone, plans)[:1]
+    stage_one = _pair_rows("stage_one", logged, clip.logged, plans)
     follow_ups = [
-        _pair_rows("stage_two", FrameKey.follow_up(clip.clip_id, i), pair, plans, tags)
-        for i, pair in clip.follow_ups.items()
+        _pair_rows("stage_two", FrameKey.follow_up(clip.clip_id, i), pair, plans) for i, pair in clip.follow_ups.items()
     ]
     groups = [_weighted(group, row.end) for group, row in zip(zip(*follow_ups), stage_one)]  # now, before
     return [*one_stage, *stage_one, *(row for pair in zip(*groups) for row in pair)]
@@ -232,18 +227,12 @@ def _weighted(group: Sequence[FrameRow], end: Array) -> list[FrameRow]:
     return [replace(row, weight=float(weight)) for row, weight in zip(group, weights)]
 
 
-def _pair_rows(
-    stage: ScoreStage,
-    keys: Pair[FrameKey],
-    pair: PreparedPair,
-    plans: Plans,
-    tags: Mapping[FrameKey, Sequence[str]],
-) -> list[FrameRow]:
+def _pair_rows(stage: ScoreStage, keys: Pair[FrameKey], pair: PreparedPair, plans: Plans) -> list[FrameRow]:
     starts = [frame.scene.ego_state[: HEADING + 1] for frame in pair]
     if stage == "stage_two" and not any(key in plans for key in keys):
         nothing = np.full(len(COLUMNS), np.nan)
         blank = FrameRow(stage, keys[0], FrameScores(nothing, nothing), np.nan, starts[0], np.full(3, np.nan))
-        return [replace(blank, key=key, start=start, tags=tuple(tags.get(key, ()))) for key, start in zip(keys, starts)]
+        return [replace(blank, key=key, start=start) for key, start in zip(keys, starts)]
     made = [_checked(key, plans) for key in keys]
     scored = score_pair(pair, made)
     return [
@@ -254,7 +243,6 @@ def _pair_rows(
             progress_m=float(driven.scores.ep_raw_m[0]),
             start=start,
             end=to_world(start, poses[-1]),
-            tags=tuple(tags.get(key, ())),
         )
         for key, start, poses, (scores, driven) in zip(keys, starts, made, scored)
     ]

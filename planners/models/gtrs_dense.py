@@ -40,7 +40,7 @@ from tasks.world.vocabulary import Vocabulary
 
 IMITATION = "imitation"
 
-WeightingName = Literal["release", "proposals", "close"]
+WeightingName = Literal["release", "close"]
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ class Weighting:
 
         total = sum_i w_i log p_i + group log(sum_j v_j p_j)
 
-    What multiplies in EPDMS and imitation in logarithms of their own, what is averaged there under one. `release` and
-    `proposals` are those of hydra_model.py (also in woxihuanjiangguo/ZTRS 3593a03). Neither weighs history comfort, for
-    which those models have no head. What is not named weighs nothing.
+    What multiplies in EPDMS and imitation in logarithms of their own, what is averaged there under one. `release` is
+    that of hydra_model.py (also in woxihuanjiangguo/ZTRS 3593a03). It does not weigh history comfort, for which that
+    model has no head. What is not named weighs nothing.
     """
 
     alone: Mapping[str, float]  # w
@@ -63,11 +63,6 @@ WEIGHTINGS: dict[WeightingName, Weighting] = {
     # HydraTrajHead.forward: what GTRS-Dense plans with; SimScale's scripts use it for navhard and navtest alike
     "release": Weighting(
         {IMITATION: 0.03, "tlc": 0.1, "nc": 0.1, "dac": 0.9, "ddc": 0.2}, 6.0, {"ttc": 7.0, "ep": 7.0, "lk": 3.0}
-    ),
-    # HydraTrajHead.eval_dp_proposals: trajectories of a diffusion policy ranked beside the vocabulary; the scores of
-    # 87.0 and 86.6 in its comment are of navtest's range
-    "proposals": Weighting(
-        {IMITATION: 0.01, "tlc": 0.1, "nc": 0.5, "dac": 0.5, "ddc": 0.5}, 3.0, {"ttc": 5.0, "ep": 5.0, "lk": 2.0}
     ),
     # ours: `release` with ten times its imitation, for small planners over hundreds of trajectories
     "close": Weighting(

@@ -1,7 +1,6 @@
 """Many trainings, resumable: what is done is not done again.
 
-A training is a process of `python -m planners train`; on one machine `jobs` of them run side by side, on a Ray cluster
-each is a task.
+A training is a process of `python -m planners train`; `jobs` of them run side by side.
 """
 
 import contextlib
@@ -16,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TextIO
+from typing import Any, ClassVar, TextIO
 
 from factory.exits import INTERRUPTED, Failed, Stopped, calling_on_stop_signal
 from factory.graph.progress import Counter
@@ -45,11 +44,8 @@ class Training:
 class Means:
     """How a sweep runs."""
 
-    executor: Literal["process", "ray"] = "process"
     jobs: int | None = None  # trainings at a time; null: one a core
     minutes: float | None = None  # after which nothing new begins and what runs is saved; the same command goes on
-    gpus: float = 0.0  # of each training on Ray
-    cpus: float = 1.0
     began: ClassVar[float]  # what the minutes are counted from; of each, but no setting
 
     def __post_init__(self) -> None:
@@ -94,8 +90,14 @@ def train_all(trainings: Sequence[Training], out: Path, means: Means) -> None:
         raise ValueError(f"labels {twice} stand for several trainings")
     left = [training for training in trainings if not is_done(out, training)]
     done, failed = len(trainings) - len(left), list[str]()
-    with Counter("trainings", len(trainings), done) as counter, stops_after(means.left_s) as stop:
-        for training, code in _codes(left, out, means, stop):
+    with (
+        Counter("trainings", len(trainings), done) as counter,
+        stops_after(means.left_s) as stop,
+        ThreadPoolExecutor(means.at_once) as pool,
+    ):
+        codes = {pool.submit(train_one, training, out, stop.is_set): training for training in left}
+        for future in as_completed(codes):
+            training, code = codes[future], future.result()
             if code == 0:
                 done += 1
             elif code != INTERRUPTED:
@@ -142,21 +144,6 @@ def exit_code(
             if stop() and not asked:
                 child.send_signal(signal.SIGTERM)
                 asked = True
-
-
-def _codes(
-    trainings: Sequence[Training], out: Path, means: Means, stop: threading.Event
-) -> Iterator[tuple[Training, int]]:
-    """Exit codes as trainings end."""
-    if means.executor == "ray":
-        from planners.training.on_ray import each_on_ray
-
-        yield from each_on_ray(train_one, trainings, out, means.cpus, means.gpus, stop)
-        return
-    with ThreadPoolExecutor(means.at_once) as pool:
-        futures = {pool.submit(train_one, training, out, stop.is_set): training for training in trainings}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""Trainings on this machine's or a cluster's Ray; the only module of the planners that imports it.
+"""A training on this machine's or a cluster's Ray; the only module of the planners that imports it.
 
 Checkpoints and curves are written by the training itself under `out`, which every node must see.
 """
@@ -6,11 +6,9 @@ Checkpoints and curves are written by the training itself under `out`, which eve
 import logging
 import os
 import signal
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # keeps every listener on 127.0.0.1
@@ -21,8 +19,6 @@ from ray.train.torch import TorchConfig, TorchTrainer, get_device
 
 from factory.exits import terminal_signals_blocked
 from planners.training.processes import RaySettings, TrainingProcess, joined
-
-T = TypeVar("T")
 
 
 def train_on_ray(train: Callable[[TrainingProcess], None], settings: RaySettings, out: str) -> None:
@@ -74,20 +70,3 @@ def _connected() -> Iterator[None]:
         yield
     finally:
         ray.shutdown()
-
-
-def each_on_ray(
-    one: Callable[..., int], items: Sequence[T], out: Path, cpus: float, gpus: float, stop: threading.Event
-) -> Iterator[tuple[T, int]]:
-    """one(item, out) as a task for each item; yields results as they come. After `stop` nothing new begins."""
-    with _connected():
-        task = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(one)
-        waiting = {task.remote(item, out.absolute()): item for item in items}
-        while waiting:
-            done, _ = ray.wait(list(waiting), num_returns=1, timeout=1.0)
-            for reference in done:
-                yield waiting.pop(reference), ray.get(reference)
-            if stop.is_set():
-                for reference in waiting:
-                    ray.cancel(reference)
-                return

@@ -111,10 +111,10 @@ def test_a_lone_frame_scores_as_the_logged_frame_among_the_one_stage_evaluation_
     plans = same_plan_everywhere(scenes, straight(8.0))
     plans[FrameKey.logged(clip.clip_id)[1]] = straight(2.0)
     before = drive(clip.alone.before, straight(2.0)).states
-    wanted, (row, _) = score_clip(clip, plans)[0], score_lone(lone, plans, before, {})
+    wanted, (row, _) = score_clip(clip, plans)[0], score_lone(lone, plans, before)
     np.testing.assert_array_equal(row.scores.filtered, wanted.scores.filtered)
     np.testing.assert_array_equal(row.end, wanted.end)
-    alone, _ = score_lone(lone, plans, None, {})
+    alone, _ = score_lone(lone, plans, None)
     assert np.isnan(alone.scores.filtered[COLUMNS.index("ec")]) and row.scores.filtered[COLUMNS.index("ec")] == 0.0
 
 

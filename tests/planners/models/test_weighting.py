@@ -21,18 +21,12 @@ def test_total_is_the_log_weighted_sum_worked_out_by_hand() -> None:
     log = math.log
     release = 0.03 * log(0.1) + 0.1 * log(0.6) + 0.1 * log(0.9) + 0.9 * log(0.8) + 0.2 * log(0.7)
     release += 6.0 * log(7.0 * 0.5 + 7.0 * 0.4 + 3.0 * 0.3)
-    proposals = 0.01 * log(0.1) + 0.1 * log(0.6) + 0.5 * log(0.9) + 0.5 * log(0.8) + 0.5 * log(0.7)
-    proposals += 3.0 * log(5.0 * 0.5 + 5.0 * 0.4 + 2.0 * 0.3)
     assert total(scores, WEIGHTINGS["release"]).item() == pytest.approx(release, rel=1e-6)
-    assert total(scores, WEIGHTINGS["proposals"]).item() == pytest.approx(proposals, rel=1e-6)
 
 
-def test_weightings_disagree_where_one_fears_collisions_more_than_it_wants_progress() -> None:
+def test_the_release_weighs_progress_more_than_collisions() -> None:
     scores = named(nc=[0.5, 0.99], ep=[0.9, 0.6])
     assert choose(scores, WEIGHTINGS["release"]).tolist() == [0]
-    scores = named(nc=[0.3, 0.99], ep=[0.65, 0.5])
-    assert choose(scores, WEIGHTINGS["release"]).tolist() == [0]
-    assert choose(scores, WEIGHTINGS["proposals"]).tolist() == [1]
 
 
 def test_of_equals_the_first_is_chosen_and_a_probability_of_zero_stays_finite() -> None:
