@@ -11,7 +11,7 @@ import pytest
 
 from factory.exits import COMPLETE
 from planners.navsim.agent import shown
-from planners.navsim.pilot import FRONT, Pilot, seen_of
+from planners.navsim.serve import FRONT, Pilot, seen_of
 from tests.pages import REPOSITORY
 from tests.planners.navsim.agent_inputs import agent_input
 from tests.planners.navsim.test_submit import files as files  # the fixture

@@ -16,8 +16,7 @@ import numpy as np
 
 from factory.config.compose import ConfigError
 from factory.readers.pickles import load_tensors
-from planners.published.import_planner import imported
-from planners.published.weights import read_public
+from planners.published.import_planner import imported, read_public
 from tests.planners.published.lesson import (
     Lesson,
     apart,

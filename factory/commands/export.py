@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from factory.config.arguments import POSITIONAL, Refused
-from factory.datasets.navsim.settings import Layout, Missing
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.views.show import find, logged_drive, open_samples
 from factory.views.status import open_store
@@ -53,9 +52,9 @@ class Request:
     round: tuple[str, ...] = ()
     split: tuple[str, ...] = ()
     tag: str = ""
-    layout: Layout = "moved"
+    layout: Literal["moved", "released"] = "moved"
     resize: bool = False
-    missing: Missing = "refuse"
+    missing: Literal["refuse", "black", "none"] = "refuse"
     map_location: str = ""
     vocabulary: str | None = None
     executor: Literal["local", "ray"] = "local"
@@ -124,7 +123,7 @@ def _export_all(request: Request) -> int:
     """All samples in SimScale's layout; the exit code. Raises Refused."""
     from factory.config.compose import need_run_extra
     from factory.datasets.navsim.export import export as export_all
-    from factory.datasets.navsim.settings import ExportSettings
+    from factory.datasets.navsim.frames import ExportSettings
     from factory.graph.parallel import WorkerDied, parallel_map
     from factory.graph.steps import TaskStopped
     from factory.store.location import Location

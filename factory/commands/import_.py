@@ -109,7 +109,7 @@ def main(request: Request) -> int:
 
 
 def _simscale(request: Request, store: "Store") -> tuple["RunSummary", str]:
-    from factory.datasets.navsim.import_table import identity_of, import_rows
+    from factory.datasets.navsim.import_rows import identity_of, import_rows
     from factory.datasets.navsim.simscale import Import, Rewards, parts_of
     from factory.setup.vocabulary import load_vocabulary
 
@@ -130,8 +130,8 @@ def _simscale(request: Request, store: "Store") -> tuple["RunSummary", str]:
 
 
 def _navhard(request: Request, store: "Store") -> tuple["RunSummary", str]:
-    from factory.datasets.navsim.filters import read_selection
-    from factory.datasets.navsim.navhard import NavsimFolders, import_navhard
+    from factory.datasets.navsim.benchmarks import NavsimFolders, import_navhard
+    from factory.datasets.navsim.reader import read_selection
 
     logs, maps = _folder(request.logs), _folder(request.maps)
     assert logs is not None and maps is not None and request.split is not None
@@ -140,8 +140,8 @@ def _navhard(request: Request, store: "Store") -> tuple["RunSummary", str]:
 
 
 def _navtest(request: Request, store: "Store") -> tuple["RunSummary", str]:
-    from factory.datasets.navsim.filters import read_selection
-    from factory.datasets.navsim.navtest import import_navtest
+    from factory.datasets.navsim.benchmarks import import_navtest
+    from factory.datasets.navsim.reader import read_selection
 
     maps = _folder(request.maps)
     assert maps is not None and request.split is not None

@@ -27,9 +27,8 @@ from pathlib import Path
 import numpy as np
 
 from factory.config.compose import ConfigError
-from factory.datasets.navsim.filters import Selection, read_selection
-from factory.datasets.navsim.navhard import NavsimFolders, import_navhard
-from factory.datasets.navsim.navtest import import_navtest
+from factory.datasets.navsim.benchmarks import NavsimFolders, import_navhard, import_navtest
+from factory.datasets.navsim.reader import Selection, read_selection
 from factory.exits import INTERRUPTED, Stopped
 from factory.files import matching, why_unusable
 from factory.stages.benchmark import BENCHMARK_FILE

@@ -6,14 +6,163 @@ Nobody starts it by hand; what it prints goes to standard error.
 
 import os
 import sys
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import torch
 
 from factory.config.arguments import Refused
-from planners.navsim.agent import receive, send
-from planners.navsim.pilot import Pilot, seen_of
+from factory.config.compose import ConfigError
+from planners.data.batch import COMMANDS, Batch, ImageLayout, Needs
+from planners.data.decode import BatchBuffer, StoredRows
+from planners.data.images import chosen_cameras, stitch_pixels
+from planners.evaluation.planner_names import needs_of, planner_of
+from planners.evaluation.planning import check_plan, plans_for
+from planners.navsim.agent import CAMERAS, HISTORY, receive, send
+from tasks.render.views import undistorted
+from tasks.trajectories import at_ten_hz
+from tasks.world.arrays import Array, Bytes
+from tasks.world.camera import Camera
+from tasks.world.clip import HORIZON_STEPS
+
+# A planner before NAVSIM's cameras: which of them it looks at, and what it plans from what they show.
+
+FRONT = ("cam_l0", "cam_f0", "cam_r0")  # the front camera and its neighbours, left to right
+
+
+@dataclass(frozen=True)
+class CameraShot:
+    """What one camera shows at now."""
+
+    camera: Camera
+    image: Bytes  # (height, width, 3) RGB
+
+    def __post_init__(self) -> None:
+        size = self.camera.height, self.camera.width, 3
+        if self.image.shape != size or self.image.dtype != np.uint8:
+            raise ValueError(f"{self.camera.name}: a picture is {size} of uint8, not {self.image.shape}")
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What NAVSIM shows an agent at one moment."""
+
+    history: Array  # (4, 3) x, y [m], heading [rad] at -1.5 .. 0 s in the ego frame at now
+    status: Array  # (8,) command one-hot (COMMANDS), vx, vy [m/s], ax, ay [m/s2]
+    views: tuple[CameraShot, ...] = ()  # left to right
+
+    def __post_init__(self) -> None:
+        for name, shape in (("history", (HISTORY, 3)), ("status", (len(COMMANDS) + 4,))):
+            array = getattr(self, name)
+            if array.shape != shape or not np.isfinite(array).all():
+                raise ValueError(f"{name} must be {shape} finite numbers, got {array.shape}")
+        if sorted(self.status[: len(COMMANDS)].tolist()) != [0.0, 0.0, 0.0, 1.0]:
+            raise ValueError(f"driving_command {self.status[: len(COMMANDS)]}: one of {', '.join(COMMANDS)} must be 1")
+
+
+class Pilot:
+    """Someone who plans from what NAVSIM shows."""
+
+    def __init__(self, planner: str, cameras: Sequence[str] = (), undistort: bool = False, device: str = "cpu") -> None:
+        """planner: see planners.evaluation.planner_names; the rest: see planners.navsim.agent.
+
+        Raises ConfigError for a planner that wants what NAVSIM shows no agent, and for cameras that it has not.
+        """
+        who = planner_of(planner)
+        if who.load is None:
+            raise ConfigError(f"planner={planner} plans from the log itself, which NAVSIM shows no agent")
+        made = who.load()
+        asked = needs_of(made)
+        if asked is None:
+            raise ConfigError(f"planner={planner} takes samples; for NAVSIM it must take batches (plan(batch), needs)")
+        needs: Needs = replace(getattr(made, "needs_to_plan", asked), labels=None)
+        if needs.bev is not None or needs.n_agents:
+            raise ConfigError(f"planner={planner} looks at a raster of map and agents, which NAVSIM shows no agent")
+        self._made = made.to(device) if isinstance(made, torch.nn.Module) else made
+        self._needs, self._undistort, self._device = needs, undistort, device
+        self._by_direction = needs.image is not None and not (cameras or needs.image.cameras)
+        self.cameras = cameras_for(needs.image, cameras)
+
+    def plan(self, seen: Sighting, n_poses: int) -> Array:
+        """(8 or 40, 3) float32 poses, 4 s. Raises ValueError where a plan is none, or the cameras look elsewhere."""
+        batch = self.batch_of(seen).to(self._device)
+        plan = plans_for(self._made, batch)[0]
+        check_plan(plan, "NAVSIM")
+        if len(plan) != n_poses:
+            plan = at_ten_hz(plan[None])[0] if n_poses == HORIZON_STEPS else plan[4::5]
+        return plan.astype(np.float32)
+
+    def batch_of(self, seen: Sighting) -> Batch:
+        """The batch of one that a row of the same content makes."""
+        views = seen.views
+        if self._by_direction:
+            assert self._needs.image is not None
+            names = [view.camera.name for view in views]
+            axes = np.array([view.camera.ego_from_camera[:2, 2] for view in views])
+            if chosen_cameras(names, axes, self._needs.image) != FRONT:
+                raise ValueError(f"{', '.join(FRONT)} do not look left, ahead and right: name others by cameras=")
+        images = [undistorted(view.image, view.camera) if self._undistort else view.image for view in views]
+        buffer = BatchBuffer(1, self._needs, 0)
+        buffer.fill(0, _SeenRow(seen, images), 0)
+        nobody = np.zeros(1, bool)
+        return buffer.batch(["navsim"], nobody, nobody)
+
+
+def cameras_for(layout: ImageLayout | None, given: Sequence[str] = ()) -> tuple[str, ...]:
+    """NAVSIM's cameras for a planner's picture, left to right: those given, else of its names, else by direction.
+
+    Raises ConfigError for a camera that NAVSIM has not, naming what to say.
+    """
+    if layout is None:
+        if given:
+            raise ConfigError("cameras: the planner looks at no picture")
+        return ()
+    trained = layout.cameras
+    if given and trained and len(given) != len(trained):
+        raise ConfigError(f"cameras: {len(given)}, in the places of {len(trained)}: {', '.join(trained)}")
+    names = tuple(name.lower() for name in given or trained or FRONT)
+    unknown = [name for name in names if name not in CAMERAS]
+    if unknown:
+        whose = "" if given else " that the planner was trained on (give cameras=, left to right, in their places)"
+        raise ConfigError(f"NAVSIM has no camera {', '.join(unknown)}{whose}; it has {', '.join(CAMERAS)}")
+    return names
+
+
+def seen_of(arrays: Mapping[str, Any], cameras: Sequence[str]) -> Sighting:
+    """What `planners.navsim.agent.shown` wrote. NAVSIM's lidar frame is the ego's. Raises ValueError."""
+    views = []
+    for name in cameras:
+        image = arrays[f"{name}.image"]
+        if image.ndim != 3:
+            raise ValueError(f"{name}: a picture of shape {image.shape}")
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = arrays[f"{name}.rotation"], arrays[f"{name}.translation"]
+        intrinsics, distortion = (np.asarray(arrays[f"{name}.{k}"], np.float64) for k in ("intrinsics", "distortion"))
+        camera = Camera(name, image.shape[1], image.shape[0], intrinsics, distortion, pose)
+        views.append(CameraShot(camera, image))
+    return Sighting(arrays["history"], arrays["status"], tuple(views))
+
+
+class _SeenRow(StoredRows):
+    """What was seen, as the loader's rows are read; zeros for the plans, which nobody knows."""
+
+    def __init__(self, seen: Sighting, images: Sequence[Bytes]) -> None:
+        status = seen.status
+        self._images = images
+        self._seen = {
+            "command": COMMANDS[int(np.argmax(status[: len(COMMANDS)]))],
+            "ego_status": status[len(COMMANDS) :],
+            "ego_history_2hz": seen.history,
+        }
+
+    def value(self, column: str, row: int) -> Any:
+        return 0.0 if column.startswith("label_") else self._seen[column]
+
+    def picture(self, row: int, layout: ImageLayout, out: Bytes, keep: bool = False) -> None:
+        stitch_pixels(self._images, layout, out)
 
 
 @dataclass(frozen=True)

@@ -16,27 +16,26 @@ from pathlib import Path
 import numpy as np
 
 from factory.config.arguments import Refused
-from factory.datasets.navsim.filters import (
+from factory.datasets.navsim.log import Frame, read_frames, read_scene_pickle
+from factory.datasets.navsim.pickles import dumps
+from factory.datasets.navsim.reader import (
     Choice,
     FrameTable,
     SceneFilter,
     Selection,
+    log_files,
     read_selection,
     table_at,
     wanted_windows,
 )
-from factory.datasets.navsim.log import Frame, read_frames
-from factory.datasets.navsim.pickles import dumps
-from factory.datasets.navsim.reader import log_files
-from factory.datasets.navsim.road import blobs_of, rig_of
-from factory.datasets.navsim.synthetic import read_scene_pickle
+from factory.datasets.navsim.window import blobs_of, rig_of
 from factory.graph.progress import Counter
 from factory.readers.base import BadClip
 from factory.stages.sensors import decode_image
 from factory.wording import one_line
 from planners.data.batch import COMMANDS
 from planners.navsim.agent import HISTORY
-from planners.navsim.pilot import CameraShot, Pilot, Sighting
+from planners.navsim.serve import CameraShot, Pilot, Sighting
 from tasks.caches import user_cache
 from tasks.kernels.compiled import write_whole
 from tasks.world.arrays import Array

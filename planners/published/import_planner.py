@@ -14,21 +14,286 @@ trained with unless another one is named. Nothing of the file runs: it is read a
 
 import hashlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, compose, fill
 from factory.config.words import SHOW, without_show
-from planners.models.gtrs_dense import GtrsDenseSettings, inference_arrays
+from factory.datasets.navsim.pickles import METRICS
+from factory.readers.pickles import load_tensors
+from planners.models.diffusiondrive import POINT_FEATURES, WAYPOINTS, DiffusionDriveSettings
+from planners.models.gtrs_dense import IMITATION, GtrsDenseSettings, inference_arrays
+from planners.models.ltf import LtfSettings
 from planners.models.planner import Planner, PlannerChoice, build_planner, settings_of
-from planners.published.weights import FAMILIES, Moves, read_public
 from planners.training.checkpoint import FOLDER, put_weights, save_checkpoint
 from planners.training.train import PlannerEntry
+from tasks.world.arrays import FloatArray
+
+# A public state dict read into a planner's: every number of it is moved, or named as left aside.
+#
+# `Moves` refuses what nobody spoke of. Below it, family by family, what of a public model goes where in ours; a call
+# is a sentence: theirs, then ours. Names are those of OpenDriveLab/SimScale 04cda10,
+# navsim/agents/{transfuser,diffusiondrive,gtrs_dense}.
+
+Arrays = dict[str, FloatArray]
+
+# GTRS's heads and scores by the names that they have here
+SCORES = {public: name for public, name in METRICS.items() if name != "score"}
+ANCHOR = "_status_encoding.weight"  # in every family's model, at its top
+
+
+@dataclass
+class Moves:
+    """Public names still to be told of, and what ours have become so far."""
+
+    public: dict[str, Tensor]
+    source: str = "checkpoint"  # for messages
+    ours: dict[str, Tensor] = field(default_factory=dict)
+    aside: dict[str, Tensor] = field(default_factory=dict)  # what a planner of ours does not have
+    came_from: dict[str, tuple[str, ...]] = field(default_factory=dict)  # ours -> public names
+
+    def one(self, name: str, ours: str, turned: Callable[[Tensor], Tensor] = lambda x: x) -> None:
+        """One number array. Raises ConfigError where the checkpoint lacks it."""
+        self.ours[ours], self.came_from[ours] = turned(self._taken(name)), (name,)
+
+    def all(self, prefix: str, ours: str) -> None:
+        """All that begins with a prefix, under the same words behind another. Raises ConfigError where nothing does."""
+        for name in self._under(prefix):
+            self.one(name, ours + name.removeprefix(prefix))
+
+    def layer(self, name: str, ours: str, turned: Callable[[Tensor], Tensor] = lambda x: x) -> None:
+        """Weight and bias of a linear map; `turned` is for the weight."""
+        self.one(f"{name}.weight", f"{ours}.weight", turned)
+        self.one(f"{name}.bias", f"{ours}.bias")
+
+    def joined(self, names: Sequence[str], ours: str) -> None:
+        """Weights and biases of several linear maps as those of one, their outputs one after the other."""
+        for kind in ("weight", "bias"):
+            parts = tuple(f"{name}.{kind}" for name in names)
+            self.ours[f"{ours}.{kind}"] = torch.cat([self._taken(part) for part in parts])
+            self.came_from[f"{ours}.{kind}"] = parts
+
+    def attention(self, name: str, ours: str) -> None:
+        """torch's MultiheadAttention, whose three maps are one, as planners.models.layers.Attention."""
+        for kind in ("weight", "bias"):
+            whole = self._taken(f"{name}.in_proj_{kind}")
+            for part, values in zip(("query", "key", "value"), whole.chunk(3)):
+                self.ours[f"{ours}.{part}.{kind}"] = values.clone()
+                self.came_from[f"{ours}.{part}.{kind}"] = (f"{name}.in_proj_{kind}",)
+        self.layer(f"{name}.out_proj", f"{ours}.out")
+
+    def decoder(self, name: str, ours: str) -> None:
+        """torch's TransformerDecoder as planners.models.layers.Decoder."""
+        numbers = sorted({int(key.removeprefix(f"{name}.layers.").split(".")[0]) for key in self._under(name)})
+        for number in numbers:
+            theirs, here = f"{name}.layers.{number}", f"{ours}.layers.{number}"
+            self.attention(f"{theirs}.self_attn", f"{here}.own")
+            self.attention(f"{theirs}.multihead_attn", f"{here}.cross")
+            for other, own in (("norm1", "own_norm"), ("norm2", "cross_norm"), ("norm3", "feedforward_norm")):
+                self.layer(f"{theirs}.{other}", f"{here}.{own}")
+            self.layer(f"{theirs}.linear1", f"{here}.feedforward.0")
+            self.layer(f"{theirs}.linear2", f"{here}.feedforward.3")
+
+    def leave(self, prefix: str) -> None:
+        """All that begins with a prefix is no part of our planner."""
+        for name in self._under(prefix):
+            self.aside[name] = self._taken(name)
+
+    def kept(self, name: str) -> Tensor:
+        """What is not learned and becomes an array that our planner is built around."""
+        self.aside[name] = self._taken(name)
+        return self.aside[name]
+
+    def done(self) -> None:
+        """Raises ConfigError where something was not told of."""
+        if self.public:
+            raise ConfigError(f"{self.source} holds {_listed(list(self.public))}, of which this planner knows nothing")
+
+    def _taken(self, name: str) -> Tensor:
+        if name not in self.public:
+            raise ConfigError(f"{self.source} lacks {name}: it is of another planner, or damaged")
+        return self.public.pop(name)
+
+    def _under(self, prefix: str) -> list[str]:
+        found = [name for name in self.public if name.startswith(prefix)]
+        if not found:
+            raise ConfigError(f"{self.source} lacks {prefix}...: it is of another planner, or damaged")
+        return found
+
+
+def read_public(path: Path) -> dict[str, Tensor]:
+    """The weights of a Lightning checkpoint under the names of the public model, without what wraps it.
+
+    Only tensors and plain values are read back; nothing of the file runs. Raises ConfigError.
+    """
+    try:
+        content = load_tensors(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    return model_weights(content, str(path))
+
+
+def model_weights(content: object, source: str) -> dict[str, Tensor]:
+    """`content` of a Lightning checkpoint, or a bare state dict, as names of the public model. Raises ConfigError."""
+    if isinstance(content, Mapping) and isinstance(content.get("state_dict"), Mapping):
+        content = content["state_dict"]
+    if not isinstance(content, Mapping) or not all(isinstance(value, Tensor) for value in content.values()):
+        raise ConfigError(f"{source} holds no state_dict of tensors: give a checkpoint of the public training")
+    found = [name.removesuffix(ANCHOR) for name in content if isinstance(name, str) and name.endswith(ANCHOR)]
+    if len(found) != 1:
+        raise ConfigError(
+            f"{source}: {len(found)} of its {len(content)} weights are named ...{ANCHOR}, not one: it is no checkpoint "
+            "of the public Latent TransFuser, DiffusionDrive or GTRS-Dense"
+        )
+    prefix = found[0]
+    other = [name for name in content if not name.startswith(prefix)]
+    if other:
+        raise ConfigError(f"{source} holds {_listed(other)} beside the model {prefix.rstrip('.')}")
+    return {name.removeprefix(prefix): value for name, value in content.items()}
+
+
+def _listed(names: list[str], most: int = 3) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def fusion(moves: Moves, ours: str) -> None:
+    """TransfuserBackbone as LatentFusion: two residual networks, four exchanges of tokens, the upsampled view."""
+    moves.all("_backbone.image_encoder.", f"{ours}image.")
+    moves.all("_backbone.lidar_encoder.", f"{ours}latent.")
+    moves.one("_backbone.lidar_latent", f"{ours}picture")
+    moves.all("_backbone.lidar_channel_to_img.", f"{ours}to_image.")
+    moves.all("_backbone.img_channel_to_lidar.", f"{ours}to_latent.")
+    for scale in range(4):
+        theirs, here = f"_backbone.transformers.{scale}", f"{ours}exchanges.{scale}"
+        moves.one(f"{theirs}.pos_emb", f"{here}.position")
+        moves.layer(f"{theirs}.ln_f", f"{here}.norm")
+        block = 0
+        while f"{theirs}.blocks.{block}.ln1.weight" in moves.public:
+            name, own = f"{theirs}.blocks.{block}", f"{here}.blocks.{block}"
+            moves.layer(f"{name}.ln1", f"{own}.norm_attention")
+            moves.layer(f"{name}.ln2", f"{own}.norm_forward")
+            moves.joined([f"{name}.attn.{part}" for part in ("query", "key", "value")], f"{own}.query_key_value")
+            moves.layer(f"{name}.attn.proj", f"{own}.project")
+            moves.layer(f"{name}.mlp.0", f"{own}.feed_forward.0")
+            moves.layer(f"{name}.mlp.2", f"{own}.feed_forward.2")
+            block += 1
+    moves.layer("_backbone.c5_conv", f"{ours}lateral")
+    moves.layer("_backbone.up_conv5", f"{ours}up.0")
+    moves.layer("_backbone.up_conv4", f"{ours}up.1")
+
+
+def heads(moves: Moves) -> None:
+    """What is learnt beside planning: boxes of vehicles and classes of cells."""
+    moves.layer("_agent_head._mlp_states.0", "agent_head.box.0")
+    moves.layer("_agent_head._mlp_states.2", "agent_head.box.2")
+    moves.layer("_agent_head._mlp_label.0", "agent_head.there")
+    moves.layer("_bev_semantic_head.0", "bev_head.layers.0")
+    moves.layer("_bev_semantic_head.2", "bev_head.layers.2")
+
+
+def ltf(moves: Moves, settings: LtfSettings) -> Arrays:
+    """TransfuserModel as Ltf."""
+    fusion(moves, "fusion.")
+    moves.layer("_bev_downscale", "reduce")
+    moves.layer("_status_encoding", "status")
+    moves.one("_keyval_embedding.weight", "key_position", _batched)
+    moves.one("_query_embedding.weight", "queries", _batched)
+    moves.all("_tf_decoder.", "decoder.")
+    moves.layer("_trajectory_head._mlp.0", "plan_head.0")
+    moves.layer("_trajectory_head._mlp.2", "plan_head.2")
+    heads(moves)
+    return {}
+
+
+def diffusiondrive(moves: Moves, settings: DiffusionDriveSettings) -> Arrays:
+    """V2TransfuserModel as DiffusionDrive."""
+    fusion(moves, "encoder.fusion.")
+    moves.layer("_bev_downscale", "encoder.narrow")
+    moves.layer("_status_encoding", "encoder.status")
+    moves.one("_keyval_embedding.weight", "encoder.places")
+    moves.one("_query_embedding.weight", "encoder.queries")
+    moves.decoder("_tf_decoder", "encoder.decoder")
+    moves.all("bev_proj.", "encoder.join.")
+    head = "_trajectory_head"
+    moves.layer(f"{head}.plan_anchor_encoder.0", "decoder.feature.0", _points_reordered)
+    moves.layer(f"{head}.plan_anchor_encoder.2", "decoder.feature.2")
+    moves.layer(f"{head}.plan_anchor_encoder.3", "decoder.feature.3")
+    moves.layer(f"{head}.time_mlp.1", "decoder.step.0")
+    moves.layer(f"{head}.time_mlp.3", "decoder.step.2")
+    for number in range(settings.refinements):
+        name, own = f"{head}.diff_decoder.layers.{number}", f"decoder.layers.{number}"
+        moves.layer(f"{name}.cross_bev_attention.attention_weights", f"{own}.along.weights")
+        moves.layer(f"{name}.cross_bev_attention.value_proj.0", f"{own}.along.value.0")
+        moves.layer(f"{name}.cross_bev_attention.output_proj", f"{own}.along.out")
+        moves.attention(f"{name}.cross_agent_attention", f"{own}.agents")
+        moves.attention(f"{name}.cross_ego_attention", f"{own}.ego")
+        for theirs, here in (("norm1", "agents_norm"), ("norm2", "ego_norm"), ("norm3", "norm")):
+            moves.layer(f"{name}.{theirs}", f"{own}.{here}")
+        moves.all(f"{name}.ffn.", f"{own}.feedforward.")
+        moves.layer(f"{name}.time_modulation.scale_shift_mlp.1", f"{own}.modulation.1")
+        moves.all(f"{name}.task_decoder.plan_cls_branch.", f"{own}.confidence.")
+        moves.all(f"{name}.task_decoder.plan_reg_branch.", f"{own}.offsets.")
+    heads(moves)
+    return {"anchors": moves.kept(f"{head}.plan_anchor").double().numpy()}
+
+
+def gtrs_dense(moves: Moves, settings: GtrsDenseSettings) -> Arrays:
+    """HydraModel as GtrsDense. Its decoder and agents' head at the top are in the file and in no forward pass."""
+    if settings.encoder == "fused":
+        fusion(moves, "tokens.fusion.")
+        moves.layer("_bev_downscale", "tokens.narrow")
+    else:
+        moves.all("_backbone.image_encoder.", "tokens.backbone.")
+        moves.layer("downscale_layer", "tokens.narrow")
+    moves.one("_keyval_embedding.weight", "tokens.places")
+    moves.layer("_status_encoding", "scorer.status")
+    head = "_trajectory_head"
+    moves.all(f"{head}.pos_embed.", "scorer.embed.")
+    for theirs, here in (("to_q", "query"), ("to_k", "key"), ("to_v", "value"), ("to_out", "out")):
+        moves.one(f"{head}.encoder.self_attn.{theirs}.weight", f"scorer.among.own.{here}.weight")
+    for theirs, here in (("norm1", "own_norm"), ("norm3", "feedforward_norm")):
+        moves.layer(f"{head}.encoder.{theirs}", f"scorer.among.{here}")
+    moves.layer(f"{head}.encoder.linear1", "scorer.among.feedforward.0")
+    moves.layer(f"{head}.encoder.linear2", "scorer.among.feedforward.3")
+    moves.decoder(f"{head}.transformer", "scorer.decoder")
+    moves.all(f"{head}.heads.imi.", f"scorer.heads.{IMITATION}.")
+    for theirs, here in SCORES.items():
+        if here not in settings.without:
+            moves.all(f"{head}.heads.{theirs}.", f"scorer.heads.{here}.")
+    moves.leave("_tf_decoder.")
+    moves.leave("_agent_head.")
+    return {"vocabulary": moves.kept(f"{head}.vocab").double().numpy()}
+
+
+FAMILIES: Mapping[str, Callable[[Moves, Any], Arrays]] = {  # each takes its own planner's settings
+    "ltf": ltf,
+    "diffusiondrive": diffusiondrive,
+    "gtrs_dense": gtrs_dense,
+}
+
+
+def _batched(embedding: Tensor) -> Tensor:
+    return embedding[None]
+
+
+def _points_reordered(weight: Tensor) -> Tensor:
+    """Columns of the first map over a plan's points, from y before x and sines and cosines in turn to x, y, all sines.
+
+    A point's numbers there (gen_sineembed_for_position) and here (planners.models.diffusiondrive.waves) are the same.
+    """
+    pairs = POINT_FEATURES // 4
+    columns = torch.arange(WAYPOINTS * POINT_FEATURES).view(WAYPOINTS, 2, pairs, 2)
+    ours = columns.flip(1).transpose(2, 3)  # points, (x, y), (sine, cosine), frequency
+    return weight[:, ours.flatten()]
+
 
 FROZEN_IN = "_trajectory_head"  # what of it is no weight of ours is not learned there either
 

@@ -3,8 +3,8 @@
 What a row is. `now` is the log's fourth frame, and the row's own log is the simulated one: `parent_states` are its ego
 at T and T+H, `now_s` is 1.5. Label and history at 2 Hz are the frames', at 10 Hz linear between them. Pictures are the
 files' own bytes. What the release does not hold stays null: scores, perturbation, what the expert asked for.
-SimScale has released simulated samples alone; the human ones are those of our own export (factory.exports.navsim),
-which writes them beside. Their log is the source log itself.
+SimScale has released simulated samples alone; the human ones are those of our own export, which writes
+them beside. Their log is the source log itself.
 """
 
 import re
@@ -17,13 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.datasets.navsim.import_table import Entry
-from factory.datasets.navsim.log import bytes_of, frames_of
-from factory.datasets.navsim.rewards import RewardFile
-from factory.datasets.navsim.road import road_around
-from factory.datasets.navsim.scenes import (
+from factory.datasets.navsim.import_rows import (
     HISTORY_FRAMES,
     SCENE_FRAMES,
+    Entry,
     Origin,
     logged_label,
     no_road,
@@ -31,7 +28,9 @@ from factory.datasets.navsim.scenes import (
     scene_of,
     world_columns,
 )
-from factory.datasets.navsim.tracks import ego_states
+from factory.datasets.navsim.log import bytes_of, frames_of
+from factory.datasets.navsim.pickles import RewardFile
+from factory.datasets.navsim.window import ego_states, road_around
 from factory.files import folders_in, matching, matching_below
 from factory.graph.steps import HUMAN_CANDIDATE
 from factory.readers.base import BadClip

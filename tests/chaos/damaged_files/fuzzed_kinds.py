@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 
 from factory.datasets.av2.reader import AV2Reader
-from factory.datasets.navsim.filters import read_scene_filter, table_of
-from factory.datasets.navsim.log import read_frames
-from factory.datasets.navsim.synthetic import read_scene_pickle
+from factory.datasets.navsim.log import read_frames, read_scene_pickle
+from factory.datasets.navsim.reader import read_scene_filter, table_of
 from factory.datasets.py123d.reader import Py123dReader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.datasets.town.reader import SyntheticReader

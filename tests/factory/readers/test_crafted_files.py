@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.datasets.navsim.rewards import RewardFile
+from factory.datasets.navsim.pickles import RewardFile
 from factory.readers.base import BadClip
 from factory.readers.pickles import load_plain
 from factory.wording import shown

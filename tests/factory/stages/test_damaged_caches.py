@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from factory.datasets.navsim.filters import kept_table, make_table
 from factory.datasets.navsim.maps import cache_file, kept_tables
+from factory.datasets.navsim.reader import kept_table, make_table
 from factory.datasets.town.reader import SensedReader, SyntheticReader, SyntheticTownsReader
 from factory.graph.steps import PrepareReport, cache_key, prepare
 from factory.readers.settings import TownSettings

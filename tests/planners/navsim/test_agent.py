@@ -12,7 +12,7 @@ import yaml
 
 from planners.navsim import agent
 from planners.navsim.agent import LENGTH, RemotePlanner, receive, send, shown
-from planners.navsim.pilot import FRONT, Pilot, seen_of
+from planners.navsim.serve import FRONT, Pilot, seen_of
 from tests.planners.navsim.agent_inputs import agent_input
 from tests.planners.navsim.trained import made, saved
 

@@ -27,7 +27,7 @@ from factory.stages.sensors import decode_image, encode_jpeg
 from factory.store.reader import SampleTable, decode_stored_image
 from planners.evaluation.planning import plans_of
 from planners.navsim.agent import RemotePlanner, shown
-from planners.navsim.pilot import FRONT, Pilot, seen_of
+from planners.navsim.serve import FRONT, Pilot, seen_of
 from planners.training.checkpoint import load_planner, newest
 from planners.training.train import main as train
 from tasks.trajectories import score_trajectories

@@ -14,7 +14,7 @@ from planners.evaluation.planning import plans_of
 from planners.evaluation.shown import as_shown, batch_of
 from planners.models.planner import Planner
 from planners.navsim.agent import shown
-from planners.navsim.pilot import FRONT, Pilot, cameras_for, seen_of
+from planners.navsim.serve import FRONT, Pilot, cameras_for, seen_of
 from tests.planners.navsim.agent_inputs import DISTORTION, agent_input, row
 from tests.planners.navsim.trained import FAMILIES, made, saved
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from factory.datasets.navsim.filters import read_selection
+from factory.datasets.navsim.reader import read_selection
 from factory.exits import BAD_CONFIG, COMPLETE
 from factory.readers.pickles import Record, load_records
 from planners.__main__ import main as planners
 from planners.navsim.agent import shown
-from planners.navsim.pilot import FRONT, Pilot, seen_of
+from planners.navsim.serve import FRONT, Pilot, seen_of
 from planners.navsim.submit import Team, scenes_of, submission_bytes
 from tests.factory.datasets.navsim import scene_pickles
 from tests.factory.datasets.navsim.openscene_writer import write_frames

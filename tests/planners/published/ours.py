@@ -16,8 +16,7 @@ from planners.models.diffusiondrive import DiffusionDrive, EncodedScene
 from planners.models.gtrs_dense import IMITATION, WEIGHTINGS, GtrsDense, total
 from planners.models.ltf import Ltf
 from planners.models.planner import Planner, PlannerChoice, evaluating
-from planners.published.import_planner import Imported, imported
-from planners.published.weights import SCORES
+from planners.published.import_planner import SCORES, Imported, imported
 from planners.training.train import PlannerEntry
 from tasks.world.arrays import Array
 from tests.planners.published.formula import CELLS, FROZEN, SEED, inputs, weight

@@ -12,7 +12,7 @@ from torch import nn
 from factory.config.compose import ConfigError
 from planners.models.diffusiondrive import waves
 from planners.models.layers import Decoder
-from planners.published.weights import Moves, _points_reordered, model_weights, read_public
+from planners.published.import_planner import Moves, _points_reordered, model_weights, read_public
 
 
 def lightning(path: Path, **more: Any) -> Path:

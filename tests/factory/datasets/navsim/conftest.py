@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from factory.datasets.navsim.export import ExportSummary, export
-from factory.datasets.navsim.settings import ExportSettings
+from factory.datasets.navsim.frames import ExportSettings
 from factory.store.samples import Store
 from tests.factory.datasets.navsim.navsim_samples import exported
 from tests.planners.samples import write_table

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from factory.datasets.navsim.export import ExportSummary, export
-from factory.datasets.navsim.settings import ExportSettings
+from factory.datasets.navsim.frames import ExportSettings
 from factory.readers.settings import MOUNTS
 from factory.stages.rows import sample_row
 from factory.store.samples import Store

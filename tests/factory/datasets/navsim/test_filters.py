@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.datasets.navsim.filters import SceneFilter, read_scene_filter, read_selection
+from factory.datasets.navsim.reader import SceneFilter, read_scene_filter, read_selection
 
 FILTER = """
 _target_: navsim.common.dataclasses.SceneFilter

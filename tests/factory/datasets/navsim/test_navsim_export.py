@@ -16,9 +16,8 @@ import yaml
 
 from factory.commands.table import COMMANDS
 from factory.datasets.navsim.export import ExportSummary
+from factory.datasets.navsim.frames import CAMERAS, CannotExport, ExportSettings, slots
 from factory.datasets.navsim.pickles import METRICS
-from factory.datasets.navsim.pictures import CAMERAS, slots
-from factory.datasets.navsim.settings import CannotExport, ExportSettings
 from factory.store.reader import labels_of
 from tasks.render.views import pinhole
 from tests.factory.datasets.navsim.navsim_samples import SIZE, TOKENS, K, exported, pictures, quiet, tree

@@ -12,10 +12,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factory.datasets.navsim.export import ExportSummary
-from factory.datasets.navsim.frames import connector_number, derivatives, in_space, log_frames, sample_names
+from factory.datasets.navsim.frames import (
+    CAMERAS,
+    YAW_DEG,
+    CannotExport,
+    ExportSettings,
+    connector_number,
+    derivatives,
+    in_space,
+    log_frames,
+    sample_names,
+    shown,
+)
 from factory.datasets.navsim.pickles import dumps
-from factory.datasets.navsim.pictures import CAMERAS, YAW_DEG, shown
-from factory.datasets.navsim.settings import CannotExport, ExportSettings
 from tasks.world.frames import to_local, to_world
 from tests.factory.datasets.navsim.navsim_samples import INSTANTS_S, ORIGIN, TOKENS, YAWS, colour, exported
 from tests.tasks.streets import SPEED_MPS

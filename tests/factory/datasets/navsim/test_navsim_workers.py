@@ -12,7 +12,7 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.datasets.navsim.export import RowGroup, write_group
-from factory.datasets.navsim.settings import CannotExport, ExportSettings
+from factory.datasets.navsim.frames import CannotExport, ExportSettings
 from factory.store.samples import Store
 from tests.factory.datasets.navsim.navsim_samples import exported, quiet, tree
 from tests.planners.samples import write_table

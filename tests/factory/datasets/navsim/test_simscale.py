@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from factory.__main__ import main as factory
-from factory.datasets.navsim import import_table as table
+from factory.datasets.navsim import import_rows as table
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.store.reader import SampleTable, labels_of
 from factory.store.samples import Store

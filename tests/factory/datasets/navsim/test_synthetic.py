@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factory.datasets.navsim.synthetic import read_scene_pickle
+from factory.datasets.navsim.log import read_scene_pickle
 from factory.readers.base import BadClip
 from factory.readers.pickles import Record, load_plain, load_records
 from tasks.world.clip import AgentKind

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factory.datasets.navsim.log import Frame, frame_of
-from factory.datasets.navsim.tracks import ego_states, lights, stretch_agents, window_agents, world_from_ego
+from factory.datasets.navsim.window import ego_states, lights, stretch_agents, window_agents, world_from_ego
 from tasks.world.clip import NOW, AgentKind, AgentTracks
 from tasks.world.road_map import LightState
 from tests.factory.datasets.navsim.logs import frame

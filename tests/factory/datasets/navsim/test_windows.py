@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.datasets.navsim.filters import (
+from factory.datasets.navsim.reader import (
     GAP,
     NO_BOXES,
     NO_ROUTE,

@@ -1,6 +1,6 @@
 """The slow twin of 2 Hz -> 10 Hz: a clip at 10 Hz thinned to its frames and brought back, track by track, in a loop.
 
-Written from docs/reward.md 2 and the public metric_cache_processor.py, not looking at factory.datasets.navsim.tracks.
+Written from docs/reward.md 2 and the public metric_cache_processor.py, not looking at factory.datasets.navsim.window.
 """
 
 from dataclasses import dataclass, replace

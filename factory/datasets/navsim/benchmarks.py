@@ -1,34 +1,35 @@
-"""NAVSIM's two-stage benchmark as a benchmark of ours: samples to plan from, and scenes to drive in.
+"""navhard and navtest as benchmarks of ours: samples to plan from, and scenes to drive in.
 
-A group of the split's `reactive_all_mapping` is a clip: its stage-one frames are the log's at T and 0.5 s before, its
-pairs of synthetic scenes the follow-ups, numbered as they stand there. Nobody drove from a synthetic scene, so the
-label of its sample is PDM-Closed's drive, which no score is made of.
+Of navhard a group of the split's `reactive_all_mapping` is a clip: its stage-one frames are the log's at T and 0.5 s
+before, its pairs of synthetic scenes the follow-ups, numbered as they stand there. Nobody drove from a synthetic scene,
+so the label of its sample is PDM-Closed's drive, which no score is made of.
 """
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from hashlib import sha256
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from factory.datasets.navsim.filters import Selection
-from factory.datasets.navsim.import_table import Entry, identity_of, import_rows
-from factory.datasets.navsim.log import LogFrames, read_frames
-from factory.datasets.navsim.road import road_around
-from factory.datasets.navsim.scenes import (
+from factory.datasets.navsim.import_rows import (
     HISTORY_FRAMES,
     SCENE_FRAMES,
+    Entry,
     Origin,
+    identity_of,
+    import_rows,
     label_columns_of,
     logged_label,
     pictures,
     scene_of,
     world_columns,
 )
-from factory.datasets.navsim.synthetic import SyntheticScene, read_scene_pickle
-from factory.datasets.navsim.tracks import ego_states
+from factory.datasets.navsim.log import LogFrames, SyntheticScene, read_frames, read_scene_pickle
+from factory.datasets.navsim.reader import Choice, Selection, log_files, table_at, wanted_windows
+from factory.datasets.navsim.window import ego_states, road_around
 from factory.files import matching
 from factory.graph.execute import RunSummary
 from factory.readers.apart import Apart
@@ -39,7 +40,8 @@ from factory.store.location import SceneFiles
 from factory.store.samples import Store
 from factory.store.schema import RunIdentity
 from tasks.experts.pdm_closed import PdmSettings, plan_for
-from tasks.hard_scenes import GivenScenes
+from tasks.caches import user_cache
+from tasks.hard_scenes import GivenScenes, OneStageClip
 from tasks.render.settings import ImageSource
 from tasks.stages import FOLLOW_UP, FOLLOW_UP_BEFORE, HUMAN, HUMAN_BEFORE
 from tasks.world.clip import Scene
@@ -69,7 +71,8 @@ def logged_frame(
     return scene, {**world_columns(scene, now.command), **logged_label(scene), **seen}
 
 
-DATASET, LICENCE = "navhard", "CC BY-NC-SA 4.0 (NAVSIM, of nuPlan)"
+NAVHARD = "navhard"
+LICENCE = "CC BY-NC-SA 4.0 (NAVSIM, of nuPlan)"
 NO_CANDIDATE = -1
 FRAME_MS = 500
 
@@ -94,7 +97,7 @@ class SceneGroup:
 
     @property
     def clip_id(self) -> str:
-        return sha256("\x1f".join((DATASET, self.now, self.before)).encode()).hexdigest()[:16]
+        return sha256("\x1f".join((NAVHARD, self.now, self.before)).encode()).hexdigest()[:16]
 
 
 def groups_of(selection: Selection) -> list[SceneGroup]:
@@ -189,7 +192,7 @@ class GroupReader:
 
     def _origin(self, file: str, log: str, group: SceneGroup, token: str) -> Origin:
         digest = sha256(token.encode()).hexdigest()
-        return Origin(file, group.clip_id, DATASET, log, "test", LICENCE, digest, None)
+        return Origin(file, group.clip_id, NAVHARD, log, "test", LICENCE, digest, None)
 
 
 def entries_of(groups: Sequence[SceneGroup], reader: GroupReader) -> list[Entry]:
@@ -203,7 +206,7 @@ def entries_of(groups: Sequence[SceneGroup], reader: GroupReader) -> list[Entry]
         )
     ]
     return [
-        Entry(group.clip_id, DATASET, reader.log_id(group), kind, 0, number, partial(reader.row, group, kind, number))
+        Entry(group.clip_id, NAVHARD, reader.log_id(group), kind, 0, number, partial(reader.row, group, kind, number))
         for group, kind, number in keys
     ]
 
@@ -234,12 +237,12 @@ def import_navhard(store: Store, selection: Selection, places: NavsimFolders) ->
     groups = groups_of(selection)
     tokens = frozenset(token for group in groups for token in (group.now, group.before))
     reader = GroupReader(places, logs_of_tokens(places.logs, tokens, selection.scene_filter.log_names), store)
-    identity = identity_of(DATASET, {"pictures": places.sensors is not None, "split": selection.name})
+    identity = identity_of(NAVHARD, {"pictures": places.sensors is not None, "split": selection.name})
     summary = import_rows(store, identity, entries_of(groups, reader))
-    return summary, write_benchmark(store, groups, reader, identity)
+    return summary, write_navhard(store, groups, reader, identity)
 
 
-def write_benchmark(store: Store, groups: Sequence[SceneGroup], reader: GroupReader, identity: RunIdentity) -> str:
+def write_navhard(store: Store, groups: Sequence[SceneGroup], reader: GroupReader, identity: RunIdentity) -> str:
     """benchmark.json of the groups all of whose frames are samples; a line that says what is in it."""
     made = {
         (row["clip_id"], row["expert"], row["candidate_index"])
@@ -249,7 +252,7 @@ def write_benchmark(store: Store, groups: Sequence[SceneGroup], reader: GroupRea
     clips: list[dict[str, Any]] = []
     left_out: list[dict[str, Any]] = []
     for group in groups:
-        named = {"clip_id": group.clip_id, "dataset": DATASET, "log_id": reader.log_id(group), "start_ms": 0}
+        named = {"clip_id": group.clip_id, "dataset": NAVHARD, "log_id": reader.log_id(group), "start_ms": 0}
         wanted = {(e.clip_id, e.expert, e.candidate_index) for e in entries_of([group], reader)}
         if wanted <= made and group.clip_id in scenes:
             tokens = {"tokens": [group.now, group.before], "follow_up_tokens": [list(pair) for pair in group.pairs]}
@@ -271,3 +274,127 @@ def write_benchmark(store: Store, groups: Sequence[SceneGroup], reader: GroupRea
     store.location.write(BENCHMARK_FILE, (json.dumps(document, indent=1) + "\n").encode())
     pairs = sum(len(clip["follow_ups"]) for clip in clips)
     return f"benchmark {store.location.uri}: {len(clips)} groups, {pairs} pairs of follow-ups; left out {len(left_out)}"
+
+
+# navtest, of one stage: the frames of a list of tokens, each a clip of its own.
+#
+# Which frames count is the public loader's choice (navsim/common/dataloader.py:24-73 at autonomousvision/navsim @
+# 0a380a9). Two plans are compared (extended comfort) where the token before in the log is at most 0.55 s earlier
+# (`infer_start_adjacent_mapping`, navsim/planning/script/run_pdm_score_one_stage.py), so a clip names that one's
+# clip.
+
+NAVTEST = "navtest"
+MOST_APART_US = 550_000  # between two frames whose plans are compared
+
+
+@dataclass(frozen=True)
+class LoneToken:
+    """One frame of the benchmark."""
+
+    token: str
+    log: Path
+    timestamp_us: int
+    start_ms: int
+    before: str | None = None  # the token up to 0.55 s earlier, if that is one of the benchmark's
+
+    @property
+    def clip_id(self) -> str:
+        return clip_of(self.token)
+
+
+def clip_of(token: str) -> str:
+    """The id of a token's clip."""
+    return sha256("\x1f".join((NAVTEST, token)).encode()).hexdigest()[:16]
+
+
+def lone_tokens(selection: Selection, logs: Path, cache_dir: Path) -> tuple[list[LoneToken], list[str]]:
+    """The frames that the selection's scene filter chooses, log by log in time, and its tokens that are no frame here.
+
+    A log that is named and not here is left out with its tokens. Raises BadClip for a log that is broken, and
+    ValueError where nothing is chosen.
+    """
+    chosen = selection.scene_filter
+    wanted = None if chosen.tokens is None else frozenset(chosen.tokens)
+    found: list[LoneToken] = []
+    for name, path in log_files(logs).items():
+        if chosen.log_names is not None and name not in chosen.log_names:
+            continue
+        table = table_at(path, cache_dir)
+        starts = table.start_ms
+        for at in wanted_windows(table, Choice(1, 0, 0.0, chosen), wanted):
+            found.append(LoneToken(str(table.tokens[at]), path, int(table.timestamps_us[at]), int(starts[at])))
+    found = found[: chosen.max_scenes]
+    if not found:
+        raise ValueError(f"logs={logs}: none of the frames that {selection.name} names is in the logs here")
+    for i, (last, now) in enumerate(pairwise(found), start=1):
+        if now.log == last.log and 0 < now.timestamp_us - last.timestamp_us <= MOST_APART_US:
+            found[i] = replace(now, before=last.token)
+    return found, sorted((wanted or frozenset()) - {one.token for one in found})
+
+
+@dataclass
+class LoneReader:
+    """Reads the frames, one log open at a time."""
+
+    maps: Path
+    sensors: Path | None
+    store: Store
+    _log: LogFrames | None = field(default=None)
+
+    def row(self, one: LoneToken) -> dict[str, object]:
+        """The columns of one frame. Its scene is written beside. Raises BadClip."""
+        if self._log is None or self._log.file != str(one.log):
+            self._log = read_frames(one.log)
+        digest = sha256(one.token.encode()).hexdigest()
+        origin = Origin(str(one.log), one.clip_id, NAVTEST, self._log.name, "test", LICENCE, digest, None)
+        scene, columns = logged_frame(self._log, one.token, self.maps, self.sensors, origin)
+        SceneFiles(self.store.location.child("scenes")).store(OneStageClip(scene.clip))
+        return columns
+
+    def entries(self, tokens: Sequence[LoneToken]) -> list[Entry]:
+        """All of them."""
+        return [
+            Entry(one.clip_id, NAVTEST, one.log.stem, HUMAN, 0, NO_CANDIDATE, partial(self.row, one)) for one in tokens
+        ]
+
+
+def import_navtest(
+    store: Store, selection: Selection, logs: Path, sensors: Path | None, maps: Path
+) -> tuple[RunSummary, str]:
+    """Every frame of a selection into a store, and its benchmark; how that ended, and a line about it.
+
+    sensors: None for frames without pictures. Raises ValueError and BadClip where nothing can begin, and what
+    `import_rows` raises.
+    """
+    tokens, absent = lone_tokens(selection, logs, user_cache() / "navsim")
+    identity = identity_of(NAVTEST, {"pictures": sensors is not None, "split": selection.name})
+    summary = import_rows(store, identity, LoneReader(maps, sensors, store).entries(tokens))
+    return summary, write_navtest(store, tokens, absent, identity)
+
+
+def write_navtest(store: Store, tokens: Sequence[LoneToken], absent: Sequence[str], identity: RunIdentity) -> str:
+    """benchmark.json of the frames that are samples; a line that says what is in it."""
+    made = set(store.samples.read(["clip_id"]).column("clip_id").to_pylist())
+    made &= set(SceneFiles(store.location.child("scenes")).clip_ids())
+    clips: list[dict[str, object]] = []
+    left_out: list[dict[str, object]] = [{"token": token, "why": "absent_token"} for token in absent]
+    for one in tokens:
+        named = {"clip_id": one.clip_id, "dataset": NAVTEST, "log_id": one.log.stem, "start_ms": one.start_ms}
+        before = None if one.before is None else clip_of(one.before)
+        if one.clip_id in made:
+            compared = before if before in made else None
+            clips.append({**named, "follow_ups": [], "tokens": [one.token], "before": compared})
+        else:
+            left_out.append({**named, "why": "failed", "token": one.token})
+    document = {
+        "format": FORMAT,
+        "stages": 1,
+        "settings_hash": identity.settings_hash,
+        "settings": dict(identity.settings),
+        "stage_versions": dict(identity.stage_versions),
+        "vocabulary_digest": identity.vocabulary_digest,
+        "clips": clips,
+        "left_out": left_out,
+    }
+    store.location.write(BENCHMARK_FILE, (json.dumps(document, indent=1) + "\n").encode())
+    return f"benchmark {store.location.uri}: {len(clips)} frames; left out {len(left_out)}"
