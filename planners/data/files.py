@@ -10,19 +10,14 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from threading import Lock
-from typing import IO
-from typing import TypeAlias
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from pyarrow import fs
 
-from factory.files import locked
 from factory.store.location import raising_damaged_file
-from factory.store.reader import TIME_TOLERANCE_S, group_rows, sample_table
-from tasks.caches import Damaged, sealed, unsealed
-from factory.store.reader import Format, StoredFile, sample_table
+from factory.store.reader import sample_table
 from tasks.world.arrays import Ints
 
 FOOTER_BYTES = 2**25  # as they are stored; parsed they take eight times that

@@ -25,8 +25,7 @@ from planners.navsim.agent import CAMERAS, HISTORY, receive, send
 from tasks.render.views import undistorted
 from tasks.trajectories import at_ten_hz
 from tasks.world.arrays import Array, Bytes
-from tasks.world.camera import Camera
-from tasks.world.clip import HORIZON_STEPS
+from tasks.world.clip import HORIZON_STEPS, Camera
 
 # A planner before NAVSIM's cameras: which of them it looks at, and what it plans from what they show.
 

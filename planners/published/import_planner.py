@@ -27,7 +27,7 @@ from factory.config.compose import ConfigError, compose, fill
 from factory.config.words import SHOW, without_show
 from factory.datasets.navsim.pickles import METRICS
 from factory.readers.pickles import load_tensors
-from planners.models.diffusiondrive import POINT_FEATURES, WAYPOINTS, DiffusionDriveSettings
+from planners.models.diffusiondrive import POINT_FEATURES, REFINEMENTS, WAYPOINTS, DiffusionDriveSettings
 from planners.models.gtrs_dense import IMITATION, GtrsDenseSettings, inference_arrays
 from planners.models.ltf import LtfSettings
 from planners.models.planner import Planner, PlannerChoice, build_planner, settings_of
@@ -228,7 +228,7 @@ def diffusiondrive(moves: Moves, settings: DiffusionDriveSettings) -> Arrays:
     moves.layer(f"{head}.plan_anchor_encoder.3", "decoder.feature.3")
     moves.layer(f"{head}.time_mlp.1", "decoder.step.0")
     moves.layer(f"{head}.time_mlp.3", "decoder.step.2")
-    for number in range(settings.refinements):
+    for number in range(REFINEMENTS):
         name, own = f"{head}.diff_decoder.layers.{number}", f"decoder.layers.{number}"
         moves.layer(f"{name}.cross_bev_attention.attention_weights", f"{own}.along.weights")
         moves.layer(f"{name}.cross_bev_attention.value_proj.0", f"{own}.along.value.0")
@@ -266,7 +266,7 @@ def gtrs_dense(moves: Moves, settings: GtrsDenseSettings) -> Arrays:
     moves.decoder(f"{head}.transformer", "scorer.decoder")
     moves.all(f"{head}.heads.imi.", f"scorer.heads.{IMITATION}.")
     for theirs, here in SCORES.items():
-        if here not in settings.without:
+        if here in settings.sub_scores:
             moves.all(f"{head}.heads.{theirs}.", f"scorer.heads.{here}.")
     moves.leave("_tf_decoder.")
     moves.leave("_agent_head.")

@@ -39,8 +39,8 @@ from factory.stages.imaging import NO_IMAGES
 from factory.store.location import SceneFiles
 from factory.store.samples import Store
 from factory.store.schema import RunIdentity
-from tasks.experts.pdm_closed import PdmSettings, plan_for
 from tasks.caches import user_cache
+from tasks.experts.pdm_closed import PdmSettings, plan_for
 from tasks.hard_scenes import GivenScenes, OneStageClip
 from tasks.render.settings import ImageSource
 from tasks.stages import FOLLOW_UP, FOLLOW_UP_BEFORE, HUMAN, HUMAN_BEFORE

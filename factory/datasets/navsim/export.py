@@ -35,8 +35,7 @@ from factory.datasets.navsim.frames import (
     split_names,
 )
 from factory.datasets.navsim.pickles import dumps, write_rewards
-from factory.store.disk import needs_disk, whole_file
-from factory.files import atomic_file
+from factory.files import atomic_file, naming_disk_errors
 from factory.store.location import Location, open_parquet
 from factory.store.reader import Sample, read_rows
 from factory.store.schema import LABEL_COLUMNS, canonical_json
@@ -83,7 +82,7 @@ class Written:
 
 def write_file(root: Path, path: str, data: bytes) -> File:
     """A whole file or none. Raises DiskFull."""
-    with whole_file(root / path, len(data)) as draft:
+    with atomic_file(root / path, len(data)) as draft:
         draft.write_bytes(data)
     return File(path, len(data), hashlib.sha256(data).hexdigest())
 
@@ -157,7 +156,7 @@ class Journal:
 
     def _append(self, line: Mapping[str, Any]) -> None:
         path, data = self.root / JOURNAL, canonical_json(line) + "\n"
-        with needs_disk(path, len(data)), path.open("a") as file:
+        with naming_disk_errors(path, len(data)), path.open("a") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())

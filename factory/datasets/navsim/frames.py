@@ -12,12 +12,11 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from factory.store.reader import decoded
+from factory.store.reader import decode_stored_image
 from factory.store.schema import AGENT_STEPS, NOW_INDEX
-from tasks.render.rigs import pinhole
+from tasks.render.views import pinhole
 from tasks.world.arrays import Array
-from tasks.world.camera import Camera
-from tasks.world.clip import HORIZON_STEPS, STEP_S
+from tasks.world.clip import HORIZON_STEPS, STEP_S, Camera
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, YAW_RATE, pose_on_ground, to_local, to_world
 
 # What an export is asked for.
@@ -490,7 +489,7 @@ def _jpeg(image: Mapping[str, Any], camera: Camera, size: tuple[int, int]) -> by
     if (camera.width, camera.height) == size:
         return bytes(image["jpeg"])
     left, top, width, height = camera.window(*size)
-    pixels = decoded(image)[top : top + height, left : left + width]
+    pixels = decode_stored_image(image)[top : top + height, left : left + width]
     shrinks = size[0] < width
     return _encoded(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR))
 

@@ -28,26 +28,33 @@ from factory.datasets.navsim.window import (
     window_agents,
     world_from_ego,
 )
-from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
+from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, calling_on_stop_signal
+from factory.files import DiskFull
 from factory.graph.driver import SHARD_BYTES
 from factory.graph.execute import RunSummary, record_summary
-from factory.graph.progress import Counter, Executed
+from factory.graph.progress import Counter, RunTotals
 from factory.readers.base import BadClip, failing_as
 from factory.readers.pictures import BadPicture, jpeg_size, refuse_size, without_exif
 from factory.stages.rows import scene_columns
-from factory.store.attempts import ErrorKind, Kind, Outcome
-from factory.store.disk import DiskFull
-from factory.store.parquet_file import Shard, write_shard
-from factory.store.samples import IMPORTED, ChangedRun, Store
+from factory.store.location import Shard, write_shard
+from factory.store.samples import IMPORTED, ChangedRun, ErrorKind, Kind, Outcome, Store
 from factory.store.schema import SAMPLES, UNLISTED, BadRow, RunIdentity, Stamp, attempt_id, sample_row_to_table
 from tasks.render.settings import ImageSource
-from tasks.world.agents import PER_STEP, AgentTracks
 from tasks.world.arrays import Array
-from tasks.world.camera import Camera
-from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, STEP_S, Clip, Scene, scene_of_clip
-from tasks.world.frames import to_local
-from tasks.world.lanes import LightState, RoadMap, Route, TrafficLights
-from tasks.world.vehicle import EGO_STATE_SIZE, HEADING
+from tasks.world.clip import (
+    CLIP_STEPS,
+    HORIZON_STEPS,
+    NOW,
+    PER_STEP,
+    STEP_S,
+    AgentTracks,
+    Camera,
+    Clip,
+    Scene,
+    scene_of_clip,
+)
+from tasks.world.frames import EGO_STATE_SIZE, HEADING, to_local
+from tasks.world.road_map import LightState, RoadMap, Route, TrafficLights
 
 HISTORY_FRAMES = FRAMES_BEFORE + 1  # now among them
 SCENE_FRAMES = HISTORY_FRAMES + 8  # with the 4 s that are driven
@@ -234,16 +241,16 @@ def import_rows(store: Store, identity: RunIdentity, entries: Sequence[Entry]) -
     stamps = [entry.stamp(identity) for entry in entries]
     if (known := store.runs()) and known[-1]["settings_hash"] != identity.settings_hash and len(store.samples):
         raise ChangedRun(f"{store.location.uri} holds rows of another run or import: choose another out")
-    records = store.agree(identity, {stamp.expert: stamp.expert_digest for stamp in stamps}, "stop")
+    records = store.checked_records(identity, {stamp.expert: stamp.expert_digest for stamp in stamps}, "stop")
     waiting = [pair for pair in zip(entries, stamps) if pair[1].attempt_id not in store.samples]
-    summary = RunSummary(COMPLETE, executed=Executed(found_done=len(entries) - len(waiting)), began_ms=began_ms)
+    summary = RunSummary(COMPLETE, executed=RunTotals(found_done=len(entries) - len(waiting)), began_ms=began_ms)
     counts = dict.fromkeys((kind.value for kind in Kind), 0)
     stopped: list[bool] = []
     began = time.monotonic()
     try:
-        store.begin(records)
+        store.begin_run(records)
         batch = _Batch(store)
-        with asked_to_stop(lambda: stopped.append(True)), Counter("imported", len(waiting)) as progress:
+        with calling_on_stop_signal(lambda: stopped.append(True)), Counter("imported", len(waiting)) as progress:
             for done, (entry, stamp) in enumerate(waiting, start=1):
                 failed = _try(batch, entry, stamp)
                 counts[Kind.FAILED if failed else Kind.ACCEPTED] += 1

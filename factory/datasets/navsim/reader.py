@@ -52,11 +52,10 @@ from factory.readers.pickles import check_values, load_plain
 from factory.readers.settings import NavsimClips
 from factory.readers.validate import validate_clip
 from factory.wording import shown, time_text
-from tasks.caches import user_cache
-from tasks.world.clip import NOW, Block, Camera, Clip, SensorFile
+from tasks.caches import sealed, unsealed, user_cache
 from tasks.kernels.compiled import write_whole
-from tasks.sealed import sealed, unsealed
 from tasks.world.arrays import Array, Bools, Ints
+from tasks.world.clip import NOW, Block, Camera, Clip, SensorFile
 
 # NAVSIM's scene filters and splits: the YAML files that name which windows of which logs count.
 #

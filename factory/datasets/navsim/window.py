@@ -25,14 +25,20 @@ from factory.readers.base import BadClip
 from factory.readers.pictures import BadPicture, Size, jpeg_size
 from factory.readers.settings import FRAME_STEPS
 from tasks.world.arrays import Array, Bools
-from tasks.world.clip import CLIP_STEPS, HISTORY_STEPS, HORIZON_STEPS, MOVING_KINDS, AgentKind, AgentTracks
+from tasks.world.clip import (
+    CLIP_STEPS,
+    HISTORY_STEPS,
+    HORIZON_STEPS,
+    MOVING_KINDS,
+    AgentKind,
+    AgentTracks,
+    Camera,
+    SensorFile,
+)
 from tasks.world.frames import AX, EGO_STATE_SIZE, HEADING, PACIFICA, VX, X, wrap_angle
-from tasks.world.camera import Camera, SensorFile
 from tasks.world.geometry import ego_boxes, touching
-from tasks.world.road_map import LightState, TrafficLights
-from tasks.world.lanes import LightState, RoadMap, Route, TrafficLights
+from tasks.world.road_map import LightState, NoRoute, RoadMap, Route, RouteFinder, TrafficLights
 from tasks.world.roadblocks import corrected_roadblocks, route_of_roadblocks
-from tasks.world.route import NoRoute, RouteFinder
 
 FRAMES_BEFORE = HISTORY_STEPS // FRAME_STEPS  # of T in a window
 HORIZON_FRAMES = HORIZON_STEPS // FRAME_STEPS

@@ -49,11 +49,10 @@ from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, Whol
 from factory.readers.pickles import id_text
 from factory.readers.settings import Py123dClips
 from factory.wording import shown
-from tasks.world.agents import AgentKind
 from tasks.world.arrays import Array, Indices
-from tasks.world.clip import STEP_S, Block, Camera, SensorFile
-from tasks.world.lanes import LightState, RoadMap, TrafficLights
-from tasks.world.vehicle import EGO_STATE_SIZE
+from tasks.world.clip import STEP_S, AgentKind, Block, Camera, SensorFile
+from tasks.world.frames import EGO_STATE_SIZE
+from tasks.world.road_map import LightState, RoadMap, TrafficLights
 
 # What moves in a log of 123D, at steps of 0.1 s: rear-axle poses, boxes, lights.
 #
