@@ -79,7 +79,7 @@ class VehiclePhoto:
 class VehiclePhotos:
     """A block's photos, for holding vehicles against them."""
 
-    find_sightings: Mapping[str, Sightings]  # by track id
+    sightings: Mapping[str, Sightings]  # by track id
     likeness: Callable[[str, int], float]  # of a track as the scene draws it to a photo that shows it, 0 to 1
     fading: Callable[[], Mapping[str, float]] = dict  # of tracks; FADING of others
     taken: Callable[[str, int], VehiclePhoto] | None = None  # a track in a photo; None: there is none beside pictures
