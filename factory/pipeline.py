@@ -21,7 +21,7 @@ from factory.graph.steps import (
     StopCheck,
     never_stop,
 )
-from factory.readers.base import BadClip, ClipReader, ClipRef, Unreadable
+from factory.readers.base import BadClip, ClipReader, ClipRef, Unreadable, painter_of
 from factory.readers.validate import read_clip
 from factory.stages.assets import running_fits
 from factory.stages.imaging import Imaging, scene_cache_counts
@@ -350,7 +350,7 @@ class FactoryWork:
     @property
     def imaging(self) -> Imaging:
         """The render stage with this run's settings."""
-        return Imaging(self.render, self.cache_dir)
+        return Imaging(self.render, self.cache_dir, painter_of(self.reader))
 
 
 def _at_hand(before: tuple[int, int]) -> bool | None:

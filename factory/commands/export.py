@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from factory.config.arguments import POSITIONAL, Refused
+from factory.config.datasets import find_function
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.views.show import find, logged_drive, open_samples
 from factory.views.status import open_store
@@ -122,7 +123,6 @@ def export(request: Request) -> Iterator[Path]:
 def _export_all(request: Request) -> int:
     """All samples in SimScale's layout; the exit code. Raises Refused."""
     from factory.config.compose import need_run_extra
-    from factory.datasets.navsim.export import export as export_all
     from factory.datasets.navsim.frames import ExportSettings
     from factory.graph.parallel import WorkerDied, parallel_map
     from factory.graph.steps import TaskStopped
@@ -133,21 +133,11 @@ def _export_all(request: Request) -> int:
         need_run_extra("ray")
     store = open_store(request.out)
     try:
-        settings = ExportSettings(
-            request.expert,
-            tuple(int(word) for word in request.round),
-            request.split,
-            request.tag,
-            request.layout,
-            request.resize,
-            request.missing,
-            request.map_location,
-        )
         target = Location.parse(request.to, setting="to")
         dealt = partial(parallel_map, executor=request.executor, workers=request.workers, to=target)
         table = sample_table(store.location.uri, store.location.options)
         trajectories = _label_trajectories(store, request.vocabulary)
-        done = export_all(table, Path(target.uri), settings, trajectories, dealt)
+        done = find_function("EXPORTS", request.format)(request, table, Path(target.uri), trajectories, dealt)
     except (OSError, ValueError, WorkerDied) as error:  # no folder, a full disk, what cannot be written as asked
         raise Refused(str(error)) from error
     except (TaskStopped, KeyboardInterrupt) as error:

@@ -33,15 +33,11 @@ The same command again goes on, and tries what failed once more. What is kept an
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from factory.config.arguments import POSITIONAL, Refused
+from factory.config.datasets import find_function
 from factory.wording import one_line
-
-if TYPE_CHECKING:
-    from factory.graph.execute import RunSummary
-    from factory.store.samples import Store
-
 
 CAMERAS = "nuscenes-cameras"
 
@@ -97,67 +93,24 @@ def main(request: Request) -> int:
         raise Refused(unusable)
     try:
         store = Store(Location.parse(request.out))
-        answers = {"simscale": _simscale, "navhard": _navhard, "navtest": _navtest}
-        summary, told = answers[request.source](request, store)
+        summary, said = find_function("IMPORTS", request.source)(request, store)
     except (BadClip, ChangedRun, AnotherWriter, ValueError, OSError, ImportError, DeltaError) as error:
         raise Refused(one_line(error)) from error
     counts = summary.counts
     print(f"{counts['accepted']:,} samples imported, {summary.executed.found_done:,} were there: {store.location.uri}")
-    for line in filter(None, (summary.message, told, failed_line(store) if counts["failed"] else "")):
+    for line in filter(None, (summary.message, said, failed_line(store) if counts["failed"] else "")):
         print(line)
     return summary.exit_code
 
 
-def _simscale(request: Request, store: "Store") -> tuple["RunSummary", str]:
-    from factory.datasets.navsim.import_rows import identity_of, import_rows
-    from factory.datasets.navsim.simscale import Import, Rewards, parts_of
-    from factory.setup.vocabulary import load_vocabulary
-
-    parts = parts_of(Path(request.root), request.only)
-    rewards = None
-    if request.rewards is not None and request.vocabulary is not None:
-        rewards = Rewards(Path(request.rewards), load_vocabulary(request.vocabulary))
-    settings = {
-        "maps": request.maps is not None,
-        "pictures": request.pictures,
-        "labels": None if rewards is None else rewards.vocabulary.digest,
-    }
-    maps = _folder(request.maps)
-    if maps is not None and not maps.is_dir():
-        raise Refused(f"maps={request.maps}: no such folder")
-    wanted = Import(maps, request.pictures, rewards)
-    return import_rows(store, identity_of(request.source, settings), wanted.entries(parts)), ""
-
-
-def _navhard(request: Request, store: "Store") -> tuple["RunSummary", str]:
-    from factory.datasets.navsim.benchmarks import NavsimFolders, import_navhard
-    from factory.datasets.navsim.reader import read_selection
-
-    logs, maps = _folder(request.logs), _folder(request.maps)
-    assert logs is not None and maps is not None and request.split is not None
-    places = NavsimFolders(logs, _folder(request.sensors), Path(request.root), maps)
-    return import_navhard(store, read_selection(request.split), places)
-
-
-def _navtest(request: Request, store: "Store") -> tuple["RunSummary", str]:
-    from factory.datasets.navsim.benchmarks import import_navtest
-    from factory.datasets.navsim.reader import read_selection
-
-    maps = _folder(request.maps)
-    assert maps is not None and request.split is not None
-    logs = Path(request.root)
-    return import_navtest(store, read_selection(request.split), logs, _folder(request.sensors), maps)
-
-
 def _cameras(request: Request) -> int:
     """Write the sidecars and say what each holds. Raises Refused."""
-    from factory.datasets.scenarionet.nuscenes_cameras import import_cameras
     from factory.readers.base import BadClip
 
     root, out = Path(request.root), Path(request.out)
     photos = 0
     try:
-        for done in import_cameras(root, out, request.version, request.only, request.sweeps):
+        for done in find_function("SIDECARS", request.source)(root, out, request.version, request.only, request.sweeps):
             photos += done.photos
             where = f"{done.photos:,} photos of {done.cameras} cameras, {done.sweeps} sweeps: {done.path}"
             print(f"{done.scene}  {where if done.photos else 'no photo is there: no sidecar'}")
@@ -168,7 +121,3 @@ def _cameras(request: Request) -> int:
     if not photos:
         raise Refused(f"{root}: none of the photos that its tables name is there; unpack samples/ and sweeps/ into it")
     return 0
-
-
-def _folder(path: str | None) -> Path | None:
-    return None if path is None else Path(path)

@@ -9,6 +9,7 @@ Each is compiled once per machine, processor and version; what is there is not c
 from dataclasses import dataclass, field
 
 from factory.config.arguments import POSITIONAL, Refused
+from factory.config.datasets import data_sets
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Request:
 def main(request: Request) -> None:
     """Compile the parts that are named, else all. Raises Refused."""
     from factory.graph.steps import NotReady
-    from factory.stages.warm import PARTS, compile_kernels, compile_town_kernels
+    from factory.stages.warm import PARTS, compile_kernels
 
     if unknown := sorted(set(request.parts) - PARTS.keys()):
         raise Refused(f"no part {', '.join(unknown)}; there are {', '.join(PARTS)}")
@@ -30,4 +31,5 @@ def main(request: Request) -> None:
     except NotReady as error:
         raise Refused(str(error)) from error
     if not request.parts:
-        compile_town_kernels()
+        for data_set in data_sets().values():
+            getattr(data_set, "compile_kernels", lambda: None)()

@@ -10,35 +10,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 from factory.config.compose import compose, conf_dir, fill, need_run_extra, refuse_unknown
+from factory.config.datasets import reader_settings
 from factory.config.plugins import with_experts
 from factory.config.shapes import defaults_of, keys_of, merged
 from factory.config.words import ConfigError, nearest
 from factory.files import in_submitted_job, matching
-from factory.readers.settings import (
-    LogClips,
-    NavsimClips,
-    Py123dClips,
-    ScenarioNetClips,
-    TownClips,
-    TownsClips,
-    TownSettings,
-)
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.settings import ExpertGate, PdmSettings, PerturbSettings, RecoverySettings, TrafficSettings
 from tasks.stages import FRAMES, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
-AV2 = "factory.datasets.av2.reader.AV2Reader"
-SCENARIONET = "factory.datasets.scenarionet.reader.ScenarioNetReader"
 LabelTraffic = Literal["replay", "idm", "navsim"]
-READERS: Mapping[str, type[Any]] = {  # `_target_` of a built-in reader -> its settings
-    AV2: LogClips,
-    "factory.datasets.navsim.reader.NavsimReader": NavsimClips,
-    "factory.datasets.py123d.reader.Py123dReader": Py123dClips,
-    SCENARIONET: ScenarioNetClips,
-    "factory.datasets.town.reader.SyntheticReader": TownClips,
-    "factory.datasets.town.reader.SyntheticTownsReader": TownsClips,
-}
 RECOVERY = "factory.setup.settings.recovery"
 
 
@@ -213,17 +195,16 @@ def run_config(values: Mapping[str, Any]) -> RunConfig:
     Raises ConfigError.
     """
     config = fill(RunConfig, values, "")
+    rig: tuple[str, ...] = ()
+    painted = config.render.mode is RenderMode.PAINTER
     for key, shape in shapes_in(values).items():
         group, _, name = key.partition(".")
         filled = fill(shape, without_labels(values[group][name] if name else values[group]), key)
-        if isinstance(filled, TownClips | TownsClips):
-            painted = config.render.mode is RenderMode.PAINTER  # of a town without photos, by its usual cameras
-            rig = filled.settings.cameras or (TownSettings().cameras if painted else ())  # others: when clips are read
-            asked = config.render.cameras if rig and config.render.mode is not RenderMode.NONE else ()
-            if missing := [name for name in asked if name not in rig]:
-                raise ConfigError(f"render.cameras: no camera {', '.join(missing)}; this rig has {', '.join(rig)}")
-    reader = READERS.get(config.clips.get("_target_", ""))
-    if config.render.mode is RenderMode.PAINTER and reader not in (TownClips, TownsClips):
+        rig = filled.rig(painted) if key == "clips" else rig
+    asked = config.render.cameras if rig and config.render.mode is not RenderMode.NONE else ()
+    if missing := [name for name in asked if name not in rig]:
+        raise ConfigError(f"render.cameras: no camera {', '.join(missing)}; this rig has {', '.join(rig)}")
+    if painted and not rig:
         raise ConfigError("render.mode=painter: only the synthetic town has a painter, and these clips are of no town")
     if config.executor == "ray":
         need_run_extra("ray")
@@ -232,13 +213,13 @@ def run_config(values: Mapping[str, Any]) -> RunConfig:
 
 def photos_alone(config: RunConfig) -> bool:
     """Whether clips may have photos and no lidar, as far as the settings of their reader tell. Raises ConfigError."""
-    shape = READERS.get(config.clips.get("_target_", ""))
+    shape = reader_settings(config.clips)
     return shape is None or bool(fill(shape, without_labels(config.clips), "clips").photos_alone)
 
 
 def refuse_relative_root(clips: Mapping[str, Any]) -> None:
     """Raises ConfigError for relative logs or photos inside a submitted Ray job, whose folder is a temporary copy."""
-    for key in ("root", "cameras", "sensor_root") if clips.get("_target_") in READERS else ("root",):
+    for key in ("root", "cameras", "sensor_root") if reader_settings(clips) else ("root",):
         path = clips.get(key)
         if in_submitted_job() and isinstance(path, str) and not Path(path).is_absolute():
             raise ConfigError(
@@ -251,7 +232,7 @@ def refuse_missing_root(clips: Mapping[str, Any]) -> None:
     """Raises ConfigError where a built-in reader's clips.root is not there, before the reader is imported."""
     refuse_relative_root(clips)
     root = clips.get("root")
-    if clips.get("_target_") in READERS and isinstance(root, str) and not Path(root).exists():
+    if reader_settings(clips) and isinstance(root, str) and not Path(root).exists():
         raise ConfigError(f"clips: {root}: no such folder")
 
 
@@ -262,7 +243,7 @@ def load_config(words: Sequence[str]) -> RunConfig:
 
 def shapes_in(values: Mapping[str, Any]) -> dict[str, type[Any]]:
     """Key -> dataclass of the built-in reader and experts that a run's settings name."""
-    reader = READERS.get(values["clips"].get("_target_", ""))
+    reader = reader_settings(values["clips"])
     experts = {
         f"expert.{name}": EXPERTS[spec["_target_"]]
         for name, spec in values["expert"].items()
@@ -291,7 +272,7 @@ def built_in_classes(group: str) -> dict[str, str]:
 
 def reader_of(choice: str) -> type[Any] | None:
     """The settings of the built-in reader `clips=<choice>`; None where there is none of that name."""
-    return READERS.get(built_in_classes("clips").get(choice, ""))
+    return reader_settings({"_target_": built_in_classes("clips").get(choice, "")})
 
 
 def _elsewhere(key: str) -> str:

@@ -2,14 +2,18 @@
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Protocol
 
 from factory.wording import one_line
+from tasks.world.agents import AgentTracks
+from tasks.world.arrays import Array, Bytes
+from tasks.world.camera import Camera
 from tasks.world.clip import Clip
+from tasks.world.lanes import TrafficLights
 
 SPLITS = ("train", "val", "test")
 MAX_FILE_BYTES = 1 << 30  # of a file that is read whole
@@ -118,6 +122,32 @@ class ClipReader(Protocol):
     def read(self, ref: ClipRef) -> Clip:
         """The validated clip. Raises BadClip."""
         ...
+
+
+class Painter(Protocol):
+    """Draws the world of a reader's clips as it is simulated, from anywhere: pictures without a scene."""
+
+    def rig(self, clip: Clip, width: int, height: int) -> tuple[Camera, ...]:
+        """The clip's cameras, of some size, or the painter's own of this size where it has none."""
+        ...
+
+    def lights(self, clip: Clip, n_steps: int) -> TrafficLights:
+        """The clip's lights over `n_steps` steps from its first one."""
+        ...
+
+    def pictures(
+        self, clip: Clip, cameras: Sequence[Camera], agents: AgentTracks, step: int, state: Array
+    ) -> tuple[Array, list[Bytes]]:
+        """The pose (4, 4) of an ego in a state (11,), and what each camera sees from there at a step of the clip.
+
+        agents: who is there, in the steps of the clip.
+        """
+        ...
+
+
+def painter_of(reader: ClipReader) -> Painter | None:
+    """Who paints the reader's clips; None where nobody does."""
+    return getattr(reader, "painter", None)
 
 
 # Which split a log belongs to by its data set's own word; None where the data set has none.

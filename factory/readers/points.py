@@ -1,7 +1,8 @@
-"""Binary PCD files, the merged lidar sweeps of nuPlan and OpenScene.
+"""Files of points: binary PCD, nuScenes' rows, feather.
 
-A text header of ten keys, then POINTS packed little-endian records. Only what nuplan-devkit @ e924167 reads
-(nuplan/database/utils/pointclouds/pointcloud.py:96-180) is read: `DATA binary`, one value a field.
+PCD files are the merged lidar sweeps of nuPlan and OpenScene. A text header of ten keys, then POINTS packed little-
+endian records. Only what nuplan-devkit @ e924167 reads (nuplan/database/utils/pointclouds/pointcloud.py:96-180) is
+read: `DATA binary`, one value a field.
 """
 
 from collections.abc import Sequence
@@ -9,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.feather
 from numpy.typing import NDArray
 
 from factory.readers.base import BadClip, bytes_of
@@ -100,5 +103,31 @@ def read_points(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     out = {name: rows[:, COLUMNS.index(name)].copy() for name in columns}
     for name, values in out.items():
         if not np.isfinite(values).all():
+            raise BadClip(str(path), name, "holds NaN or infinity")
+    return out
+
+
+# Feather files: columns of numbers and texts, as Argoverse 2 has them.
+
+
+def read_feather(path: Path, columns: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
+    """Named columns as writable arrays; numbers are checked to be finite. Raises BadClip."""
+    try:
+        table = pyarrow.feather.read_table(path)
+        table.validate(full=True)
+    except FileNotFoundError as error:
+        raise BadClip(str(path), "file", "missing") from error
+    except (pa.ArrowException, OSError, ValueError) as error:  # a name that is no text
+        raise BadClip(str(path), "file", f"cannot be read as feather, truncated? {error}") from error
+    if table.num_rows == 0:
+        raise BadClip(str(path), "file", "holds no rows")
+    out = {}
+    for name in columns:
+        if name not in table.column_names:
+            raise BadClip(str(path), name, "column is missing")
+        if table[name].null_count:
+            raise BadClip(str(path), name, "holds nulls")
+        out[name] = np.array(table[name].to_numpy())
+        if out[name].dtype.kind == "f" and not np.isfinite(out[name]).all():
             raise BadClip(str(path), name, "holds NaN or infinity")
     return out

@@ -3,13 +3,10 @@
 Classes of plug-ins, folders of logs, the cameras of their rigs. What only reading a clip can tell comes later.
 """
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
-
 from factory.config.classes import class_of
+from factory.config.datasets import data_set_of
 from factory.config.plugins import offered
-from factory.config.run import AV2, SCENARIONET, RunConfig, built_in_classes, refuse_missing_root
+from factory.config.run import RunConfig, built_in_classes, refuse_missing_root
 from factory.config.words import ConfigError
 from tasks.render.settings import RenderMode
 
@@ -37,16 +34,16 @@ def refuse_missing_classes(config: RunConfig) -> None:
 def refuse_cameras_of_no_rig(config: RunConfig) -> None:
     """Raises ConfigError for a root without logs, and for a camera in render.cameras that the rig of no log has.
 
-    Towns' rigs are settings, and held against them; the rig of a user's own reader is known when a clip is read.
+    Settings of rigs are held against themselves; the rig of a user's own reader is known when a clip is read.
     """
-    target, root, wanted = config.clips.get("_target_"), config.clips.get("root"), config.render.cameras
-    if target not in (AV2, SCENARIONET):
+    clips, wanted = config.clips, config.render.cameras
+    look = getattr(data_set_of(clips), "camera_names", None)
+    if look is None:
         return
-    rig: tuple[str, ...] = ()
-    if target == AV2:
-        rig = _argoverse_rig(Path(str(root)), config.clips["only"])
-    elif config.clips["cameras"] is not None:
-        rig = _scenarionet_rig(Path(str(root)), config.clips)
+    try:
+        rig: tuple[str, ...] = look(clips)
+    except ValueError as error:
+        raise ConfigError(f"clips: {error}") from error
     if not wanted or config.render.mode is RenderMode.NONE:
         return
     if not rig and config.render.mode is RenderMode.MAP:
@@ -54,29 +51,8 @@ def refuse_cameras_of_no_rig(config: RunConfig) -> None:
 
         rig = tuple(camera.name for camera in MAP_RIG)
     if missing := [name for name in wanted if name not in rig]:
-        none = f"no log under {root} has calibrated cameras"
-        if target == SCENARIONET:
+        none = f"no log under {clips['root']} has calibrated cameras"
+        if "cameras" in clips:
             none += "; clips.cameras=<sidecar> brings some"
         has = f"this rig has {', '.join(rig)}" if rig else none
         raise ConfigError(f"render.cameras: no camera {', '.join(missing)}; {has}")
-
-
-def _scenarionet_rig(root: Path, clips: Mapping[str, Any]) -> tuple[str, ...]:
-    from factory.datasets.scenarionet.reader import scenario_files
-    from factory.datasets.scenarionet.sidecars import camera_names, sidecars_of
-
-    try:
-        log_ids = [log_id for log_id in scenario_files(root) if not clips["only"] or log_id in clips["only"]]
-        return camera_names(sidecars_of(Path(clips["cameras"]), log_ids).values())
-    except ValueError as error:
-        raise ConfigError(f"clips: {error}") from error
-
-
-def _argoverse_rig(root: Path, only: Sequence[str]) -> tuple[str, ...]:
-    from factory.datasets.av2.folders import camera_names, log_folders
-
-    try:
-        folders = log_folders(root)
-    except ValueError as error:
-        raise ConfigError(f"clips: {error}") from error
-    return camera_names(folder for log_id, folder in folders.items() if not only or log_id in only)

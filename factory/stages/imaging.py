@@ -1,4 +1,4 @@
-"""The render stage: a sample's images, from the block's scene, the log's own photos, the map or the town's painter.
+"""The render stage: a sample's images, from the block's scene, the log's own photos, the map or the reader's painter.
 
 A human sample of a clip with photos keeps them, whatever its block. Every other sample is drawn from the block where
 `factory.stages.assets.block_sensing` finds something to make it of, else written with image_source=none and no images.
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from factory.graph.steps import StopCheck, never_stop
-from factory.readers.base import BadClip
+from factory.readers.base import BadClip, Painter
 from factory.stages.assets import (
     RIG_SUFFIX,
     CorrectedRig,
@@ -23,7 +23,6 @@ from factory.stages.assets import (
     load_or_correct_rig,
     scene_path,
 )
-from factory.stages.painted import town_cameras, town_pictures
 from factory.stages.rows import agent_columns
 from factory.stages.sensors import block_of, choose_cameras, encode_jpeg, files_of_cameras, load_photos
 from tasks.attempt import Judged
@@ -63,6 +62,7 @@ class Imaging:
 
     settings: RenderSettings
     cache_dir: str
+    painter: Painter | None = None  # of the reader's clips
 
     def build(self, clip: Clip, threads: int, stopped: StopCheck = never_stop) -> tuple[bool, float | None]:
         """Make sure of the clip's block in the cache: whether it was there, and its PSNR in dB where it has one.
@@ -194,12 +194,13 @@ class Imaging:
         return {"cameras": self.rig(cameras), "images": found, "image_source": str(source), **measured}
 
     def _painted(self, clip: Clip, judged: Judged) -> dict[str, object]:
+        assert self.painter is not None, "render.mode=painter goes with a reader that has one"
         scene, states = judged.scene, self._ego_states(judged)
-        cameras = town_cameras(clip, self.settings)
+        cameras = painted_cameras(self.painter, clip, self.settings)
         agents = scene.agents.overwritten(scene.step, judged.rollout.agents)
         found: list[dict[str, object]] = []
         for offset, state in zip(STEPS_OF[self.settings.frames], states):
-            pose, taken = town_pictures(clip, cameras, agents, scene.step + offset, state)
+            pose, taken = self.painter.pictures(clip, cameras, agents, scene.step + offset, state)
             found += [self.image(one.name, offset * STEP_S, pose, rgb) for one, rgb in zip(cameras, taken)]
         return {"cameras": self.rig(cameras), "images": found, "image_source": str(ImageSource.PAINTER)}
 
@@ -250,6 +251,12 @@ class Imaging:
 
 
 def height_columns(scene: Scene, on_road: Array, lifted: AgentTracks) -> dict[str, object]:
+def painted_cameras(painter: Painter, clip: Clip, settings: RenderSettings) -> tuple[Camera, ...]:
+    """The chosen cameras as pinholes of the settings' size. Raises ValueError for one that the rig does not have."""
+    rig = painter.rig(clip, settings.width, settings.height)
+    return tuple(one.resized(settings.width, settings.height) for one in chosen_cameras(rig, settings.cameras))
+
+
     """The columns that say how high ego and agents of a sample are, where photos say what the log does not.
 
     on_road: (P, 4, 4) poses of the ego on the road as photos show it; lifted: the sample's agents, as high above it as

@@ -6,7 +6,6 @@ import logging
 import os
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -330,16 +329,6 @@ DISK_FULL = 5  # exit code of a part whose files could not be kept
 def _tiny_scene() -> tuple[Scene, Array]:
     ahead = np.stack([np.arange(1, 41) * 0.5, np.zeros(40), np.zeros(40)], axis=1)
     return scene_of_clip(tiny_clip()), ahead
-
-
-def compile_town_kernels() -> None:
-    """Writes the smallest log of the synthetic town into a folder that is thrown away."""
-    from factory.datasets.town.town import write_town
-    from factory.readers.settings import TownSettings
-
-    settings = TownSettings(cameras=("ring_front_center",), width=16, height=16, lidar_beams=1, lidar_azimuths=8)
-    with tempfile.TemporaryDirectory() as folder:
-        write_town(Path(folder), 1, 0, settings, threads=1)
 
 
 def tiny_clip() -> Clip:

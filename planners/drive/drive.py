@@ -31,7 +31,7 @@ from factory.files import why_unusable
 from factory.graph.parallel import WorkerDied, parallel_map
 from factory.graph.progress import Counter
 from factory.graph.steps import TaskStopped
-from factory.readers.base import ClipRef
+from factory.readers.base import ClipRef, painter_of
 from factory.setup.settings import choose_vocabulary, open_reader
 from factory.store.location import Location
 from factory.store.table import AnotherWriter, KeyedTable
@@ -40,7 +40,7 @@ from planners.drive.settings import DriveSettings, Pictures, settings_of
 from planners.drive.starts import LOGGED
 from planners.drive.summary import Row, differences_of, lines_of, summary_text, write_summary
 from planners.drive.table import FACTS, Committer, DriveRow, open_drives, write_rows
-from planners.drive.work import DriveItem, DriveWork, DrivingPlanner, NotDriven, reads_towns
+from planners.drive.work import DriveItem, DriveWork, DrivingPlanner, NotDriven
 from planners.evaluation.planner_names import planners_of
 from tasks.render.scene import engine
 from tasks.render.splatting.gsplat_backend import BackendMissing
@@ -103,7 +103,7 @@ def driven(settings: DriveSettings) -> tuple[list[Row], bool]:
 def _asked(settings: DriveSettings) -> DrivesAsked:
     planners = _planners(settings)
     reader, index = open_reader(settings.clips)
-    if any("truth" in kinds for _, kinds in planners) and not reads_towns(reader):
+    if any("truth" in kinds for _, kinds in planners) and painter_of(reader) is None:
         raise ConfigError("pictures=truth is the painter's of the synthetic town: give pictures=engine for these clips")
     if any("engine" in kinds for _, kinds in planners):
         try:

@@ -8,10 +8,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from factory.readers.base import BadClip
+from factory.readers.base import BadClip, Painter
 from factory.stages.assets import load_or_build_scene
 from factory.stages.imaging import Imaging, clip_offset_s, scene_in_clip_time
-from factory.stages.painted import town_cameras, town_pictures
+from factory.stages.imaging import Imaging, first_of, in_time_of, painted_cameras
 from factory.stages.rows import scene_columns
 from factory.stages.sensors import choose_cameras
 from factory.store.reader import Sample
@@ -115,21 +115,22 @@ def ground_of(clip: Clip) -> Array:
     return np.concatenate([clip.world_from_ego, *(file.world_from_ego[None] for file in files)])
 
 
-# A drive's cameras as the synthetic town's painter shows them: pictures without a reconstruction.
+# A drive's cameras as the painter of its reader shows them: pictures without a reconstruction.
 
 
 @dataclass(frozen=True)
 class PaintedEyes:
-    """The cameras of a clip's rig, or of the town's own where it has none, of the render settings' size."""
+    """The cameras of a clip's rig, or the painter's own where it has none, of the render settings' size."""
 
     clip: Clip
     settings: RenderSettings
+    painter: Painter
     source: ImageSource = ImageSource.PHOTO  # what a camera would have taken
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
         """As pinholes of the wanted size. Raises ValueError for one that the rig does not have."""
-        return town_cameras(self.clip, self.settings)
+        return painted_cameras(self.painter, self.clip, self.settings)
 
     @property
     def rig(self) -> Sequence[Mapping[str, Any]]:
@@ -140,9 +141,9 @@ class PaintedEyes:
         return tuple(offset for offset in STEPS_OF[self.settings.frames] if offset <= 0)
 
     def look(self, scene: Scene, offset: int) -> Images:
-        """Raises ValueError where the clip is of no town."""
+        """Raises ValueError where the clip is not the painter's."""
         state = states_at(scene, offset)[0]
-        pose, taken = town_pictures(scene.clip, self.cameras, scene.agents, scene.step + offset, state)
+        pose, taken = self.painter.pictures(scene.clip, self.cameras, scene.agents, scene.step + offset, state)
         names = (camera.name for camera in self.cameras)
         return [self._imaging.image(name, offset * STEP_S, pose, rgb) for name, rgb in zip(names, taken)]
 

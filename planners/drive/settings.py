@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from factory.config.compose import fill, refuse_unknown
-from factory.config.run import READERS, VocabularyChoice, refuse_missing_root, without_labels
+from factory.config.datasets import reader_settings
+from factory.config.run import VocabularyChoice, refuse_missing_root, without_labels
 from factory.config.shapes import defaults_of, merged
 from planners.drive.loop import LoopSettings
 from planners.evaluation.planner_names import composed
@@ -80,7 +81,7 @@ def settings_of(argv: Sequence[str]) -> DriveSettings:
 def with_clips(values: dict[str, Any]) -> dict[str, Any]:
     """With the defaults of the reader's settings, held against their types where it is a built-in one."""
     clips = values["clips"]
-    shape = READERS.get(clips.get("_target_", ""))
+    shape = reader_settings(clips)
     if shape is None:
         return values
     refuse_unknown(shape, without_labels(clips), "clips")

@@ -3,7 +3,7 @@
 A clip is 9.5 s and a drive may be 20: the clip is lengthened. As long as the log is known, which the clip's block says,
 the agents' tracks are the log's. After it no newcomer comes; who is driven by IDM goes on, who replays its log leaves
 with it (tasks.rollout.simulate), and things and what never left its place stay. A light is unknown where nobody says
-better: the synthetic town's phases go on (factory.stages.painted).
+better: the synthetic town's phases go on (its painter).
 """
 
 from dataclasses import dataclass, replace

@@ -7,11 +7,9 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Any
 
-from factory.datasets.town.reader import SensedReader
-from factory.readers.base import BadClip, ClipReader, ClipRef
+from factory.readers.base import BadClip, ClipReader, ClipRef, painter_of
 from factory.readers.validate import read_clip
 from factory.setup.settings import cache_folder
-from factory.stages.painted import town_lights
 from factory.store.location import Location
 from factory.store.schema import canonical_json
 from planners.drive.drivers import Driver, driver_of
@@ -24,7 +22,6 @@ from planners.drive.starts import LOGGED, DriveStart, lengthened, logged_start, 
 from planners.drive.table import DriveKey, DriveRow
 from planners.evaluation.planner_names import planner_of
 from tasks.perturb import Perturbation, perturb
-from tasks.render.settings import RenderSettings
 from tasks.rollout.simulate import traffic_record
 from tasks.stages import stage_versions
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, stream
@@ -121,7 +118,8 @@ class DriveWork:
     def _clip(self, item: DriveItem) -> Clip:
         last = NOW + HORIZON_STEPS if any(key.start != LOGGED for _, key in item.keys) else NOW
         clip, n_steps = read_clip(self.reader, item.ref), self.settings.loop.clip_steps(last)
-        return lengthened(clip, n_steps, town_lights(clip, n_steps) if reads_towns(self.reader) else None)
+        painter = painter_of(self.reader)
+        return lengthened(clip, n_steps, None if painter is None else painter.lights(clip, n_steps))
 
     def _starts(self, clip: Clip, wanted: set[int]) -> dict[int, DriveStart]:
         found = [logged_start(clip)] if LOGGED in wanted else []
@@ -136,7 +134,11 @@ class DriveWork:
         return {start.number: start for start in found}
 
     def _eyes(self, clip: Clip, pictures: Pictures) -> Eyes:
-        return eyes_of(clip, pictures, self.settings.render, self.settings.cache or cache_folder(self.out.uri))
+        """The cameras of drives of a clip. Raises BadClip where the engine has no scene of it."""
+        s, painter = self.settings, painter_of(self.reader)
+        if pictures == "engine":
+            return rendered_eyes(clip, s.render, s.cache or cache_folder(self.out.uri))
+        return PaintedEyes(clip, s.render, painter) if pictures == "truth" and painter else NoEyes()
 
     def _driver(self, who: DrivingPlanner) -> Driver:
         return kept_driver(who, canonical_json(self.settings.settings), self.settings.pdm, self.settings.device)
@@ -175,18 +177,6 @@ class DriveWork:
             ego_states=tuple(map(tuple, made.ego_states.tolist())),
             plans=tuple(map(tuple, made.plans.reshape(len(made.plans), -1).tolist())),
         )
-
-
-def eyes_of(clip: Clip, pictures: Pictures, render: RenderSettings, cache_dir: str) -> Eyes:
-    """The cameras of drives of a clip. Raises BadClip where the engine has no scene of it."""
-    if pictures == "engine":
-        return rendered_eyes(clip, render, cache_dir)
-    return PaintedEyes(clip, render) if pictures == "truth" else NoEyes()
-
-
-def reads_towns(reader: ClipReader) -> bool:
-    """Whether a reader's logs are of the synthetic town, whose painter can be asked for more."""
-    return isinstance(reader, SensedReader)
 
 
 @lru_cache(maxsize=8)

@@ -20,7 +20,7 @@ from scipy.special import stdtrit
 from tasks.world.arrays import Array, Indices
 
 LEVELS = ("clip", "log", "town")
-_SYNTHETIC_LOG = re.compile(r"(town-\d+)-\d{4}-")  # factory.datasets.town.town.log_name
+_SYNTHETIC_LOG = re.compile(r"(town-\d+)-\d{4}-")  # as the synthetic town calls its logs
 
 
 def town_of(log_id: str) -> str:

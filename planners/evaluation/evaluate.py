@@ -8,12 +8,12 @@
     python -m planners evaluate benchmark=navhard data=/data/openscene planner=runs/ltf
 
 The benchmark is the folder that `python -m factory.run preset=hard_benchmark` or `python -m factory import` made, or
-`navhard` or `navtest`, which are made of NAVSIM's folders first (planners/evaluation/navsim.py) and are
-among the public traffic unless `traffic@two_stage_traffic=` says otherwise. Who may stand under `planner=`, and what a
-planner of one's own looks like, planners/evaluation/planner_names.py says. Every planner gets a folder: its plans, a
-row of sub-scores for each frame (frames.parquet, frames.csv), and record.json, written last. What is done is not
-planned or scored again unless it, the benchmark or the rules changed; the same command goes on after a kill. All
-planners of a command share what scoring prepares of a frame, so name several at once.
+`navhard` or `navtest`, which are made of NAVSIM's folders first and are among the public traffic unless
+`traffic@two_stage_traffic=` says otherwise. Who may stand under `planner=`, and what a planner of one's own looks like,
+planners/evaluation/planner_names.py says. Every planner gets a folder: its plans, a row of sub-scores for each frame
+(frames.parquet, frames.csv), and record.json, written last. What is done is not planned or scored again unless it, the
+benchmark or the rules changed; the same command goes on after a kill. All planners of a command share what scoring
+prepares of a frame, so name several at once.
 
     summary.csv                   all planners of this command
     <planner>/navsim_*.csv        of NAVSIM's benchmarks: the tables that its own scripts write, by the score's filter
@@ -36,12 +36,13 @@ from typing import Any
 
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, fill
+from factory.config.datasets import find_function, words_of
 from factory.config.shapes import plain
 from factory.graph.progress import Counter
 from planners.evaluation.aggregation import SummaryLine, lines_of, summarise
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.frames import Benchmark, FrameKey
-from planners.evaluation.navsim import SPLITS, NavsimData, benchmark_by_name, write_tables
+from planners.evaluation.navsim import write_tables
 from planners.evaluation.planner_names import EvaluatedPlanner, composed, needs_of, planners_of
 from planners.evaluation.planning import all_plans
 from planners.evaluation.score_rows import RECORD, FrameRow, is_done, read_rows, write_record, write_rows
@@ -219,7 +220,7 @@ def settings_of(argv: Sequence[str]) -> EvaluateSettings:
     """
 
     def completed(values: dict[str, Any]) -> dict[str, Any]:
-        if values["benchmark"] in SPLITS and not any("two_stage_traffic" in word for word in argv):
+        if values["benchmark"] in words_of("BENCHMARKS") and not any("two_stage_traffic" in word for word in argv):
             return values | {"two_stage_traffic": plain(TrafficSettings(mode="navsim"))}
         return values
 
@@ -228,11 +229,12 @@ def settings_of(argv: Sequence[str]) -> EvaluateSettings:
 
 def _folder(settings: EvaluateSettings) -> str:
     """Where the benchmark is, made where it is asked for by its name. Raises ConfigError."""
-    given = NavsimData(settings.data, settings.maps, settings.split, settings.pictures)
-    if settings.benchmark in SPLITS:
-        return benchmark_by_name(settings.benchmark, given, settings.made)
-    if given != NavsimData():
-        raise ConfigError(f"data=, maps=, split= and pictures= are of benchmark={' or '.join(SPLITS)} alone")
+    names = words_of("BENCHMARKS")
+    given = {name: getattr(settings, name) for name in ("data", "maps", "split", "pictures")}
+    if settings.benchmark in names:
+        return str(find_function("BENCHMARKS", settings.benchmark)(settings.benchmark, settings.made, **given))
+    if any(value != getattr(EvaluateSettings, name) for name, value in given.items()):
+        raise ConfigError(f"data=, maps=, split= and pictures= are of benchmark={' or '.join(names)} alone")
     return settings.benchmark
 
 

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.town.draw import Theatre, paint
 from factory.datasets.town.drive import TownDrive
+from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import log_name, plan_log, write_log
-from factory.readers.settings import TownSettings
 from factory.stages.sensors import block_of, load_sensors
 from factory.views.scene_files import camera_rows
 from tasks.render.fit.reconstruct import LEAST_PIXELS as LEAST_OF_CLASS

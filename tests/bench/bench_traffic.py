@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.datasets.av2.reader import read_log
+from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import write_logs
-from factory.readers.settings import TownSettings
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tests.bench.peer import peer_python
 from tests.tasks.rollout.crowds import Crowd, arrays_of, crowd, crowd_of, limited, relevant

@@ -18,8 +18,8 @@ import numpy as np
 
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.town.draw import Theatre
+from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import log_name, plan_log, write_log
-from factory.readers.settings import TownSettings
 from factory.stages.assets import without_other_logs
 from factory.stages.sensors import block_cameras, block_of, load_sensors
 from tasks.render.fit.reconstruct import finish_scene, run_iterations

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from factory.datasets.town.reader import SyntheticReader
-from factory.readers.settings import TownSettings
+from factory.datasets.town.settings import TownSettings
 
 
 @pytest.fixture(scope="session")

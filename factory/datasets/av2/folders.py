@@ -30,7 +30,7 @@ def log_folders(root: Path) -> dict[str, Path]:
     return dict(sorted(folders.items()))
 
 
-def camera_names(folders: Iterable[Path]) -> tuple[str, ...]:
+def rig_names(folders: Iterable[Path]) -> tuple[str, ...]:
     """The rig of the first log with a calibration that can be read, in file order; none where no log has one.
 
     What is wrong with the others is told when they are read.

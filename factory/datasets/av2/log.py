@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.feather
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from factory.datasets.av2.folders import ANNOTATIONS, POSES
 from factory.readers.base import BadClip
+from factory.readers.points import read_feather
 from tasks.world.arrays import Array, Bools, Indices, Ints
 from tasks.world.clip import MOVING_KINDS, STEP_S, AgentKind, AgentTracks
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, X, Y, wrap_angle
@@ -94,29 +93,6 @@ def seconds_since(start_ns: int, stamps_ns: Ints) -> Array:
 def step_times(start: int, stop: int) -> Array:
     """Seconds since the log's first annotated frame at steps start..stop-1."""
     return np.asarray(np.arange(start, stop) * STEP_S, np.float64)
-
-
-def read_feather(path: Path, columns: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
-    """Named columns as writable arrays; numbers are checked to be finite. Raises BadClip."""
-    try:
-        table = pyarrow.feather.read_table(path)
-        table.validate(full=True)
-    except FileNotFoundError as error:
-        raise BadClip(str(path), "file", "missing") from error
-    except (pa.ArrowException, OSError, ValueError) as error:  # a name that is no text
-        raise BadClip(str(path), "file", f"cannot be read as feather, truncated? {error}") from error
-    if table.num_rows == 0:
-        raise BadClip(str(path), "file", "holds no rows")
-    out = {}
-    for name in columns:
-        if name not in table.column_names:
-            raise BadClip(str(path), name, "column is missing")
-        if table[name].null_count:
-            raise BadClip(str(path), name, "holds nulls")
-        out[name] = np.array(table[name].to_numpy())
-        if out[name].dtype.kind == "f" and not np.isfinite(out[name]).all():
-            raise BadClip(str(path), name, "holds NaN or infinity")
-    return out
 
 
 def numbers(path: Path, table: Mapping[str, NDArray[np.generic]], columns: tuple[str, ...]) -> Array:

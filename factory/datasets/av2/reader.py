@@ -23,7 +23,6 @@ from factory.datasets.av2.log import (
     ego_states_at,
     numbers,
     observed_at,
-    read_feather,
     read_motion,
     rotations,
     stamps,
@@ -34,6 +33,7 @@ from factory.files import matching
 from factory.readers.base import BadClip, ClipRef, folder_split
 from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive
 from factory.readers.pickles import id_text
+from factory.readers.points import read_feather
 from tasks.world.arrays import Array
 from tasks.world.clip import STEP_S, Block, Camera, SensorFile
 from tasks.world.road_map import (

@@ -4,3 +4,14 @@ An export has logs, pictures, splits and rewards that NAVSIM and SimScale read u
 and the public line that reads it, stands in docs/navsim_format.md. Names and steps follow `OpenDriveLab/SimScale` @
 f51ad64 and `autonomousvision/navsim` @ 0a380a9.
 """
+
+from factory.datasets.navsim.settings import NavsimClips
+
+READERS = {"NavsimReader": NavsimClips}
+IMPORTS = {
+    "simscale": "factory.datasets.navsim.commands:import_simscale",
+    "navhard": "factory.datasets.navsim.commands:import_two_stages",
+    "navtest": "factory.datasets.navsim.commands:import_one_stage",
+}
+EXPORTS = {"navsim": "factory.datasets.navsim.commands:export_samples"}
+BENCHMARKS = dict.fromkeys(("navhard", "navtest"), "factory.datasets.navsim.commands:benchmark_by_name")

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from factory.datasets.navsim.log import LogFrames, frames_of, read_frames
 from factory.datasets.navsim.maps import DOWNLOAD, file_digest, map_file
 from factory.datasets.navsim.window import (
+from factory.datasets.navsim.settings import NavsimClips
     FRAMES_BEFORE,
     HORIZON_FRAMES,
     WINDOW_FRAMES,
@@ -49,7 +50,6 @@ from factory.readers.logs import (
     traversals,
 )
 from factory.readers.pickles import check_values, load_plain
-from factory.readers.settings import NavsimClips
 from factory.readers.validate import validate_clip
 from factory.wording import shown, time_text
 from tasks.caches import sealed, unsealed, user_cache

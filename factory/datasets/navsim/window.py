@@ -23,7 +23,7 @@ from factory.datasets.navsim.log import Frame
 from factory.datasets.navsim.maps import open_city
 from factory.readers.base import BadClip
 from factory.readers.pictures import BadPicture, Size, jpeg_size
-from factory.readers.settings import FRAME_STEPS
+from factory.datasets.navsim.settings import FRAME_STEPS
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import (
     CLIP_STEPS,

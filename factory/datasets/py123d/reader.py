@@ -31,6 +31,7 @@ from factory.datasets.av2.log import (
     yaw_of,
 )
 from factory.datasets.av2.reader import BLOCK_STEPS, BLOCK_STRIDE_STEPS
+from factory.datasets.py123d import Py123dClips
 from factory.datasets.py123d.arrow import (
     KINDS_OF_LABELS,
     SOURCES,
@@ -47,7 +48,6 @@ from factory.files import matching, matching_below
 from factory.readers.base import SPLITS, BadClip, ClipRef
 from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive, within
 from factory.readers.pickles import id_text
-from factory.readers.settings import Py123dClips
 from factory.wording import shown
 from tasks.world.arrays import Array, Indices
 from tasks.world.clip import STEP_S, AgentKind, Block, Camera, SensorFile

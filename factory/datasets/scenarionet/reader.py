@@ -17,6 +17,7 @@ import numpy as np
 
 from factory.datasets.scenarionet.map import road_map, traffic_lights
 from factory.datasets.scenarionet.photos import NO_PHOTOGRAPHS, Photographs, in_step, read_photographs
+from factory.datasets.scenarionet.settings import ScenarioNetClips
 from factory.datasets.scenarionet.sidecars import load_sidecar, sidecars_of
 from factory.datasets.scenarionet.tracks import (
     SOURCES,
@@ -33,7 +34,6 @@ from factory.readers.apart import Apart
 from factory.readers.base import BadClip, ClipIndex, ClipRef, bytes_of, folder_split, nuscenes_split, waymo_split
 from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive, within
 from factory.readers.pickles import id_text, load_plain
-from factory.readers.settings import ScenarioNetClips
 from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, STEP_S, Block

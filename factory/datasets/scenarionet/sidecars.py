@@ -75,7 +75,7 @@ def cameras_in(content: Mapping[str, Any], file: str) -> dict[str, Mapping[str, 
     return cameras
 
 
-def camera_names(paths: Iterable[Path]) -> tuple[str, ...]:
+def rig_names(paths: Iterable[Path]) -> tuple[str, ...]:
     """The rig of the first sidecar that can be read; none where none can: what is wrong is told when they are read."""
     for path in paths:
         try:

@@ -14,8 +14,8 @@ from factory.datasets.town import textures as tx
 from factory.datasets.town.drive import TownDrive, TownTrack
 from factory.datasets.town.raster import LitScene, Mesh, Sun, merged, rasterise, shade
 from factory.datasets.town.scenery import Scenery, figure, lamps_lit
+from factory.datasets.town.settings import MOUNTS, check_cameras
 from factory.datasets.town.textures import TREELINE
-from factory.readers.settings import MOUNTS, check_cameras
 from tasks.world.arrays import F32, Array, Bytes, ShortInts
 from tasks.world.clip import Camera
 

@@ -7,9 +7,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.town.painter import TownPainter
+from factory.datasets.town.settings import LOGS_PER_TOWN, TownClips, TownsClips, TownSettings
 from factory.datasets.town.town import TownFolder, mend_all, write_all, write_town
 from factory.readers.base import ClipIndex, ClipRef
-from factory.readers.settings import LOGS_PER_TOWN, TownClips, TownsClips, TownSettings
 from factory.readers.whole_folder import make_whole, mend
 from tasks.caches import user_cache
 from tasks.world.clip import Clip
@@ -22,6 +23,7 @@ class SensedReader(AV2Reader):
 
     data_set = "synthetic"
     settings: TownSettings
+    painter = TownPainter()
 
     def read(self, ref: ClipRef) -> Clip:
         """The validated clip. Raises BadClip."""

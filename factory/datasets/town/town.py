@@ -26,9 +26,9 @@ from factory.datasets.av2.log import POSE_COLUMNS, SIZE_COLUMNS
 from factory.datasets.town.draw import MOUNT_M, REAR_AXLE_Z_M, Theatre, build_rig, paint, scan, world_from_ego
 from factory.datasets.town.drive import GREEN, RED, SCENARIOS, YELLOW, TownDrive, TownTrack, parked_cars, plan_drive
 from factory.datasets.town.scenery import Scenery, build_scenery
+from factory.datasets.town.settings import LOG_STEPS, LOGS_PER_TOWN, STEPS_PER_SWEEP, TownSettings
 from factory.datasets.town.streets import Streets, TownLane, build_streets
 from factory.exits import become_worker, terminal_signals_blocked
-from factory.readers.settings import LOG_STEPS, LOGS_PER_TOWN, STEPS_PER_SWEEP, TownSettings
 from factory.readers.whole_folder import finish_whole, make_whole, mend, unfinished_folder
 from factory.wording import time_text
 from tasks.world.arrays import Array, Ints

@@ -16,8 +16,8 @@ from factory.datasets.navsim.reader import read_scene_filter, table_of
 from factory.datasets.py123d.reader import Py123dReader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.datasets.town.reader import SyntheticReader
+from factory.datasets.town.settings import TownSettings
 from factory.readers.base import BadClip
-from factory.readers.settings import TownSettings
 from factory.setup.vocabulary import load_recovery_table, load_vocabulary, save_recovery_table, save_vocabulary
 from factory.stages.scene_file import BadScene, read_scene, write_scene
 from factory.stages.sensors import decode_image, load_sweeps

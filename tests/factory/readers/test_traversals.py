@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import log_name, plan_log, write_log
 from factory.readers.logs import DrivenPath, OtherDrive, Traversal, joined, path_of, traversals
-from factory.readers.settings import LogClips, TownSettings
+from factory.readers.settings import LogClips
 from factory.stages.assets import block_id, load_or_build_scene
 from factory.stages.sensors import block_cameras, block_of, choose_cameras, load_photos
 from tasks.render.scene.build import held_out_rows

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factory.config.compose import ConfigError
-from factory.config.run import SCENARIONET, load_config, refuse_relative_root
+from factory.config.run import built_in_classes, load_config, refuse_relative_root
 from factory.files import machine_fault_of
 from factory.setup.settings import assemble
 from factory.setup.vocabulary import save_recovery_table
@@ -26,7 +26,8 @@ def test_a_relative_root_in_a_submitted_job_is_refused(monkeypatch: pytest.Monke
     refuse_relative_root({"n_clips": 3})
     with pytest.raises(ConfigError, match=r"clips\.root=logs is relative"):
         refuse_relative_root({"root": "logs"})
-    photos = {"_target_": SCENARIONET, "root": "/data/logs", "cameras": "photos", "sensor_root": None}
+    photos = {"root": "/data/logs", "cameras": "photos", "sensor_root": None}
+    photos["_target_"] = built_in_classes("clips")["scenarionet"]
     with pytest.raises(ConfigError, match=r"clips\.cameras=photos is relative"):
         refuse_relative_root(photos)
     refuse_relative_root(photos | {"_target_": "my.Reader"})  # whose cameras may be names

@@ -11,8 +11,8 @@ import pytest
 from factory import run
 from factory.config.run import load_config
 from factory.datasets.town.reader import SyntheticReader
+from factory.datasets.town.settings import TownSettings
 from factory.exits import BAD_CONFIG, COMPLETE
-from factory.readers.settings import TownSettings
 from factory.setup.settings import identity_of
 from factory.setup.vocabulary import Starts, load_starts
 from factory.store.samples import Store

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from factory.config.run import BenchmarkSettings, load_config
+from factory.datasets.town.settings import TownSettings
 from factory.exits import COMPLETE
 from factory.graph.steps import Columns, PreparedClip, RejectedAttempt, run_attempt
 from factory.pipeline import BenchmarkWork, FactoryWork
 from factory.readers.base import ClipRef
-from factory.readers.settings import TownSettings
 from factory.setup.settings import assemble, identity_of
 from factory.stages.benchmark import describe_benchmark, write_benchmark
 from factory.store.location import BadCacheFile, Location, SceneFiles

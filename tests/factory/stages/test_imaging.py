@@ -10,9 +10,9 @@ import pytest
 from factory.config.run import load_config
 from factory.datasets.town.reader import SyntheticReader
 from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, run_attempt
+from factory.datasets.town.settings import TownSettings
 from factory.pipeline import FactoryWork
 from factory.readers.base import BadClip
-from factory.readers.settings import TownSettings
 from factory.setup.settings import assemble
 from factory.stages.imaging import nearest_photo, scene_cache_counts, scene_in_clip_time
 from factory.stages.sensors import block_of

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from factory.commands.table import COMMANDS
 from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import write_logs
-from factory.readers.settings import TownSettings
 from factory.run import main as run_main
 from factory.store.reader import SampleTable
 from factory.views.bev import EXPERT, LOGGED

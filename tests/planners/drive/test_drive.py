@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from factory.datasets.town.reader import SyntheticReader
+from factory.datasets.town.settings import TownSettings
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
-from factory.readers.settings import TownSettings
 from factory.store.location import Location
 from planners.drive import drive as command
 from planners.drive import work

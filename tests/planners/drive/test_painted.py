@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from examples.csv_logs import write_log
+from factory.datasets.town.painter import TownPainter, town_log
 from factory.datasets.town.reader import SyntheticReader
+from factory.datasets.town.settings import TownSettings
 from factory.exits import BAD_CONFIG, COMPLETE
-from factory.readers.settings import TownSettings
-from factory.stages.painted import town_lights, town_log
 from planners.drive.drive import main
 from planners.drive.eyes import NoEyes, PaintedEyes, Sight
 from planners.drive.starts import lengthened, logged_start
@@ -35,7 +35,7 @@ def photographed(tmp_path_factory: pytest.TempPathFactory) -> Clip:
     )
     reader = SyntheticReader(tmp_path_factory.mktemp("town"), 1, settings=settings)
     clip = reader.read(reader.index().refs[0])
-    return lengthened(clip, 300, town_lights(clip, 300))
+    return lengthened(clip, 300, TownPainter().lights(clip, 300))
 
 
 def unit(jpeg: bytes) -> np.ndarray:
@@ -54,7 +54,7 @@ def front(images: Any) -> bytes:
 @pytest.mark.slow
 def test_where_the_log_drives_the_painter_shows_the_log_s_photos(photographed: Clip) -> None:
     """At T and 1.5 s before; who is beyond 100 m of the log's ego is not annotated and not painted."""
-    scene, eyes = logged_start(photographed).scene, PaintedEyes(photographed, SMALL)
+    scene, eyes = logged_start(photographed).scene, PaintedEyes(photographed, SMALL, TownPainter())
     files = {round(file.time_s, 2): Path(file.uri) for file in photographed.images}
     for offset in (0, -15):
         painted = unit(front(eyes.look(scene, offset)))
@@ -64,7 +64,7 @@ def test_where_the_log_drives_the_painter_shows_the_log_s_photos(photographed: C
 @pytest.mark.slow
 def test_it_paints_what_the_simulation_has(photographed: Clip) -> None:
     """From a metre further to the left, and without anybody, other pictures."""
-    scene, eyes = logged_start(photographed).scene, PaintedEyes(photographed, SMALL)
+    scene, eyes = logged_start(photographed).scene, PaintedEyes(photographed, SMALL, TownPainter())
     here = unit(front(eyes.look(scene, 0)))
     beside = scene.ego_history.copy()
     heading = beside[-1, 2]

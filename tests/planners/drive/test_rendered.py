@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from factory.datasets.town.reader import SyntheticReader
+from factory.datasets.town.settings import TownSettings
 from factory.readers.base import BadClip
-from factory.readers.settings import TownSettings
 from planners.drive.eyes import RenderedEyes, rendered_eyes
 from planners.drive.starts import lengthened, logged_start
 from tasks.render.scene.asset import psnr

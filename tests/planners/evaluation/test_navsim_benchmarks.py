@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from factory.datasets.navsim.commands import IN_DEVKIT
 from planners.evaluation.evaluate import main
-from planners.evaluation.navsim import IN_DEVKIT, read_table
+from planners.evaluation.navsim import read_table
 from tests.factory.datasets.navsim.navsim_town import NOW, TOKENS, frames_of, write_installation
 
 pytestmark = pytest.mark.slow  # a town, a city's map, PDM-Closed

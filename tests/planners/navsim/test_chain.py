@@ -19,9 +19,9 @@ import pytest
 from factory.__main__ import main as factory
 from factory.datasets.av2.reader import read_log
 from factory.datasets.navsim.reader import NavsimReader
+from factory.datasets.town.settings import MOUNTS, TownSettings
 from factory.datasets.town.town import write_logs
 from factory.readers.pickles import load_plain
-from factory.readers.settings import MOUNTS, TownSettings
 from factory.run import main as run
 from factory.stages.sensors import decode_image, encode_jpeg
 from factory.store.reader import SampleTable, decode_stored_image

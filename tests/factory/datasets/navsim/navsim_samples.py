@@ -11,7 +11,7 @@ import numpy as np
 
 from factory.datasets.navsim.export import ExportSummary, export
 from factory.datasets.navsim.frames import ExportSettings
-from factory.readers.settings import MOUNTS
+from factory.datasets.town.settings import MOUNTS
 from factory.stages.rows import sample_row
 from factory.store.samples import Store
 from tasks.attempt import drive_and_judge, human_sample, perturbed_scene

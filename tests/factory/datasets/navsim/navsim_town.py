@@ -7,9 +7,9 @@ import numpy as np
 import yaml
 
 from factory.datasets.av2.reader import read_log
+from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import write_logs
 from factory.readers.pickles import load_plain
-from factory.readers.settings import TownSettings
 from tests.factory.datasets.navsim import scene_pickles
 from tests.factory.datasets.navsim.geopackage_writer import (
     CITIES,

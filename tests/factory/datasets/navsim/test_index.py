@@ -9,8 +9,8 @@ import pytest
 from factory.config.run import load_config
 from factory.config.words import ConfigError
 from factory.datasets.navsim.reader import NavsimReader
+from factory.datasets.navsim.settings import NavsimClips
 from factory.readers.base import BadClip, ClipRef
-from factory.readers.settings import NavsimClips
 from tests.factory.datasets.navsim.logs import NAME, frame
 from tests.factory.datasets.navsim.openscene_writer import hex16, write_frames
 

@@ -12,8 +12,8 @@ import pytest
 from factory.datasets.av2.reader import AV2Reader, read_log
 from factory.datasets.navsim.log import read_frames
 from factory.datasets.navsim.reader import LICENCE, NavsimReader
+from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import write_logs
-from factory.readers.settings import TownSettings
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW, Clip
 from tasks.world.road_map import LightState, RoadMap, RouteFinder, driving_command

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import TownFolder, write_all, write_one
-from factory.readers.settings import TownSettings
 
 SMALL = TownSettings(cameras=("ring_front_center",), width=32, height=18, lidar_beams=0)
 PATIENCE_S = 60.0
@@ -65,7 +65,7 @@ INTERRUPTED = """
 import os, signal, sys
 from pathlib import Path
 from factory.datasets.town.town import TownFolder, write_all
-from factory.readers.settings import TownSettings
+from factory.datasets.town.settings import TownSettings
 signal.signal(signal.SIGTERM, signal.default_int_handler)
 signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the processes it starts, too
 os.cpu_count = lambda: 2

@@ -23,7 +23,7 @@ from factory.datasets.town.drive import YELLOW as YELLOW_LIGHT
 from factory.datasets.town.raster import Builder, LitScene
 from factory.datasets.town.scenery import _signal as signal_mast
 from factory.datasets.town.scenery import lamps_lit
-from factory.readers.settings import CAMERA_NAMES
+from factory.datasets.town.settings import CAMERA_NAMES
 
 FRONT = build_rig(("ring_front_center",), 320, 180)[0]
 SIDE = build_rig(("ring_side_left",), 320, 180)[0]

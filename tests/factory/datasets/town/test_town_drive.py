@@ -19,9 +19,9 @@ from factory.datasets.town.drive import (
     drive,
     overlaps,
 )
+from factory.datasets.town.settings import LOG_STEPS, TownSettings
 from factory.datasets.town.streets import Streets, build_streets
 from factory.datasets.town.town import WINDOWS_PER_LOG, plan_log, write_town
-from factory.readers.settings import LOG_STEPS, TownSettings
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW
 from tasks.world.frames import PACIFICA, box_corners, to_local

@@ -11,8 +11,8 @@ import pytest
 
 import factory.datasets.town.reader as reader_module
 from factory.datasets.town.reader import SyntheticReader
+from factory.datasets.town.settings import LOG_STEPS, STEPS_PER_SWEEP, TownSettings
 from factory.datasets.town.town import LICENCE, WINDOWS_PER_LOG, write_town
-from factory.readers.settings import LOG_STEPS, STEPS_PER_SWEEP, TownSettings
 from tasks.world.clip import Clip
 from tasks.world.road_map import LightState
 

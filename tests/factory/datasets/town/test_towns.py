@@ -7,8 +7,8 @@ import pytest
 import factory.datasets.town.town as painters_module
 from factory.datasets.town.drive import SCENARIOS
 from factory.datasets.town.reader import SyntheticTownsReader
+from factory.datasets.town.settings import LOGS_PER_TOWN, TownSettings
 from factory.readers.base import BadClip, ClipRef
-from factory.readers.settings import LOGS_PER_TOWN, TownSettings
 
 BLIND = TownSettings(cameras=(), lidar_beams=0)
 

@@ -13,16 +13,15 @@ import numpy as np
 
 from factory.datasets.town.draw import Theatre, build_rig, paint, world_from_ego
 from factory.datasets.town.drive import TownDrive, TownTrack
+from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import Town, log_name, plan_log
-from factory.readers.settings import TownSettings
 from factory.stages.sensors import choose_cameras
-from tasks.render.settings import RenderSettings
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import STEP_S, AgentTracks, Camera, Clip
 from tasks.world.frames import HEADING, X, Y
 from tasks.world.road_map import TrafficLights
 
-_LOG = re.compile(r"town-(\d+)-(\d{4})-")  # factory.datasets.town.town.log_name
+_LOG = re.compile(r"town-(\d+)-(\d{4})-")  # log_name
 
 
 def town_log(log_id: str) -> tuple[int, int]:
@@ -33,38 +32,31 @@ def town_log(log_id: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def town_lights(clip: Clip, n_steps: int) -> TrafficLights:
-    """The clip's lights over `n_steps` steps from its first one. Raises ValueError for a clip of no town."""
-    town, drive = _planned(*town_log(clip.log_id))
-    times_s = _time_of(drive, clip, np.arange(n_steps))
-    groups = [town.streets.lanes[int(lane_id)].light_group for lane_id in clip.lights.lane_ids]
-    states = [[drive.signals.state(group, float(time_s)) for group in groups] for time_s in times_s]
-    return replace(clip.lights, states=np.array(states, np.int8).reshape(n_steps, len(groups)))
+class TownPainter:
+    """The painter of the synthetic town (factory.readers.base.Painter). Raises ValueError for a clip of no town."""
 
+    def rig(self, clip: Clip, width: int, height: int) -> tuple[Camera, ...]:
+        """The clip's cameras, or the town's usual ones where it has none."""
+        return clip.cameras or build_rig(TownSettings().cameras, width, height)
 
-def town_cameras(clip: Clip, settings: RenderSettings) -> tuple[Camera, ...]:
-    """The clip's rig, or the town's own where it has none, as pinholes of the settings' size.
+    def lights(self, clip: Clip, n_steps: int) -> TrafficLights:
+        """The clip's lights over `n_steps` steps from its first one, beyond the log too."""
+        town, drive = _planned(*town_log(clip.log_id))
+        times_s = _time_of(drive, clip, np.arange(n_steps))
+        groups = [town.streets.lanes[int(lane_id)].light_group for lane_id in clip.lights.lane_ids]
+        states = [[drive.signals.state(group, float(time_s)) for group in groups] for time_s in times_s]
+        return replace(clip.lights, states=np.array(states, np.int8).reshape(n_steps, len(groups)))
 
-    Raises ValueError for a camera that the rig does not have.
-    """
-    width, height = settings.width, settings.height
-    rig = clip.cameras or build_rig(TownSettings().cameras, width, height)
-    return tuple(camera.resized(width, height) for camera in choose_cameras(rig, settings.cameras))
-
-
-def town_pictures(
-    clip: Clip, cameras: Sequence[Camera], agents: AgentTracks, step: int, state: Array
-) -> tuple[Array, list[Bytes]]:
-    """The pose (4, 4) of an ego in a state (11,), and what each camera sees from there at a step of the clip.
-
-    agents: who is there, in the steps of the clip. Raises ValueError for a clip of no town.
-    """
-    log = town_log(clip.log_id)
-    _, drive = _planned(*log)
-    time_s = float(_time_of(drive, clip, np.array([step]))[0])
-    lit = _theatre(*log).among(_tracks(drive, agents), step, state[[X, Y]], time_s)
-    pose = world_from_ego(state[: HEADING + 1])
-    return pose, [paint(lit, camera, pose) for camera in cameras]
+    def pictures(
+        self, clip: Clip, cameras: Sequence[Camera], agents: AgentTracks, step: int, state: Array
+    ) -> tuple[Array, list[Bytes]]:
+        """The pose (4, 4) of an ego in a state (11,), and what each camera sees from there at a step of the clip."""
+        log = town_log(clip.log_id)
+        _, drive = _planned(*log)
+        time_s = float(_time_of(drive, clip, np.array([step]))[0])
+        lit = _theatre(*log).among(_tracks(drive, agents), step, state[[X, Y]], time_s)
+        pose = world_from_ego(state[: HEADING + 1])
+        return pose, [paint(lit, camera, pose) for camera in cameras]
 
 
 def _tracks(drive: TownDrive, agents: AgentTracks) -> list[TownTrack]:

@@ -1,0 +1,52 @@
+"""What the built-in data sets offer: one folder of factory/datasets each, found by its name and imported nowhere else.
+
+The package of a folder is light, and says what there is by these names, each of which may be missing:
+
+    READERS             class in its module `reader` -> dataclass of the settings of `clips`
+    camera_names        settings of clips -> names of the rig, before a log is read; ValueError where there is no log
+    compile_kernels     what `python -m factory warm` compiles beside the kernels of runs
+
+and by these words -> `module:function`, which is imported when the word is used:
+
+    IMPORTS, SIDECARS   of `python -m factory import`: it writes samples, or sidecars of photos
+    EXPORTS             of `python -m factory export`: it writes all samples
+    BENCHMARKS          of `python -m planners evaluate benchmark=`: it makes the folder
+"""
+
+from collections.abc import Mapping
+from functools import cache
+from importlib import import_module
+from pkgutil import iter_modules, resolve_name
+from types import ModuleType
+from typing import Any
+
+FOLDER = "factory.datasets"
+
+
+@cache
+def data_sets() -> Mapping[str, ModuleType]:
+    """Name of a folder -> its package, sorted."""
+    names = sorted(found.name for found in iter_modules(import_module(FOLDER).__path__))
+    return {name: import_module(f"{FOLDER}.{name}") for name in names}
+
+
+def data_set_of(clips: Mapping[str, Any]) -> ModuleType | None:
+    """The data set whose reader the settings of clips name; None for a reader of the user's own."""
+    folder, _, inside = str(clips.get("_target_", "")).rpartition(".reader.")
+    return next((found for found in data_sets().values() if inside and found.__name__ == folder), None)
+
+
+def reader_settings(clips: Mapping[str, Any]) -> type[Any] | None:
+    """The dataclass of a built-in reader's settings; None for a reader of the user's own."""
+    shapes: Mapping[str, type[Any]] = getattr(data_set_of(clips), "READERS", {})
+    return shapes.get(str(clips.get("_target_", "")).rpartition(".")[2])
+
+
+def words_of(kind: str) -> dict[str, str]:
+    """Word -> name of what some data set offers under it, `module:function`; kind: IMPORTS or another of the above."""
+    return {word: name for found in data_sets().values() for word, name in getattr(found, kind, {}).items()}
+
+
+def find_function(kind: str, word: str) -> Any:
+    """What a data set offers under a word of a kind, imported now."""
+    return resolve_name(words_of(kind)[word])

@@ -1,0 +1,198 @@
+"""NAVSIM's part of the commands: imports, the export, and benchmarks by name, made of NAVSIM's own folders.
+
+`benchmark=navhard` and `benchmark=navtest` of `python -m planners evaluate` are `python -m factory import`'s, in a
+folder of their own. One is used again while it is whole and the files that it was made of are as they were; what is not
+whole goes on.
+"""
+
+import json
+import os
+from collections.abc import Mapping
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from factory.config.arguments import Refused
+from factory.config.words import ConfigError
+from factory.datasets.navsim.export import Each, ExportSummary, export
+from factory.datasets.navsim.filters import Selection, read_selection
+from factory.datasets.navsim.import_table import identity_of, import_rows
+from factory.datasets.navsim.navhard import NavsimFolders, import_navhard
+from factory.datasets.navsim.navtest import import_navtest
+from factory.datasets.navsim.settings import ExportSettings
+from factory.datasets.navsim.simscale import Import, Rewards, parts_of
+from factory.exits import INTERRUPTED, Stopped
+from factory.files import matching
+from factory.graph.execute import RunSummary
+from factory.setup.vocabulary import load_vocabulary
+from factory.stages.benchmark import BENCHMARK_FILE
+from factory.store.disk import why_unusable
+from factory.store.location import Location
+from factory.store.samples import Store
+from factory.store.table import KeyedTable
+from tasks.world.arrays import Array
+
+
+def import_simscale(request: Any, store: Store) -> tuple[RunSummary, str]:
+    """The rows of released folders, or exported ones. Raises Refused."""
+
+    parts = parts_of(Path(request.root), request.only)
+    rewards = None
+    if request.rewards is not None and request.vocabulary is not None:
+        rewards = Rewards(Path(request.rewards), load_vocabulary(request.vocabulary))
+    settings = {
+        "maps": request.maps is not None,
+        "pictures": request.pictures,
+        "labels": None if rewards is None else rewards.vocabulary.digest,
+    }
+    maps = _folder(request.maps)
+    if maps is not None and not maps.is_dir():
+        raise Refused(f"maps={request.maps}: no such folder")
+    wanted = Import(maps, request.pictures, rewards)
+    return import_rows(store, identity_of(request.source, settings), wanted.entries(parts)), ""
+
+
+def import_two_stages(request: Any, store: Store) -> tuple[RunSummary, str]:
+    """The rows of navhard, and what is said of them."""
+
+    logs, maps = _folder(request.logs), _folder(request.maps)
+    assert logs is not None and maps is not None and request.split is not None
+    places = NavsimFolders(logs, _folder(request.sensors), Path(request.root), maps)
+    return import_navhard(store, read_selection(request.split), places)
+
+
+def import_one_stage(request: Any, store: Store) -> tuple[RunSummary, str]:
+    """The rows of navtest, and what is said of them."""
+
+    maps = _folder(request.maps)
+    assert maps is not None and request.split is not None
+    logs = Path(request.root)
+    return import_navtest(store, read_selection(request.split), logs, _folder(request.sensors), maps)
+
+
+def export_samples(request: Any, table: KeyedTable, to: Path, trajectories: Array | None, each: Each) -> ExportSummary:
+    """All samples that the command asks for, as `factory.datasets.navsim.export.export`."""
+    rounds = tuple(int(word) for word in request.round)
+    named = {name: getattr(request, name) for name in ("tag", "layout", "resize", "missing", "map_location")}
+    return export(table, to, ExportSettings(request.expert, rounds, request.split, **named), trajectories, each)
+
+
+def _folder(path: str | None) -> Path | None:
+    return None if path is None else Path(path)
+
+
+SPLITS: Mapping[str, str] = {"navhard": "navhard_two_stage", "navtest": "navtest"}  # name -> its split's file
+DATA, MAPS, DEVKIT = "OPENSCENE_DATA_ROOT", "NUPLAN_MAPS_ROOT", "NAVSIM_DEVKIT_ROOT"  # NAVSIM's own variables
+IN_DEVKIT = "navsim/planning/script/config/common/train_test_split"
+MADE_FROM = "made_from.json"
+
+
+def benchmark_by_name(
+    name: str, made: str, data: str | None, maps: str | None, split: str | None, pictures: bool
+) -> str:
+    """The folder of a benchmark of SPLITS, `<made>/<name>`, made first where it is not there whole.
+
+    data: of navsim_logs, sensor_blobs and navhard_two_stage; maps: nuPlan's, also `maps` in data; split: its .yaml,
+    also that of a checkout. What is None, one of NAVSIM's own variables says.
+    Raises ConfigError for a folder that is missing, or a benchmark there that was made of other files, and Stopped.
+    """
+    root = _there(name, "data", data, DATA, "the folder of navsim_logs and sensor_blobs")
+    listed = _split(name, split)
+    try:
+        selection = read_selection(str(listed))
+    except ValueError as error:
+        raise ConfigError(f"benchmark={name}: {error}") from error
+    places = _places(name, root, _maps(name, maps, root), selection, pictures)
+    out = f"{made.rstrip('/')}/{name}"
+    store = Location.parse(out)
+    source = {"benchmark": name, "pictures": pictures, "files": _digest(name, places, listed)}
+    kept = store.read(MADE_FROM)
+    whole = kept is not None and _is_whole(store)
+    if not whole and (unusable := why_unusable(out)):
+        raise ConfigError(f"benchmark={name}: {unusable}")
+    if kept is None:
+        store.write(MADE_FROM, json.dumps(source, indent=1).encode())
+    elif other := [key for key, value in json.loads(kept).items() if source[key] != value]:
+        raise ConfigError(
+            f"benchmark={name}: {out} was made of other {other[0]} than these: remove it, or choose another made="
+        )
+    elif whole:
+        return out
+    _import(name, Store(store), selection, places)
+    return out
+
+
+def _import(name: str, store: Store, selection: Selection, places: NavsimFolders) -> None:
+    try:
+        if name == "navhard":
+            summary, told = import_navhard(store, selection, places)
+        else:
+            summary, told = import_navtest(store, selection, places.logs, places.sensors, places.maps)
+    except ValueError as error:
+        raise ConfigError(f"benchmark={name}: {error}") from error
+    print(told)
+    if summary.counts["failed"]:
+        print(f"{summary.counts['failed']} frames failed: python -m factory failed out={store.location.uri}")
+    if summary.exit_code == INTERRUPTED:
+        raise Stopped(summary.message)
+
+
+def _is_whole(store: Location) -> bool:
+    document = store.read(BENCHMARK_FILE)
+    return document is not None and not json.loads(document)["left_out"]
+
+
+def _places(name: str, data: Path, maps: Path, selection: Selection, pictures: bool) -> NavsimFolders:
+    part = selection.data_split or "test"
+    logs, sensors, scenes = data / "navsim_logs" / part, data / "sensor_blobs" / part, data / SPLITS["navhard"]
+    needed = {"its logs": logs}
+    needed |= {"the pictures of its logs (pictures=false goes without)": sensors} if pictures else {}
+    if name == "navhard":
+        needed["the scenes of its second stage"] = scenes / "synthetic_scene_pickles"
+        needed |= {"their pictures (pictures=false goes without)": scenes / "sensor_blobs"} if pictures else {}
+    for what, folder in needed.items():
+        if not folder.is_dir():
+            raise ConfigError(f"benchmark={name}: {folder} is missing: {what}")
+    return NavsimFolders(logs, sensors if pictures else None, scenes, maps)
+
+
+def _maps(name: str, given: str | None, data: Path) -> Path:
+    if given is None and MAPS not in os.environ and (data / "maps").is_dir():
+        return data / "maps"
+    return _there(name, "maps", given, MAPS, "nuPlan's maps, with one folder a city")
+
+
+def _split(name: str, given: str | None) -> Path:
+    if given is not None:
+        path = Path(given)
+    else:
+        path = _there(name, "split", None, DEVKIT, "a checkout of NAVSIM, or give the split's .yaml")
+        path = path / IN_DEVKIT / f"{SPLITS[name]}.yaml"
+    if not path.is_file():
+        raise ConfigError(f"benchmark={name}: split {path} is missing")
+    return path
+
+
+def _there(name: str, setting: str, given: str | None, variable: str, what: str) -> Path:
+    said = os.environ.get(variable) if given is None else given
+    if not said:
+        raise ConfigError(f"benchmark={name}: give {setting}=... or set {variable}: {what}")
+    path = Path(said).expanduser()
+    if not path.is_dir():
+        raise ConfigError(f"benchmark={name}: {setting} {path} is missing: {what}")
+    return path
+
+
+def _digest(name: str, places: NavsimFolders, split: Path) -> str:
+    """Of the split's files, and of the names, sizes and times of logs, maps and scenes; pictures are not looked at."""
+    found = sha256(split.read_bytes())
+    filters = matching(split.parent / "scene_filter", "*.yaml")
+    for path in filters:
+        found.update(path.read_bytes())
+    folders = [(places.logs, "*.pkl"), (places.maps, "*/*/map.gpkg")]
+    folders += [(places.scenes / "synthetic_scene_pickles", "*.pkl")] if name == "navhard" else []
+    for folder, pattern in folders:
+        for path in matching(folder, pattern):
+            stat = path.stat()
+            found.update(f"{path.relative_to(folder)}\x1f{stat.st_size}\x1f{stat.st_mtime_ns}\x1e".encode())
+    return found.hexdigest()[:16]
