@@ -123,7 +123,6 @@ def export(request: Request) -> Iterator[Path]:
 def _export_all(request: Request) -> int:
     """All samples in SimScale's layout; the exit code. Raises Refused."""
     from factory.config.compose import need_run_extra
-    from factory.datasets.navsim.frames import ExportSettings
     from factory.graph.parallel import WorkerDied, parallel_map
     from factory.graph.steps import TaskStopped
     from factory.store.location import Location

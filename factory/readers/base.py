@@ -9,11 +9,9 @@ from pathlib import Path, PurePosixPath
 from typing import Protocol
 
 from factory.wording import one_line
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bytes
-from tasks.world.camera import Camera
-from tasks.world.clip import Clip
-from tasks.world.lanes import TrafficLights
+from tasks.world.clip import AgentTracks, Camera, Clip
+from tasks.world.road_map import TrafficLights
 
 SPLITS = ("train", "val", "test")
 MAX_FILE_BYTES = 1 << 30  # of a file that is read whole

@@ -250,13 +250,13 @@ class Imaging:
         ]
 
 
-def height_columns(scene: Scene, on_road: Array, lifted: AgentTracks) -> dict[str, object]:
 def painted_cameras(painter: Painter, clip: Clip, settings: RenderSettings) -> tuple[Camera, ...]:
     """The chosen cameras as pinholes of the settings' size. Raises ValueError for one that the rig does not have."""
     rig = painter.rig(clip, settings.width, settings.height)
-    return tuple(one.resized(settings.width, settings.height) for one in chosen_cameras(rig, settings.cameras))
+    return tuple(one.resized(settings.width, settings.height) for one in choose_cameras(rig, settings.cameras))
 
 
+def height_columns(scene: Scene, on_road: Array, lifted: AgentTracks) -> dict[str, object]:
     """The columns that say how high ego and agents of a sample are, where photos say what the log does not.
 
     on_road: (P, 4, 4) poses of the ego on the road as photos show it; lifted: the sample's agents, as high above it as

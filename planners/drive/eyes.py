@@ -10,8 +10,7 @@ import numpy as np
 
 from factory.readers.base import BadClip, Painter
 from factory.stages.assets import load_or_build_scene
-from factory.stages.imaging import Imaging, clip_offset_s, scene_in_clip_time
-from factory.stages.imaging import Imaging, first_of, in_time_of, painted_cameras
+from factory.stages.imaging import Imaging, clip_offset_s, painted_cameras, scene_in_clip_time
 from factory.stages.rows import scene_columns
 from factory.stages.sensors import choose_cameras
 from factory.store.reader import Sample

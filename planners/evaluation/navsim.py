@@ -21,9 +21,6 @@ from pathlib import Path
 import numpy as np
 
 from factory.config.compose import ConfigError
-from factory.datasets.navsim.benchmarks import NavsimFolders, import_navhard, import_navtest
-from factory.datasets.navsim.reader import Selection, read_selection
-from factory.files import matching, why_unusable
 from planners.evaluation.aggregation import HumanFilter, Measured, Summary, by_clip, summary_of
 from planners.evaluation.bootstrap import Interval
 from planners.evaluation.frames import FrameKey

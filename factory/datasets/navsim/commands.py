@@ -14,19 +14,17 @@ from typing import Any
 
 from factory.config.arguments import Refused
 from factory.config.words import ConfigError
+from factory.datasets.navsim.benchmarks import NavsimFolders, import_navhard, import_navtest
 from factory.datasets.navsim.export import Each, ExportSummary, export
-from factory.datasets.navsim.filters import Selection, read_selection
-from factory.datasets.navsim.import_table import identity_of, import_rows
-from factory.datasets.navsim.navhard import NavsimFolders, import_navhard
-from factory.datasets.navsim.navtest import import_navtest
-from factory.datasets.navsim.settings import ExportSettings
+from factory.datasets.navsim.frames import ExportSettings
+from factory.datasets.navsim.import_rows import identity_of, import_rows
+from factory.datasets.navsim.reader import Selection, read_selection
 from factory.datasets.navsim.simscale import Import, Rewards, parts_of
 from factory.exits import INTERRUPTED, Stopped
-from factory.files import matching
+from factory.files import matching, why_unusable
 from factory.graph.execute import RunSummary
 from factory.setup.vocabulary import load_vocabulary
 from factory.stages.benchmark import BENCHMARK_FILE
-from factory.store.disk import why_unusable
 from factory.store.location import Location
 from factory.store.samples import Store
 from factory.store.table import KeyedTable

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from factory.datasets.navsim.log import LogFrames, frames_of, read_frames
 from factory.datasets.navsim.maps import DOWNLOAD, file_digest, map_file
-from factory.datasets.navsim.window import (
 from factory.datasets.navsim.settings import NavsimClips
+from factory.datasets.navsim.window import (
     FRAMES_BEFORE,
     HORIZON_FRAMES,
     WINDOW_FRAMES,

@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from factory.datasets.navsim.log import Frame
 from factory.datasets.navsim.maps import open_city
+from factory.datasets.navsim.settings import FRAME_STEPS
 from factory.readers.base import BadClip
 from factory.readers.pictures import BadPicture, Size, jpeg_size
-from factory.datasets.navsim.settings import FRAME_STEPS
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import (
     CLIP_STEPS,

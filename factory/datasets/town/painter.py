@@ -15,7 +15,6 @@ from factory.datasets.town.draw import Theatre, build_rig, paint, world_from_ego
 from factory.datasets.town.drive import TownDrive, TownTrack
 from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import Town, log_name, plan_log
-from factory.stages.sensors import choose_cameras
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import STEP_S, AgentTracks, Camera, Clip
 from tasks.world.frames import HEADING, X, Y

@@ -11,8 +11,8 @@ import pytest
 from factory.datasets.navsim.maps import cache_file, kept_tables
 from factory.datasets.navsim.reader import kept_table, make_table
 from factory.datasets.town.reader import SensedReader, SyntheticReader, SyntheticTownsReader
-from factory.graph.steps import PrepareReport, cache_key, prepare
 from factory.datasets.town.settings import TownSettings
+from factory.graph.steps import PrepareReport, cache_key, prepare
 from factory.readers.whole_folder import SUMS
 from factory.setup.settings import _table_of
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table, save_vocabulary

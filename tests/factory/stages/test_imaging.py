@@ -9,8 +9,8 @@ import pytest
 
 from factory.config.run import load_config
 from factory.datasets.town.reader import SyntheticReader
-from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, run_attempt
 from factory.datasets.town.settings import TownSettings
+from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, run_attempt
 from factory.pipeline import FactoryWork
 from factory.readers.base import BadClip
 from factory.setup.settings import assemble
