@@ -1,9 +1,8 @@
-"""`python -m factory export mcap|mp4|rerun|navsim out=<folder or URL> ...`: samples as files for other tools.
+"""`python -m factory export mcap|mp4|navsim out=<folder or URL> ...`: samples as files for other tools.
 
     python -m factory export mcap out=runs/demo sample=0             one sample for Foxglove, Lichtblick or Rerun
     python -m factory export mcap out=runs/demo every=10 to=looks    every tenth sample, a file each
     python -m factory export mp4 out=runs/demo sample=3fa9           a drive as H.264, from above and from the cameras
-    python -m factory export rerun out=runs/demo sample=0            a .rrd, with Rerun's SDK (pip install rerun-sdk)
     python -m factory export navsim out=runs/demo to=openscene       all samples in SimScale's layout, for its training
 
 `sample` is an ordinal, an id or the beginning of one, `to` a folder (the current one) or, for one sample, a file.
@@ -45,6 +44,7 @@ class Request:
     """The command line."""
 
     format: Literal["mcap", "mp4", "rerun", "navsim"] = field(metadata=POSITIONAL)
+    format: Literal["mcap", "mp4", "navsim"] = field(metadata=WORD)
     out: str
     sample: str | None = None
     every: int | None = None
@@ -106,7 +106,7 @@ def export(request: Request) -> Iterator[Path]:
         chosen = [find(table, store, request.sample)]
     else:
         chosen = list(table.attempt_ids[:: request.every])
-    suffix = ".rrd" if request.format == "rerun" else f".{request.format}"
+    suffix = f".{request.format}"
     is_file = target.suffix == suffix and not target.is_dir()
     if is_file and request.every is not None:
         raise Refused(f"to={request.to}: every=... writes a file for each sample; name a folder")
@@ -116,7 +116,7 @@ def export(request: Request) -> Iterator[Path]:
             path.parent.mkdir(parents=True, exist_ok=True)
             write(request.format, store, table[attempt_id], path)
             yield path
-    except (OSError, ValueError, ImportError) as error:  # no such folder, another schema version, no SDK
+    except (OSError, ValueError) as error:  # no such folder, another schema version
         raise Refused(f"{store.location.uri}: {error}") from error
 
 
@@ -170,10 +170,6 @@ def write(format: str, store: "Store", row: Row, path: Path) -> None:
         from factory.views.episode_messages import episode_of
 
         path.write_bytes(episode_of(row, logged))
-    elif format == "rerun":
-        from factory.views.rerun_log import write_recording
-
-        write_recording(path, row, logged)
     else:
         from factory.views.bev import write_mp4
         from factory.views.seen_again import digest_of, film, scene_of

@@ -1,4 +1,4 @@
-"""`python -m factory scene info|export|import|view ...`: the scene file of a block, looked into and exchanged.
+"""`python -m factory scene info|export|import ...`: the scene file of a block, looked into and exchanged.
 
 info SCENE...                       what is in it: Gaussians, nodes, sky, range, quality, digest
 export SCENE to=FOLDER              background.ply, one node-<track id>.ply a vehicle, sky.png, scene.json
@@ -8,8 +8,6 @@ export SCENE to=FOLDER format=spz   the same, a tenth the size; format=ckpt: che
 import FILE to=SCENE                a .ply, .spz or checkpoint (.ckpt, .pt, .pth: splatfacto, MTGS, WorldEngine) as a
                                     scene under a plain sky; origin=x,y,z puts it into the world [m]
 import FILE to=SCENE like=OTHER     the same with the origin, nodes, sky and range of another scene
-view SCENE out=RUN                  in the browser, until Ctrl-C, with the log's drives and the run's samples through
-                                    it; without out= the scene alone. port=8267, host=127.0.0.1
 
 traversal=N takes the colours of an MTGS checkpoint's N-th traversal (default: their mean), transforms=FILE takes back
 nerfstudio's dataparser_transforms.json. antialiased=true|false: how a file was made to be drawn (rasterize_mode of
@@ -22,13 +20,10 @@ back under the same name is what the next run draws.
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Event
 from typing import Literal
 
 from factory.config.arguments import POSITIONAL, Refused
 from factory.exits import calling_on_stop_signal
-
-PORT = 8267  # the dashboard is at 8266
 
 
 @dataclass(frozen=True)
@@ -45,8 +40,6 @@ class Request:
     transforms: str | None = None
     antialiased: bool | None = None
     out: str | None = None
-    port: int | None = None
-    host: str | None = None
 
     def __post_init__(self) -> None:
         if self.action != "info" and len(self.files) != 1:
@@ -57,9 +50,8 @@ class Request:
             "info": (),
             "export": ("to", "format", "out"),
             "import": ("to", "like", "origin", "traversal", "transforms", "antialiased"),
-            "view": ("out", "port", "host"),
         }[self.action]
-        for name in ("to", "like", "origin", "format", "traversal", "transforms", "antialiased", "out", "port", "host"):
+        for name in ("to", "like", "origin", "format", "traversal", "transforms", "antialiased", "out"):
             if getattr(self, name) is not None and name not in takes:
                 raise ValueError(f"scene {self.action} takes no {name}=; see --help")
         if self.action == "export" and self.out is not None and self.format != "ckpt":
@@ -95,31 +87,5 @@ def main(request: Request) -> None:
                 )
                 if found.left_out:
                     print(f"left out    {', '.join(found.left_out)}: bodies that bend need their network")
-            case "view":
-                view(request)
     except (ValueError, OSError) as error:
         raise Refused(str(error)) from error
-
-
-def view(request: Request) -> None:
-    """Until Ctrl-C or SIGTERM. Raises ValueError and OSError."""
-    from factory.stages.scene_file import read_scene
-    from factory.views.board.server import LOOPBACK
-    from factory.views.scene_view import NOTHING, drives_through, shown
-    from factory.views.status import open_store
-
-    asset = read_scene(Path(request.files[0]))
-    here = NOTHING if request.out is None else drives_through(open_store(request.out), asset)
-    server = shown(asset, here, request.host or LOOPBACK[0], PORT if request.port is None else request.port)
-    told = f"{len(here.samples)} samples and {len(here.logged)} logged drives" if request.out else "no run's drives"
-    ended = Event()
-    try:
-        with calling_on_stop_signal(ended.set):
-            print(
-                f"{request.files[0]}, {told}: http://{server.get_host()}:{server.get_port()}/ until Ctrl-C", flush=True
-            )
-            if server.get_host() not in LOOPBACK:
-                print("warning: everyone who reaches this port sees the scene; there is no password")
-            ended.wait()
-    finally:
-        server.stop()

@@ -41,7 +41,7 @@ COMMANDS: Mapping[str, Command] = {
     "show": Command("one sample: numbers, a picture, a film", "factory.commands.show"),
     "dashboard": Command("a live page of a run in the browser", "factory.commands.dashboard"),
     "report": Command("the same page as one file", "factory.commands.report"),
-    "export": Command("samples as MCAP, Rerun recordings, films; all in NAVSIM's layout", "factory.commands.export"),
+    "export": Command("samples as MCAP, films; all in NAVSIM's layout", "factory.commands.export"),
     "import": Command("SimScale's samples, NAVSIM's benchmarks, nuScenes' photos", "factory.commands.import_"),
     "explain": Command("one clip: every candidate, why it fell, a film", "factory.commands.explain"),
     "vocabulary": Command("build a vocabulary or a recovery table from logs", "factory.commands.vocabulary"),

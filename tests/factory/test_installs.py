@@ -26,7 +26,6 @@ DISTRIBUTIONS = {  # of modules whose distribution has another name
     "google": "protobuf",
     "hydra": "hydra-core",
     "mcap_protobuf": "mcap-protobuf-support",
-    "rerun": "rerun-sdk",
     "yaml": "pyyaml",
 }
 UNSEEN = {  # declared without an import statement of ours
@@ -72,7 +71,7 @@ def _modules(node: ast.AST, at_import: bool) -> Iterator[str]:
     ("package", "extras"),
     [
         ("tasks", ("run", "gpu")),
-        ("factory", ("run", "rerun", "view", "gpu", "navsim")),
+        ("factory", ("run", "gpu", "navsim")),
         ("planners", ("planners",)),
     ],
 )

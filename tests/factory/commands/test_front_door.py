@@ -314,10 +314,10 @@ def test_completion_knows_commands_keys_groups_and_choices() -> None:
     assert set(candidates(["plan"], "on_change=")) == {"on_change=stop", "on_change=keep", "on_change=redo"}
     assert "clips.root=" in candidates(["run", "clips=av2"], "") and "clips.root=" not in candidates(["run"], "")
     assert set(candidates(["show"], "film=")) == {"film=true", "film=false"}
-    assert set(candidates(["export"], "m")) == {"mcap", "mp4", "navsim", "rerun"}
+    assert set(candidates(["export"], "m")) == {"mcap", "mp4", "navsim"}
     assert {"out=", "workers="} <= set(candidates(["retry"], ""))
     assert {"clip=", "clips=", "tries="} <= set(candidates(["explain"], ""))
-    assert set(candidates(["scene"], "")) == {"info", "export", "import", "view"}
+    assert set(candidates(["scene"], "")) == {"info", "export", "import"}
     assert not list(candidates(["nothing"], ""))
 
 
