@@ -143,7 +143,7 @@ def _run(
     from factory.store.location import BadLocation, Location
     from factory.store.samples import OtherSchema, Store
     from factory.store.table import DamagedLog
-    from factory.views.board.report import remember, write_report
+    from factory.views.board.report import write_facts, write_report
     from factory.views.card import write_card
     from factory.views.show import prepared_episode
     from factory.views.status import failed_line
@@ -200,7 +200,7 @@ def _run(
         print(seconds_text(summary.seconds))
     if set(config.experts) >= NEEDED and summary.exit_code == COMPLETE:
         print(write_benchmark(store, refs, assembled.work.identity, config.rounds, config.benchmark))
-    remember(store, assembled)
+    write_facts(store, assembled)
     where = store.location.uri
     print(f"report: {write_report(store)}")
     print(f"card: {write_card(store)}")

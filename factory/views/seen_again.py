@@ -100,18 +100,14 @@ def photographed(store: Store, row: Row, asset: RenderAsset) -> dict[str, Any] |
     return SampleTable(store.location.uri, store.location.options).sample(nearest["attempt_id"], VIEW_COLUMNS)
 
 
-def real_and_rendered(
-    asset: RenderAsset, photos: Row, at_s: float, only: Sequence[str] = ()
-) -> list[tuple[CaptionedPicture, CaptionedPicture]]:
+def real_and_rendered(asset: RenderAsset, photos: Row, at_s: float) -> list[tuple[CaptionedPicture, CaptionedPicture]]:
     """For each camera, left ones first, the photo nearest to a time of the log, and the scene from the same pose.
 
-    `photos`: VIEW_COLUMNS of a human sample, whose agents are the log's; `only` these cameras, all for none.
+    `photos`: VIEW_COLUMNS of a human sample, whose agents are the log's.
     """
     agents, pairs, scene = agents_of(photos), [], _in_time_of(photos, asset)
     for camera in sorted(photos["cameras"], key=_looks_right):
         mine = [image for image in photos["images"] if image["camera"] == camera["name"]]
-        if only and camera["name"] not in only:
-            continue
         nearest = min(mine, key=lambda image: abs(_now(photos) + image["time_s"] - at_s), default=None)
         if nearest is None:
             continue

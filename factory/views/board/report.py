@@ -1,43 +1,60 @@
-"""A run as one HTML file: the dashboard with its answers and some pictures inside, nothing fetched."""
+"""A run as one HTML file: the dashboard's page, style and scripts, the answers to what it asks, and some pictures.
+
+Scripts and numbers are those of the live page; nothing is fetched, and the file's own policy forbids it.
+"""
 
 import base64
 import json
+import re
+import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
 from factory.config.arguments import Refused
+from factory.store.codes import equals
+from factory.store.reader import decoded
+from factory.store.samples import Store
+from factory.store.schema import NOW_INDEX
+from factory.views.board.drives import Drives, drives_as_json
+from factory.views.board.gallery import Pictures, card_of, failures, gallery, place_of, whole
+from factory.views.board.overview import overview
+from factory.views.board.server import STATIC
+from factory.views.board.watch import Snapshot, Watch
+from factory.views.sample_picture import front_camera, images_at_now, small_jpeg
+from factory.views.scene_files import scene_tables
+from factory.views.status import counted
 
 if TYPE_CHECKING:
     from factory.setup.settings import Run
-    from factory.store.samples import Store
-    from factory.views.examples import Picture
 
+N_SAMPLES = 18  # in the gallery, each with a page and some 150 kB of pictures
+N_LOOKS = 6  # the newest simulated ones, as the overview asks for them
+N_FAILED = 200
+N_VARIED = 24
+PER_EXPERT = 200  # samples that `spread` looks at
+CAMERA_PX = 320  # width of a camera frame on the page
 FILE = "report.html"
-TOLD = "report.json"  # what only the newest run knows: its facts, what its reader left out, rejected attempts drawn
+FACTS = "report.json"  # what only the newest run knows: its facts, and what its reader left out
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' data:; style-src 'unsafe-inline'; img-src data:; "
+    "base-uri 'none'; form-action 'none'"
+)
 
 
-def write_report(store: "Store", to: str | None = None) -> str:
+def write_report(store: Store, to: str | None = None) -> str:
     """Write the file, into `out` where no other place is named; where it is now. Raises Refused where it cannot be."""
-    from factory.views.board.gallery import Pictures
-    from factory.views.board.still import still_page
-    from factory.views.board.watch import Watch
-    from factory.views.examples import strips_of
-    from factory.views.scene_files import scene_tables
-
-    told: dict[str, Any] = json.loads(store.location.read(TOLD) or b"{}")
+    extra: dict[str, Any] = json.loads(store.location.read(FACTS) or b"{}")
     shot, pictures = Watch(store).now(), Pictures(store)
-    shot.funnel  # noqa: B018  # counted first, while no picture takes memory
-    told["strips"] = [
-        strip | {"rows": {name: _plain(row) for name, row in strip["rows"].items()}}
-        for strip in strips_of(store, shot.samples, partial(pictures.row, shot))
-    ]
-    told["scenes"] = scene_tables(Path(store.location.uri, "cache")) if store.location.is_local else {}
+    extra["scenes"] = scene_tables(Path(store.location.uri, "cache")) if store.location.is_local else {}
     settings = store.runs()[-1]["settings"] if store.runs() else {}
-    told["settings"] = {name: str(value) for name, value in settings.items()}
-    page = still_page(store, shot, pictures, told)
+    extra["settings"] = {name: str(value) for name, value in settings.items()}
+    page = still_page(store, shot, pictures, extra)
     if to is None:
         store.location.write(FILE, page)
         return f"{store.location.uri}/{FILE}"
@@ -48,16 +65,12 @@ def write_report(store: "Store", to: str | None = None) -> str:
     return str(Path(to).expanduser().resolve())
 
 
-def remember(store: "Store", assembled: "Run") -> None:
+def write_facts(store: Store, assembled: "Run") -> None:
     """Write report.json, for this report and later ones."""
-    from factory.views.examples import Again, rejected_examples, rejected_rows
-
     config, index, vocabulary = assembled.config, assembled.index, assembled.work.vocabulary
-    again = Again(store, assembled.work, {ref.clip_id: ref for ref in index.refs})
-    drawn = rejected_examples(rejected_rows(store), again.picture)
     n_found = len(index.refs) + len(index.broken)
     planned = n_found if config.limit is None else min(config.limit, n_found)
-    told = {
+    facts = {
         "facts": {
             "clips of the newest run": f"{planned} of {n_found} found",
             "rounds": str(config.rounds),
@@ -69,13 +82,106 @@ def remember(store: "Store", assembled: "Run") -> None:
             "Skipped logs": dict(index.skipped_logs),
             "Broken logs": {f"{ref.log_id} at {ref.start_ms} ms": why for ref, why in index.broken.items()},
         },
-        "rejected": _plain(drawn),
     }
-    store.location.write(TOLD, json.dumps(told).encode())
+    store.location.write(FACTS, json.dumps(facts).encode())
 
 
-def _plain(pictures: "Sequence[Picture]") -> list[Mapping[str, Any]]:
-    """As JSON has them."""
-    return [
-        asdict(one) | {"data": None if one.data is None else base64.b64encode(one.data).decode()} for one in pictures
-    ]
+def still_page(store: Store, shot: Snapshot, pictures: Pictures, extra: Mapping[str, Any]) -> bytes:
+    """The file.
+
+    extra: what the live page does not show: facts, settings, scenes, left_out (static/extra.js reads it).
+    """
+    looks = gallery(shot, {"simulated": "1"}, 1, N_LOOKS)
+    items = [card_of(shot, row) for row in _shown(shot, [item["attempt_id"] for item in looks["items"]])]
+    kept: dict[str, str] = {}
+    answers: dict[str, Any] = {
+        "/api/overview": overview(shot, store.location.uri, time.time()),
+        f"/api/samples?size={N_LOOKS}&simulated=1": looks,
+        "/api/samples": {"total": shot.samples.num_rows, "page": 1, "pages": 1, "items": items},
+        "/api/failed?page=1": failures(shot, 1, N_FAILED) | {"pages": 1},
+        "/api/drives": drives_as_json(Drives(store.location).rows(), with_films=False),
+    }
+    ids = [item["attempt_id"] for item in items]
+    for i, attempt_id in enumerate(ids):
+        found = whole(shot, attempt_id, row := pictures.row(shot, attempt_id), store.candidates)
+        newer, older = ids[i - 1] if i else None, ids[i + 1] if i + 1 < len(ids) else None
+        images = _with_pictures(found, row, kept)
+        answers[f"/api/samples/{attempt_id}"] = found | {"images": images, "newer": newer, "older": older}
+        kept[f"{attempt_id}/bev.jpg"] = _text(pictures.bev(shot, attempt_id, 600, NOW_INDEX))
+    return _document({"answers": answers, "pictures": kept, "extra": extra})
+
+
+def _shown(shot: Snapshot, always: Sequence[str]) -> list[Mapping[str, Any]]:
+    """Rows of samples, newest first: some that must be there, and others as unlike each other as can be."""
+    ids = list(dict.fromkeys([*always, *spread(shot.samples)]))[:N_SAMPLES]
+    return [shot.newest(place) for place in sorted(place_of(shot, attempt_id) for attempt_id in ids)]
+
+
+def spread(samples: pa.Table) -> list[str]:
+    """Ids of a few samples, each next one the least like those before it in expert, clip and round, then by its id.
+
+    The same samples in any order give the same list.
+    """
+    rows = samples.select(["attempt_id", "expert", "clip_id", "round"])
+    left: list[tuple[str, list[tuple[str, Any]]]] = []
+    for expert in counted(rows["expert"]):
+        of_expert = rows.take(np.flatnonzero(equals(rows["expert"], expert)))
+        few = pc.select_k_unstable(of_expert, PER_EXPERT, [("attempt_id", "ascending")])
+        left += [(str(row.pop("attempt_id")), list(row.items())) for row in of_expert.take(few).to_pylist()]
+    left.sort(key=lambda row: row[0])
+    used: Counter[tuple[str, Any]] = Counter()
+    chosen: list[str] = []
+    while left and len(chosen) < N_VARIED:
+        best = min(range(len(left)), key=lambda i: (sum(used[value] for value in left[i][1]), i))
+        attempt_id, values = left.pop(best)
+        chosen.append(attempt_id)
+        used.update(values)
+    return chosen
+
+
+def _with_pictures(found: Mapping[str, Any], row: Mapping[str, Any], kept: dict[str, str]) -> list[dict[str, Any]]:
+    """A sample's images at now alone, which are kept, small."""
+    at_now = {(image["camera"], float(image["time_s"])): image for image in images_at_now(row)}
+    images = []
+    for image in found["images"]:
+        stored = at_now.get((image["camera"], image["time_s"]))
+        try:
+            small = None if stored is None else _text(small_jpeg(decoded(stored), CAMERA_PX))
+        except ValueError:  # the page says that there is no picture
+            continue
+        if small is None:
+            continue
+        images.append(image)
+        kept[f"{row['attempt_id']}/{image['index']}.jpg"] = small
+        if image["camera"] == front_camera(row):
+            kept[f"{row['attempt_id']}/front.jpg"] = small
+    return images
+
+
+def _text(data: bytes) -> str:
+    return base64.b64encode(data).decode()
+
+
+def _document(kept: Mapping[str, Any]) -> bytes:
+    """index.html with everything that it names inside; data is JSON in which no tag can begin."""
+    scripts = {
+        path.stem: "data:text/javascript;base64," + _text(_bare(path.read_text(encoding="utf-8")).encode())
+        for path in STATIC.glob("*.js")
+    }
+    data = json.dumps(kept, allow_nan=False).replace("<", "\\u003c")
+    page = (STATIC / "index.html").read_text(encoding="utf-8")
+    page, links = re.subn(r"<link [^>]*>\n|<script [^>]*></script>\n", "", page)
+    assert links == 3, "index.html names an icon, a style and a script"
+    style = (STATIC / "board.css").read_text(encoding="utf-8")
+    inside = (
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n<style>{style}</style>\n'
+        f'<script type="importmap">{json.dumps({"imports": scripts})}</script>\n'
+        f'<script type="application/json" id="kept">{data}</script>\n'
+        '<script type="module">import "app";</script>\n</head>'
+    )
+    return page.replace("</head>", inside).encode()
+
+
+def _bare(script: str) -> str:
+    """Its imports by bare names, which the import map knows: a data: URL has no neighbours."""
+    return re.sub(r'from "\./(\w+)\.js"', r'from "\1"', script)

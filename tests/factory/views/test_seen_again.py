@@ -1,7 +1,6 @@
 """A stored sample's block seen again: photos beside renderings of their poses, the side views, the film."""
 
 import shutil
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,6 @@ from factory.config.run import load_config
 from factory.setup.settings import assemble
 from factory.store.reader import SampleTable, decode_stored_image
 from factory.store.samples import Store
-from factory.views.board.gallery import Pictures
-from factory.views.board.watch import Watch
-from factory.views.examples import strips_of
 from factory.views.sample_picture import sample_bev
 from factory.views.seen_again import (
     ASIDE_M,
@@ -139,14 +135,6 @@ def test_show_writes_the_picture_and_the_film(
     assert "is not in the run's cache" in capsys.readouterr().out
     assert cv2.imread(str(tmp_path / "y.png")).shape[0] < whole.shape[0]
     assert main([out, "film=true"]) == 2
-
-
-def test_the_report_shows_photos_with_their_renderings_and_the_view_from_the_side(store: Store) -> None:
-    shot = Watch(store).now()
-    made = strips_of(store, shot.samples, partial(Pictures(store).row, shot))
-    strips = {strip["source"]: strip["rows"] for strip in made}
-    assert len(strips["render"]["photos"]) == 2 and len(strips["render"]["aside"]) == len(ASIDE_M)
-    assert strips["photo"]["photos"] == strips["photo"]["aside"] == ()
 
 
 def test_every_reason_of_every_stage_has_its_words() -> None:

@@ -45,7 +45,7 @@ const kept = JSON.parse(document.getElementById("kept")?.textContent ?? "null");
 export const still = kept !== null;
 export const extra = kept?.extra ?? null;
 export const holds = (id) => !still || `/api/samples/${id}` in kept.answers;
-export const jpeg = (base64) => `data:image/jpeg;base64,${base64}`;
+const jpeg = (base64) => `data:image/jpeg;base64,${base64}`;
 
 export function address(item, name, query = "") {
   if (!still) return `/picture/${item.attempt_id}/${name}?v=${item.file}${query}`;

@@ -1,29 +1,9 @@
-// What a report shows beyond the live page: rejected attempts, cameras beside the log's photos, how good the scenes are,
-// what was left out, settings.
+// What a report shows beyond the live page: how good the scenes are, what was left out, settings.
 
-import { extra, h, jpeg, section, table } from "./dom.js";
-
-const ROWS = { now: "", earlier: "up to now", photos: "photo and rendering of the same pose", aside: "the same instant from the side" };
+import { extra, h, section, table } from "./dom.js";
 
 export function extraSections() {
-  return extra ? [rejected(), strips(), scenes(), leftOut(), settings()] : [];
-}
-
-function figure(one) {
-  const shown = one.data ? h("img", { alt: one.caption, src: jpeg(one.data) }) : h("div", { class: "missing" }, "no picture");
-  return h("figure", null, shown, h("figcaption", null, one.caption, one.detail ? h("small", null, one.detail) : null));
-}
-
-function rejected() {
-  if (!extra.rejected?.length) return null;
-  return section("What was turned down", "Rejected attempts at now, seen from above, 60 m from bottom to top; orange the perturbation, blue the expert.", h("div", { class: "cards" }, extra.rejected.map(figure)));
-}
-
-function strips() {
-  if (!extra.strips?.length) return null;
-  const one = (strip) => h("div", { class: "strip" }, h("h3", null, strip.title, " ", h("span", { class: "pill plain" }, strip.source)),
-    Object.entries(ROWS).filter(([name]) => strip.rows[name].length).map(([name, title]) => [title ? h("p", { class: "note" }, title) : null, h("div", { class: name === "now" || name === "photos" ? "cams" : "cams small" }, strip.rows[name].map(figure))]));
-  return section("Camera frames", "photo: the log's own image. render: drawn from the block's reconstruction at the simulated poses. map: lanes and boxes drawn.", extra.strips.map(one));
+  return extra ? [scenes(), leftOut(), settings()] : [];
 }
 
 const listed = (name, rows, heads = ["what", "why"]) => table(name, heads, Object.entries(rows).map(([k, v]) => h("tr", null, h("th", { scope: "row" }, k), h("td", null, v))));

@@ -6,13 +6,13 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pytest
 
 from factory.commands.table import COMMANDS
 from factory.stages.scene_file import write_scene
 from factory.store.samples import Store
-from factory.views.board.report import FILE, TOLD
-from factory.views.board.still import N_LOOKS, N_SAMPLES
+from factory.views.board.report import FACTS, FILE, N_LOOKS, N_SAMPLES, PER_EXPERT, spread
 from tests.factory.stages.test_scene_file import scene
 from tests.factory.views.board.runs import EVIL, counted, run, told
 
@@ -24,12 +24,8 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with hostile names, pictures and failures, and what it remembered for its report."""
     folder = tmp_path_factory.mktemp("run")
     run(folder, 2)
-    remembered = {
-        "facts": {EVIL: EVIL},
-        "left_out": {"Skipped logs": {EVIL: EVIL}},
-        "rejected": [{"data": None, "caption": EVIL, "detail": EVIL}],
-    }
-    (folder / TOLD).write_text(json.dumps(remembered))
+    remembered = {"facts": {EVIL: EVIL}, "left_out": {"Skipped logs": {EVIL: EVIL}}}
+    (folder / FACTS).write_text(json.dumps(remembered))
     write_scene(folder / "cache" / "block-0123.safetensors", scene())
     (folder / "cache" / "block-4567.safetensors").write_bytes(b"no scene")
     assert main([f"out={folder}"]) == 0
@@ -94,6 +90,21 @@ def test_it_fetches_nothing_and_data_is_no_markup(text: str) -> None:
     style = re.search(r"<style>(.*?)</style>", text, re.S)
     assert style is not None and "url(" not in style[1] and "@import" not in style[1]
     assert EVIL not in text and text.count("<script") == 3
+
+
+def test_its_samples_are_spread_and_do_not_depend_on_the_order_of_rows() -> None:
+    rows = [
+        {"attempt_id": f"{i:03d}", "expert": f"e{i % 2}", "clip_id": f"c{i % 7}", "round": i % 3} for i in range(900)
+    ]
+
+    def chosen(rows: list[dict[str, Any]]) -> list[str]:
+        table = pa.table({name: [row[name] for row in rows] for name in rows[0]})
+        return spread(table.set_column(1, "expert", table["expert"].dictionary_encode()))
+
+    first = chosen(rows)
+    assert chosen(rows[::-1]) == first == chosen(rows[: 2 * PER_EXPERT])
+    seen = [rows[int(attempt_id)] for attempt_id in first[:7]]
+    assert len({row["clip_id"] for row in seen}) == 7 and len({(row["expert"], row["round"]) for row in seen}) == 6
 
 
 @pytest.mark.slow

@@ -1,10 +1,16 @@
-"""Sides are words: nobody has to know that y points left."""
+"""Pictures of samples; sides are words: nobody has to know that y points left."""
+
+from pathlib import Path
 
 import numpy as np
 
+from factory.store.reader import SampleTable, decoded
+from factory.store.samples import Store
+from factory.views.sample_picture import encoded, fitted, sample_sheet
 from factory.views.seen_again import ASIDE_M, _looks_right
 from factory.views.status import to_the_side, turned
 from tasks.world.frames import to_local
+from tests.factory.toy import ToyWork, executed, refs
 
 
 def test_what_lies_on_the_left_of_a_car_that_drives_north_lies_west_and_is_called_left() -> None:
@@ -24,3 +30,19 @@ def test_views_stand_side_by_side_as_their_cameras_do() -> None:
     rig = [looking(yaw) for yaw in (0.0, 0.9, -0.9)]
     assert [camera["name"] for camera in sorted(rig, key=_looks_right)] == [0.9, 0.0, -0.9]
     assert list(ASIDE_M) == sorted(ASIDE_M, reverse=True), "y points left"
+
+
+def test_a_picture_keeps_its_aspect_and_survives_coding() -> None:
+    wide = np.full((100, 400, 3), (200, 40, 90), np.uint8)
+    tile = fitted(wide, 200, 100)
+    assert tile.shape == (100, 200, 3)
+    assert (tile[30:70] == wide[0, 0]).all() and not (tile[:20] == wide[0, 0]).all()
+    back = decoded({"jpeg": encoded(wide), "camera": "front", "time_s": 0.0})
+    assert np.abs(back.astype(int) - wide).max() <= 4
+
+
+def test_a_sample_s_sheet_holds_the_world_and_its_cameras(tmp_path: Path) -> None:
+    executed(ToyWork(), refs(1), ["human"], 1, Store(tmp_path))
+    sample = SampleTable(tmp_path)[0]
+    assert sample_sheet(sample)[:720, :720].std() > 0
+    assert sample_sheet({**sample, "images": None}).shape == (720, 720 + 400, 3)
