@@ -114,7 +114,7 @@ def test_rooms_are_small_enough_to_be_looked_at() -> None:
 
 
 def test_a_class_s_name_means_one_thing() -> None:
-    """Each command has its own Request; a Protocol may bear the name of the class that it describes."""
+    """A module of a command has its own Request; a Protocol may bear the name of the class that it describes."""
     where: dict[str, list[str]] = {}
     for module, path in modules().items():
         for node in nodes(path):

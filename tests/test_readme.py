@@ -18,11 +18,8 @@ import pytest
 
 from examples.csv_logs import write_log
 from factory.__main__ import main as door_main
-from factory.commands.dashboard import Request as DashboardRequest
-from factory.commands.explain import Request as ExplainRequest
-from factory.commands.export import Request as ExportRequest
-from factory.commands.import_ import Request as ImportRequest
-from factory.commands.scene import Request as SceneRequest
+from factory.commands.exchange import ExportRequest, ImportRequest, SceneRequest
+from factory.commands.look import DashboardRequest, ExplainRequest
 from factory.commands.table import COMMANDS, PLANNERS
 from factory.config.arguments import parse
 from factory.config.compose import compose, conf_dir, fill

@@ -1,11 +1,4 @@
-"""`python -m factory completion bash|zsh`: completion for the shell; commands, keys, config groups and their choices.
-
-    source <(python -m factory completion bash)             for this shell; into ~/.bashrc for all
-    source <(python -m factory completion zsh)              after compinit
-
-Completes `factory ...` and `planners ...`, `python -m` of both, and of factory.run and planners.drive. Keys of
-planners' commands take the time that PyTorch takes to be imported.
-"""
+"""Completion for bash and zsh."""
 
 import re
 import sys
@@ -15,6 +8,7 @@ from typing import Literal
 
 from factory.commands.table import COMMANDS, DOORS
 from factory.config.arguments import POSITIONAL, RUN_SETTINGS, ComposedCommand, given_as, groups_of, keys_of
+from factory.config.arguments import RUN, WORD, ComposedCommand, given_as, groups_of, keys_of, request_of
 from factory.config.compose import conf_dir
 from factory.config.plugins import choices
 from factory.config.run import EXPERTS, built_in_classes, reader_of
@@ -66,14 +60,21 @@ compdef _factory_python python python3
 
 
 @dataclass(frozen=True)
-class Request:
+class CompletionRequest:
     """The command line."""
 
     shell: Literal["bash", "zsh"] = field(metadata=POSITIONAL)
 
 
-def main(request: Request) -> None:
-    """Print the script of a shell."""
+def completion(request: CompletionRequest) -> None:
+    """`python -m factory completion bash|zsh`: completion for the shell: commands, keys, groups, their choices.
+
+        source <(python -m factory completion bash)             for this shell; into ~/.bashrc for all
+        source <(python -m factory completion zsh)              after compinit
+
+    Completes `factory ...` and `planners ...`, `python -m` of both, and of factory.run and planners.drive. Keys of
+    planners' commands take the time that PyTorch takes to be imported.
+    """
     script = {"bash": BASH, "zsh": ZSH}[request.shell]
     print(script.replace("PYTHON", sys.executable).replace("MODULES", "|".join(MODULES)), end="")
 
@@ -98,13 +99,13 @@ def candidates(words: Sequence[str], last: str, door: str = "factory") -> Iterab
     name, *given = words
     if name not in commands:
         return ()
-    module = commands[name].imported()
-    shape = getattr(module, "Request", None)
-    known: dict[str, list[str]] = {}
-    if shape is None:
-        known = settings_of(given, module.main)
+    function = commands[name].function()
+    if isinstance(function, ComposedCommand):
+        known = settings_of(given, function)
     else:
         known |= settings_of(given) if given_as(shape, RUN_SETTINGS) else {}
+        shape = request_of(function)
+        known = settings_of(given) if given_as(shape, RUN) else {}
         known |= {key: choices_of(kind) for key, kind in keys_of(shape).items()}
         if (words := given_as(shape, POSITIONAL)) and not given and known[words[0]]:
             return known[words[0]]

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from types import ModuleType
+from typing import Any
 
 from factory import __version__
 from factory.config.arguments import ComposedCommand, answer
@@ -18,39 +18,40 @@ class Command:
     """One word behind `python -m factory` or `python -m planners`."""
 
     about: str
-    module: str  # as factory.config.arguments has it
+    module: str
+    name: str = "main"  # of the function there, which is as factory.config.arguments has it
 
-    def imported(self) -> ModuleType:
-        """The file of the command."""
-        return import_module(self.module)
+    def function(self) -> Any:
+        """What does it: of a request, or a ComposedCommand."""
+        return getattr(import_module(self.module), self.name)
 
     def load(self) -> Callable[[Sequence[str]], int]:
         """What answers: arguments -> exit code."""
-        module = self.imported()
-        composed: ComposedCommand = module.main
-        return partial(answer, module) if hasattr(module, "Request") else composed
+        function = self.function()
+        return function if isinstance(function, ComposedCommand) else partial(answer, function)
 
 
+LOOK, KEEP, EXCHANGE, PREPARE = (f"factory.commands.{name}" for name in ("look", "keep", "exchange", "prepare"))
 COMMANDS: Mapping[str, Command] = {
     "run": Command("make samples; the same command again goes on", "factory.run"),
-    "plan": Command("what a run would take: attempts, samples, hours, GB", "factory.commands.plan"),
-    "status": Command("what a run holds, its acceptance funnel, how it ended", "factory.commands.status"),
-    "failed": Command("failed attempts: file, field, message, how to retry", "factory.commands.failed"),
-    "retry": Command("try failed attempts again, with the run's own settings", "factory.commands.retry"),
-    "lineage": Command("where a sample comes from: clip, candidate, attempt, files", "factory.commands.lineage"),
-    "show": Command("one sample: numbers, a picture, a film", "factory.commands.show"),
-    "dashboard": Command("a live page of a run in the browser", "factory.commands.dashboard"),
-    "report": Command("the same page as one file", "factory.commands.report"),
-    "export": Command("samples as MCAP, films; all in NAVSIM's layout", "factory.commands.export"),
-    "import": Command("SimScale's samples, NAVSIM's benchmarks, nuScenes' photos", "factory.commands.import_"),
-    "explain": Command("one clip: every candidate, why it fell, a film", "factory.commands.explain"),
-    "vocabulary": Command("build a vocabulary or a recovery table from logs", "factory.commands.vocabulary"),
-    "scene": Command("scene files of 3D Gaussians: info, import, export", "factory.commands.scene"),
-    "verify": Command("check a run's tables and caches; repair them", "factory.commands.verify"),
-    "clean": Command("remove orphans and temporary files of a run", "factory.commands.clean"),
-    "compact": Command("merge a run's small shards", "factory.commands.compact"),
-    "warm": Command("compile the kernels before the first run", "factory.commands.warm"),
-    "completion": Command("completion for bash or zsh", "factory.commands.completion"),
+    "plan": Command("what a run would take: attempts, samples, hours, GB", PREPARE, "plan"),
+    "status": Command("what a run holds, its acceptance funnel, how it ended", LOOK, "status"),
+    "failed": Command("failed attempts: file, field, message, how to retry", LOOK, "failed"),
+    "retry": Command("try failed attempts again, with the run's own settings", KEEP, "retry"),
+    "lineage": Command("where a sample comes from: clip, candidate, attempt, files", LOOK, "lineage"),
+    "show": Command("one sample: numbers, a picture, a film", LOOK, "show"),
+    "dashboard": Command("a live page of a run in the browser", LOOK, "dashboard"),
+    "report": Command("the same page as one file", LOOK, "report"),
+    "export": Command("samples as MCAP, films; all in NAVSIM's layout", EXCHANGE, "export"),
+    "import": Command("SimScale's samples, NAVSIM's benchmarks, nuScenes' photos", EXCHANGE, "import_"),
+    "explain": Command("one clip: every candidate, why it fell, a film", LOOK, "explain"),
+    "vocabulary": Command("build a vocabulary or a recovery table from logs", PREPARE, "vocabulary"),
+    "scene": Command("scene files of 3D Gaussians: info, import, export", EXCHANGE, "scene"),
+    "verify": Command("check a run's tables and caches; repair them", KEEP, "verify"),
+    "clean": Command("remove orphans and temporary files of a run", KEEP, "clean"),
+    "compact": Command("merge a run's small shards", KEEP, "compact"),
+    "warm": Command("compile the kernels before the first run", PREPARE, "warm"),
+    "completion": Command("completion for bash or zsh", "factory.commands.completion", "completion"),
 }
 
 # What is built on the factory: names alone, as nothing here imports it. `python -m planners` is their door.

@@ -1,14 +1,15 @@
 """What the commands of `factory` and `planners` do alike: arguments, help, and one line for what ends them.
 
-A command is a module: its docstring says what it does, `main` does it. Its keys are a dataclass: `Request`, read here
-from `key=value` and plain words, or the settings that Hydra composes from a file of conf/, where `main` is a `command`.
+A command is a function whose docstring, or its module's, says what it does. Its keys are a dataclass: that of its
+argument `request`, read here from `key=value` and plain words, or, of a `command`, the settings that Hydra composes
+from a file of conf/.
 """
 
+import inspect
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from factory.config.compose import conf_dir
@@ -56,7 +57,7 @@ class ComposedCommand:
         chosen = {word.rpartition("@")[2] for word in groups}
         values = {**_values(self.shape), **dict(re.findall(r"^(\w+): (\S+)", text, re.M))}
         keys = {key: value for key, value in values.items() if key not in chosen}
-        return help_of(f"{sys.modules[self.does.__module__].__doc__}{told}", keys, self.shape)
+        return help_of(f"{about_of(self.does)}{told}", keys, self.shape)
 
 
 def command(
@@ -66,16 +67,26 @@ def command(
     return lambda does: ComposedCommand(does, conf, shape, refused, resumes)
 
 
-def answer(module: ModuleType, argv: Sequence[str]) -> int:
-    """A command with a Request: its exit code."""
-    shape = module.Request
+def answer(does: Callable[[Any], int | None], argv: Sequence[str]) -> int:
+    """The exit code of a command that takes a request."""
+    shape = request_of(does)
     keys = {name: value for name, value in _values(shape).items() if name in keys_of(shape)}
     return answered(
         argv,
-        lambda words: module.main(parse(shape, words)),
-        lambda: help_of(module.__doc__ or "", keys, shape),
+        lambda words: does(parse(shape, words)),
+        lambda: help_of(about_of(does), keys, shape),
         elsewhere=", or give to=<another place>" if "to" in keys else "",
     )
+
+
+def request_of(does: Callable[[Any], int | None]) -> Any:
+    """The dataclass of a command's request."""
+    return get_type_hints(does)["request"]
+
+
+def about_of(does: Callable[..., Any]) -> str:
+    """What a command says of itself: its function, or the module where it is the module's only one, `main`."""
+    return inspect.cleandoc((sys.modules[does.__module__] if does.__name__ == "main" else does).__doc__ or "") + "\n"
 
 
 def answered(

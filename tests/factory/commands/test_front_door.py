@@ -20,6 +20,7 @@ from factory.commands.completion import candidates, settings_of
 from factory.commands.table import COMMANDS, DOORS, PLANNERS
 from factory.exits import EXIT_CODE_TEXT
 from factory.graph.driver import EpisodeSettings
+from factory.config.arguments import ComposedCommand
 from factory.graph.execute import Execution
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import COPIES
@@ -162,7 +163,7 @@ def test_each_door_lists_its_commands_and_names_those_of_the_other(capsys: pytes
     for name, command in PLANNERS.items():
         assert f"  {name} " in shown and f"  {name} " in ours and command.about in shown
         assert callable(command.load())
-    modules = {command.module for command in PLANNERS.values() if not hasattr(command.imported(), "Request")}
+    modules = {command.module for command in PLANNERS.values() if isinstance(command.function(), ComposedCommand)}
     runnable = {
         ".".join(path.relative_to(REPOSITORY).with_suffix("").parts)
         for path in (REPOSITORY / "planners").rglob("*.py")

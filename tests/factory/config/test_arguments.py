@@ -1,7 +1,6 @@
 """Arguments of the commands that look at a run."""
 
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Literal
 
@@ -9,6 +8,7 @@ import pytest
 
 from factory.commands.table import COMMANDS, DOORS
 from factory.config.arguments import POSITIONAL, RUN_SETTINGS, Refused, keys_of, parse
+from factory.config.arguments import RUN, WORD, Refused, keys_of, parse, request_of
 from factory.config.shapes import choices_of
 from factory.config.words import ConfigError
 from tests.factory.text_keys import text_keys
@@ -46,7 +46,7 @@ def test_a_home_folder_is_one_in_every_key_that_takes_text(
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     package, name = command.split()
-    shape = import_module(DOORS[package][name].module).Request
+    shape = request_of(DOORS[package][name].function())
     texts = [key for key in text_keys(shape) if key in keys_of(shape)]
     chosen = [f"{key}={choices_of(hint)[0]}" for key, hint in keys_of(shape).items() if choices_of(hint)]
     monkeypatch.setattr(shape, "__post_init__", lambda self: None, raising=False)  # what goes with what

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from factory.commands.prepare import VocabularyRequest, build_from_logs
 from factory.commands.table import COMMANDS
-from factory.commands.vocabulary import Request, run
 from factory.config.arguments import Refused, parse
 from factory.config.run import VocabularyChoice
 from factory.readers.base import BadClip, ClipIndex, ClipRef
@@ -77,22 +77,22 @@ def test_without_a_train_log_there_is_no_vocabulary_and_it_says_so() -> None:
 
 
 def test_a_broken_log_is_named_and_the_others_are_used(tmp_path: Path) -> None:
-    settings = Request(table=str(tmp_path / "t.npz"))
-    lines = run(settings, DriveReader({"a": "train", "x": "train"}, broken=["x"]))
+    settings = VocabularyRequest(table=str(tmp_path / "t.npz"))
+    lines = build_from_logs(settings, DriveReader({"a": "train", "x": "train"}, broken=["x"]))
     assert len(load_recovery_table(tmp_path / "t.npz")) == 30
     assert sum("poses.feather: tx_m: NaN" in line for line in lines) == 10
 
 
 def test_both_artefacts_come_back_with_their_digests(tmp_path: Path) -> None:
     np.save(tmp_path / "human.npy", kinematic_trajectories(20, 0).astype(np.float32))
-    settings = Request(
+    settings = VocabularyRequest(
         out=str(tmp_path / "deep/voc.npy"),
         k=8,
         table=str(tmp_path / "table.npz"),
         vocabularies=(str(tmp_path / "human.npy"),),
     )
     reader = DriveReader({"a": "train"})
-    run(settings, reader)
+    build_from_logs(settings, reader)
     first = (tmp_path / "deep/voc.npy").read_bytes()
     vocabulary, table = load_vocabulary(tmp_path / "deep/voc.npy"), load_recovery_table(tmp_path / "table.npz")
     assert len(vocabulary) == 8
@@ -103,7 +103,7 @@ def test_both_artefacts_come_back_with_their_digests(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "table.json").read_text())["vocabularies"] == {
         "human.npy": load_vocabulary(tmp_path / "human.npy").digest
     }
-    run(settings, reader)
+    build_from_logs(settings, reader)
     assert (tmp_path / "deep/voc.npy").read_bytes() == first
     assert load_recovery_table(tmp_path / "table.npz").digest == table.digest
     assert not list(tmp_path.rglob("*.part"))
@@ -142,8 +142,8 @@ def test_the_first_entries_of_a_vocabulary_can_be_asked_for(tmp_path: Path) -> N
 
 def test_the_command_line_separates_clips_from_its_own_settings() -> None:
     clips = ("clips=av2", "clips.root=/logs")
-    found = parse(Request, [*clips, "k=16", "out=v.npy", "vocabularies=[a.npy,b.npy]", "every_s=0.2"])
-    assert found == Request(out="v.npy", k=16, vocabularies=("a.npy", "b.npy"), every_s=0.2, settings=clips)
+    found = parse(VocabularyRequest, [*clips, "k=16", "out=v.npy", "vocabularies=[a.npy,b.npy]", "every_s=0.2"])
+    assert found == VocabularyRequest(out="v.npy", k=16, vocabularies=("a.npy", "b.npy"), every_s=0.2, settings=clips)
     for wrong, message in (
         (["k=3"], "nothing to build"),
         (["out=v.npz"], r"must end in \.npy"),
@@ -153,7 +153,7 @@ def test_the_command_line_separates_clips_from_its_own_settings() -> None:
         (["out"], "expected key=value"),
     ):
         with pytest.raises(Refused, match=message):
-            parse(Request, wrong)
+            parse(VocabularyRequest, wrong)
 
 
 def test_the_kinematic_vocabulary_is_written_as_a_run_has_it(

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from factory.commands.dashboard import awaited
+from factory.commands.look import awaited
 from factory.commands.table import COMMANDS
 from factory.config.arguments import Refused
 from factory.config.run import load_config

@@ -1,26 +1,35 @@
-"""`python -m factory vocabulary`: vocabularies and recovery tables out of a data set's own TRAIN logs.
+"""Commands before a run: plan, vocabulary, warm."""
 
-    python -m factory vocabulary clips=av2 clips.root=<logs> k=1024 out=vocabulary.npy
-    python -m factory vocabulary kinematic=true k=1024 out=labels.npy
-    python -m factory vocabulary clips=av2 clips.root=<logs> table=recovery.npz vocabularies=[human_8192x40x3.npy]
-
-`clips` and `clips.*` are those of `python -m factory.run`. Other keys: k=8192 and seed=0 of the vocabulary, every_s=0.5
-between the starts of windows. Each artefact has a .json with its digest and origin beside it.
-"""
-
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from factory.config.arguments import SOME_RUN_SETTINGS, Refused, keys_of
-from factory.config.words import nearest
+import factory.run
+from factory.config.arguments import SOME, WORD, Refused, command, keys_of
+from factory.config.run import RunConfig
+from factory.config.words import asked_of, nearest
 
 if TYPE_CHECKING:
     from factory.readers.base import ClipReader
 
 
+@command("run", RunConfig, refused=(), resumes=True)
+def plan(argv: Sequence[str]) -> int:
+    """`python -m factory plan ...`: what a run of these settings would take; nothing is written but cached blocks.
+
+        python -m factory plan clips=av2 clips.root=<logs> rounds=5 out=runs/next
+
+    Clips, attempts, samples, core-hours, GPU-hours and GB, from a calibration on three clips; where `out` has samples
+    already, also what the rates there come to. Takes the settings of `python -m factory run`.
+    Exit codes: 0 told, 2 bad settings or no clip.
+    """
+    return factory.run.run(asked_of(argv), only_plan=True)
+
+
 @dataclass(frozen=True)
-class Request:
+class VocabularyRequest:
     """What to build from the train clips."""
 
     out: str | None = None  # a vocabulary: .npy (k, 40, 3)
@@ -37,7 +46,9 @@ class Request:
             if not equals:
                 raise ValueError(f"{key!r}: expected key=value; see --help")
             if key.partition(".")[0] != "clips":
-                raise ValueError(f"{key}: there is no such setting; see --help{nearest(key, list(keys_of(Request)))}")
+                raise ValueError(
+                    f"{key}: there is no such setting; see --help{nearest(key, list(keys_of(VocabularyRequest)))}"
+                )
         if self.kinematic and (self.out is None or self.table is not None):
             raise ValueError("kinematic=true makes a vocabulary: give out=<file>.npy, and no table")
         if self.out is None and self.table is None:
@@ -47,20 +58,28 @@ class Request:
                 raise ValueError(f"{name}={file} must end in {suffix}")
 
 
-def main(request: Request) -> None:
-    """Write what is asked for and name it. Raises Refused, ConfigError."""
+def vocabulary(request: VocabularyRequest) -> None:
+    """`python -m factory vocabulary`: vocabularies and recovery tables out of a data set's own TRAIN logs.
+
+        python -m factory vocabulary clips=av2 clips.root=<logs> k=1024 out=vocabulary.npy
+        python -m factory vocabulary kinematic=true k=1024 out=labels.npy
+        python -m factory vocabulary clips=av2 clips.root=<logs> table=recovery.npz vocabularies=[human_8192x40x3.npy]
+
+    `clips` and `clips.*` are those of `python -m factory.run`. Other keys: k=8192 and seed=0 of the vocabulary,
+    every_s=0.5 between the starts of windows. Each artefact has a .json with its digest and origin beside it.
+    """
     from factory.config.compose import build, compose
 
     try:
         if request.kinematic:
             print(write_kinematic(request))
         else:
-            print("\n".join(run(request, build(compose("run", request.settings)["clips"], "clips"))))
+            print("\n".join(build_from_logs(request, build(compose("run", request.settings)["clips"], "clips"))))
     except (ValueError, OSError) as error:
         raise Refused(str(error)) from error
 
 
-def run(request: Request, reader: "ClipReader") -> list[str]:
+def build_from_logs(request: VocabularyRequest, reader: "ClipReader") -> list[str]:
     """Builds and writes what is asked for; one line of report for each artefact.
 
     Raises ValueError where the root has no data, no train log or too few windows, or a vocabulary file is broken.
@@ -99,7 +118,7 @@ def run(request: Request, reader: "ClipReader") -> list[str]:
     return lines
 
 
-def write_kinematic(request: Request) -> str:
+def write_kinematic(request: VocabularyRequest) -> str:
     """Writes the kinematic vocabulary of `k` and `seed`; a line of report."""
     from factory.setup.vocabulary import save_vocabulary
     from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
@@ -107,3 +126,31 @@ def write_kinematic(request: Request) -> str:
     vocabulary = Vocabulary(kinematic_trajectories(request.k, request.seed), source="kinematic")
     save_vocabulary(str(request.out), vocabulary, {"source": "kinematic", "seed": request.seed})
     return f"{request.out}: {len(vocabulary)} kinematic trajectories, {vocabulary.digest}"
+
+
+@dataclass(frozen=True)
+class WarmRequest:
+    """The command line."""
+
+    parts: tuple[str, ...] = field(default=(), metadata=WORD)
+
+
+def warm(request: WarmRequest) -> None:
+    """`python -m factory warm [part ...]`: compile the kernels before the first run, some 110 s on a core.
+
+        python -m factory warm                  all of them, and what the synthetic town is drawn with
+        python -m factory warm drive judge      parts: what a run that only drives needs, what scores need
+
+    Each is compiled once per machine, processor and version; what is there is not compiled again.
+    """
+    from factory.graph.work import NotReady
+    from factory.stages.warm import PARTS, compile_kernels, compile_town_kernels
+
+    if unknown := sorted(set(request.parts) - PARTS.keys()):
+        raise Refused(f"no part {', '.join(unknown)}; there are {', '.join(PARTS)}")
+    try:
+        compile_kernels(list(request.parts) or ["judge", "plan", "answers", "fit", "rig"])
+    except NotReady as error:
+        raise Refused(str(error)) from error
+    if not request.parts:
+        compile_town_kernels()

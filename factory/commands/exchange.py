@@ -1,0 +1,439 @@
+"""Commands that exchange samples and scenes with other programs: export, import, scene."""
+
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from factory.config.arguments import WORD, Refused
+from factory.datasets.navsim.settings import Layout, Missing
+from factory.exits import COMPLETE, INTERRUPTED
+from factory.views.show import find, logged_drive, open_samples
+from factory.views.status import open_store
+from factory.wording import one_line
+
+if TYPE_CHECKING:
+    from factory.graph.execute import RunSummary
+    from factory.store.samples import Store
+    from tasks.world.arrays import Array
+
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """The command line."""
+
+    format: Literal["mcap", "mp4", "navsim"] = field(metadata=WORD)
+    out: str
+    sample: str | None = None
+    every: int | None = None
+    to: str = "."
+    expert: tuple[str, ...] = ()
+    round: tuple[str, ...] = ()
+    split: tuple[str, ...] = ()
+    tag: str = ""
+    layout: Layout = "moved"
+    resize: bool = False
+    missing: Missing = "refuse"
+    map_location: str = ""
+    vocabulary: str | None = None
+    executor: Literal["local", "ray"] = "local"
+    workers: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.format == "navsim":
+            self._check_all()
+            return
+        for name in [f.name for f in fields(self) if f.name not in EVERYWHERE]:
+            if getattr(self, name) != getattr(type(self), name):
+                raise ValueError(f"{name}=...: of export navsim alone; {self.format} takes sample= or every=, and to=")
+        if (self.sample is None) == (self.every is None):
+            raise ValueError("give either sample=<id> or every=<n>; see --help")
+        if self.every == 0:
+            raise ValueError("every=0: must be 1 or more")
+
+    def _check_all(self) -> None:
+        if self.sample is not None or self.every is not None:
+            raise ValueError("sample= and every= are of single files; navsim takes expert=, round= and split=")
+        if self.to == ".":
+            raise ValueError("to=<folder> is missing: where logs, pictures, splits and rewards are written")
+        if "://" in self.to:
+            raise ValueError(f"to={self.to}: is written to a local folder; copy that")
+        if self.workers == 0:
+            raise ValueError("workers=0: must be 1 or more")
+        if odd := [word for word in self.round if not (word.isascii() and word.isdecimal())]:
+            raise ValueError(f"round={odd[0]}: must be a whole number, 0 or more")
+
+
+EVERYWHERE = ("format", "out", "sample", "every", "to")
+
+
+def export(request: ExportRequest) -> int:
+    """`python -m factory export mcap|mp4|navsim out=<folder or URL> ...`: samples as files for other tools.
+
+        python -m factory export mcap out=runs/demo sample=0             one sample for Foxglove, Lichtblick or Rerun
+        python -m factory export mcap out=runs/demo every=10 to=looks    every tenth sample, a file each
+        python -m factory export mp4 out=runs/demo sample=3fa9           a drive as H.264, from above and its cameras
+        python -m factory export navsim out=runs/demo to=openscene       all in SimScale's layout, for its training
+
+    `sample` is an ordinal, an id or the beginning of one, `to` a folder (the current one) or, for one sample, a file.
+    `navsim` takes all samples, or those of expert=a,b round=0,1 split=train,val, and goes on where it was stopped:
+        tag=<word>          behind the experts' names, so that splits of ours stand beside the released ones
+        layout=released     as SimScale's archives unpack; moved (the default): as after its tools/move.sh
+        resize=true         pictures of other sizes to 1920x1080, which the released agents take for granted
+        missing=black|none  for pictures that a sample has not: a black one, or none; refuse is the default
+        map_location=<one>  of NAVSIM's four, for logs whose map has another name
+        vocabulary=<.npy>   the trajectories that the labels are of, to be written beside the rewards
+        executor=ray        workers on Ray: the cluster of RAY_ADDRESS, whose nodes see `out` and `to` by the same
+                            paths, or one of this machine's own; local (the default): processes
+        workers=<n>         at once; else 1, on Ray every core
+    What is written: docs/navsim_format.md.
+    """
+    if request.format == "navsim":
+        return _export_all(request)
+    for path in _export_some(request):
+        print(path.resolve())
+    return COMPLETE
+
+
+def _export_some(request: ExportRequest) -> Iterator[Path]:
+    """Write the files; their paths as they are written. Raises Refused where there is nothing, or no file can be."""
+    store, target = open_store(request.out), Path(request.to)
+    table = open_samples(store)
+    if request.sample is not None:
+        chosen = [find(table, store, request.sample)]
+    else:
+        chosen = list(table.attempt_ids[:: request.every])
+    suffix = f".{request.format}"
+    is_file = target.suffix == suffix and not target.is_dir()
+    if is_file and request.every is not None:
+        raise Refused(f"to={request.to}: every=... writes a file for each sample; name a folder")
+    try:
+        for attempt_id in chosen:
+            path = target if is_file else target / f"sample_{attempt_id}{suffix}"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _write_sample(request.format, store, table[attempt_id], path)
+            yield path
+    except (OSError, ValueError) as error:  # no such folder, another schema version
+        raise Refused(f"{store.location.uri}: {error}") from error
+
+
+def _export_all(request: ExportRequest) -> int:
+    """All samples in SimScale's layout; the exit code. Raises Refused."""
+    from factory.config.compose import need_run_extra
+    from factory.datasets.navsim.export import export as export_all
+    from factory.datasets.navsim.settings import ExportSettings
+    from factory.graph.each import WorkerDied, each
+    from factory.graph.work import TaskStopped
+    from factory.store.location import Location
+    from factory.store.reader import sample_table
+
+    if request.executor == "ray":
+        need_run_extra("ray")
+    store = open_store(request.out)
+    try:
+        settings = ExportSettings(
+            request.expert,
+            tuple(int(word) for word in request.round),
+            request.split,
+            request.tag,
+            request.layout,
+            request.resize,
+            request.missing,
+            request.map_location,
+        )
+        target = Location.parse(request.to, setting="to")
+        dealt = partial(each, executor=request.executor, workers=request.workers, to=target)
+        table = sample_table(store.location.uri, store.location.options)
+        trajectories = _label_trajectories(store, request.vocabulary)
+        done = export_all(table, Path(target.uri), settings, trajectories, dealt)
+    except (OSError, ValueError, WorkerDied) as error:  # no folder, a full disk, what cannot be written as asked
+        raise Refused(str(error)) from error
+    except (TaskStopped, KeyboardInterrupt) as error:
+        at_once = "" if isinstance(error, TaskStopped) else " at once"
+        print(f"interrupted{at_once}; run the same command again to go on", file=sys.stderr)
+        return INTERRUPTED
+    for note in done.notes:
+        print(f"note: {note}")
+    print(f"{done.written:,} logs written, {done.logs:,} in all, {done.n_bytes / 1e9:,.3f} GB: {target.uri}")
+    return COMPLETE
+
+
+def _label_trajectories(store: "Store", file: str | None) -> "Array | None":
+    """(K, 40, 3) that the samples' labels are of; None where there are none, or of a file that was not named."""
+    from factory.store.reader import SampleTable
+    from factory.store.schema import LABEL_COLUMNS
+    from factory.views.show import labelled_trajectories
+
+    samples = SampleTable(store.location.uri, store.location.options)
+    digests = samples.table(["label_vocabulary"])["label_vocabulary"].to_pylist()
+    labelled = next((i for i, digest in enumerate(digests) if digest is not None), None)
+    if labelled is None:
+        return None
+    return labelled_trajectories(samples.sample(labelled, ["attempt_id", *LABEL_COLUMNS]), file)
+
+
+def _write_sample(format: str, store: "Store", row: Row, path: Path) -> None:
+    """One sample as one file."""
+    logged = logged_drive(store, dict(row))
+    if format == "mcap":
+        from factory.views.episode_messages import episode_of
+
+        path.write_bytes(episode_of(row, logged))
+    else:
+        from factory.views.bev import write_mp4
+        from factory.views.seen_again import digest_of, film, scene_of
+
+        digest = digest_of(store, row)
+        write_mp4(path, film(row, None if digest is None else scene_of(store, digest), logged))
+
+
+CAMERAS = "nuscenes-cameras"
+
+
+@dataclass(frozen=True)
+class ImportRequest:
+    """The command line."""
+
+    source: Literal["simscale", "navhard", "navtest", "nuscenes-cameras"] = field(metadata=WORD)
+    root: str
+    out: str
+    maps: str | None = None
+    rewards: str | None = None
+    vocabulary: str | None = None
+    pictures: bool = True
+    only: tuple[str, ...] = ()
+    logs: str | None = None
+    sensors: str | None = None
+    split: str | None = None
+    version: str | None = None
+    sweeps: bool = True
+
+    def __post_init__(self) -> None:
+        if self.source == CAMERAS:
+            return
+        if self.version is not None or not self.sweeps:
+            raise ValueError(f"version= and sweeps= are of import {CAMERAS}")
+        if (self.rewards is None) != (self.vocabulary is None):
+            raise ValueError("rewards= and vocabulary= go together: scores mean nothing without their trajectories")
+        if self.source != "simscale":
+            needed = ("logs", "maps", "split") if self.source == "navhard" else ("maps", "split")
+            if missing := [name for name in needed if getattr(self, name) is None]:
+                takes = ", ".join(f"{name}=" for name in needed)
+                raise ValueError(f"{missing[0]}=... is missing: import {self.source} takes {takes}")
+            if (self.sensors is None) == self.pictures:
+                raise ValueError("sensors= and pictures=: give the folder of pictures, or pictures=false")
+
+
+def import_(request: ImportRequest) -> int:
+    """`python -m factory import simscale|navhard|navtest|nuscenes-cameras root=<folder> out=<...>`: others' data.
+
+        python -m factory import simscale root=SimScale_data out=runs/simscale maps=nuplan/maps
+        python -m factory import simscale root=exported out=runs/back only=[synthetic_reaction_pdm_v1.0-0]
+        python -m factory import simscale root=SimScale_data out=runs/simscale rewards=traj_pdm vocabulary=16384.npy
+
+    simscale: the released layout, moved into NAVSIM's folders or as unpacked, and what `export navsim` wrote, human
+    samples too. One row for each log, which `train`, `show`, `dashboard`, `report` and `export` take as any other
+    (`data.sim=[runs/simscale]`).
+        maps=<folder>        nuPlan's, for lanes, route and lights of each row; without it these columns are empty
+        rewards=<folder>     reward pickles, or one of them; with vocabulary=<.npy> they become the rows' labels
+        pictures=false       rows without pictures
+        only=[a,b]           these of the folders alone
+    navhard: NAVSIM's two-stage benchmark, which `python -m planners evaluate benchmark=<out>` takes.
+        python -m factory import navhard root=navhard_two_stage logs=navsim_logs/test sensors=sensor_blobs/test \\
+            maps=maps split=.../train_test_split/navhard_two_stage.yaml out=runs/navhard
+        root=<folder>        synthetic_scene_pickles and sensor_blobs of the second stage
+        logs=, sensors=      of the first stage; pictures=false needs no sensors
+        split=<.yaml>        whose reactive_all_mapping says which scenes belong together
+    navtest: its one-stage benchmark, the frames that a scene filter or split names, for the same `evaluate`.
+        python -m factory import navtest root=navsim_logs/test sensors=sensor_blobs/test maps=maps \\
+            split=.../train_test_split/navtest.yaml out=runs/navtest
+        root=<folder>        the logs; sensors=, pictures= and maps= as above
+    nuscenes-cameras: where nuScenes' photos and lidar are, as sidecars of ScenarioNet's logs (docs/photos.md), one
+    file a scene below out=, which `clips=scenarionet clips.cameras=<out> clips.sensor_root=<root>` takes.
+        python -m factory import nuscenes-cameras root=/data/nuscenes version=v1.0-mini out=/data/photos
+        root=<folder>        samples, sweeps, v1.0-*; nothing of it is copied
+        version=v1.0-mini    of the tables; needed where several are there
+        sweeps=false         keyframes alone: photos at 2 Hz instead of 12; lidar is always that of keyframes
+        only=[scene-0103]    these scenes alone
+    The same command again goes on, and tries what failed once more. What is kept and what is lost: docs/navsim.md.
+    """
+    if request.source == CAMERAS:
+        return _cameras(request)
+    from deltalake.exceptions import DeltaError
+
+    from factory.readers.base import BadClip
+    from factory.store.disk import why_unusable
+    from factory.store.location import Location
+    from factory.store.samples import ChangedRun, Store
+    from factory.store.table import AnotherWriter
+    from factory.views.status import failed_line
+
+    if unusable := why_unusable(request.out):
+        raise Refused(unusable)
+    try:
+        store = Store(Location.parse(request.out))
+        answers = {"simscale": _simscale, "navhard": _navhard, "navtest": _navtest}
+        summary, told = answers[request.source](request, store)
+    except (BadClip, ChangedRun, AnotherWriter, ValueError, OSError, ImportError, DeltaError) as error:
+        raise Refused(one_line(error)) from error
+    counts = summary.counts
+    print(f"{counts['accepted']:,} samples imported, {summary.executed.found_done:,} were there: {store.location.uri}")
+    for line in filter(None, (summary.message, told, failed_line(store) if counts["failed"] else "")):
+        print(line)
+    return summary.exit_code
+
+
+def _simscale(request: ImportRequest, store: "Store") -> tuple["RunSummary", str]:
+    from factory.datasets.navsim.import_table import identity_of, import_rows
+    from factory.datasets.navsim.simscale import Import, Rewards, parts_of
+    from factory.setup.vocabulary import load_vocabulary
+
+    parts = parts_of(Path(request.root), request.only)
+    rewards = None
+    if request.rewards is not None and request.vocabulary is not None:
+        rewards = Rewards(Path(request.rewards), load_vocabulary(request.vocabulary))
+    settings = {
+        "maps": request.maps is not None,
+        "pictures": request.pictures,
+        "labels": None if rewards is None else rewards.vocabulary.digest,
+    }
+    maps = _folder(request.maps)
+    if maps is not None and not maps.is_dir():
+        raise Refused(f"maps={request.maps}: no such folder")
+    wanted = Import(maps, request.pictures, rewards)
+    return import_rows(store, identity_of(request.source, settings), wanted.entries(parts)), ""
+
+
+def _navhard(request: ImportRequest, store: "Store") -> tuple["RunSummary", str]:
+    from factory.datasets.navsim.filters import read_selection
+    from factory.datasets.navsim.navhard import NavsimFolders, import_navhard
+
+    logs, maps = _folder(request.logs), _folder(request.maps)
+    assert logs is not None and maps is not None and request.split is not None
+    places = NavsimFolders(logs, _folder(request.sensors), Path(request.root), maps)
+    return import_navhard(store, read_selection(request.split), places)
+
+
+def _navtest(request: ImportRequest, store: "Store") -> tuple["RunSummary", str]:
+    from factory.datasets.navsim.filters import read_selection
+    from factory.datasets.navsim.navtest import import_navtest
+
+    maps = _folder(request.maps)
+    assert maps is not None and request.split is not None
+    logs = Path(request.root)
+    return import_navtest(store, read_selection(request.split), logs, _folder(request.sensors), maps)
+
+
+def _cameras(request: ImportRequest) -> int:
+    """Write the sidecars and say what each holds. Raises Refused."""
+    from factory.datasets.scenarionet.nuscenes_cameras import import_cameras
+    from factory.readers.base import BadClip
+
+    root, out = Path(request.root), Path(request.out)
+    photos = 0
+    try:
+        for done in import_cameras(root, out, request.version, request.only, request.sweeps):
+            photos += done.photos
+            where = f"{done.photos:,} photos of {done.cameras} cameras, {done.sweeps} sweeps: {done.path}"
+            print(f"{done.scene}  {where if done.photos else 'no photo is there: no sidecar'}")
+            if done.missing:
+                print(f"  {len(done.missing):,} files of the tables are not there, such as {done.missing[0]}")
+    except (BadClip, ValueError, OSError) as error:
+        raise Refused(one_line(error)) from error
+    if not photos:
+        raise Refused(f"{root}: none of the photos that its tables name is there; unpack samples/ and sweeps/ into it")
+    return 0
+
+
+def _folder(path: str | None) -> Path | None:
+    return None if path is None else Path(path)
+
+
+@dataclass(frozen=True)
+class SceneRequest:
+    """The command line."""
+
+    action: Literal["info", "export", "import"] = field(metadata=WORD)
+    files: tuple[str, ...] = field(metadata=WORD)
+    to: str | None = None
+    like: str | None = None
+    origin: str | None = None
+    format: Literal["ply", "spz", "ckpt"] | None = None
+    traversal: int | None = None
+    transforms: str | None = None
+    antialiased: bool | None = None
+    out: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.action != "info" and len(self.files) != 1:
+            raise ValueError(f"scene {self.action} takes one file; see --help")
+        if self.action in ("export", "import") and self.to is None:
+            raise ValueError(f"scene {self.action} takes to=...; see --help")
+        takes = {
+            "info": (),
+            "export": ("to", "format", "out"),
+            "import": ("to", "like", "origin", "traversal", "transforms", "antialiased"),
+        }[self.action]
+        for name in ("to", "like", "origin", "format", "traversal", "transforms", "antialiased", "out"):
+            if getattr(self, name) is not None and name not in takes:
+                raise ValueError(f"scene {self.action} takes no {name}=; see --help")
+        if self.action == "export" and self.out is not None and self.format != "ckpt":
+            raise ValueError("out= brings vehicles' poses into a checkpoint: format=ckpt")
+        if self.like is not None and self.origin is not None:
+            raise ValueError("give origin= or like=: the other scene has an origin of its own")
+
+
+def scene(request: SceneRequest) -> None:
+    """`python -m factory scene info|export|import ...`: the scene file of a block, looked into and exchanged.
+
+    info SCENE...                       what is in it: Gaussians, nodes, sky, range, quality, digest
+    export SCENE to=FOLDER              background.ply, one node-<track id>.ply a vehicle, sky.png, scene.json
+    export SCENE to=FOLDER format=spz   the same, a tenth the size; format=ckpt: checkpoints, of the background as of
+                                        WorldEngine, of vehicles as of nerfstudio's splatfacto; with out=RUN the former
+                                        has the vehicles too, where the log had them by the run's prepared clips
+    import FILE to=SCENE                a .ply, .spz or checkpoint (.ckpt, .pt, .pth: splatfacto, MTGS, WorldEngine) as
+                                        a scene under a plain sky; origin=x,y,z puts it into the world [m]
+    import FILE to=SCENE like=OTHER     the same with the origin, nodes, sky and range of another scene
+
+    traversal=N takes the colours of an MTGS checkpoint's N-th traversal (default: their mean), transforms=FILE
+    takes back nerfstudio's dataparser_transforms.json. antialiased=true|false: how a file was made to be drawn
+    (rasterize_mode of gsplat), where it does not say so; .spz, MTGS and WorldEngine do, of others it is that of
+    like=, or false.
+
+    The .ply files are standard 3D Gaussian splatting (gsplat, nerfstudio, SuperSplat). A background is in metres
+    from the scene's origin, a node in its box's frame. A block's scene lies in <out>/cache/block-*.safetensors; an
+    edited one put back under the same name is what the next run draws.
+    """
+    from factory.stages.scene_file import read_scene, write_scene
+    from factory.views.scene_files import export as export_scene
+    from factory.views.scene_files import imported, info_text, logged_vehicles, read_splats
+    from factory.views.status import open_store
+    from tasks.render.splatting.formats import LoggedVehicle
+
+    file, to = Path(request.files[0]), Path(request.to or "")
+    try:
+        match request.action:
+            case "info":
+                print("\n\n".join(info_text(path, read_scene(path)) for path in map(Path, request.files)))
+            case "export":
+                asset, vehicles, unseen = read_scene(file), list[LoggedVehicle](), list[str]()
+                if request.out is not None:
+                    vehicles, unseen = logged_vehicles(open_store(request.out), asset)
+                print("\n".join(map(str, export_scene(asset, to, f".{request.format or 'ply'}", vehicles))))
+                if unseen:
+                    print(f"left out    {', '.join(unseen)}: no clip of the run shows them here")
+            case "import":
+                transforms = None if request.transforms is None else Path(request.transforms)
+                found = read_splats(file, request.traversal, transforms)
+                print(
+                    info_text(to, write_scene(to, imported(found, request.like, request.origin, request.antialiased)))
+                )
+                if found.left_out:
+                    print(f"left out    {', '.join(found.left_out)}: bodies that bend need their network")
+    except (ValueError, OSError) as error:
+        raise Refused(str(error)) from error

@@ -1,0 +1,231 @@
+"""Commands that keep a run's tables in order: retry, verify, clean, compact."""
+
+import json
+import os
+import re
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from factory.commands.look import FolderRequest
+from factory.config.arguments import SOME, WORD, Refused
+from factory.exits import COMPLETE, DAMAGED
+from factory.views.status import IMPORT_AGAIN, failed_lines, open_store, out_of
+
+if TYPE_CHECKING:
+    from factory.store.samples import Store
+    from factory.store.verify import Verdict
+
+
+@dataclass(frozen=True)
+class RetryRequest:
+    """The command line."""
+
+    out: str
+    settings: tuple[str, ...] = field(default=(), metadata=SOME)
+
+
+def retry(request: RetryRequest) -> int:
+    """`python -m factory retry out=<folder or URL>`: failed attempts once more, with the run's own settings.
+
+        python -m factory retry out=runs/demo                   says what is tried again and how, then does it
+        python -m factory retry out=runs/demo executor=local    with other settings of the run beside the recorded ones
+
+    What it would try: python -m factory failed. The settings are those of the newest start of the run
+    (current_run.json); attempts that are settled are not touched. Code that they name (`_target_`) is not called on
+    the word of a table: give those settings again. A table that `import` wrote is no run: the same import again
+    tries what failed. Exit codes: those of the run; 0 where nothing failed.
+    """
+    from factory.run import main as run
+    from factory.store.samples import imported_from
+
+    store = open_store(request.out)
+    print("\n".join(failed_lines(store)))
+    if "failed" not in store.outcomes.read(["kind"])["kind"].to_pylist():
+        return COMPLETE
+    if source := imported_from(store.runs()):
+        raise Refused(f"{store.location.uri} is no run, its rows were imported: {IMPORT_AGAIN.format(source)}")
+    folder, recorded = recorded_command(store, request.settings)
+    command = [*recorded, *request.settings, f"out={store.location.uri}", "retry_failed=true"]
+    print(f"\nin {folder}: python -m factory run {shlex.join(command)}", flush=True)
+    if Path(folder).is_dir():
+        os.chdir(folder)  # paths among the settings are relative to where the run was started
+    return run(command)
+
+
+def recorded_command(store: "Store", given: Sequence[str] = ()) -> tuple[str, list[str]]:
+    """The folder that the newest start was given in, and its settings less those that are `given`.
+
+    Raises Refused where none is recorded, and where they name code: a table is data, whoever wrote it, and what is
+    called on its behalf must be said by who runs it.
+    """
+    from factory.store.samples import CURRENT_RUN
+
+    document = json.loads(store.location.read(CURRENT_RUN) or b"{}")
+    where = f"{store.location.uri}/{CURRENT_RUN}"
+    if document.get("command") is None:
+        raise Refused(f"{where} records no settings: run the same command with retry_failed=true")
+    mine = ("out=", "retry_failed=")
+    words = [str(word) for word in document["command"]]
+    words = [word for word in words if not word.startswith(mine) and word not in given]
+    code = [word for word in words if "_target_" in word or word.startswith("-")]
+    if code:
+        raise Refused(f"{where} names code to be called: if you trust it, give it yourself: {shlex.join(code)}")
+    return str(document["folder"]), words
+
+
+@dataclass(frozen=True)
+class VerifyRequest:
+    """The command line."""
+
+    out: str = field(metadata=WORD)
+    repair: bool = False  # what can be
+
+
+def verify(request: VerifyRequest) -> int:
+    """`python -m factory verify <folder or URL>`: check a run's tables, caches and episodes from their files alone.
+
+        python -m factory verify runs/demo
+        python -m factory verify runs/demo repair=true      the run's command makes again what was damaged
+
+    Damage is a file that is missing or is not what was written, of a table, its log, the episodes, the benchmark's
+    scenes or the cache; a key twice, a round out of order. Orphans are harmless: files that no commit names, left
+    behind by a run that died; readers ignore them and `python -m factory clean` removes them. repair=true puts a
+    damaged log back from the copies beside it and takes damaged files out of the tables, a transaction each;
+    nothing else is touched. It waits for no run: while one writes here it is refused. Exit code 1: damaged, after a
+    repair what it could not put right.
+    """
+    from factory.store.location import BadLocation
+    from factory.store.samples import OtherSchema, refuse_other_schema
+    from factory.store.table import AnotherWriter, DamagedLog
+    from factory.store.verify import RunGoesOn, damaged_logs, drop_damaged, hold, restore_logs
+
+    out = out_of(request.out)
+    try:
+        refuse_other_schema(out)
+        if request.repair:
+            for name in restore_logs(out):
+                print(f"put back {name}")
+        if found := damaged_logs(out):
+            for name, damage in found:
+                print(f"DAMAGED {name}/{damage.name}: {damage.problem}")
+            print(f"{len(found)} damages of the tables' logs; the tables were not read. repair=true puts them back")
+            return DAMAGED
+        store = open_store(request.out)
+        verdict = _verify_again(request.out)
+        if request.repair and verdict.files:
+            hold(store)
+            drop_damaged(store, verdict)
+            for name in verdict.files:
+                print(f"taken out {name}")
+            verdict = _verify_again(request.out)
+    except DamagedLog as error:
+        print(f"DAMAGED {error}")
+        return DAMAGED
+    except (RunGoesOn, AnotherWriter, BadLocation, OtherSchema) as error:
+        raise Refused(str(error)) from error
+    for line in verdict.damage:
+        print(f"DAMAGED {line}")
+    for line in verdict.orphans:
+        print(f"orphan  {line}")
+    print(f"{verdict.n_samples} samples, {len(verdict.damage)} damages, {len(verdict.orphans)} orphans")
+    if verdict.files:
+        print(
+            "repair=true takes the damaged files out; the run's command then makes again what they held",
+            file=sys.stderr,
+        )
+    return DAMAGED if verdict.damage else COMPLETE
+
+
+def _verify_again(out: str) -> "Verdict":
+    """Of the tables and of the blocks in the cache, opened anew."""
+    from factory.stages.assets import damaged_blocks
+    from factory.store.verify import Verdict, verify
+
+    store = open_store(out)
+    found, blocks = verify(store), damaged_blocks(store.location)
+    damage = (*found.damage, *(f"{name}: {problem}" for name, problem in blocks.items()))
+    return Verdict(found.n_samples, damage, found.orphans, (*found.files, *blocks))
+
+
+UNITS_S = {"d": 86_400.0, "h": 3600.0, "min": 60.0}
+
+
+@dataclass(frozen=True)
+class CleanRequest:
+    """The command line."""
+
+    out: str
+    older_than: str = "1d"  # days, hours or minutes, as 7d, 12h, 30min: what is younger stays
+    say: bool = False  # and remove nothing
+
+    def __post_init__(self) -> None:
+        _ = self.older_s
+
+    @property
+    def older_s(self) -> float:
+        """Raises ValueError for what is no time."""
+        told = re.fullmatch(r"(\d+(?:\.\d+)?)(d|h|min)", self.older_than)
+        if told is None:
+            raise ValueError(
+                f"older_than={self.older_than}: must be a number of days, hours or minutes: 7d, 12h, 30min"
+            )
+        return float(told[1]) * UNITS_S[told[2]]
+
+
+def clean(request: CleanRequest) -> None:
+    """`python -m factory clean out=<folder or URL>`: remove what runs that died left behind.
+
+        python -m factory clean out=runs/demo                     what was last written a day ago or earlier
+        python -m factory clean out=runs/demo older_than=2h       days, hours or minutes: 7d, 12h, 30min
+        python -m factory clean out=runs/demo say=true            name them and remove nothing
+
+    These are temporary files, files in the tables' folders that no commit names, and episodes of rows that were
+    replaced. A reader that was opened before rows were replaced or shards merged still reads what they stood in:
+    leave it its time. While a run writes here the command is refused.
+    """
+    from factory.store.disk import why_not_written
+    from factory.store.location import BadLocation
+    from factory.store.table import AnotherWriter
+    from factory.store.verify import RunGoesOn, hold, leftovers, refuse_held
+
+    store = open_store(request.out)
+    try:
+        (refuse_held if request.say else hold)(store)
+        found = leftovers(store, request.older_s, time.time())
+    except (RunGoesOn, AnotherWriter, BadLocation, OSError) as error:
+        raise Refused(why_not_written(error) or str(error)) from error
+    for name in found:
+        if not request.say:
+            store.location.remove(name)
+        print(f"{'leftover' if request.say else 'removed'}  {name}")
+    print(f"{len(found)} files older than {request.older_than}")
+
+
+def compact(request: FolderRequest) -> None:
+    """`python -m factory compact out=<folder or URL>`: merge the small shards of a run into larger ones.
+
+    Of each round and expert, files below 64 MB are merged into files of up to 128 MB, one transaction a table. No
+    sample changes: readers, trainings and their order are the same before and after. MCAP shards
+    (store.episodes=all) follow, and those that the samples lack are written. What was merged is left for readers
+    that are open; `python -m factory clean` removes it. While a run writes here the command is refused.
+    """
+    from factory.store.location import BadLocation
+    from factory.store.parquet_file import DamagedFile
+    from factory.store.table import AnotherWriter
+    from factory.store.verify import RunGoesOn, hold
+    from factory.store.verify import compact as merge_shards
+
+    store = open_store(request.out)
+    try:
+        hold(store)
+        for merged in merge_shards(store):
+            print(f"{merged.table:<13}{merged.before} files, now {merged.after}")
+    except (RunGoesOn, AnotherWriter, BadLocation) as error:
+        raise Refused(str(error)) from error
+    except DamagedFile as error:
+        raise Refused(f"{error}; python -m factory verify out={request.out} repair=true takes it out") from error
