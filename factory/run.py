@@ -17,16 +17,25 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from factory.config.arguments import command
-from factory.config.classes import class_of
 from factory.config.compose import ConfigError
-from factory.config.run import RunConfig, load_config, photos_alone
+from factory.config.plugins import class_of, offered
+from factory.config.run import (
+    AV2,
+    SCENARIONET,
+    RunConfig,
+    built_in_classes,
+    load_config,
+    photos_alone,
+    refuse_missing_root,
+)
 from factory.config.words import Asked, asked_of
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, run_program
 from factory.files import why_unusable
-from factory.setup.early import refuse_what_is_not_there
+from tasks.render.settings import RenderMode
 
 if TYPE_CHECKING:
     from factory.readers.base import ClipRef
@@ -145,7 +154,7 @@ def _run(
     from factory.store.table import DamagedLog
     from factory.views.board.report import write_facts, write_report
     from factory.views.card import write_card
-    from factory.views.show import prepared_episode
+    from factory.views.sample_text import prepared_episode
     from factory.views.status import failed_line
 
     try:
@@ -208,6 +217,74 @@ def _run(
     if summary.exit_code == COMPLETE_WITH_FAILURES:
         print(failed_line(store))
     return summary.exit_code
+
+
+# What a run names outside its settings, looked up before anything heavy is imported and any clip is read.
+#
+# Classes of plug-ins, folders of logs, the cameras of their rigs. What only reading a clip can tell comes later.
+
+
+def refuse_what_is_not_there(config: RunConfig) -> None:
+    """Raises ConfigError for the first name that stands for nothing, with the nearest that does."""
+    refuse_missing_root(config.clips)
+    refuse_missing_classes(config)
+    refuse_cameras_of_no_rig(config)
+
+
+def refuse_missing_classes(config: RunConfig) -> None:
+    """Raises ConfigError where the class of the reader, or of an expert that the user configured, is not there."""
+    named = {"clips": (config.clips, "my_package.MyReader")}
+    others = {plugin.target for plugins in offered("expert").values() for plugin in plugins}
+    for name, spec in config.expert.items():
+        if name in config.experts or spec.get("_target_") not in others:  # an installed one may lie idle, and broken
+            named[f"expert.{name}"] = (spec, "my_package.MyExpert")
+    built_in = {*built_in_classes("clips").values(), *built_in_classes("expert").values()}
+    for where, (spec, example) in named.items():
+        if spec.get("_target_") not in built_in:
+            class_of(spec, where, example)
+
+
+def refuse_cameras_of_no_rig(config: RunConfig) -> None:
+    """Raises ConfigError for a root without logs, and for a camera in render.cameras that the rig of no log has.
+
+    Towns' rigs are settings, and held against them; the rig of a user's own reader is known when a clip is read.
+    """
+    clips, wanted = config.clips, config.render.cameras
+    try:
+        rig = _rig_of_logs(clips)
+    except ValueError as error:
+        raise ConfigError(f"clips: {error}") from error
+    if rig is None or not wanted or config.render.mode is RenderMode.NONE:
+        return
+    if not rig and config.render.mode is RenderMode.MAP:
+        from tasks.render.rigs import RIGS
+
+        rig = tuple(camera.name for camera in RIGS[config.render.map_rig])
+    if missing := [name for name in wanted if name not in rig]:
+        none = f"no log under {clips['root']} has calibrated cameras"
+        if clips["_target_"] == SCENARIONET:
+            none += "; clips.cameras=<sidecar> brings some"
+        has = f"this rig has {', '.join(rig)}" if rig else none
+        raise ConfigError(f"render.cameras: no camera {', '.join(missing)}; {has}")
+
+
+def _rig_of_logs(clips: Mapping[str, Any]) -> tuple[str, ...] | None:
+    """The cameras that the chosen logs' folders name; None where only reading a clip can tell. Raises ValueError."""
+    target, root, only = clips.get("_target_"), Path(str(clips.get("root"))), clips.get("only")
+    if target == AV2:
+        from factory.datasets.av2.folders import camera_names, log_folders
+
+        return camera_names(folder for log_id, folder in log_folders(root).items() if not only or log_id in only)
+    if target != SCENARIONET:
+        return None
+    if clips["cameras"] is None:
+        return ()
+    from factory.datasets.scenarionet.reader import scenario_files
+    from factory.datasets.scenarionet.sidecars import camera_names as cameras_of_sidecars
+    from factory.datasets.scenarionet.sidecars import sidecars_of
+
+    log_ids = [log_id for log_id in scenario_files(root) if not only or log_id in only]
+    return cameras_of_sidecars(sidecars_of(Path(clips["cameras"]), log_ids).values())
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from factory.config.arguments import WORD, Refused
 from factory.datasets.navsim.settings import Layout, Missing
 from factory.exits import COMPLETE, INTERRUPTED
-from factory.views.show import find, logged_drive, open_samples
+from factory.views.sample_text import find, logged_drive, open_samples
 from factory.views.status import open_store
 from factory.wording import one_line
 
@@ -167,7 +167,7 @@ def _label_trajectories(store: "Store", file: str | None) -> "Array | None":
     """(K, 40, 3) that the samples' labels are of; None where there are none, or of a file that was not named."""
     from factory.store.reader import SampleTable
     from factory.store.schema import LABEL_COLUMNS
-    from factory.views.show import labelled_trajectories
+    from factory.views.sample_text import labelled_trajectories
 
     samples = SampleTable(store.location.uri, store.location.options)
     digests = samples.table(["label_vocabulary"])["label_vocabulary"].to_pylist()
@@ -185,7 +185,7 @@ def _write_sample(format: str, store: "Store", row: Row, path: Path) -> None:
 
         path.write_bytes(episode_of(row, logged))
     else:
-        from factory.views.bev import write_mp4
+        from factory.views.pictures import write_mp4
         from factory.views.seen_again import digest_of, film, scene_of
 
         digest = digest_of(store, row)

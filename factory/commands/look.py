@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from factory.config.arguments import RUN, WORD, Refused
 from factory.config.run import composed_run, run_config
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
-from factory.views.lineage import lineage as lineage_parts
-from factory.views.show import find, label_lines, labelled_trajectories, logged_drive, number_lines, open_samples
+from factory.views.sample_text import find, label_lines, labelled_trajectories, logged_drive, number_lines, open_samples
+from factory.views.sample_text import lineage as lineage_parts
 from factory.views.status import NothingThere, failed_lines, open_store, status_lines
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def show(request: ShowRequest) -> None:
 
 def sample_lines(store: "Store", table: "SampleTable", which: str, request: ShowRequest) -> Iterator[str]:
     """One sample's numbers; writes its picture and says where it is."""
-    from factory.views.sample_picture import encoded, sample_sheet
+    from factory.views.pictures import encoded, sample_sheet
     from factory.views.seen_again import again_sheet, digest_of, film, scene_of, stacked
 
     attempt_id = find(table, store, which)
@@ -129,7 +129,7 @@ def sample_lines(store: "Store", table: "SampleTable", which: str, request: Show
         path.write_bytes(encoded(stacked(sheets), ".png"))
         yield f"picture       {path.resolve()}"
         if request.film:
-            from factory.views.bev import write_mp4
+            from factory.views.pictures import write_mp4
 
             write_mp4(path.with_suffix(".mp4"), film(row, scene, logged))
             yield f"film          {path.with_suffix('.mp4').resolve()}"
@@ -195,7 +195,7 @@ def _explain(request: ExplainRequest) -> None:
 
     from factory.graph.plan import candidate_order
     from factory.setup.settings import assemble
-    from factory.views.bev import attempt_picture, candidates_picture, film, write_mp4
+    from factory.views.pictures import attempt_picture, candidates_picture, film, write_mp4
     from tasks.stages import Rejected
     from tasks.subscores import OF_ONE_PLAN
 

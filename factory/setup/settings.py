@@ -11,8 +11,8 @@ from inspect import signature
 from pathlib import Path
 from typing import Any
 
-from factory.config.classes import class_of
 from factory.config.compose import ConfigError, build, fill
+from factory.config.plugins import class_of
 from factory.config.run import RecoverySources, RunConfig, VocabularyChoice, photos_alone, refuse_relative_root
 from factory.files import machine_fault_of
 from factory.pipeline import BenchmarkWork, FactoryWork

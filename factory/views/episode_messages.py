@@ -25,8 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from factory.store.episodes import Message, episode_bytes
 from factory.store.schema import FIELDS, NOW_INDEX, Column
-from factory.views.bev import AGENT_COLOURS, EXPERT, LOGGED, OBJECT, PERTURBED, Colour
-from factory.views.sample_picture import ego_way
+from factory.views.pictures import AGENT_COLOURS, EXPERT, LOGGED, OBJECT, PERTURBED, Colour, ego_way
 from tasks.subscores import JUDGED, SUBSCORES
 from tasks.world.arrays import Array
 from tasks.world.frames import PACIFICA, to_local

@@ -15,8 +15,8 @@ from factory.stages.scene_file import BadScene, find_scene
 from factory.store.reader import SampleTable, decode_stored_image
 from factory.store.samples import Store
 from factory.store.schema import AGENT_STEPS, NOW_INDEX, SCHEMA
-from factory.views.bev import BACKGROUND
-from factory.views.sample_picture import (
+from factory.views.pictures import (
+    BACKGROUND,
     BEV_COLUMNS,
     CAPTION_PX,
     beside,

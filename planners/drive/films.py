@@ -9,7 +9,8 @@ import numpy as np
 
 from factory.store.location import Location
 from factory.store.reader import decode_stored_image
-from factory.views.bev import (
+from factory.views.board.overview import FILMS
+from factory.views.pictures import (
     BACKGROUND,
     EXPERT,
     LOGGED,
@@ -17,12 +18,12 @@ from factory.views.bev import (
     Boxes,
     DrawnPath,
     draw_bev,
+    fitted,
+    front_camera,
     map_shapes,
     write,
     write_mp4,
 )
-from factory.views.board.drives import FILMS
-from factory.views.sample_picture import fitted, front_camera
 from planners.drive.loop import PLAN_STEPS, ClosedLoop
 from planners.drive.measures import measures_of
 from tasks.world.arrays import Image

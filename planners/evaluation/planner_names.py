@@ -25,9 +25,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from factory.config.classes import object_named
 from factory.config.compose import ConfigError, compose
-from factory.config.plugins import installed, names
+from factory.config.plugins import installed, names, object_named
 from factory.config.words import at_home, nearest
 from planners.data.batch import Needs
 from planners.evaluation.frames import FrameKey

@@ -15,8 +15,19 @@ import numpy as np
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, fill
 from factory.store.reader import Sample, decode_stored_image
-from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, DrawnPath, draw_bev, map_shapes, write_mp4
-from factory.views.sample_picture import earlier_images, fitted, front_camera
+from factory.views.pictures import (
+    EXPERT,
+    LOGGED,
+    PERTURBED,
+    Boxes,
+    DrawnPath,
+    draw_bev,
+    earlier_images,
+    fitted,
+    front_camera,
+    map_shapes,
+    write_mp4,
+)
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.evaluate import check_needs
 from planners.evaluation.frames import Benchmark, FrameKey, Pair

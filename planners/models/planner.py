@@ -24,9 +24,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from factory.config.classes import object_named
 from factory.config.compose import ConfigError, fill
-from factory.config.plugins import installed, names
+from factory.config.plugins import installed, names, object_named
 from factory.config.shapes import defaults_of, merged
 from factory.config.words import nearest
 from planners.data.batch import COMMANDS, Batch, Needs, TrainingData

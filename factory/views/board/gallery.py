@@ -18,7 +18,7 @@ from factory.store.schema import AGENT_STEPS, SAMPLES, SCHEMA, table_to_rows
 from factory.store.table import KeyedTable, text_equals
 from factory.views.board.watch import Snapshot, plain
 from factory.views.episode_messages import episode_of
-from factory.views.sample_picture import (
+from factory.views.pictures import (
     BEV_COLUMNS,
     encoded,
     front_camera,
@@ -27,7 +27,7 @@ from factory.views.sample_picture import (
     sample_bev,
     small_jpeg,
 )
-from factory.views.show import logged_drive
+from factory.views.sample_text import logged_drive
 from factory.views.status import REASON_WORDS, fate, how_to_retry, to_the_side, turned
 from tasks.subscores import SUBSCORES
 from tasks.world.arrays import Array, Ints

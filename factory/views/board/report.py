@@ -21,12 +21,11 @@ from factory.store.codes import equals
 from factory.store.reader import decoded
 from factory.store.samples import Store
 from factory.store.schema import NOW_INDEX
-from factory.views.board.drives import Drives, drives_as_json
 from factory.views.board.gallery import Pictures, card_of, failures, gallery, place_of, whole
-from factory.views.board.overview import overview
+from factory.views.board.overview import Drives, drives_as_json, overview
 from factory.views.board.server import STATIC
 from factory.views.board.watch import Snapshot, Watch
-from factory.views.sample_picture import front_camera, images_at_now, small_jpeg
+from factory.views.pictures import front_camera, images_at_now, small_jpeg
 from factory.views.scene_files import scene_tables
 from factory.views.status import counted
 

@@ -7,7 +7,7 @@
 | `/api/samples?page=1&size=12&order=newest&expert=...` | factory.views.board.gallery.gallery; filters: FILTERS there |
 | `/api/samples/<attempt_id>` | factory.views.board.gallery.whole |
 | `/api/failed?page=1` | factory.views.board.gallery.failures |
-| `/api/drives` | factory.views.board.drives.drives_as_json |
+| `/api/drives` | factory.views.board.overview.drives_as_json |
 | `/picture/<attempt_id>/<name>.jpg` | a JPEG, see factory.views.board.gallery |
 | `/film/<drive_id>.mp4` | a planner's drive as a film |
 | `/episode/<attempt_id>.mcap` | the sample for Foxglove, Lichtblick or Rerun |
@@ -34,9 +34,8 @@ import pyarrow as pa
 from deltalake.exceptions import DeltaError
 
 from factory.store.samples import ChangedRun, Store
-from factory.views.board.drives import Drives, drives_as_json
 from factory.views.board.gallery import BadRequest, NotThere, Pictures, failures, gallery, whole
-from factory.views.board.overview import overview
+from factory.views.board.overview import Drives, drives_as_json, overview
 from factory.views.board.watch import LOOK_EVERY_S, Watch
 from factory.wording import one_line
 

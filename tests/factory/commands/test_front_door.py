@@ -24,7 +24,7 @@ from factory.config.arguments import ComposedCommand
 from factory.graph.execute import Execution
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import COPIES
-from factory.views.show import prepared_episode
+from factory.views.sample_text import prepared_episode
 from factory.views.status import failed_line
 from planners.__main__ import main as planners_main
 from tests.factory.filmed import FilmedWork

@@ -16,7 +16,7 @@ from factory.store.episodes import EPISODES_FOLDER, episode_name, has_episode
 from factory.store.location import Location
 from factory.store.samples import Store
 from factory.store.verify import verify
-from factory.views.show import prepared_episode
+from factory.views.sample_text import prepared_episode
 from tests.factory.filmed import FilmedWork
 from tests.factory.toy import executed, refs
 

@@ -17,7 +17,7 @@ from factory.graph.on_ray import graph
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
 from factory.store.samples import Store
 from factory.store.verify import verify
-from factory.views.show import prepared_episode
+from factory.views.sample_text import prepared_episode
 from tests.factory.filmed import FilmedWork
 from tests.factory.graph.wild import WildWork
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of

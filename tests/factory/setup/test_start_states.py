@@ -16,7 +16,7 @@ from factory.exits import BAD_CONFIG, COMPLETE
 from factory.setup.settings import identity_of
 from factory.setup.vocabulary import Starts, load_starts
 from factory.store.samples import Store
-from factory.views.lineage import lineage
+from factory.views.sample_text import lineage
 from tasks.world.arrays import Array
 from tasks.world.vocabulary import FIRST_START, Vocabulary, kinematic_trajectories
 

@@ -16,7 +16,7 @@ from factory.setup.settings import Run, assemble
 from factory.setup.vocabulary import save_vocabulary
 from factory.store.reader import SampleTable, labels_of
 from factory.store.schema import LABEL_COLUMNS
-from factory.views.sample_picture import SCORE_COLOURS, sample_bev
+from factory.views.pictures import SCORE_COLOURS, sample_bev
 from tasks.attempt import Judged
 from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.rollout.lqr import track

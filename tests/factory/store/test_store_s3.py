@@ -13,7 +13,7 @@ from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.verify import verify
 from factory.views.board.server import Board
-from factory.views.show import prepared_episode
+from factory.views.sample_text import prepared_episode
 from tests.chaos.buckets.bad_store import BUCKET, credentials, moto_server
 from tests.factory.filmed import FilmedWork
 from tests.factory.tables import assert_same_tables

@@ -6,7 +6,7 @@ import numpy as np
 
 from factory.store.reader import SampleTable, decoded
 from factory.store.samples import Store
-from factory.views.sample_picture import encoded, fitted, sample_sheet
+from factory.views.pictures import encoded, fitted, sample_sheet
 from factory.views.seen_again import ASIDE_M, _looks_right
 from factory.views.status import to_the_side, turned
 from tasks.world.frames import to_local

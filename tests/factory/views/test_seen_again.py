@@ -13,7 +13,7 @@ from factory.config.run import load_config
 from factory.setup.settings import assemble
 from factory.store.reader import SampleTable, decode_stored_image
 from factory.store.samples import Store
-from factory.views.sample_picture import sample_bev
+from factory.views.pictures import sample_bev
 from factory.views.seen_again import (
     ASIDE_M,
     agents_of,

@@ -23,7 +23,7 @@ from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import write_logs
 from factory.run import main as run_main
 from factory.store.reader import SampleTable
-from factory.views.bev import EXPERT, LOGGED
+from factory.views.pictures import EXPERT, LOGGED
 from tasks.stages import HUMAN
 from tasks.world.clip import NOW
 from tasks.world.frames import HEADING, X, Y

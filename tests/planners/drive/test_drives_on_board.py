@@ -8,7 +8,7 @@ import pytest
 from factory.exits import COMPLETE
 from factory.store.location import Location
 from factory.store.samples import Store
-from factory.views.board.drives import SCHEMA, Drives, drives_as_json
+from factory.views.board.overview import SCHEMA, Drives, drives_as_json
 from factory.views.board.server import Board
 from planners.drive import table
 from planners.drive.drive import main

@@ -23,8 +23,8 @@ from factory.views.board.gallery import Kept
 from factory.views.board.overview import QUIET_S, overview
 from factory.views.board.server import SERVED, STATIC, Board, Server
 from factory.views.board.watch import Watch
-from factory.views.sample_picture import encoded, nearer, sample_bev
-from factory.views.show import logged_drive
+from factory.views.pictures import encoded, nearer, sample_bev
+from factory.views.sample_text import logged_drive
 from tests.factory.toy import executed
 from tests.factory.views.board.runs import EVIL, REFS, VIEW, counted, run, told
 
