@@ -17,21 +17,13 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from factory.config.arguments import command
 from factory.config.compose import ConfigError
+from factory.config.datasets import data_set_of
 from factory.config.plugins import class_of, offered
-from factory.config.run import (
-    AV2,
-    SCENARIONET,
-    RunConfig,
-    built_in_classes,
-    load_config,
-    photos_alone,
-    refuse_missing_root,
-)
+from factory.config.run import RunConfig, built_in_classes, load_config, photos_alone, refuse_missing_root
 from factory.config.words import Asked, asked_of
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, run_program
 from factory.files import why_unusable
@@ -247,44 +239,28 @@ def refuse_missing_classes(config: RunConfig) -> None:
 def refuse_cameras_of_no_rig(config: RunConfig) -> None:
     """Raises ConfigError for a root without logs, and for a camera in render.cameras that the rig of no log has.
 
-    Towns' rigs are settings, and held against them; the rig of a user's own reader is known when a clip is read.
+    Settings of rigs are held against themselves; the rig of a user's own reader is known when a clip is read.
     """
     clips, wanted = config.clips, config.render.cameras
+    look = getattr(data_set_of(clips), "camera_names", None)
+    if look is None:
+        return
     try:
-        rig = _rig_of_logs(clips)
+        rig: tuple[str, ...] = look(clips)
     except ValueError as error:
         raise ConfigError(f"clips: {error}") from error
-    if rig is None or not wanted or config.render.mode is RenderMode.NONE:
+    if not wanted or config.render.mode is RenderMode.NONE:
         return
     if not rig and config.render.mode is RenderMode.MAP:
-        from tasks.render.rigs import RIGS
+        from tasks.render.views import MAP_RIG
 
-        rig = tuple(camera.name for camera in RIGS[config.render.map_rig])
+        rig = tuple(camera.name for camera in MAP_RIG)
     if missing := [name for name in wanted if name not in rig]:
         none = f"no log under {clips['root']} has calibrated cameras"
-        if clips["_target_"] == SCENARIONET:
+        if "cameras" in clips:
             none += "; clips.cameras=<sidecar> brings some"
         has = f"this rig has {', '.join(rig)}" if rig else none
         raise ConfigError(f"render.cameras: no camera {', '.join(missing)}; {has}")
-
-
-def _rig_of_logs(clips: Mapping[str, Any]) -> tuple[str, ...] | None:
-    """The cameras that the chosen logs' folders name; None where only reading a clip can tell. Raises ValueError."""
-    target, root, only = clips.get("_target_"), Path(str(clips.get("root"))), clips.get("only")
-    if target == AV2:
-        from factory.datasets.av2.folders import camera_names, log_folders
-
-        return camera_names(folder for log_id, folder in log_folders(root).items() if not only or log_id in only)
-    if target != SCENARIONET:
-        return None
-    if clips["cameras"] is None:
-        return ()
-    from factory.datasets.scenarionet.reader import scenario_files
-    from factory.datasets.scenarionet.sidecars import camera_names as cameras_of_sidecars
-    from factory.datasets.scenarionet.sidecars import sidecars_of
-
-    log_ids = [log_id for log_id in scenario_files(root) if not only or log_id in only]
-    return cameras_of_sidecars(sidecars_of(Path(clips["cameras"]), log_ids).values())
 
 
 if __name__ == "__main__":

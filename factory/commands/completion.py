@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from factory.commands.table import COMMANDS, DOORS
-from factory.config.arguments import POSITIONAL, RUN_SETTINGS, ComposedCommand, given_as, groups_of, keys_of
-from factory.config.arguments import RUN, WORD, ComposedCommand, given_as, groups_of, keys_of, request_of
+from factory.config.arguments import POSITIONAL, RUN_SETTINGS, ComposedCommand, given_as, groups_of, keys_of, request_of
 from factory.config.compose import conf_dir
 from factory.config.plugins import choices
 from factory.config.run import EXPERTS, built_in_classes, reader_of
@@ -103,9 +102,8 @@ def candidates(words: Sequence[str], last: str, door: str = "factory") -> Iterab
     if isinstance(function, ComposedCommand):
         known = settings_of(given, function)
     else:
-        known |= settings_of(given) if given_as(shape, RUN_SETTINGS) else {}
         shape = request_of(function)
-        known = settings_of(given) if given_as(shape, RUN) else {}
+        known = settings_of(given) if given_as(shape, RUN_SETTINGS) else {}
         known |= {key: choices_of(kind) for key, kind in keys_of(shape).items()}
         if (words := given_as(shape, POSITIONAL)) and not given and known[words[0]]:
             return known[words[0]]

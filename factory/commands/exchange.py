@@ -7,15 +7,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from factory.config.arguments import WORD, Refused
-from factory.datasets.navsim.settings import Layout, Missing
+from factory.config.arguments import POSITIONAL, Refused
+from factory.config.datasets import find_function
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.views.sample_text import find, logged_drive, open_samples
 from factory.views.status import open_store
 from factory.wording import one_line
 
 if TYPE_CHECKING:
-    from factory.graph.execute import RunSummary
     from factory.store.samples import Store
     from tasks.world.arrays import Array
 
@@ -27,7 +26,7 @@ Row = Mapping[str, Any]
 class ExportRequest:
     """The command line."""
 
-    format: Literal["mcap", "mp4", "navsim"] = field(metadata=WORD)
+    format: Literal["mcap", "mp4", "navsim"] = field(metadata=POSITIONAL)
     out: str
     sample: str | None = None
     every: int | None = None
@@ -36,9 +35,9 @@ class ExportRequest:
     round: tuple[str, ...] = ()
     split: tuple[str, ...] = ()
     tag: str = ""
-    layout: Layout = "moved"
+    layout: Literal["moved", "released"] = "moved"
     resize: bool = False
-    missing: Missing = "refuse"
+    missing: Literal["refuse", "black", "none"] = "refuse"
     map_location: str = ""
     vocabulary: str | None = None
     executor: Literal["local", "ray"] = "local"
@@ -125,10 +124,8 @@ def _export_some(request: ExportRequest) -> Iterator[Path]:
 def _export_all(request: ExportRequest) -> int:
     """All samples in SimScale's layout; the exit code. Raises Refused."""
     from factory.config.compose import need_run_extra
-    from factory.datasets.navsim.export import export as export_all
-    from factory.datasets.navsim.settings import ExportSettings
-    from factory.graph.each import WorkerDied, each
-    from factory.graph.work import TaskStopped
+    from factory.graph.parallel import WorkerDied, parallel_map
+    from factory.graph.steps import TaskStopped
     from factory.store.location import Location
     from factory.store.reader import sample_table
 
@@ -136,21 +133,11 @@ def _export_all(request: ExportRequest) -> int:
         need_run_extra("ray")
     store = open_store(request.out)
     try:
-        settings = ExportSettings(
-            request.expert,
-            tuple(int(word) for word in request.round),
-            request.split,
-            request.tag,
-            request.layout,
-            request.resize,
-            request.missing,
-            request.map_location,
-        )
         target = Location.parse(request.to, setting="to")
-        dealt = partial(each, executor=request.executor, workers=request.workers, to=target)
+        dealt = partial(parallel_map, executor=request.executor, workers=request.workers, to=target)
         table = sample_table(store.location.uri, store.location.options)
         trajectories = _label_trajectories(store, request.vocabulary)
-        done = export_all(table, Path(target.uri), settings, trajectories, dealt)
+        done = find_function("EXPORTS", request.format)(request, table, Path(target.uri), trajectories, dealt)
     except (OSError, ValueError, WorkerDied) as error:  # no folder, a full disk, what cannot be written as asked
         raise Refused(str(error)) from error
     except (TaskStopped, KeyboardInterrupt) as error:
@@ -199,7 +186,7 @@ CAMERAS = "nuscenes-cameras"
 class ImportRequest:
     """The command line."""
 
-    source: Literal["simscale", "navhard", "navtest", "nuscenes-cameras"] = field(metadata=WORD)
+    source: Literal["simscale", "navhard", "navtest", "nuscenes-cameras"] = field(metadata=POSITIONAL)
     root: str
     out: str
     maps: str | None = None
@@ -266,8 +253,8 @@ def import_(request: ImportRequest) -> int:
         return _cameras(request)
     from deltalake.exceptions import DeltaError
 
+    from factory.files import why_unusable
     from factory.readers.base import BadClip
-    from factory.store.disk import why_unusable
     from factory.store.location import Location
     from factory.store.samples import ChangedRun, Store
     from factory.store.table import AnotherWriter
@@ -277,67 +264,24 @@ def import_(request: ImportRequest) -> int:
         raise Refused(unusable)
     try:
         store = Store(Location.parse(request.out))
-        answers = {"simscale": _simscale, "navhard": _navhard, "navtest": _navtest}
-        summary, told = answers[request.source](request, store)
+        summary, said = find_function("IMPORTS", request.source)(request, store)
     except (BadClip, ChangedRun, AnotherWriter, ValueError, OSError, ImportError, DeltaError) as error:
         raise Refused(one_line(error)) from error
     counts = summary.counts
     print(f"{counts['accepted']:,} samples imported, {summary.executed.found_done:,} were there: {store.location.uri}")
-    for line in filter(None, (summary.message, told, failed_line(store) if counts["failed"] else "")):
+    for line in filter(None, (summary.message, said, failed_line(store) if counts["failed"] else "")):
         print(line)
     return summary.exit_code
 
 
-def _simscale(request: ImportRequest, store: "Store") -> tuple["RunSummary", str]:
-    from factory.datasets.navsim.import_table import identity_of, import_rows
-    from factory.datasets.navsim.simscale import Import, Rewards, parts_of
-    from factory.setup.vocabulary import load_vocabulary
-
-    parts = parts_of(Path(request.root), request.only)
-    rewards = None
-    if request.rewards is not None and request.vocabulary is not None:
-        rewards = Rewards(Path(request.rewards), load_vocabulary(request.vocabulary))
-    settings = {
-        "maps": request.maps is not None,
-        "pictures": request.pictures,
-        "labels": None if rewards is None else rewards.vocabulary.digest,
-    }
-    maps = _folder(request.maps)
-    if maps is not None and not maps.is_dir():
-        raise Refused(f"maps={request.maps}: no such folder")
-    wanted = Import(maps, request.pictures, rewards)
-    return import_rows(store, identity_of(request.source, settings), wanted.entries(parts)), ""
-
-
-def _navhard(request: ImportRequest, store: "Store") -> tuple["RunSummary", str]:
-    from factory.datasets.navsim.filters import read_selection
-    from factory.datasets.navsim.navhard import NavsimFolders, import_navhard
-
-    logs, maps = _folder(request.logs), _folder(request.maps)
-    assert logs is not None and maps is not None and request.split is not None
-    places = NavsimFolders(logs, _folder(request.sensors), Path(request.root), maps)
-    return import_navhard(store, read_selection(request.split), places)
-
-
-def _navtest(request: ImportRequest, store: "Store") -> tuple["RunSummary", str]:
-    from factory.datasets.navsim.filters import read_selection
-    from factory.datasets.navsim.navtest import import_navtest
-
-    maps = _folder(request.maps)
-    assert maps is not None and request.split is not None
-    logs = Path(request.root)
-    return import_navtest(store, read_selection(request.split), logs, _folder(request.sensors), maps)
-
-
 def _cameras(request: ImportRequest) -> int:
     """Write the sidecars and say what each holds. Raises Refused."""
-    from factory.datasets.scenarionet.nuscenes_cameras import import_cameras
     from factory.readers.base import BadClip
 
     root, out = Path(request.root), Path(request.out)
     photos = 0
     try:
-        for done in import_cameras(root, out, request.version, request.only, request.sweeps):
+        for done in find_function("SIDECARS", request.source)(root, out, request.version, request.only, request.sweeps):
             photos += done.photos
             where = f"{done.photos:,} photos of {done.cameras} cameras, {done.sweeps} sweeps: {done.path}"
             print(f"{done.scene}  {where if done.photos else 'no photo is there: no sidecar'}")
@@ -350,16 +294,12 @@ def _cameras(request: ImportRequest) -> int:
     return 0
 
 
-def _folder(path: str | None) -> Path | None:
-    return None if path is None else Path(path)
-
-
 @dataclass(frozen=True)
 class SceneRequest:
     """The command line."""
 
-    action: Literal["info", "export", "import"] = field(metadata=WORD)
-    files: tuple[str, ...] = field(metadata=WORD)
+    action: Literal["info", "export", "import"] = field(metadata=POSITIONAL)
+    files: tuple[str, ...] = field(metadata=POSITIONAL)
     to: str | None = None
     like: str | None = None
     origin: str | None = None

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from factory.commands.look import FolderRequest
-from factory.config.arguments import SOME, WORD, Refused
+from factory.config.arguments import POSITIONAL, SOME_RUN_SETTINGS, Refused
 from factory.exits import COMPLETE, DAMAGED
 from factory.views.status import IMPORT_AGAIN, failed_lines, open_store, out_of
 
@@ -26,7 +26,7 @@ class RetryRequest:
     """The command line."""
 
     out: str
-    settings: tuple[str, ...] = field(default=(), metadata=SOME)
+    settings: tuple[str, ...] = field(default=(), metadata=SOME_RUN_SETTINGS)
 
 
 def retry(request: RetryRequest) -> int:
@@ -82,7 +82,7 @@ def recorded_command(store: "Store", given: Sequence[str] = ()) -> tuple[str, li
 class VerifyRequest:
     """The command line."""
 
-    out: str = field(metadata=WORD)
+    out: str = field(metadata=POSITIONAL)
     repair: bool = False  # what can be
 
 
@@ -102,7 +102,7 @@ def verify(request: VerifyRequest) -> int:
     from factory.store.location import BadLocation
     from factory.store.samples import OtherSchema, refuse_other_schema
     from factory.store.table import AnotherWriter, DamagedLog
-    from factory.store.verify import RunGoesOn, damaged_logs, drop_damaged, hold, restore_logs
+    from factory.store.verify import RunInProgress, claim_for_upkeep, damaged_logs, drop_damaged, restore_logs
 
     out = out_of(request.out)
     try:
@@ -118,7 +118,7 @@ def verify(request: VerifyRequest) -> int:
         store = open_store(request.out)
         verdict = _verify_again(request.out)
         if request.repair and verdict.files:
-            hold(store)
+            claim_for_upkeep(store)
             drop_damaged(store, verdict)
             for name in verdict.files:
                 print(f"taken out {name}")
@@ -126,7 +126,7 @@ def verify(request: VerifyRequest) -> int:
     except DamagedLog as error:
         print(f"DAMAGED {error}")
         return DAMAGED
-    except (RunGoesOn, AnotherWriter, BadLocation, OtherSchema) as error:
+    except (RunInProgress, AnotherWriter, BadLocation, OtherSchema) as error:
         raise Refused(str(error)) from error
     for line in verdict.damage:
         print(f"DAMAGED {line}")
@@ -188,16 +188,16 @@ def clean(request: CleanRequest) -> None:
     replaced. A reader that was opened before rows were replaced or shards merged still reads what they stood in:
     leave it its time. While a run writes here the command is refused.
     """
-    from factory.store.disk import why_not_written
+    from factory.files import why_not_written
     from factory.store.location import BadLocation
     from factory.store.table import AnotherWriter
-    from factory.store.verify import RunGoesOn, hold, leftovers, refuse_held
+    from factory.store.verify import RunInProgress, claim_for_upkeep, leftovers, refuse_while_running
 
     store = open_store(request.out)
     try:
-        (refuse_held if request.say else hold)(store)
+        (refuse_while_running if request.say else claim_for_upkeep)(store)
         found = leftovers(store, request.older_s, time.time())
-    except (RunGoesOn, AnotherWriter, BadLocation, OSError) as error:
+    except (RunInProgress, AnotherWriter, BadLocation, OSError) as error:
         raise Refused(why_not_written(error) or str(error)) from error
     for name in found:
         if not request.say:
@@ -214,18 +214,17 @@ def compact(request: FolderRequest) -> None:
     (store.episodes=all) follow, and those that the samples lack are written. What was merged is left for readers
     that are open; `python -m factory clean` removes it. While a run writes here the command is refused.
     """
-    from factory.store.location import BadLocation
-    from factory.store.parquet_file import DamagedFile
+    from factory.store.location import BadLocation, DamagedFile
     from factory.store.table import AnotherWriter
-    from factory.store.verify import RunGoesOn, hold
+    from factory.store.verify import RunInProgress, claim_for_upkeep
     from factory.store.verify import compact as merge_shards
 
     store = open_store(request.out)
     try:
-        hold(store)
+        claim_for_upkeep(store)
         for merged in merge_shards(store):
             print(f"{merged.table:<13}{merged.before} files, now {merged.after}")
-    except (RunGoesOn, AnotherWriter, BadLocation) as error:
+    except (RunInProgress, AnotherWriter, BadLocation) as error:
         raise Refused(str(error)) from error
     except DamagedFile as error:
         raise Refused(f"{error}; python -m factory verify out={request.out} repair=true takes it out") from error

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from factory.config.arguments import RUN, WORD, Refused
+from factory.config.arguments import POSITIONAL, RUN_SETTINGS, Refused
 from factory.config.run import composed_run, run_config
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.views.sample_text import find, label_lines, labelled_trajectories, logged_drive, number_lines, open_samples
@@ -49,7 +49,7 @@ class LineageRequest:
     """The command line."""
 
     out: str
-    sample: str = field(metadata=WORD)
+    sample: str = field(metadata=POSITIONAL)
 
 
 def lineage(request: LineageRequest) -> None:
@@ -72,7 +72,7 @@ class ShowRequest:
     """The command line."""
 
     out: str
-    sample: str | None = field(default=None, metadata=WORD)  # attempt_id, its beginning, or an ordinal
+    sample: str | None = field(default=None, metadata=POSITIONAL)  # attempt_id, its beginning, or an ordinal
     list: bool = False  # the ids, one a line, and no sample
     to: str | None = None  # folder or .png of the picture
     film: bool = False  # beside the picture
@@ -154,7 +154,7 @@ class ExplainRequest:
     expert: str = "pdm_closed"
     tries: int = 6  # candidates to try before giving up on an accepted one
     to: str = "explain"  # folder for the pictures
-    settings: tuple[str, ...] = field(default=(), metadata=RUN)
+    settings: tuple[str, ...] = field(default=(), metadata=RUN_SETTINGS)
 
 
 def explain(request: ExplainRequest) -> int:
@@ -205,7 +205,7 @@ def _explain(request: ExplainRequest) -> None:
     ref = clip_named((*run.index.refs, *run.index.broken), request.clip)
     work = run.work
     began = time.perf_counter()
-    made = work.considered(ref)
+    made = work.read_and_perturb(ref)
     if isinstance(made, Rejected):
         print(f"clip {ref.clip_id}: log {ref.log_id} at {ref.start_ms / 1000:.1f} s")
         print(f"rejected by {made.stage}: {made.reason}: {made.detail}")
@@ -227,7 +227,7 @@ def _explain(request: ExplainRequest) -> None:
         print("gated trajectories: " + ", ".join(f"{fate} {count}" for fate, count in fates.most_common()))
         cv2.imwrite(f"{stem}_candidates.png", candidates_picture(clip, found.considered)[..., ::-1])
 
-    prepared = work.listed(ref, made)
+    prepared = work.prepared_clip(ref, made)
     order = candidate_order(work.once(expert), min(request.tries, len(made.candidates)))
     shown = None
     for candidate in order:

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from factory.config.arguments import SOME_RUN_SETTINGS, Refused, keys_of
 import factory.run
-from factory.config.arguments import SOME, WORD, Refused, command, keys_of
+from factory.config.arguments import POSITIONAL, SOME_RUN_SETTINGS, Refused, command, keys_of
+from factory.config.datasets import data_sets
 from factory.config.run import RunConfig
 from factory.config.words import asked_of, nearest
 
@@ -132,7 +132,7 @@ def write_kinematic(request: VocabularyRequest) -> str:
 class WarmRequest:
     """The command line."""
 
-    parts: tuple[str, ...] = field(default=(), metadata=WORD)
+    parts: tuple[str, ...] = field(default=(), metadata=POSITIONAL)
 
 
 def warm(request: WarmRequest) -> None:
@@ -143,8 +143,8 @@ def warm(request: WarmRequest) -> None:
 
     Each is compiled once per machine, processor and version; what is there is not compiled again.
     """
-    from factory.graph.work import NotReady
-    from factory.stages.warm import PARTS, compile_kernels, compile_town_kernels
+    from factory.graph.steps import NotReady
+    from factory.stages.warm import PARTS, compile_kernels
 
     if unknown := sorted(set(request.parts) - PARTS.keys()):
         raise Refused(f"no part {', '.join(unknown)}; there are {', '.join(PARTS)}")
@@ -153,4 +153,5 @@ def warm(request: WarmRequest) -> None:
     except NotReady as error:
         raise Refused(str(error)) from error
     if not request.parts:
-        compile_town_kernels()
+        for data_set in data_sets().values():
+            getattr(data_set, "compile_kernels", lambda: None)()

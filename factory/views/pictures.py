@@ -8,14 +8,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from factory.store.reader import decoded, labels_of
+from factory.store.reader import decode_stored_image, labels_of
 from factory.store.schema import NOW_INDEX
 from tasks.attempt import Judged
 from tasks.perturb import Candidate, Considered
 from tasks.world.arrays import Array, Bytes, Image, ShortInts
 from tasks.world.clip import NOW, AgentKind, Clip
-from tasks.world.frames import HEADING, PACIFICA, box_corners, points_to_local
-from tasks.world.frames import box_corners, points_to_local, to_local
+from tasks.world.frames import HEADING, PACIFICA, box_corners, points_to_local, to_local
 from tasks.world.geometry import ego_boxes
 from tasks.world.road_map import LightState
 
@@ -425,7 +424,7 @@ def in_rows(tiles: Sequence[Image], columns: int) -> Image:
 
 def _stored(image: Mapping[str, Any]) -> Image:
     try:
-        return tile(decoded(image), f"{image['camera']}  {image['time_s']:+.1f} s")
+        return tile(decode_stored_image(image), f"{image['camera']}  {image['time_s']:+.1f} s")
     except ValueError as error:
         return note(str(error))
 

@@ -8,7 +8,7 @@ from factory.config.arguments import Refused
 from factory.views.status import fate, rows_where, to_the_side, turned
 
 if TYPE_CHECKING:
-    from factory.graph.work import PreparedClip
+    from factory.graph.steps import PreparedClip
     from factory.store.reader import SampleTable
     from factory.store.samples import Store
     from factory.store.table import KeyedTable
@@ -29,16 +29,16 @@ def open_samples(store: "Store") -> "SampleTable":
 
 def find(table: "SampleTable", store: "Store", which: str) -> str:
     """The attempt_id meant by an ordinal, an id or the beginning of one. Raises Refused."""
-    from factory.store.codes import beginning
+    from factory.store.table import keys_with_prefix
 
     if which.isascii() and which.isdecimal() and int(which) < len(table):
         return str(table.sample(int(which), ("attempt_id",))["attempt_id"])
-    found = table.beginning(which)
+    found = table.keys_with_prefix(which)
     if len(found) == 1:
         return found[0]
     if found:
         raise Refused(f"sample={which} is the beginning of {len(found)} ids: {', '.join(found[:8])}")
-    dropped = beginning(store.outcomes.keys(), which)
+    dropped = keys_with_prefix(store.outcomes.keys(), which)
     if len(dropped) == 1:
         raise Refused(fate(rows_where(store.outcomes, {"attempt_id": dropped[0]})[0]))
     raise Refused(f"no sample {which}: ids begin otherwise, ordinals go from 0 to {len(table) - 1}; see list=true")
@@ -86,7 +86,7 @@ def logged_drive(store: "Store", row: dict[str, Any]) -> "Array | None":
     """(81, 3) the log from T to T+2H, world frame, from the prepared clip; None where the cache has it no more."""
     from factory.graph.steps import cache_key
     from factory.pipeline import logged_poses
-    from factory.store.cache import BadCacheFile
+    from factory.store.location import BadCacheFile
 
     digests = {run["settings_hash"]: run["prepare_digest"] for run in store.runs()}
     if row["settings_hash"] not in digests:

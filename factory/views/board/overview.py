@@ -14,11 +14,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from factory.store.funnel import Funnel
-from factory.store.samples import Kind
-from factory.store.table import text_equals
 from factory.store.location import Location
-from factory.store.parquet_file import TableSpec
-from factory.store.table import KeyedTable
+from factory.store.samples import Kind
+from factory.store.schema import TableSpec
+from factory.store.table import KeyedTable, text_equals
 from factory.views.board.gallery import FILTERS
 from factory.views.board.watch import Snapshot, plain
 from factory.views.status import GATE_WORDS, PAPER_CLIP_PERCENT, REASON_WORDS, STATUS

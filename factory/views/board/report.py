@@ -17,10 +17,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from factory.config.arguments import Refused
-from factory.store.codes import equals
-from factory.store.reader import decoded
+from factory.store.reader import decode_stored_image
 from factory.store.samples import Store
 from factory.store.schema import NOW_INDEX
+from factory.store.table import text_equals
 from factory.views.board.gallery import Pictures, card_of, failures, gallery, place_of, whole
 from factory.views.board.overview import Drives, drives_as_json, overview
 from factory.views.board.server import STATIC
@@ -124,7 +124,7 @@ def spread(samples: pa.Table) -> list[str]:
     rows = samples.select(["attempt_id", "expert", "clip_id", "round"])
     left: list[tuple[str, list[tuple[str, Any]]]] = []
     for expert in counted(rows["expert"]):
-        of_expert = rows.take(np.flatnonzero(equals(rows["expert"], expert)))
+        of_expert = rows.take(np.flatnonzero(text_equals(rows["expert"], expert)))
         few = pc.select_k_unstable(of_expert, PER_EXPERT, [("attempt_id", "ascending")])
         left += [(str(row.pop("attempt_id")), list(row.items())) for row in of_expert.take(few).to_pylist()]
     left.sort(key=lambda row: row[0])
@@ -145,7 +145,7 @@ def _with_pictures(found: Mapping[str, Any], row: Mapping[str, Any], kept: dict[
     for image in found["images"]:
         stored = at_now.get((image["camera"], image["time_s"]))
         try:
-            small = None if stored is None else _text(small_jpeg(decoded(stored), CAMERA_PX))
+            small = None if stored is None else _text(small_jpeg(decode_stored_image(stored), CAMERA_PX))
         except ValueError:  # the page says that there is no picture
             continue
         if small is None:

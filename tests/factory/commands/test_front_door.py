@@ -18,9 +18,9 @@ import yaml
 from factory.__main__ import main
 from factory.commands.completion import candidates, settings_of
 from factory.commands.table import COMMANDS, DOORS, PLANNERS
+from factory.config.arguments import ComposedCommand
 from factory.exits import EXIT_CODE_TEXT
 from factory.graph.driver import EpisodeSettings
-from factory.config.arguments import ComposedCommand
 from factory.graph.execute import Execution
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import COPIES

@@ -7,8 +7,7 @@ from typing import Literal
 import pytest
 
 from factory.commands.table import COMMANDS, DOORS
-from factory.config.arguments import POSITIONAL, RUN_SETTINGS, Refused, keys_of, parse
-from factory.config.arguments import RUN, WORD, Refused, keys_of, parse, request_of
+from factory.config.arguments import POSITIONAL, RUN_SETTINGS, Refused, keys_of, parse, request_of
 from factory.config.shapes import choices_of
 from factory.config.words import ConfigError
 from tests.factory.text_keys import text_keys

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.store.reader import SampleTable, decoded
+from factory.store.reader import SampleTable, decode_stored_image
 from factory.store.samples import Store
 from factory.views.pictures import encoded, fitted, sample_sheet
 from factory.views.seen_again import ASIDE_M, _looks_right
@@ -37,7 +37,7 @@ def test_a_picture_keeps_its_aspect_and_survives_coding() -> None:
     tile = fitted(wide, 200, 100)
     assert tile.shape == (100, 200, 3)
     assert (tile[30:70] == wide[0, 0]).all() and not (tile[:20] == wide[0, 0]).all()
-    back = decoded({"jpeg": encoded(wide), "camera": "front", "time_s": 0.0})
+    back = decode_stored_image({"jpeg": encoded(wide), "camera": "front", "time_s": 0.0})
     assert np.abs(back.astype(int) - wide).max() <= 4
 
 
