@@ -25,7 +25,6 @@ from torch import Tensor
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, compose, fill
 from factory.config.words import SHOW, without_show
-from factory.datasets.navsim.pickles import METRICS
 from factory.readers.pickles import load_tensors
 from planners.models.diffusiondrive import POINT_FEATURES, REFINEMENTS, WAYPOINTS, DiffusionDriveSettings
 from planners.models.gtrs_dense import IMITATION, GtrsDenseSettings, inference_arrays
@@ -33,6 +32,7 @@ from planners.models.ltf import LtfSettings
 from planners.models.planner import Planner, PlannerChoice, build_planner, settings_of
 from planners.training.checkpoint import FOLDER, put_weights, save_checkpoint
 from planners.training.train import PlannerEntry
+from tasks.subscores import RECORDS
 from tasks.world.arrays import FloatArray
 
 # A public state dict read into a planner's: every number of it is moved, or named as left aside.
@@ -44,7 +44,7 @@ from tasks.world.arrays import FloatArray
 Arrays = dict[str, FloatArray]
 
 # GTRS's heads and scores by the names that they have here
-SCORES = {public: name for public, name in METRICS.items() if name != "score"}
+SCORES = {record.long_name: record.name for record in RECORDS if record.plans == 1}
 ANCHOR = "_status_encoding.weight"  # in every family's model, at its top
 
 

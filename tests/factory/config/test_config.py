@@ -92,7 +92,7 @@ def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
     ("choice", "n_least"),
     [
         *((name, 12) for name in ("synthetic", "synthetic_towns")),
-        *((f"{name} clips.root=x", 14) for name in ("av2", "scenarionet", "py123d")),
+        *((f"{name} clips.root=x", 13) for name in ("av2", "scenarionet", "py123d")),
         ("navsim clips.root=x clips.maps=x", 16),
     ],
 )
