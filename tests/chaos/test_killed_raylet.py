@@ -11,12 +11,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from factory.exits import INTERRUPTED, calling_on_stop_signal
 from factory.graph.apart import run_in_own_process
-from factory.graph.execute import NEW_CLUSTERS, Execution, RunSummary, execute, on_new_clusters
+from factory.graph.execute import Execution, execute
 from factory.run import main as run_main
 from factory.store.samples import Store
 from factory.store.verify import verify
@@ -194,16 +195,17 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("how", "code"), [("code", 3), ("bug", 1), ("killed", -signal.SIGKILL)])
-def test_a_command_ends_as_its_run_did(tmp_path: Path, how: str, code: int) -> None:
+def test_a_command_ends_as_its_run_did(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(APART)
-    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
-    done = subprocess.run(
-        [sys.executable, str(script), "ends", how], env=environment, capture_output=True, text=True, timeout=100
-    )
-    assert done.returncode == code and "new cluster" not in done.stdout
-    assert done.stderr.count("RuntimeError: a bug of ours") == (how == "bug"), done.stderr
+    how: dict[str, Any] = {"env": os.environ | {"PYTHONPATH": str(REPOSITORY)}, "text": True}
+    how |= dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
+    codes = {"code": 3, "bug": 1, "killed": -signal.SIGKILL}
+    running = {word: subprocess.Popen([sys.executable, str(script), "ends", word], **how) for word in codes}
+    for word, process in running.items():
+        told, said = process.communicate(timeout=100)
+        assert process.returncode == codes[word] and "new cluster" not in told
+        assert said.count("RuntimeError: a bug of ours") == (word == "bug"), said
 
 
 @pytest.mark.slow
@@ -240,14 +242,3 @@ def test_a_run_goes_on_where_its_own_raylet_dies(tmp_path: Path) -> None:
     execute(ToyWork(), refs(5), EXPERTS, 2, Store(tmp_path / "plain"), Execution("local"), say=lambda line: None)
     assert_same_tables(tmp_path / "out", tmp_path / "plain")
     assert verify(Store(tmp_path / "out")).damage == ()
-
-
-def test_no_more_than_three_clusters_are_started_anew() -> None:
-    runs, told = [], list[str]()
-
-    def once() -> RunSummary:
-        runs.append(1)
-        return RunSummary(4, "Ray's raylet died", lost_cluster=True)
-
-    assert on_new_clusters(once, told.append).exit_code == 4
-    assert len(runs) == 1 + NEW_CLUSTERS and [line[-6:] for line in told] == ["1 of 3", "2 of 3", "3 of 3"]

@@ -13,7 +13,7 @@ from factory.store.verify import verify
 from tests.factory.graph.wild import WildWork
 from tests.factory.toy import refs
 
-LIMITS = Limits(seconds={"drive": 30.0, "render": 0.0, "label": 0.0})
+LIMITS = Limits(seconds={"drive": 10.0, "render": 0.0, "label": 0.0})
 HOW = {  # kind -> what is told of it, and a pattern in the message
     "compiled loop": ("limit", "at work for more than"),
     "segfault": ("system", r"at drive\+render\+label|worker died"),

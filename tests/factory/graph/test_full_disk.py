@@ -3,7 +3,7 @@
 import errno
 import re
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pyarrow.compute as pc
@@ -59,10 +59,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
     return set(Store(out).samples)
 
 
-MORE_SIZES = ["192k", "512k"]
-
-
-@pytest.mark.parametrize("size", ["64k", *(pytest.param(size, marks=pytest.mark.slow) for size in MORE_SIZES)])
+@pytest.mark.parametrize("size", ["64k", pytest.param("192k", marks=pytest.mark.slow), "512k"])
 def test_wherever_the_disk_is_full_the_same_command_goes_on(disk: Path, undisturbed: set[str], size: str) -> None:
     out = disk / "out"
     resize(disk, size)
@@ -72,7 +69,7 @@ def test_wherever_the_disk_is_full_the_same_command_goes_on(disk: Path, undistur
     assert "\n" not in stopped.message and "run the same command again" in stopped.message
     resize(disk, LARGE)
     committed = set(Store(out).samples)
-    assert committed <= undisturbed
+    assert committed < undisturbed and (committed or size != "512k")
     assert not list(out.rglob("*.tmp")), "half a file takes space from the next run"
     if Store(out).samples.version is not None:
         assert verify(Store(out)).damage == ()
@@ -109,12 +106,6 @@ def test_a_whole_run_on_a_disk_that_fills_says_so_once_and_goes_on(
     assert verify(Store(disk / "out")).damage == ()
     assert run_main(command) == COMPLETE
     assert_same_tables(disk / "out", whole_town)
-
-
-def test_some_of_these_disks_hold_a_part_of_the_samples(disk: Path, undisturbed: set[str]) -> None:
-    resize(disk, "512k")
-    run(disk / "out")
-    assert 0 < len(Store(disk / "out").samples) < len(undisturbed)
 
 
 def test_a_disk_without_room_for_a_row_group_is_refused_at_once(disk: Path) -> None:
@@ -166,21 +157,30 @@ def test_a_machine_that_is_ill_while_kernels_are_compiled_is_no_bug_and_no_wrong
     assert COLD in summary.message and "run the same command again" in summary.message
 
 
-def test_ray_that_cannot_begin_ends_the_run_with_one_line_that_says_how_full_its_place_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def without_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], tuple[RunSummary, list[str]]]:
+    """A run whose cluster does not begin, with the folder of Ray's files: how it ended, and what was said."""
+
     def timed_out(*given: object, **options: object) -> None:
         raise RuntimeError("Timed out waiting for file gcs_server_port")
 
+    def ended(files: Path) -> tuple[RunSummary, list[str]]:
+        monkeypatch.setenv("RAY_TMPDIR", str(files))
+        out, told = tmp_path / "out", list[str]()
+        how = Execution("ray")
+        summary = on_new_clusters(lambda: executed(ToyWork(), refs(1), ["human"], 1, Store(out), how), told.append)
+        assert summary.exit_code == INTERRUPTED and not out.exists()
+        return summary, told
+
     monkeypatch.setattr("ray.init", timed_out)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
-    out, told = tmp_path / "out", list[str]()
-    summary = on_new_clusters(
-        lambda: execute(ToyWork(), refs(1), ["human"], 1, Store(out), Execution("ray"), say=told.append),
-        told.append,
-    )
-    assert summary.exit_code == INTERRUPTED and not out.exists()
+    return ended
+
+
+def test_ray_that_cannot_begin_ends_the_run_with_one_line_that_says_how_full_its_place_is(
+    tmp_path: Path, without_ray: Callable[[Path], tuple[RunSummary, list[str]]]
+) -> None:
+    summary, told = without_ray(tmp_path)
     assert [line.rpartition("; ")[2] for line in told] == [f"a new cluster is started, {i} of 3" for i in (1, 2, 3)]
     said = (
         rf"Ray did not begin on this machine \(Timed out .*\); its files lie in {tmp_path}, where [\d,]+ bytes are free"
@@ -189,23 +189,12 @@ def test_ray_that_cannot_begin_ends_the_run_with_one_line_that_says_how_full_its
 
 
 def test_ray_without_space_for_its_files_is_not_begun_again(
-    disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    disk: Path, without_ray: Callable[[Path], tuple[RunSummary, list[str]]]
 ) -> None:
     """Each new cluster would wait for half a minute for what it cannot write."""
-
-    def timed_out(*given: object, **options: object) -> None:
-        raise RuntimeError("Timed out waiting for file gcs_server_port")
-
-    monkeypatch.setattr("ray.init", timed_out)
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    monkeypatch.setenv("RAY_TMPDIR", str(disk))
     resize(disk, "64k")
-    out, told = tmp_path / "out", list[str]()
-    summary = on_new_clusters(
-        lambda: execute(ToyWork(), refs(1), ["human"], 1, Store(out), Execution("ray"), say=told.append),
-        told.append,
-    )
-    assert summary.exit_code == INTERRUPTED and not out.exists() and not told
+    summary, told = without_ray(disk)
+    assert not told
     assert f"its files lie in {disk}: the disk is full, 65,536 bytes are free; free disk space" in summary.message
 
 

@@ -10,16 +10,16 @@ from pathlib import Path
 import pytest
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
+from factory.graph import local
 from factory.graph.driver import EpisodeSettings
 from factory.graph.execute import Execution
-from factory.graph.local import Claims, Limits
+from factory.graph.local import Claims
 from factory.graph.on_ray import graph
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
 from factory.store.samples import Store
 from factory.store.verify import verify
 from factory.views.sample_text import prepared_episode
 from tests.factory.filmed import FilmedWork
-from tests.factory.graph.wild import WildWork
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
 from tests.factory.toy import ToyWork, executed, ran, refs
 
@@ -78,15 +78,8 @@ def test_local_and_ray_with_one_and_two_workers_make_identical_rows(tmp_path: Pa
 
 def test_workers_write_the_same_episodes_as_one_process(tmp_path: Path, two_cpus: None) -> None:
     for executor in ("local", "ray"):
-        store = Store(tmp_path / executor)
-        executed(
-            FilmedWork(),
-            refs(3),
-            EXPERTS,
-            2,
-            store,
-            Execution(executor, 2, episodes=EpisodeSettings(1, prepared_episode)),
-        )  # type: ignore[arg-type]
+        how = Execution(executor, 2, episodes=EpisodeSettings(1, prepared_episode))  # type: ignore[arg-type]
+        executed(FilmedWork(), refs(3), EXPERTS, 2, Store(tmp_path / executor), how)
     local, ray_s = (
         {path.name: path.read_bytes() for path in (tmp_path / executor / "episodes").iterdir()}
         for executor in ("local", "ray")
@@ -114,24 +107,64 @@ def test_a_clip_that_kills_its_workers_hurts_nobody_else(tmp_path: Path, two_cpu
     assert ran(journal, "attempt log0:2000:recovery:0") == 3  # once and two retries
     failed = {o["error_kind"] for o in tables_of(tmp_path / "out")[1] if o["kind"] == "failed"}  # type: ignore[index]
     assert failed == {"system", "input"}
-    assert (
-        executed(ToyWork(), refs(5), EXPERTS, 2, Store(tmp_path / "out"), Execution("local", retry=True)).exit_code
-        == COMPLETE
-    )
+    retried = executed(ToyWork(), refs(5), EXPERTS, 2, Store(tmp_path / "out"), Execution("local", retry=True))
+    assert retried.exit_code == COMPLETE
     run(tmp_path / "never", "local", ToyWork(), 2, 1)
     assert_same_tables(tmp_path / "out", tmp_path / "never")
     assert verify(Store(tmp_path / "out")).damage == ()
 
 
-def test_a_loop_is_ended_on_a_worker_too_and_tried_once_a_run(tmp_path: Path, two_cpus: None) -> None:
-    journal = str(tmp_path / "journal")
-    work = WildWork(wild=(("log0:0:recovery:0", "loop"),), journal=journal)
-    limits = Limits(seconds={"drive": 1.0, "render": 0.0, "label": 0.0})
-    summary = executed(work, refs(3), EXPERTS, 1, Store(tmp_path / "out"), Execution("ray", 2, limits=limits))
-    assert summary.exit_code == COMPLETE_WITH_FAILURES
-    (failed,) = [o for o in tables_of(tmp_path / "out")[1] if o["kind"] == "failed"]  # type: ignore[index]
-    assert failed["error_kind"] == "limit" and "wild.py" in failed["error"]
-    assert ran(journal, "loop") == 1
-    assert run(tmp_path / "out", "local", ToyWork(), 1, 1, 3).exit_code == COMPLETE
-    run(tmp_path / "never", "local", ToyWork(), 1, 1, 3)
-    assert_same_rows(tables_of(tmp_path / "out")[0], tables_of(tmp_path / "never")[0])
+# Attempts of a walk that one task makes together: the same rows, each failure its own attempt's.
+
+ROUNDS, CLIPS = 4, 4
+
+
+@pytest.fixture
+def long(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Stretches as long as they can be, from the second attempt on; how many attempts each has had."""
+    monkeypatch.setattr(local, "SEEN", 1)
+    monkeypatch.setattr(graph, "AHEAD_S", 1e9)
+    lengths: list[int] = []
+    waited = graph.RayGraph.wait
+
+    def wait(self: graph.RayGraph, timeout_s: float):  # type: ignore[no-untyped-def]
+        finished = waited(self, timeout_s)
+        if finished is not None and isinstance(finished[1], graph.BatchReport):
+            lengths.append(len(finished[1].reports))
+        return finished
+
+    monkeypatch.setattr(graph.RayGraph, "wait", wait)
+    return lengths
+
+
+def test_stretches_make_the_rows_of_attempts_one_by_one(tmp_path: Path, two_cpus: None, long: list[int]) -> None:
+    """A longer walk goes on behind the shorter one."""
+    run(tmp_path / "one", "local", ToyWork(n_candidates=12), ROUNDS, 1, CLIPS)
+    run(tmp_path / "many", "ray", ToyWork(n_candidates=12), 2, 2, CLIPS)
+    run(tmp_path / "many", "ray", ToyWork(n_candidates=12), ROUNDS, 2, CLIPS)
+    assert_same_tables(tmp_path / "one", tmp_path / "many")
+    assert max(long) >= 4 and sum(long) > 3 * len(long)
+
+
+def test_a_failure_ends_a_stretch_and_is_its_own(tmp_path: Path, two_cpus: None, long: list[int]) -> None:
+    trouble = {"log1:1000:recovery:3": "bug", "log0:2000:pdm_closed:2": "bad", "log0:0:recovery:2": "disk"}
+    work = ToyWork(n_candidates=12, trouble=trouble)
+    run(tmp_path / "one", "local", work, ROUNDS, 1, CLIPS)
+    assert run(tmp_path / "many", "ray", work, ROUNDS, 2, CLIPS).exit_code == COMPLETE_WITH_FAILURES
+    assert_same_tables(tmp_path / "one", tmp_path / "many")
+    assert max(long) >= 4
+
+
+def test_whose_worker_dies_is_found_one_by_one(tmp_path: Path, two_cpus: None, long: list[int]) -> None:
+    """The stretch says nothing of those before it; they are made again, each by itself."""
+    work = ToyWork(n_candidates=12, trouble={"log1:1000:recovery:3": "die"}, journal=str(tmp_path / "journal"))
+    ended = run(tmp_path / "many", "ray", work, ROUNDS, 2, CLIPS)
+    assert (ended.exit_code, ended.counts["failed"]) == (COMPLETE_WITH_FAILURES, 1)
+    (failed,) = (row for row in Store(tmp_path / "many").outcomes.read().to_pylist() if row["kind"] == "failed")
+    assert (failed["expert"], failed["candidate_index"], failed["error_kind"]) == ("recovery", 3, "system")
+    assert ran(work.journal, "attempt log1:1000:recovery:3") >= 3
+    assert ran(work.journal, "attempt log1:1000:recovery:4") == 0
+    mended = ToyWork(n_candidates=12)
+    run(tmp_path / "many", "ray", mended, ROUNDS, 2, CLIPS)
+    run(tmp_path / "one", "local", mended, ROUNDS, 1, CLIPS)
+    assert_same_rows(*(Store(tmp_path / name).samples.read().sort_by("attempt_id") for name in ("one", "many")))

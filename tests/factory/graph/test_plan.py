@@ -124,5 +124,5 @@ def test_complete_walks_are_not_unpacked(monkeypatch: pytest.MonkeyPatch) -> Non
     def unpacked(*given: object) -> None:
         raise AssertionError("a walk was unpacked")
 
-    monkeypatch.setattr(History, "known", unpacked)
+    monkeypatch.setattr(History, "past_attempts", unpacked)
     assert [clip.ref for clip in plan_of(history, 2).done] == list(CLIPS)

@@ -2,11 +2,14 @@
 
 import numpy as np
 import pyarrow as pa
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from factory.store import table
 from factory.store.table import (
     PACKED_ROWS,
+    KeyIndex,
     distinct_rows,
     fixed_bytes,
     keys_with_prefix,
@@ -57,3 +60,27 @@ def test_packed_rows_are_the_same_in_fewer_tables() -> None:
     whole = pa.concat_tables(found).cast(parts[0].schema)
     assert whole.equals(pa.concat_tables(parts).combine_chunks())
     assert list(packed_tables([], "key")) == []
+
+
+# The index of a table's keys is a dict that takes little.
+
+KEYS = st.text("abcdé", min_size=1, max_size=4)
+CHANGES = st.lists(st.tuples(st.sets(KEYS), st.dictionaries(KEYS, st.sampled_from(["x", "y", "z"]))))
+
+
+@pytest.mark.parametrize("merged_at", [0, 3, 1000])
+@settings(max_examples=25, deadline=None)
+@given(known=st.dictionaries(KEYS, st.sampled_from(["x", "y"])), changes=CHANGES, asked=st.sets(KEYS))
+def test_it_finds_what_a_dict_finds(
+    merged_at: int, known: dict[str, str], changes: list[tuple[set[str], dict[str, str]]], asked: set[str]
+) -> None:
+    files = [(path, pa.array([key for key, of in known.items() if of == path], pa.string())) for path in ("x", "y")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(table, "MERGED_AT", merged_at)
+        index, there = KeyIndex((path, pa.chunked_array([keys])) for path, keys in files), dict(known)
+        for drop, add in changes:
+            index.change(drop, add)
+            there = {key: path for key, path in there.items() if key not in drop} | add
+            assert index.files_of(asked) == {key: there[key] for key in asked if key in there}
+        assert index.files_of(there) == there
+        assert sorted(index) == sorted(there) and len(index) == len(there)

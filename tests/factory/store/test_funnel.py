@@ -97,7 +97,7 @@ def test_an_attempt_belongs_to_the_round_it_was_tried_for() -> None:
         ),
     )
 )
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_the_funnel_is_that_of_a_count_attempt_by_attempt(whys: dict[str, dict[str, list[str]]]) -> None:
     walks = {
         expert: {clip: [(i - (expert == "human"), why) for i, why in enumerate(tries)] for clip, tries in clips.items()}

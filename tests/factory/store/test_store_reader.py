@@ -1,14 +1,14 @@
 """Reading samples: no Ray, no Hydra, little I/O; and verify, which reads everything."""
 
 import json
+import pickle
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields
-from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -60,12 +60,10 @@ def test_workers_of_a_data_loader_read_the_snapshot_that_was_opened_however_they
     grown(3)
     assert len(SampleTable(tmp_path)) > len(table)
     places = [len(table) - 1, 0]
-    for chosen, rows in ((table, expected), (Subset(table, places), [expected[i] for i in places])):  # type: ignore[arg-type]
-        loader = DataLoader(chosen, 2, num_workers=1, multiprocessing_context=start, collate_fn=list, timeout=300)  # type: ignore[arg-type]
-        read = [row for batch in loader for row in batch]
-        assert list(map(repr, read)) == list(map(repr, rows))
-    with ProcessPoolExecutor(1, get_context(start)) as process:
-        ids = process.submit(SampleTable.table, table, ["attempt_id"]).result()["attempt_id"].to_pylist()
+    chosen: Any = Subset(table, places)  # type: ignore[arg-type]
+    loader = DataLoader(chosen, 2, num_workers=1, multiprocessing_context=start, collate_fn=list, timeout=300)
+    assert [repr(row) for batch in loader for row in batch] == [repr(expected[i]) for i in places]
+    ids = pickle.loads(pickle.dumps(table)).table(["attempt_id"])["attempt_id"].to_pylist()
     assert tuple(ids) == table.attempt_ids
 
 

@@ -46,29 +46,15 @@ def test_a_bucket_holds_the_same_rows_as_a_folder(s3: dict[str, str], tmp_path: 
 def test_a_bucket_holds_the_same_episodes_as_a_folder_and_makes_up_for_lost_ones(
     s3: dict[str, str], tmp_path: Path
 ) -> None:
-    url = f"s3://{BUCKET}/runs/filmed"
+    url, how = f"s3://{BUCKET}/runs/filmed", Execution("local", episodes=EpisodeSettings(1, prepared_episode))
     for out in (Store(url, s3), Store(tmp_path)):
-        executed(
-            FilmedWork(),
-            refs(2),
-            ["recovery"],
-            1,
-            out,
-            Execution("local", episodes=EpisodeSettings(1, prepared_episode)),
-        )
+        executed(FilmedWork(), refs(2), ["recovery"], 1, out, how)
     there, here = Location.parse(url, s3).child("episodes"), Location.parse(tmp_path).child("episodes")
     names = here.names()
     assert names and there.names() == names
     assert [there.read(name) for name in names] == [here.read(name) for name in names]
     there.remove(names[0])
-    again = executed(
-        FilmedWork(),
-        refs(2),
-        ["recovery"],
-        1,
-        Store(url, s3),
-        Execution("local", episodes=EpisodeSettings(1, prepared_episode)),
-    )
+    again = executed(FilmedWork(), refs(2), ["recovery"], 1, Store(url, s3), how)
     assert again.executed.episodes == 1 and there.read(names[0]) == here.read(names[0])
 
 
