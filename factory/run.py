@@ -82,7 +82,7 @@ def needs_own_process(config: RunConfig) -> bool:
     return config.graph.isolated == "always" or (config.graph.isolated == "auto" and foreign)
 
 
-def left(minutes: float | None, began: float) -> float | None:
+def minutes_left(minutes: float | None, began: float) -> float | None:
     """Of so many minutes since then, on the monotonic clock."""
     return None if minutes is None else max(0.0, minutes - (time.monotonic() - began) / 60.0)
 
@@ -173,13 +173,12 @@ def _run(
                     config.executor,
                     config.workers,
                     claims=Claims(config.gpu_share if assembled.work.draws_on_gpu else 0.0, config.graph.memory_gb),
-                    fuse=config.graph.fuse,
                     isolated=needs_own_process(config),
                     limits=Limits({**label_time_limits(config), **config.graph.limit_s}, config.graph.limit_gb),
                     on_change=config.on_change,
                     retry=config.retry_failed,
                     shard_seconds=config.shard_seconds,
-                    minutes=left(config.minutes, since),
+                    minutes=minutes_left(config.minutes, since),
                     episodes=EpisodeSettings(config.one_episode_in, prepared_episode)
                     if config.one_episode_in
                     else None,

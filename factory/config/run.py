@@ -93,9 +93,8 @@ EXPERTS: Mapping[str, type[Any]] = {RECOVERY: RecoverySources}  # `_target_` of 
 
 @dataclass(frozen=True)
 class GraphChoice:
-    """How the work is cut into tasks, and what they claim on Ray; rows do not depend on it."""
+    """Where tasks work, and what they claim on Ray; rows do not depend on it."""
 
-    fuse: Literal["auto", "all", "none"] = "auto"  # drive, render, label in one task; auto: unless drawing claims a GPU
     isolated: Literal["auto", "always", "never"] = "auto"  # local work in another process; auto: plug-ins, pickles
     memory_gb: dict[str, float] = field(default_factory=dict)  # by task, where it is not the 1 GB (reconstruct: 2)
     limit_s: dict[str, float] = field(default_factory=dict)  # seconds after which a task is ended, by task

@@ -33,7 +33,6 @@ from factory.graph.local import (
     Claims,
     ClusterDied,
     ClusterLacks,
-    Fuse,
     Graph,
     Limits,
     LocalGraph,
@@ -79,7 +78,6 @@ class Execution:
     retry: bool = False  # attempts that failed by input or a bug are tried again, too
     ray_address: str | None = None
     claims: Claims = field(default_factory=Claims)  # on Ray
-    fuse: Fuse = "auto"  # whether the stages of an attempt are one task; auto: not where drawing claims a GPU
     limits: Limits = field(default_factory=Limits)  # of a task, beyond which it is ended
     isolated: bool = False  # executor=local works in a process of its own, which may die
     shard_bytes: int = SHARD_BYTES
@@ -176,13 +174,13 @@ class _Run:
             if how.executor == "local" and how.isolated:
                 from factory.graph.local import IsolatedGraph
 
-                self._graph = IsolatedGraph(*to, lambda: self._driver.interrupted, how.fuse, how.limits)
+                self._graph = IsolatedGraph(*to, lambda: self._driver.interrupted, how.limits)
             elif how.executor == "local":
-                self._graph = LocalGraph(*to, lambda: self._driver.interrupted, how.fuse)
+                self._graph = LocalGraph(*to, lambda: self._driver.interrupted)
             else:
                 from factory.graph.on_ray.graph import RayGraph
 
-                self._graph = RayGraph(*to, how.workers, how.ray_address, how.claims, how.fuse, how.limits)
+                self._graph = RayGraph(*to, how.workers, how.ray_address, how.claims, how.limits)
         except (BadLocation, ClusterLacks, NotReady, ConnectionError) as error:
             return RunSummary(BAD_CONFIG, str(error))
         except ClusterDied as error:
@@ -239,7 +237,7 @@ class _Run:
     def _loop(self, graph: Graph) -> None:
         store, how, episodes = self._store, self._how, self._episodes
         self._ended.began_ms = _announce(store, self._plan, self._experts, self._rounds, how.command)
-        metrics = RunMetrics(graph.recorder, store.location)
+        metrics = RunMetrics(graph.record_metric, store.location)
         with calling_on_stop_signal(self._driver.stop_soon), _alarm(self._driver.stop, how.minutes):
             if episodes is not None:
                 episodes.begin(graph)

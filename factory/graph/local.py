@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from itertools import count
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from factory.exits import become_worker, terminal_signals_blocked
 from factory.files import DiskFull
 from factory.graph import steps
 from factory.graph.guard import OVER, WORK, WatchedProcess, read_note
-from factory.graph.progress import NoRecorder, Recorder
+from factory.graph.progress import Record, record_nothing
 from factory.graph.steps import Failure, NotReady, StopCheck, Work, warm
 from factory.readers.base import ClipRef
 from factory.store.location import Location
@@ -158,7 +158,6 @@ def read_only(value: T) -> T:
     return value
 
 
-Fuse = Literal["auto", "all", "none"]
 MAX_RETRIES = 2  # of a task whose worker died
 
 
@@ -209,7 +208,7 @@ class Graph(Protocol):
     parallelism: int  # tasks at once
     cores: int  # that one task can have
     attempt_tasks: Sequence[Sequence[str]]  # the stages of an attempt, by the tasks that they are fused into
-    recorder: Recorder  # of metrics
+    record_metric: Record
 
     def submit(self, step: str, *args: Any) -> Ticket:
         """Run `step`; arguments may be results of earlier tickets. What STEPS says is supplied to it."""
@@ -237,9 +236,9 @@ STEPS: Mapping[str, tuple[Any, tuple[str, ...]]] = {  # its function, and what i
 }
 
 
-def attempt_tasks(fuse: Fuse, apart: bool) -> tuple[tuple[str, ...], ...]:
-    """The stages of an attempt by task; apart: whether `auto` makes a task of each, as where `render` claims a GPU."""
-    return tuple((stage,) for stage in ATTEMPT) if fuse == "none" or (fuse == "auto" and apart) else (ATTEMPT,)
+def attempt_tasks(apart: bool) -> tuple[tuple[str, ...], ...]:
+    """The stages of an attempt by task; apart: a task of each, as where `render` claims a GPU."""
+    return tuple((stage,) for stage in ATTEMPT) if apart else (ATTEMPT,)
 
 
 def task_name(step: str, args: tuple[Any, ...]) -> str:
@@ -271,11 +270,11 @@ class LocalGraph:
 
     parallelism = 1
 
-    def __init__(self, work: Work, out: Location, stopped: StopCheck, fuse: Fuse) -> None:
+    def __init__(self, work: Work, out: Location, stopped: StopCheck) -> None:
         """stopped: asked now and then by tasks that take long, as nobody else can while they are at work."""
-        self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(fuse, apart=False)
+        self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(apart=False)
         self.cores = os.cpu_count() or 1
-        self.recorder: Recorder = NoRecorder()
+        self.record_metric: Record = record_nothing
         self._supplied = {"work": work, "out": out, "stopped": stopped}
         self._waiting: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
         self._notes = notes_folder(out)
@@ -335,11 +334,11 @@ class IsolatedGraph:
 
     parallelism = 1
 
-    def __init__(self, work: Work, out: Location, stopped: StopCheck, fuse: Fuse, limits: Limits) -> None:
+    def __init__(self, work: Work, out: Location, stopped: StopCheck, limits: Limits) -> None:
         """Raises NotReady where the process cannot be given the work, or is not ready for it."""
-        self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(fuse, apart=False)
+        self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(apart=False)
         self.cores = os.cpu_count() or 1
-        self.recorder: Recorder = NoRecorder()
+        self.record_metric: Record = record_nothing
         self._work, self._out, self._stopped = work, out, stopped
         self._context = multiprocessing.get_context("spawn")
         with terminal_signals_blocked():  # what keeps its semaphores is a process, too

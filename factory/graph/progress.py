@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Protocol, Self, TextIO
+from typing import Self, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
@@ -274,26 +274,19 @@ DISK_FREE = Metric("factory_disk_free_bytes", Type.GAUGE, "B", (), "Free space t
 METRICS = tuple(metric for metric in list(globals().values()) if isinstance(metric, Metric))
 
 
-class Recorder(Protocol):
-    """Where values go."""
-
-    def record(self, metric: Metric, value: float, labels: Mapping[str, str]) -> None:
-        """Add to a counter (more than 0), set a gauge, or observe in a histogram; `labels` has all of the metric's."""
-        ...
+# Adds to a counter (more than 0), sets a gauge, or observes in a histogram; with all labels that the metric has.
+Record = Callable[[Metric, float, Mapping[str, str]], None]
 
 
-class NoRecorder:
+def record_nothing(metric: Metric, value: float, labels: Mapping[str, str]) -> None:
     """Of runs in one process: nobody watches."""
-
-    def record(self, metric: Metric, value: float, labels: Mapping[str, str]) -> None:
-        pass
 
 
 class RunMetrics:
     """Turns what the driver learns into metrics."""
 
-    def __init__(self, recorder: Recorder, out: Location, clock: Callable[[], float] = time.monotonic) -> None:
-        self._recorder, self._out, self._clock = recorder, out, clock
+    def __init__(self, record: Record, out: Location, clock: Callable[[], float] = time.monotonic) -> None:
+        self._record, self._out, self._clock = record, out, clock
         self._gauges_at = self._disk_at = -math.inf
 
     def record_task(self, step: str, queued_s: float, report: object) -> None:
@@ -369,4 +362,4 @@ class RunMetrics:
 
     def _add(self, metric: Metric, value: float, **labels: str) -> None:
         if value > 0 or metric.type is not Type.COUNTER:
-            self._recorder.record(metric, value, {"run": self._out.uri, **labels})
+            self._record(metric, value, {"run": self._out.uri, **labels})

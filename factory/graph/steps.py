@@ -10,7 +10,8 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from functools import wraps
+from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar
 
 import pyarrow as pa
 
@@ -203,6 +204,8 @@ def run_attempt(work: Work, prepared: PreparedClip, candidate: int, expert: str)
     raise AssertionError(f"{ATTEMPT[-1]} does not end an attempt")
 
 
+P = ParamSpec("P")
+R = TypeVar("R")
 ERROR_LINES = 12  # of a traceback that an outcome keeps
 
 
@@ -284,6 +287,34 @@ def cache_key(clip_id: str, prepare_digest: str) -> str:
     return f"{clip_id}-{hashlib.sha256(prepare_digest.encode()).hexdigest()[:16]}"
 
 
+def failure_from_error(error: BaseException) -> Failure:
+    """Broken input, an ailing machine, what may be either, or a bug; with the last lines of the traceback."""
+    if isinstance(error, BadClip) and not isinstance(error, Unreadable):
+        return Failure(ErrorKind.INPUT, str(error))
+    raised = error.__cause__ if isinstance(error, Unreadable) else error
+    kind = ErrorKind.SYSTEM if isinstance(raised, OSError | MemoryError) else ErrorKind.BUG
+    kind = ErrorKind.MACHINE if machine_fault_of(error) else kind
+    lines = "".join(traceback.format_exception(error)).strip().splitlines()
+    return Failure(kind, "\n".join(lines[-ERROR_LINES:]), why_disk_full(error))
+
+
+def reporting_failures(task: Callable[P, R]) -> Callable[P, R]:
+    """The boundary where whatever a stage or a user's code raises, SystemExit too, becomes data: a Failure's report."""
+
+    @wraps(task)
+    def reported(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return task(*args, **kwargs)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            trace = error.__traceback__
+            return failure_from_error(error.with_traceback(trace and trace.tb_next)), None  # type: ignore[return-value]
+
+    return reported
+
+
+@reporting_failures
 def prepare(
     work: Work, out: Location, ref: ClipRef, wanted_content: str | None = None
 ) -> tuple[PrepareReport | Rejected | Failure, PreparedClip | None]:
@@ -294,37 +325,30 @@ def prepare(
     cache, key = ClipCache(out.child("cache/prepared")), cache_key(ref.clip_id, work.identity.prepare_digest)
     note, began = "", time.perf_counter()
     try:
-        try:
-            stored = cache.load(key)
-        except BadCacheFile as error:
-            stored, note = None, f"cache file {key}: {error}; prepared again"
-        except OSError as error:
-            stored, note = None, f"cache file {key}: cannot be read: {one_line(error)}; prepared again"
-        found = work.content_digest(ref) if stored is not None or wanted_content is not None else None
-        _refuse_changed(ref, found, wanted_content)
-        if isinstance(stored, PreparedClip) and found not in (None, stored.content_digest):
-            stored, note = None, f"cache file {key}: log {ref.log_id} was changed since; prepared again"
-        if isinstance(stored, PreparedClip):
-            _refuse_changed(ref, stored.content_digest, wanted_content)
-            _keep_scenes(out, stored)
-            seconds = {"cache": time.perf_counter() - began}
-            return PrepareReport(replace(stored, payload=None, scenes=None), True, note, "", seconds), stored
-        result = work.prepare(ref)
-        if isinstance(result, Rejected):
-            _refuse_changed(ref, f"none ({result.reason})", wanted_content)  # the clip had candidates
-            return result, None
-        if result.clip_id != ref.clip_id:
-            raise ValueError(f"prepare({ref.clip_id}) returned clip {result.clip_id}")
-        _refuse_changed(ref, result.content_digest, wanted_content)
-        uncached = _why_uncached(cache, key, result)
-        _keep_scenes(out, result)
-        return PrepareReport(replace(result, payload=None, scenes=None), False, note, uncached, result.seconds), result
-    except KeyboardInterrupt:
-        raise
-    except (
-        BaseException
-    ) as error:  # the boundary where whatever a stage or a user's code raises, SystemExit too, becomes data
-        return failure_from_error(error), None
+        stored = cache.load(key)
+    except BadCacheFile as error:
+        stored, note = None, f"cache file {key}: {error}; prepared again"
+    except OSError as error:
+        stored, note = None, f"cache file {key}: cannot be read: {one_line(error)}; prepared again"
+    found = work.content_digest(ref) if stored is not None or wanted_content is not None else None
+    _refuse_changed(ref, found, wanted_content)
+    if isinstance(stored, PreparedClip) and found not in (None, stored.content_digest):
+        stored, note = None, f"cache file {key}: log {ref.log_id} was changed since; prepared again"
+    if isinstance(stored, PreparedClip):
+        _refuse_changed(ref, stored.content_digest, wanted_content)
+        _keep_scenes(out, stored)
+        seconds = {"cache": time.perf_counter() - began}
+        return PrepareReport(replace(stored, payload=None, scenes=None), True, note, "", seconds), stored
+    result = work.prepare(ref)
+    if isinstance(result, Rejected):
+        _refuse_changed(ref, f"none ({result.reason})", wanted_content)  # the clip had candidates
+        return result, None
+    if result.clip_id != ref.clip_id:
+        raise ValueError(f"prepare({ref.clip_id}) returned clip {result.clip_id}")
+    _refuse_changed(ref, result.content_digest, wanted_content)
+    uncached = _why_uncached(cache, key, result)
+    _keep_scenes(out, result)
+    return PrepareReport(replace(result, payload=None, scenes=None), False, note, uncached, result.seconds), result
 
 
 def _why_uncached(cache: ClipCache, key: str, clip: PreparedClip) -> str:
@@ -393,28 +417,25 @@ def write(out: Location, *rows: pa.Table) -> tuple[Shard | Failure, None]:
         return failure_from_error(error), None
 
 
+@reporting_failures
 def episodes(work: Work, out: Location, wanted: EpisodeBatch) -> tuple[EpisodesReport | Failure, None]:
     """Committed samples as MCAP files beside their table; the log's drive comes from the prepared clip."""
     written, errors = 0, []
-    try:
-        for row in read_samples(out.child("samples"), wanted.path, wanted.partition, wanted.refs):
-            key = row["attempt_id"]
-            report, clip = prepare(work, out, wanted.refs[key], row["content_digest"])
-            if clip is None:
-                errors.append(f"clip {row['clip_id']}: {report.error if isinstance(report, Failure) else report}")
-                continue
-            try:
-                out.child(EPISODES_FOLDER).write(episode_name(row), wanted.make(row, clip))
-                written += 1
-            except Exception as error:  # one that cannot be made costs no other
-                errors.append(f"sample {key}: {failure_from_error(error).error.splitlines()[-1]}")
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # the same boundary
-        return failure_from_error(error), None
+    for row in read_samples(out.child("samples"), wanted.path, wanted.partition, wanted.refs):
+        key = row["attempt_id"]
+        report, clip = prepare(work, out, wanted.refs[key], row["content_digest"])
+        if clip is None:
+            errors.append(f"clip {row['clip_id']}: {report.error if isinstance(report, Failure) else report}")
+            continue
+        try:
+            out.child(EPISODES_FOLDER).write(episode_name(row), wanted.make(row, clip))
+            written += 1
+        except Exception as error:  # one that cannot be made costs no other
+            errors.append(f"sample {key}: {failure_from_error(error).error.splitlines()[-1]}")
     return EpisodesReport(written, tuple(errors)), None
 
 
+@reporting_failures
 def reconstruct(
     work: Work, stopped: StopCheck, ref: ClipRef, threads: int
 ) -> tuple[BlockReport | BlockUnfinished | Failure, None]:
@@ -425,31 +446,13 @@ def reconstruct(
         return work.reconstruct(ref, threads, stopped), None
     except TaskStopped:
         return BlockUnfinished(), None
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # the same boundary
-        return failure_from_error(error), None
 
 
+@reporting_failures
 def warm(work: Work, draws: bool) -> tuple[str | Failure, None]:
     """Kernels into the cache of this machine."""
     try:
         work.warm(draws)
     except NotReady as error:
         return Failure(ErrorKind.INPUT, str(error)), None
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # the same boundary
-        return failure_from_error(error), None
     return "", None
-
-
-def failure_from_error(error: BaseException) -> Failure:
-    """Broken input, an ailing machine, what may be either, or a bug; with the last lines of the traceback."""
-    if isinstance(error, BadClip) and not isinstance(error, Unreadable):
-        return Failure(ErrorKind.INPUT, str(error))
-    raised = error.__cause__ if isinstance(error, Unreadable) else error
-    kind = ErrorKind.SYSTEM if isinstance(raised, OSError | MemoryError) else ErrorKind.BUG
-    kind = ErrorKind.MACHINE if machine_fault_of(error) else kind
-    lines = "".join(traceback.format_exception(error)).strip().splitlines()
-    return Failure(kind, "\n".join(lines[-ERROR_LINES:]), why_disk_full(error))

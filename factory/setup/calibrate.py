@@ -117,8 +117,8 @@ def calibrate(run: Run, refs: Sequence[ClipRef], store: Store | None = None) -> 
     core_hours = sum(sums.seconds.values()) * factor / 3600.0
     cores = run.config.workers or os.cpu_count() or 1
     total = f"{core_hours:.2f} core-hours ({core_hours / cores:.2f} h on {cores} cores)"
-    if run.work.draws_on_gpu:  # a task that draws holds its share of a GPU; where all is fused, the whole attempt does
-        tasks = [task for task in TASKS if task.per == "attempt" and (task.may_draw or run.config.graph.fuse == "all")]
+    if run.work.draws_on_gpu:  # a task that draws holds its share of a GPU
+        tasks = [task for task in TASKS if task.per == "attempt" and task.may_draw]
         spent = sum(sums.seconds[stage] for task in tasks for stage in task.stages)
         total += f", {spent * run.config.gpu_share * factor / 3600.0:.2f} GPU-hours"
     lines = [

@@ -36,7 +36,6 @@ from factory.graph.local import (
     ClusterDied,
     ClusterLacks,
     Costs,
-    Fuse,
     Limits,
     MachineIll,
     Ticket,
@@ -51,7 +50,7 @@ from factory.graph.local import (
     task_note,
 )
 from factory.graph.plan import AttemptBatch
-from factory.graph.progress import METRICS, Metric, Recorder, Type
+from factory.graph.progress import METRICS, Metric, Record, Type
 from factory.graph.steps import BatchReport, Failure, NotReady, PreparedClip, Work, attempt, never_stop
 from factory.store.location import BadLocation, Location
 from factory.store.samples import ErrorKind
@@ -209,17 +208,13 @@ WARMING = {"key": "warm", "what": "compiling kernels", "run": "", "limited": Fal
 _HELD: dict[str, Any] = {}  # per worker process: the run's Work, fetched once
 
 
-class RayRecorder:
-    """A factory.graph.progress.Recorder by way of `ray.util.metrics`: each node's agent serves Prometheus.
+def ray_metrics() -> Record:
+    """By way of `ray.util.metrics`: each node's agent serves Prometheus.
 
     Measured: 4 us a value, about 50 us an attempt of 100 ms or more.
     """
-
-    def __init__(self) -> None:
-        self._record = {metric.name: _recording(metric) for metric in METRICS}
-
-    def record(self, metric: Metric, value: float, labels: Mapping[str, str]) -> None:
-        self._record[metric.name](value, dict(labels))
+    recording = {metric.name: _recording(metric) for metric in METRICS}
+    return lambda metric, value, labels: recording[metric.name](value, dict(labels))
 
 
 def _recording(metric: Metric) -> Callable[[float, dict[str, str]], None]:
@@ -243,7 +238,6 @@ class RayGraph:
         workers: int | None,
         address: str | None,
         claims: Claims,
-        fuse: Fuse,
         limits: Limits,
     ) -> None:
         """workers: CPUs of a cluster started here, tasks at once on one that is there already; None: all its CPUs.
@@ -258,7 +252,7 @@ class RayGraph:
         self._is_ours = self._connected and connect(workers, address)
         self.parallelism = tasks_at_once(workers, self._is_ours)
         self.cores = min(self.parallelism, *(of_nodes("CPU") or [1]))  # none yet where a cluster grows from nothing
-        self.recorder: Recorder = RayRecorder()
+        self.record_metric: Record = ray_metrics()
         self._supplied: dict[str, Any] = {
             "work": [ray.put(work)],
             "out": out,
@@ -273,7 +267,7 @@ class RayGraph:
         try:
             self._gpu_share = claims.gpu_share if claims.gpu_share and has_gpu(wait=not self._is_ours) else 0.0
             self._claims, self._most_memory = claims, max(of_nodes("memory"), default=None)
-            self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(fuse, apart=self._gpu_share > 0.0)
+            self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(apart=self._gpu_share > 0.0)
             self._after_drawing = _after_drawing(self.attempt_tasks) if self._gpu_share else frozenset()
             prove_shared(out, "out", "shared storage or a URL")
             self._warm_every_node(with_gpu_only=self._gpu_share > 0.0)

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from factory.graph import local
 from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, Execution, execute
 from factory.graph.local import Claims, attempt_tasks
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
@@ -31,10 +32,8 @@ def run(out: Path, work: ToyWork, **options: object):  # type: ignore[no-untyped
 
 
 def test_the_tasks_of_an_attempt() -> None:
-    assert attempt_tasks("all", apart=True) == attempt_tasks("auto", apart=False) == (ATTEMPT,)
-    assert (
-        attempt_tasks("none", apart=False) == attempt_tasks("auto", apart=True) == (("drive",), ("render",), ("label",))
-    )
+    assert attempt_tasks(apart=False) == (ATTEMPT,)
+    assert attempt_tasks(apart=True) == (("drive",), ("render",), ("label",))
     assert [task.name for task in TASKS if task.may_draw] == ["reconstruct", "render"]
 
 
@@ -43,11 +42,14 @@ def test_the_page_of_concepts_names_every_task() -> None:
     assert re.findall(r"^\| `(\w+)` \|", page, re.M) == [task.name for task in TASKS]
 
 
-def test_stages_as_tasks_of_their_own_make_the_same_rows_in_this_process(tmp_path: Path) -> None:
+def test_stages_as_tasks_of_their_own_make_the_same_rows_in_this_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     journal = str(tmp_path / "journal")
     work = ToyWork(trouble={**UNFIT, "log1:1000:recovery:1": "bug"}, journal=journal)
-    apart = run(tmp_path / "apart", work, executor="local", fuse="none")
-    fused = run(tmp_path / "fused", ToyWork(trouble=work.trouble), executor="local", fuse="all")
+    fused = run(tmp_path / "fused", ToyWork(trouble=work.trouble), executor="local")
+    monkeypatch.setattr(local, "attempt_tasks", lambda apart: attempt_tasks(True))
+    apart = run(tmp_path / "apart", work, executor="local")
     assert apart.exit_code == fused.exit_code == COMPLETE_WITH_FAILURES
     assert apart.counts == fused.counts and apart.executed == fused.executed
     assert_same_tables(tmp_path / "apart", tmp_path / "fused")
@@ -80,10 +82,7 @@ def test_fused_stages_claim_what_the_hungriest_of_them_wants() -> None:
 
 @pytest.mark.ray
 @pytest.mark.slow
-@pytest.mark.parametrize(("claimed_gb", "at_once"), [(1.0, 2), (9.0, 1)])
-def test_memory_bounds_what_a_node_does_at_once(
-    tmp_path: Path, memory_of_two: None, claimed_gb: float, at_once: int
-) -> None:
+def test_memory_bounds_what_a_node_does_at_once(tmp_path: Path, memory_of_two: None) -> None:
     """Of four cores, memory fills two; a task that claims more than any node has is alone on one."""
 
     class Timed(ToyWork):
@@ -93,13 +92,13 @@ def test_memory_bounds_what_a_node_does_at_once(
                 file.write(f"at {began} {time.time()}\n")
             return result
 
-    journal = tmp_path / "journal"
-    work = Timed(journal=str(journal), seconds=0.2)
-    claims = Claims(memory_gb={task.name: claimed_gb for task in TASKS})
-    assert run(tmp_path / "out", work, workers=4, claims=claims).exit_code == COMPLETE
-    spans = [[float(t) for t in line.split()[1:]] for line in journal.read_text().splitlines() if line[:3] == "at "]
-    together = [sum(began <= start < ended for began, ended in spans) for start, _ in spans]
-    assert max(together) == at_once
+    for claimed_gb, at_once in ((1.0, 2), (9.0, 1)):
+        journal = tmp_path / f"journal{at_once}"
+        work = Timed(journal=str(journal), seconds=0.2)
+        claims = Claims(memory_gb={task.name: claimed_gb for task in TASKS})
+        assert run(tmp_path / f"out{at_once}", work, workers=4, claims=claims).exit_code == COMPLETE
+        spans = [[float(t) for t in line.split()[1:]] for line in journal.read_text().splitlines() if line[:3] == "at "]
+        assert max(sum(began <= start < ended for began, ended in spans) for start, _ in spans) == at_once
 
 
 @pytest.fixture(scope="module")

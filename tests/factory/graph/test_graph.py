@@ -44,13 +44,17 @@ def test_when_minutes_are_up_nothing_new_begins_and_the_same_command_goes_on(
 
 def test_the_same_command_again_executes_nothing(tmp_path: Path) -> None:
     journal = str(tmp_path / "journal")
-    first = run(tmp_path / "out", ToyWork(journal=journal))
+    first = run(tmp_path / "out", ToyWork(journal=journal), rounds=5)
     tasks = ran(journal, "")
-    second = run(tmp_path / "out", ToyWork(journal=journal))
+    second = run(tmp_path / "out", ToyWork(journal=journal), rounds=5)
     assert first.exit_code == second.exit_code == COMPLETE
     assert ran(journal, "") == tasks and second.executed.attempts == 0
     assert second.executed.found_done == first.executed.attempts
     assert second.counts == first.counts
+    samples, outcomes, _ = tables_of(tmp_path / "out")
+    keys = samples["attempt_id"].to_pylist() + [o["attempt_id"] for o in outcomes]  # type: ignore[index]
+    assert len(keys) == len(set(keys)) == sum(first.counts.values()), "one row in one table for every attempt"
+    assert verify(Store(tmp_path / "out")).damage == ()
 
 
 def test_a_prepared_clip_under_another_s_name_is_named_and_prepared_again(
@@ -86,14 +90,6 @@ def test_five_rounds_after_two_are_five_rounds_and_perturb_nothing_again(tmp_pat
     direct = run(tmp_path / "direct", rounds=5)
     assert later.executed.attempts + later.executed.found_done == direct.executed.attempts
     assert_same_tables(tmp_path / "nested", tmp_path / "direct")
-
-
-def test_every_attempt_has_one_row_in_one_table(tmp_path: Path) -> None:
-    summary = run(tmp_path / "out", rounds=5)
-    samples, outcomes, _ = tables_of(tmp_path / "out")
-    keys = samples["attempt_id"].to_pylist() + [o["attempt_id"] for o in outcomes]  # type: ignore[index]
-    assert len(keys) == len(set(keys)) == sum(summary.counts.values())
-    assert verify(Store(tmp_path / "out")).damage == ()
 
 
 def test_a_walk_that_runs_out_of_candidates_is_exhausted_once(tmp_path: Path) -> None:
@@ -161,7 +157,7 @@ def test_zero_inputs_and_double_ones_write_nothing(tmp_path: Path) -> None:
 def test_nothing_new_begins_once_a_run_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a cluster, where tasks that were handed over end; in this process those that wait are left undone too."""
     local = execution.LocalGraph
-    monkeypatch.setattr(execution, "LocalGraph", lambda work, out, stopped, fuse: local(work, out, never_stop, fuse))
+    monkeypatch.setattr(execution, "LocalGraph", lambda work, out, stopped: local(work, out, never_stop))
 
     class Stopping(ToyWork):
         def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:

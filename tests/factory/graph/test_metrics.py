@@ -59,7 +59,7 @@ def recorded_run(out: Path, monkeypatch: pytest.MonkeyPatch, rounds: int = 2, bl
     class Watched(LocalGraph):
         def __init__(self, *args: object) -> None:
             super().__init__(*args)  # type: ignore[arg-type]
-            self.recorder = recorded
+            self.record_metric = recorded.record
 
     monkeypatch.setattr(execution, "LocalGraph", Watched)
     work = ToyWork(trouble=TROUBLE, blocks=blocks)
@@ -103,7 +103,7 @@ def test_tasks_stages_caches_and_psnr_come_from_the_reports(tmp_path: Path, monk
 
 def test_gauges_are_set_once_a_second_however_often_they_are_offered(tmp_path: Path) -> None:
     recorded, now = Recorded(), [100.0]
-    metrics = RunMetrics(recorded, Location.parse(tmp_path), clock=lambda: now[0])
+    metrics = RunMetrics(recorded.record, Location.parse(tmp_path), clock=lambda: now[0])
     for _ in range(50):
         metrics.record_state(10, 4, {"walks": 3})
         now[0] += 0.1
@@ -113,7 +113,7 @@ def test_gauges_are_set_once_a_second_however_often_they_are_offered(tmp_path: P
 
 def test_a_commit_of_outcomes_alone_adds_no_sample(tmp_path: Path) -> None:
     recorded = Recorded()
-    metrics = RunMetrics(recorded, Location.parse("s3://bucket/out"))
+    metrics = RunMetrics(recorded.record, Location.parse("s3://bucket/out"))
     metrics.record_commit([], 0.02)
     assert recorded.total(SAMPLES) == 0
     metrics.record_commit([Shard("p", 70, {"round": "1", "expert": "recovery"}, ("a", "b"))], 0.02)
