@@ -67,7 +67,7 @@ def matching_below(folder: Path, pattern: str) -> list[Path]:
                 found.append(here / entry.name)
             if entry.is_dir(follow_symlinks=False):
                 folders.append(here / entry.name)
-            elif _leads_to_folder(entry, told=not matches):
+            elif _leads_to_folder(entry, warn=not matches):
                 links.append(here / entry.name)
         links.sort()
     return sorted(found)
@@ -81,11 +81,11 @@ def folders_in(folder: Path) -> list[Path]:
     )
 
 
-def _leads_to_folder(entry: os.DirEntry[str], told: bool = True) -> bool:
-    """Whether it is a link to a folder; told: one that leads nowhere, or where nobody may look, is named in the log."""
+def _leads_to_folder(entry: os.DirEntry[str], warn: bool = True) -> bool:
+    """Whether it is a link to a folder; warn: one that leads nowhere, or where nobody may look, is named in the log."""
     if not entry.is_symlink() or os.path.isdir(entry):
         return entry.is_symlink()
-    if told and not os.path.exists(entry):
+    if warn and not os.path.exists(entry):
         _pass_over(entry.path, f"the link leads to {os.readlink(entry)}, which is not there")
     return False
 

@@ -241,8 +241,8 @@ class FactoryWork:
             unfit = self.unfit(sensed, drive)
             pictures = {} if unfit is not None else self.imaging.pictures(sensed, drive.candidate, drive.sampled)
         if unfit is not None:
-            return RejectedAttempt(unfit, _subscores(drive), watch.seconds, _at_hand(before))
-        return Columns(pictures, watch.seconds, _at_hand(before))
+            return RejectedAttempt(unfit, _subscores(drive), watch.seconds, _all_in_memory(before))
+        return Columns(pictures, watch.seconds, _all_in_memory(before))
 
     def unfit(self, clip: Clip, drive: Drive) -> Rejected | None:
         """Why the pictures of an accepted drive are no sample's; `clip` with its sensor files. Raises BadClip.
@@ -353,7 +353,7 @@ class FactoryWork:
         return Imaging(self.render, self.cache_dir, painter_of(self.reader))
 
 
-def _at_hand(before: tuple[int, int]) -> bool | None:
+def _all_in_memory(before: tuple[int, int]) -> bool | None:
     """Whether every scene wanted since `before` was in memory; None where none was."""
     hits, misses = scene_cache_counts()
     return None if (hits, misses) == before else misses == before[1]

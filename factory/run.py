@@ -95,9 +95,9 @@ def run(asked: Asked, only_plan: bool) -> int:
     config = _checked(asked)
     if config.executor == "local" or only_plan or ("ray" in sys.modules and sys.modules["ray"].is_initialized()):
         return _run(config, asked, only_plan)
-    from factory.graph.apart import run_in_own_process
+    from factory.graph.own_process import run_in_own_process
 
-    work = partial(_run_again, tuple(asked.words), time.monotonic())
+    work = partial(_run_in_child, tuple(asked.words), time.monotonic())
     return run_in_own_process(work, not os.environ.get("RAY_ADDRESS"), lambda line: print(line, flush=True))
 
 
@@ -109,7 +109,7 @@ def _checked(asked: Asked) -> RunConfig:
     return config
 
 
-def _run_again(words: Sequence[str], first_began: float, begun: int, tell: Callable[[str], None]) -> int:
+def _run_in_child(words: Sequence[str], first_began: float, begun: int, tell: Callable[[str], None]) -> int:
     """The run in its own process. first_began: of the first one, on the monotonic clock; begun: clusters begun anew."""
 
     def say(line: str) -> None:
@@ -134,7 +134,7 @@ def _run(
     say: Callable[[str], None] = print,
 ) -> int:
     from factory.graph.driver import EpisodeSettings
-    from factory.graph.execute import Execution, execute, on_new_clusters
+    from factory.graph.execute import Execution, execute, rerun_on_new_clusters
     from factory.graph.local import Claims, Limits
     from factory.setup.calibrate import calibrate, plan_text
     from factory.setup.settings import assemble
@@ -162,7 +162,7 @@ def _run(
             print(calibrate(assembled, refs, store))
             return 0
         since = time.monotonic() if began is None else began
-        summary = on_new_clusters(
+        summary = rerun_on_new_clusters(
             lambda: execute(
                 assembled.work,
                 refs,

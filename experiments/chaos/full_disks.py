@@ -34,7 +34,7 @@ import numpy as np
 import pyarrow.compute as pc
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
-from factory.graph.execute import Execution, Executor, execute, on_new_clusters
+from factory.graph.execute import Execution, Executor, execute, rerun_on_new_clusters
 from factory.graph.steps import PreparedClip
 from factory.readers.base import ClipRef
 from factory.run import main as run_main
@@ -89,7 +89,7 @@ def toys(out: str, journal: str, executor: Executor = "local") -> int:
     work = kind(threshold=0.4, journal=journal, seconds=seconds)
     given = work, refs(8), ["recovery", "human"], 2
     how = Execution(executor, 2, shard_seconds=0.05)
-    summary = on_new_clusters(lambda: execute(*given, Store(out), how, say=str), say=str)
+    summary = rerun_on_new_clusters(lambda: execute(*given, Store(out), how, say=str), say=str)
     if summary.message:
         print(f"error: {summary.message}", file=sys.stderr)
     return summary.exit_code

@@ -1,6 +1,6 @@
 """The driver's loop: keeps a bounded number of clips open and walks their candidates, in either executor.
 
-Attempts of one walk are a chain, walks are parallel. Results go to the gatherer, which commits them in groups.
+Attempts of one walk are a chain, walks are parallel. Results go to a CommitQueue, which commits them in groups.
 Everything the driver knows it can know again from the tables, so it can die at any moment.
 """
 
@@ -17,7 +17,7 @@ from typing import Any
 import pyarrow as pa
 
 from factory.files import DiskFull
-from factory.graph.local import Graph, MachineIll, Ticket
+from factory.graph.local import Graph, MachineFailure, Ticket
 from factory.graph.plan import (
     CLIP_CANDIDATE,
     AttemptBatch,
@@ -90,30 +90,30 @@ class Episodes:
         self.written = 0
         self.errors: list[str] = []
         for path, partition in sorted(store.samples.live_files().items()):
-            self._look(path, partition)
+            self._queue_missing(path, partition)
 
     @property
     def is_due(self) -> bool:
         return bool(self._queue or self._writing)
 
-    def begin(self, graph: Graph) -> None:
+    def start(self, graph: Graph) -> None:
         self._graph = graph
         self._submit()
 
-    def tidy(self) -> None:
+    def remove_outdated(self) -> None:
         live = {episode_name(row) for row in self._store.samples.read(ROWS).to_pylist()}
         for name in sorted(set(self._folder.names()) - live):
             if OURS.fullmatch(name):
                 self._folder.remove(name)
 
-    def committed(self, paths: Sequence[str]) -> None:
+    def on_commit(self, paths: Sequence[str]) -> None:
         live = self._store.samples.live_files()
         for path in paths:
             if path in live:
-                self._look(path, live[path])
+                self._queue_missing(path, live[path])
         self._submit()
 
-    def finished(self, ticket: Ticket, report: Any) -> bool:
+    def take_report(self, ticket: Ticket, report: Any) -> bool:
         if ticket not in self._writing:
             return False
         self._writing.remove(ticket)
@@ -126,7 +126,7 @@ class Episodes:
     def stop(self) -> None:
         self._queue.clear()
 
-    def _look(self, path: str, partition: Mapping[str, str]) -> None:
+    def _queue_missing(self, path: str, partition: Mapping[str, str]) -> None:
         missing: dict[str, ClipRef] = {}
         for row in self._store.samples.read_file(path, partition, ROWS).to_pylist():
             name = episode_name(row)
@@ -141,7 +141,7 @@ class Episodes:
 
     def _submit(self) -> None:
         """A few at once: walks and episodes share the cores."""
-        assert self._graph is not None, "begin() comes first"
+        assert self._graph is not None, "start() comes first"
         while self._queue and len(self._writing) < self._graph.parallelism:
             self._writing.add(self._graph.submit("episodes", self._queue.popleft()))
 
@@ -196,7 +196,7 @@ class BlockQueue:
                 return None
         return None
 
-    def built(self, block: str) -> None:
+    def mark_built(self, block: str) -> None:
         """Its clips may go on, also where building failed: each of them will say so itself."""
         self._built.add(block)
         self._ready.extend(self._waiting.pop(block))
@@ -312,7 +312,7 @@ class CommitQueue:
         if not batch.writing:
             self._commit(batch)
 
-    def finished(self, ticket: Ticket, report: Any) -> bool:
+    def take_report(self, ticket: Ticket, report: Any) -> bool:
         """Take the report of a write; False where the ticket is not one. Raises WriteFailed and the store's errors."""
         batch = self._written_by.pop(ticket, None)
         if batch is None:
@@ -339,7 +339,7 @@ CLIPS_PER_WORKER = 2  # open at once: one works while the next is being prepared
 WAIT_S = 0.5
 DRAIN_S = 18.0  # of the 30 that are given after a first signal
 WRITE_S = 6.0  # to write what is done, after that
-ILL_IN_A_ROW = 6  # tasks that fail by the machine, or three for every task at once: then the run stops
+MACHINE_FAILURES_IN_A_ROW = 6  # tasks that fail by the machine, or three for every task at once: then the run stops
 
 
 @dataclass(frozen=True)
@@ -382,11 +382,11 @@ class RunDriver:
         self._held: dict[tuple[str, str], tuple[list[PendingRow], list[Outcome]]] = {}  # redo: until the walk ends
         self._stopping = threading.Event()
         self._deadline = math.inf
-        self._ill_in_a_row = 0
+        self._machine_failures = 0
         self._uncached = ""  # why the first could not be kept
         self._tally = RunCounts()
         self._wanted = {
-            (clip.ref.clip_id, walk.expert): _wanted(walk, rounds) for clip in plan.todo for walk in clip.walks
+            (clip.ref.clip_id, walk.expert): _samples_left(walk, rounds) for clip in plan.todo for walk in clip.walks
         }
         self._forecast = RunForecast(Workload(), Workload(left=sum(self._wanted.values())))
 
@@ -414,33 +414,33 @@ class RunDriver:
     def interrupted(self) -> bool:
         return self._stopping.is_set()
 
-    def loop(self, graph: Graph, gatherer: CommitQueue, metrics: RunMetrics, episodes: Episodes | None = None) -> None:
-        """Until nothing is left, or until stopped and drained. Raises DiskFull once a disk is full, and MachineIll."""
-        self._graph, self._gatherer, self._metrics, self._episodes = graph, gatherer, metrics, episodes
-        gatherer.committed = self._committed
+    def loop(self, graph: Graph, commits: CommitQueue, metrics: RunMetrics, episodes: Episodes | None = None) -> None:
+        """Until nothing is left, or stopped and drained. Raises DiskFull once a disk is full, and MachineFailure."""
+        self._graph, self._commits, self._metrics, self._episodes = graph, commits, metrics, episodes
+        commits.committed = self._committed
         with ProgressLine(len(self._plan.todo), self._forecast.left_s, doing=self._doing) as progress:
-            self._work_through(graph, gatherer, progress)
+            self._work_through(graph, commits, progress)
         if self.executed.uncached:
             what = f"{self.executed.uncached} prepared clips could not be kept ({self._uncached})"
             self.notes.append(f"{what}; a later run that needs them prepares them again")
 
-    def _work_through(self, graph: Graph, gatherer: CommitQueue, progress: ProgressLine) -> None:
+    def _work_through(self, graph: Graph, commits: CommitQueue, progress: ProgressLine) -> None:
         self._queue = BlockQueue(self._plan.todo, self._block_of, graph.parallelism)
         self._forecast.blocks.left = self._queue.n_blocks
         while True:
             wanted = len(self._walks_left) + len(self._preparing) < CLIPS_PER_WORKER * graph.parallelism
-            if gatherer.n_writing < 2 and not self.interrupted:
+            if commits.n_writing < 2 and not self.interrupted:
                 begun = self._queue.next(wanted)
                 if begun is not None:
-                    self._open(begun)
+                    self._start(begun)
                     continue
             finished = graph.wait(WAIT_S)
             if finished is not None:
-                self._take(*finished)
-            gatherer.send_if_due()
+                self._take_report(*finished)
+            commits.send_if_due()
             progress.show(self._tally)
             self._show_state()
-            idle = not self._preparing and not self._trying and not gatherer.n_writing
+            idle = not self._preparing and not self._trying and not commits.n_writing
             if time.monotonic() > self._deadline:
                 in_hand = len(self._preparing) + len(self._trying) + len(self._building)
                 self.notes.append(f"{in_hand} tasks did not end within {DRAIN_S:.0f} s of the signal: left undone")
@@ -448,15 +448,15 @@ class RunDriver:
                 break
             if idle and (self.interrupted or not self._queue):  # the next run continues a half-built block
                 break
-        gatherer.send()
+        commits.send()
         while time.monotonic() < self._deadline and (
-            gatherer.n_writing or (self._episodes is not None and self._episodes.is_due)
+            commits.n_writing or (self._episodes is not None and self._episodes.is_due)
         ):
             if self.interrupted and self._episodes is not None:
                 self._episodes.stop()
             finished = graph.wait(WAIT_S)
             if finished is not None:
-                self._take(*finished)
+                self._take_report(*finished)
             progress.show(self._tally)
         progress.show(self._tally, last=True)
         self._show_state(last=True)
@@ -464,7 +464,7 @@ class RunDriver:
     def _committed(self, shards: Sequence[Shard], seconds: float) -> None:
         self._metrics.record_commit(shards, seconds)
         if self._episodes is not None:
-            self._episodes.committed([shard.path for shard in shards])
+            self._episodes.on_commit([shard.path for shard in shards])
 
     def _show_state(self, last: bool = False) -> None:
         in_flight = {
@@ -472,12 +472,12 @@ class RunDriver:
             "attempts": len(self._trying),
             "clips": len(self._preparing),
             "blocks": len(self._building),
-            "batches": self._gatherer.n_writing,
+            "batches": self._commits.n_writing,
         }
         clips = len(self._plan.todo)
         self._metrics.record_state(clips, clips - self._tally.clips, in_flight, last)
 
-    def _open(self, what: ClipPlan | BlockBuild) -> None:
+    def _start(self, what: ClipPlan | BlockBuild) -> None:
         if isinstance(what, BlockBuild):
             threads = max(1, self._graph.cores // self._queue.at_once)
             self._building[self._graph.submit("reconstruct", what.ref, threads)] = what
@@ -486,15 +486,15 @@ class RunDriver:
         else:
             self._start_walks(what, None)
 
-    def _take(self, ticket: Ticket, report: Any) -> None:
+    def _take_report(self, ticket: Ticket, report: Any) -> None:
         self._metrics.record_task(ticket.step, ticket.queued_s, report)
         last = report.reports[-1] if isinstance(report, BatchReport) else report
         if isinstance(last, Failure) and last.disk_full:
             raise DiskFull(last.disk_full)
-        self._count_illness(last)
-        if self._gatherer.finished(ticket, report):
+        self._count_machine_failures(last)
+        if self._commits.take_report(ticket, report):
             return
-        if self._episodes is not None and self._episodes.finished(ticket, report):
+        if self._episodes is not None and self._episodes.take_report(ticket, report):
             self.executed.episodes = self._episodes.written
             return
         if ticket in self._building:
@@ -504,12 +504,12 @@ class RunDriver:
         else:
             self._take_attempt(self._trying.pop(ticket), ticket.result, report)
 
-    def _count_illness(self, report: Any) -> None:
+    def _count_machine_failures(self, report: Any) -> None:
         ill = isinstance(report, Failure) and report.kind is ErrorKind.MACHINE
-        self._ill_in_a_row = self._ill_in_a_row + 1 if ill else 0
-        if self._ill_in_a_row >= max(ILL_IN_A_ROW, 3 * self._graph.parallelism):
+        self._machine_failures = self._machine_failures + 1 if ill else 0
+        if self._machine_failures >= max(MACHINE_FAILURES_IN_A_ROW, 3 * self._graph.parallelism):
             said = report.error.splitlines()[-1]
-            raise MachineIll(f"the machine failed {self._ill_in_a_row} tasks in a row, the last one by: {said}")
+            raise MachineFailure(f"the machine failed {self._machine_failures} tasks in a row, the last one by: {said}")
 
     def _take_block(self, build: BlockBuild, report: BlockReport | BlockUnfinished | Failure) -> None:
         if isinstance(report, BlockUnfinished):
@@ -517,11 +517,11 @@ class RunDriver:
             return
         self._forecast.blocks.finish(1)
         if isinstance(report, BlockReport):
-            self._count(report.seconds, self._forecast.blocks)
+            self._add_seconds(report.seconds, self._forecast.blocks)
         else:
             last = report.error.splitlines()[-1]
             self.notes.append(f"block {build.block} failed ({last}); it is tried again for each of its clips")
-        self._queue.built(build.block)
+        self._queue.mark_built(build.block)
 
     def _take_prepared(self, clip: ClipPlan, result: Any, report: PrepareReport | Rejected | Failure) -> None:
         clip_id = clip.ref.clip_id
@@ -529,7 +529,7 @@ class RunDriver:
         if isinstance(report, Rejected):
             replaced += [key for walk in clip.walks for key in walk.stale]
         if isinstance(report, PrepareReport):
-            self._count(report.seconds, self._forecast.samples)
+            self._add_seconds(report.seconds, self._forecast.samples)
             if report.note:
                 self.notes.append(report.note)
             elif (
@@ -545,7 +545,7 @@ class RunDriver:
             clip.n_candidates = len(report.clip.candidates)
             is_listed = clip.listed is not None and clip.listed.content_digest == report.clip.content_digest
             rows = [] if is_listed else [self._records.candidates(clip.ref, report.clip)]
-            self._gatherer.add(candidates=rows, replaced=replaced)
+            self._commits.add(candidates=rows, replaced=replaced)
             clip.past = None
             self._start_walks(clip, result)
             return
@@ -554,13 +554,13 @@ class RunDriver:
         clip.past = past_from_outcome(outcome)
         clip.failed = outcome.kind == Kind.FAILED
         unlisted = [clip_id] if isinstance(report, Rejected) else []
-        self._gatherer.add(outcomes=[outcome], replaced=replaced, unlisted=unlisted)
+        self._commits.add(outcomes=[outcome], replaced=replaced, unlisted=unlisted)
         self._metrics.record_outcome(outcome, None)
         self._tally.rejected += not clip.failed
         self._tally.failed += clip.failed
         self._tally.clips += 1
         for walk in clip.walks:
-            self._settle(clip, walk)
+            self._forecast_settled(clip, walk)
 
     def _start_walks(self, clip: ClipPlan, prepared: Any) -> None:
         self._walks_left[clip.ref.clip_id] = len(clip.walks)
@@ -574,16 +574,18 @@ class RunDriver:
             stamp = self._records.stamp(clip.ref, walk.expert, step)
             ahead = 1 if walk.one_by_one else self._graph.attempts_per_task()
             along = next_batch(walk.once, clip.n_candidates, self._rounds, walk.known, step, ahead)
-            self._try(AttemptInFlight(clip, walk, prepared, stamp, batch=along if along.n > 1 else None), prepared)
+            self._submit_attempt(
+                AttemptInFlight(clip, walk, prepared, stamp, batch=along if along.n > 1 else None), prepared
+            )
             return
-        self._finish(clip, walk, step)
+        self._end_walk(clip, walk, step)
         walk.forget()
         self._walks_left[clip.ref.clip_id] -= 1
         if not self._walks_left[clip.ref.clip_id]:
             del self._walks_left[clip.ref.clip_id]
             self._tally.clips += not self.interrupted
 
-    def _try(self, trial: AttemptInFlight, so_far: Any) -> None:
+    def _submit_attempt(self, trial: AttemptInFlight, so_far: Any) -> None:
         """The next task of an attempt, from the result of the one before."""
         stages = self._graph.attempt_tasks[trial.tasks_done]
         if trial.batch is not None:
@@ -592,35 +594,35 @@ class RunDriver:
             ticket = self._graph.submit("attempt", stages, so_far, trial.stamp)
         self._trying[ticket] = trial
 
-    def _settle(self, clip: ClipPlan, walk: WalkState, n: int | None = None) -> None:
+    def _forecast_settled(self, clip: ClipPlan, walk: WalkState, n: int | None = None) -> None:
         """`n` of the samples that the walk was to make are behind it, None: all, made or not."""
         key = clip.ref.clip_id, walk.expert
         n = self._wanted[key] if n is None else min(n, self._wanted[key])
         self._wanted[key] -= n
         self._forecast.samples.finish(n)
 
-    def _finish(self, clip: ClipPlan, walk: WalkState, step: Step) -> None:
+    def _end_walk(self, clip: ClipPlan, walk: WalkState, step: Step) -> None:
         if not isinstance(step, Try):
-            self._settle(clip, walk)
-        if walk.lacks_exhausted(step):
+            self._forecast_settled(clip, walk)
+        if walk.needs_exhausted_row(step):
             assert isinstance(step, Exhausted)
             stamp = self._records.stamp(clip.ref, walk.expert, Try(step.n_tried, -1))
             outcome = self._records.outcome(clip.ref, stamp.attempt_id, walk.expert, step.n_tried, step, 0, {}, {})
             walk.known[step.n_tried] = past_from_outcome(outcome)
-            self._keep(clip, walk, outcomes=[outcome])
+            self._store_or_hold(clip, walk, outcomes=[outcome])
             self._metrics.record_outcome(outcome, None)
         rows, outcomes = self._held.pop((clip.ref.clip_id, walk.expert), ([], []))
         if isinstance(step, Complete | Exhausted):
             if walk.stale:
-                self._gatherer.add(rows=rows, outcomes=outcomes, replaced=sorted(walk.stale))
+                self._commits.add(rows=rows, outcomes=outcomes, replaced=sorted(walk.stale))
         else:  # rows of an unfinished redo are made again, so that readers see the old walk or the new one
-            self._gatherer.add(outcomes=[o for o in outcomes if o.kind == Kind.FAILED])
+            self._commits.add(outcomes=[o for o in outcomes if o.kind == Kind.FAILED])
 
     def _take_attempt(
         self, trial: AttemptInFlight, result: Any, report: AttemptReport | AttemptUnfinished | BatchReport | Failure
     ) -> None:
         if isinstance(report, AttemptUnfinished):
-            self._try(replace(trial, tasks_done=trial.tasks_done + 1), result)
+            self._submit_attempt(replace(trial, tasks_done=trial.tasks_done + 1), result)
             return
         if isinstance(report, BatchReport):
             self._take_batch(trial, result, report)
@@ -647,13 +649,13 @@ class RunDriver:
         known = walk.known.get(stamp.candidate_index)
         replaced = [known.attempt_id] if known is not None else []  # under keep perhaps of other expert inputs
         if isinstance(report, AttemptReport):
-            self._count(report.seconds, self._forecast.samples)
+            self._add_seconds(report.seconds, self._forecast.samples)
         if isinstance(report, AttemptReport) and report.rejected is None:
             walk.known[stamp.candidate_index] = PastAttempt(stamp.attempt_id, Kind.ACCEPTED, True, round=stamp.round)
             row = PendingRow(result, report.n_bytes, (stamp.round, stamp.expert), report.licence)
-            self._keep(clip, walk, rows=[row], replaced=replaced)
+            self._store_or_hold(clip, walk, rows=[row], replaced=replaced)
             self._tally.accepted += 1
-            self._settle(clip, walk, 1)
+            self._forecast_settled(clip, walk, 1)
             self._metrics.record_accepted(stamp.expert, stamp.round)
         else:
             what = report if isinstance(report, Failure) else report.rejected
@@ -665,12 +667,12 @@ class RunDriver:
             walk.known[stamp.candidate_index] = past_from_outcome(outcome)
             if outcome.kind == Kind.FAILED:
                 self._fresh.add(stamp.attempt_id)
-            self._keep(clip, walk, outcomes=[outcome], replaced=replaced)
+            self._store_or_hold(clip, walk, outcomes=[outcome], replaced=replaced)
             self._metrics.record_outcome(outcome, stamp.round)
             self._tally.rejected += outcome.kind == Kind.REJECTED
             self._tally.failed += outcome.kind == Kind.FAILED
 
-    def _keep(
+    def _store_or_hold(
         self,
         clip: ClipPlan,
         walk: WalkState,
@@ -678,9 +680,9 @@ class RunDriver:
         outcomes: Sequence[Outcome] = (),
         replaced: Sequence[str] = (),
     ) -> None:
-        """On to the gatherer; a walk that replaces rows is held back until it ends."""
+        """On to the commit queue; a walk that replaces rows is held back until it ends."""
         if not walk.stale:
-            self._gatherer.add(rows=rows, outcomes=outcomes, replaced=replaced)
+            self._commits.add(rows=rows, outcomes=outcomes, replaced=replaced)
             return
         held_rows, held_outcomes = self._held.setdefault((clip.ref.clip_id, walk.expert), ([], []))
         held_rows.extend(rows)
@@ -689,13 +691,13 @@ class RunDriver:
     def _may_retry(self, past: PastAttempt) -> bool:
         return past.attempt_id not in self._fresh and self._policy(past)
 
-    def _count(self, seconds: Mapping[str, float], work: Workload) -> None:
+    def _add_seconds(self, seconds: Mapping[str, float], work: Workload) -> None:
         work.spent_s += sum(seconds.values())
         for stage, spent in seconds.items():
             self._seconds[stage][0] += 1
             self._seconds[stage][1] += spent
 
 
-def _wanted(walk: WalkState, rounds: int) -> int:
+def _samples_left(walk: WalkState, rounds: int) -> int:
     """Samples that the walk is still to make, as far as its list lasts."""
     return max(0, (1 if walk.once else rounds) - walk.n_found)

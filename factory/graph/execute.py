@@ -18,7 +18,6 @@ from deltalake.exceptions import DeltaError
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, calling_on_stop_signal
 from factory.files import DiskFull, machine_fault_of
-from factory.graph.apart import AGAIN, NEW_CLUSTERS, new_cluster_text
 from factory.graph.driver import (
     SHARD_BYTES,
     SHARD_SECONDS,
@@ -36,9 +35,10 @@ from factory.graph.local import (
     Graph,
     Limits,
     LocalGraph,
-    MachineIll,
+    MachineFailure,
     notes_folder,
 )
+from factory.graph.own_process import AGAIN, NEW_CLUSTERS, new_cluster_text
 from factory.graph.plan import RunPlan, RunRecords, Try, count_crash, make_plan, read_crash, retry_policy
 from factory.graph.progress import RunMetrics, RunTotals
 from factory.graph.steps import NotReady, Work
@@ -148,7 +148,7 @@ class _Run:
         self._notes = notes_folder(self._store.location)
         records = RunRecords(self._identity, self._digests)
         plan, self._died = count_crash(read_crash(self._notes), plan, records, self._policy)
-        self._follow(plan)
+        self._use_plan(plan)
         if plan.frozen:
             kept_clips = f"{len(plan.frozen)} clips kept as they are"
             self._driver.notes.append(f"{kept_clips}: their candidates come from other settings")
@@ -159,7 +159,7 @@ class _Run:
         wanted = (self._refs, self._experts, self._rounds)
         return make_plan(*wanted, history, self._identity, self._on_change, self._policy, self._work.once)
 
-    def _follow(self, plan: RunPlan) -> None:
+    def _use_plan(self, plan: RunPlan) -> None:
         self._plan, work = plan, self._work
         self._driver = RunDriver(
             self._identity, plan, self._digests, self._rounds, self._policy, work.block, work.doing
@@ -185,10 +185,10 @@ class _Run:
             return RunSummary(BAD_CONFIG, str(error))
         except ClusterDied as error:
             return RunSummary(INTERRUPTED, str(error), lost_cluster=error.is_ours)
-        except (MachineIll, OSError) as error:  # while kernels are compiled
+        except (MachineFailure, OSError) as error:  # while kernels are compiled
             if isinstance(error, OSError) and not machine_fault_of(error):
                 raise
-            return RunSummary(INTERRUPTED, _again_after(error))
+            return RunSummary(INTERRUPTED, _advice_after(error))
         except KeyboardInterrupt:
             return RunSummary(INTERRUPTED, "stopped before anything was begun")
         return None
@@ -209,13 +209,13 @@ class _Run:
                 ended.exit_code, ended.message = INTERRUPTED, "interrupted; run the same command again to go on"
         except KeyboardInterrupt:
             ended.exit_code, ended.message = INTERRUPTED, "stopped at once; run the same command again"
-        except MachineIll as error:
-            self._break(f"{error}; put it right and run the same command again: no clip is blamed")
+        except MachineFailure as error:
+            self._end_broken(f"{error}; put it right and run the same command again: no clip is blamed")
         except (AnotherWriter, WriteFailed, ClusterDied) as error:
-            self._break(str(error))
+            self._end_broken(str(error))
             ended.lost_cluster = isinstance(error, ClusterDied) and error.is_ours
         except (OSError, DeltaError) as error:  # what holds the tables fails: a full disk, a share that went away
-            self._break(_again_after(error))
+            self._end_broken(_advice_after(error))
         finally:
             if self._graph is not None:
                 self._graph.close()
@@ -224,7 +224,7 @@ class _Run:
         """The run's first words in the tables; planned again where another run committed while this one got ready."""
         store, once = self._store, self._work.once
         if store.begin_run(self._records):
-            self._follow(self._planned(True))
+            self._use_plan(self._planned(True))
             self._died = []
         wanted = {expert: 1 if once(expert) else self._rounds for expert in self._experts}
         store.record_plan(wanted, [ref.clip_id for ref in self._refs])
@@ -236,16 +236,16 @@ class _Run:
 
     def _loop(self, graph: Graph) -> None:
         store, how, episodes = self._store, self._how, self._episodes
-        self._ended.began_ms = _announce(store, self._plan, self._experts, self._rounds, how.command)
+        self._ended.began_ms = _write_current_run(store, self._plan, self._experts, self._rounds, how.command)
         metrics = RunMetrics(graph.record_metric, store.location)
-        with calling_on_stop_signal(self._driver.stop_soon), _alarm(self._driver.stop, how.minutes):
+        with calling_on_stop_signal(self._driver.stop_soon), _stop_after(self._driver.stop, how.minutes):
             if episodes is not None:
-                episodes.begin(graph)
+                episodes.start(graph)
             self._driver.loop(graph, CommitQueue(graph, store, how.shard_bytes, how.shard_seconds), metrics, episodes)
             if episodes is not None:
-                episodes.tidy()
+                episodes.remove_outdated()
 
-    def _break(self, message: str) -> None:
+    def _end_broken(self, message: str) -> None:
         self._ended.exit_code, self._ended.message, self._ended.is_broken = INTERRUPTED, message, True
 
     def close(self) -> RunSummary:
@@ -253,27 +253,29 @@ class _Run:
         ended = self._ended
         try:
             ended.funnel = funnel_of(self._store, [ref.clip_id for ref in self._refs])
-            ended.counts = _counts(ended.funnel, self._experts)
+            ended.counts = _attempt_counts(ended.funnel, self._experts)
         except (OSError, DeltaError) as error:
-            self._break(ended.message or f"{one_line(error)}; {AGAIN}")
+            self._end_broken(ended.message or f"{one_line(error)}; {AGAIN}")
         driver = self._driver
         ended.executed, ended.seconds, ended.notes = driver.executed, driver.seconds, driver.notes
         if ended.began_ms or ended.exit_code:
             try:
-                record_summary(self._store, ended)
+                write_last_run(self._store, ended)
             except OSError as error:  # the same disk or share
-                self._break(ended.message or _again_after(error))
+                self._end_broken(ended.message or _advice_after(error))
         return ended
 
 
-def _again_after(error: Exception) -> str:
+def _advice_after(error: Exception) -> str:
     """What to do where this machine, or what holds the tables, fails."""
     if isinstance(error, DiskFull):
         return f"{error}; free disk space and run the same command again: it goes on from what is committed"
     return f"{one_line(error)}; {AGAIN}"
 
 
-def on_new_clusters(once: Callable[[], RunSummary], say: Callable[[str], None] = print, begun: int = 0) -> RunSummary:
+def rerun_on_new_clusters(
+    once: Callable[[], RunSummary], say: Callable[[str], None] = print, begun: int = 0
+) -> RunSummary:
     """A run, and again on a new cluster where its own died: it goes on from what is committed.
 
     begun: new clusters that it had before.
@@ -290,7 +292,7 @@ def on_new_clusters(once: Callable[[], RunSummary], say: Callable[[str], None] =
 
 
 @contextmanager
-def _alarm(stop: Callable[[], None], minutes: float | None) -> Iterator[None]:
+def _stop_after(stop: Callable[[], None], minutes: float | None) -> Iterator[None]:
     """Drains the run after so many minutes."""
     timer = threading.Timer(60.0 * (minutes or 0.0), stop)
     timer.daemon = True
@@ -304,7 +306,7 @@ def _alarm(stop: Callable[[], None], minutes: float | None) -> Iterator[None]:
         timer.cancel()
 
 
-def _counts(funnel: Funnel, experts: Sequence[str]) -> dict[str, int]:
+def _attempt_counts(funnel: Funnel, experts: Sequence[str]) -> dict[str, int]:
     """Attempts of the planned clips by what became of them; clip-level rows among them."""
     rows = [row for row in funnel.rows if row.expert in experts]
     broken = sum(n for why, n in funnel.clip_outcomes.items() if why.startswith("failed."))
@@ -316,13 +318,15 @@ def _counts(funnel: Funnel, experts: Sequence[str]) -> dict[str, int]:
     }
 
 
-def _announce(store: Store, plan: RunPlan, experts: Sequence[str], rounds: int, command: Sequence[str] | None) -> int:
+def _write_current_run(
+    store: Store, plan: RunPlan, experts: Sequence[str], rounds: int, command: Sequence[str] | None
+) -> int:
     """current_run.json: when the run began and how many walks it has before it, for who watches; the beginning."""
     walks = [
         step
         for clip in plan.todo
         for walk in clip.walks
-        if (step := clip.steps.get(walk.expert)) is None or isinstance(step, Try) or walk.lacks_exhausted(step)
+        if (step := clip.steps.get(walk.expert)) is None or isinstance(step, Try) or walk.needs_exhausted_row(step)
     ]
     began_ms = int(time.time() * 1000)
     document = {
@@ -339,7 +343,7 @@ def _announce(store: Store, plan: RunPlan, experts: Sequence[str], rounds: int, 
     return began_ms
 
 
-def record_summary(store: Store, summary: RunSummary) -> None:
+def write_last_run(store: Store, summary: RunSummary) -> None:
     """last_run.json: what the newest run that did anything did, for people and reports."""
     document = {
         "began_ms": summary.began_ms,

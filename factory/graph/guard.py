@@ -113,16 +113,16 @@ def main(pid: int, folder: Path, stack: Path, alone: bool) -> None:
                     (folder / f"{task['key']}{WORK}").unlink(missing_ok=True)
                 task = json.loads(line) if line else task
                 began, shown = now, now
-        if task and (why := _over(task, now - began, held_gb(pid))):
-            _write(folder / f"{task['key']}{OVER}", {**task, "why": why, "stack": _where(pid, stack)})
+        if task and (why := _limit_exceeded(task, now - began, resident_gb(pid))):
+            _write_note(folder / f"{task['key']}{OVER}", {**task, "why": why, "stack": _stack_of(pid, stack)})
             (folder / f"{task['key']}{WORK}").unlink(missing_ok=True)  # before anybody can see that it has ended
             os.kill(pid, signal.SIGKILL)
             task = {}
             break
         if task and now - shown >= SHOWN_S:
             shown = now
-            at = {"pid": pid, "host": socket.gethostname(), "held_gb": round(held_gb(pid), 2)}
-            _write(folder / f"{task['key']}{WORK}", {**task, **at, "since": time.time() - (now - began)})
+            at = {"pid": pid, "host": socket.gethostname(), "held_gb": round(resident_gb(pid), 2)}
+            _write_note(folder / f"{task['key']}{WORK}", {**task, **at, "since": time.time() - (now - began)})
         if alone and asked and now - asked >= ASKED_S and not again:
             again = True
             os.kill(pid, signal.SIGINT)
@@ -133,11 +133,11 @@ def main(pid: int, folder: Path, stack: Path, alone: bool) -> None:
     if task:
         (folder / f"{task['key']}{WORK}").unlink(missing_ok=True)
         if alone:
-            _write(folder / CRASHED, task)
+            _write_note(folder / CRASHED, task)
     stack.unlink(missing_ok=True)
 
 
-def held_gb(pid: int) -> float:
+def resident_gb(pid: int) -> float:
     """Resident memory of a process."""
     try:
         pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
@@ -147,7 +147,7 @@ def held_gb(pid: int) -> float:
         return int(found.stdout.strip() or 0) * 1024 / 1e9
 
 
-def _over(task: dict[str, Any], seconds: float, gb: float) -> str:
+def _limit_exceeded(task: dict[str, Any], seconds: float, gb: float) -> str:
     most_gb = task.get("gb") or MEMORY_SHARE * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9
     if task.get("limited", True) and gb > most_gb:
         return f"held {gb:.1f} GB of memory, more than {most_gb:.1f} GB"
@@ -156,7 +156,7 @@ def _over(task: dict[str, Any], seconds: float, gb: float) -> str:
     return ""
 
 
-def _where(pid: int, stack: Path) -> str:
+def _stack_of(pid: int, stack: Path) -> str:
     """The calls that the process is in."""
     os.kill(pid, signal.SIGUSR1)
     time.sleep(STACK_S)
@@ -164,7 +164,7 @@ def _where(pid: int, stack: Path) -> str:
     return "\n".join(lines[:STACK_LINES])
 
 
-def _write(path: Path, document: dict[str, Any]) -> None:
+def _write_note(path: Path, document: dict[str, Any]) -> None:
     draft = path.with_name(f"{path.name}.tmp")
     with suppress(OSError):  # a full disk, which the run itself tells of
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -179,7 +179,7 @@ class ClusterLacks(ValueError):
     """The cluster has no node that the run could use."""
 
 
-class MachineIll(RuntimeError):
+class MachineFailure(RuntimeError):
     """The machine fails what it is given, or task after task."""
 
 
@@ -252,7 +252,7 @@ def task_cores(step: str, args: tuple[Any, ...]) -> int:
 
 
 @dataclass
-class _Box:
+class _Result:
     value: Any = None
 
 
@@ -261,7 +261,7 @@ def not_ready_error(failure: Failure) -> Exception:
     if failure.disk_full:
         return DiskFull(failure.disk_full)
     if failure.kind is ErrorKind.MACHINE:
-        return MachineIll(failure.error.splitlines()[-1])
+        return MachineFailure(failure.error.splitlines()[-1])
     return NotReady(failure.error) if failure.kind is ErrorKind.INPUT else RuntimeError(failure.error)
 
 
@@ -282,7 +282,7 @@ class LocalGraph:
         work.warm()
 
     def submit(self, step: str, *args: Any) -> Ticket:
-        ticket = Ticket(task_name(step, args), _Box())
+        ticket = Ticket(task_name(step, args), _Result())
         self._waiting.append((ticket, step, args))
         return ticket
 
@@ -294,7 +294,7 @@ class LocalGraph:
             return None
         ticket, step, args = self._waiting.popleft()
         function, wants = STEPS[step]
-        plain = [arg.value if isinstance(arg, _Box) else arg for arg in args]
+        plain = [arg.value if isinstance(arg, _Result) else arg for arg in args]
         ticket.queued_s = time.monotonic() - ticket.submitted
         self._guard = self._guard or WatchedProcess(self._notes, alone=True)
         with self._guard.watching({**task_note(step, ticket.step, args), "limited": False}):
@@ -420,7 +420,7 @@ class IsolatedGraph:
     def _begin(self) -> None:
         self._pipe, theirs = self._context.Pipe()
         given = (theirs, self._work, self._out, self._stop, self._notes)
-        self._process = self._context.Process(target=_serve, args=given, daemon=False)
+        self._process = self._context.Process(target=_serve_tasks, args=given, daemon=False)
         try:
             with terminal_signals_blocked():
                 self._process.start()
@@ -439,7 +439,7 @@ class IsolatedGraph:
             raise not_ready_error(said)
 
 
-def _serve(pipe: Connection, work: Work, out: Location, stop: Any, notes: Path) -> None:
+def _serve_tasks(pipe: Connection, work: Work, out: Location, stop: Any, notes: Path) -> None:
     """The other process: a task at a time, until there is none or the run is gone."""
     become_worker()
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the run decides

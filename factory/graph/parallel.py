@@ -69,10 +69,10 @@ def _pool(executor: str, workers: int | None, to: Location | None) -> Iterator[t
         pool = RayPool(workers, to)
         most = IN_HAND * pool.parallelism
     elif workers is None or workers == 1:
-        pool, most = _Here(), 1
+        pool, most = _InThisProcess(), 1
     else:
         with terminal_signals_blocked():  # what keeps the pool's semaphores is a process, too
-            pool = _Processes(workers, multiprocessing.get_context("spawn"), _apart)
+            pool = _Processes(workers, multiprocessing.get_context("spawn"), _detach_worker)
         most = IN_HAND * workers
     try:
         yield pool, most
@@ -80,7 +80,7 @@ def _pool(executor: str, workers: int | None, to: Location | None) -> Iterator[t
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-class _Here(Executor):
+class _InThisProcess(Executor):
     """In this process, at once."""
 
     def submit(self, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
@@ -100,7 +100,7 @@ class _Processes(ProcessPoolExecutor):
             return super().submit(function, *args, **kwargs)
 
 
-def _apart() -> None:
+def _detach_worker() -> None:
     """A worker process out of reach of what is sent to all of a terminal, that ends when its driver was killed."""
     become_worker()
     os.setpgrp()

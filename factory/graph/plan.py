@@ -140,7 +140,7 @@ class WalkState:
 
     expert: str
     once: bool  # tried once, on the log itself
-    recall: Callable[[], dict[int, PastAttempt]]  # what the tables say of it
+    load_known: Callable[[], dict[int, PastAttempt]]  # what the tables say of it
     stale: frozenset[str] = frozenset()  # redo: attempt_ids whose rows this walk replaces as a whole
     n_found: int = 0  # samples that were there when the run began
     one_by_one: bool = False  # a task that was to make several of its attempts died
@@ -148,7 +148,7 @@ class WalkState:
     @cached_property
     def known(self) -> dict[int, PastAttempt]:
         """Candidate -> what became of it; unpacked when it is asked for, and until it is put away."""
-        return self.recall()
+        return self.load_known()
 
     def forget(self) -> None:
         """The tables tell it again; of walks that are not at work nothing is kept."""
@@ -157,7 +157,7 @@ class WalkState:
     def step(self, n_candidates: int, rounds: int, may_retry: Policy) -> Step:
         return next_step(self.once, n_candidates, rounds, self.known, may_retry)
 
-    def lacks_exhausted(self, step: Step) -> bool:
+    def needs_exhausted_row(self, step: Step) -> bool:
         """The walk stands at the end of its list and no outcome says so yet."""
         return isinstance(step, Exhausted) and step.n_tried not in self.known
 
@@ -209,7 +209,7 @@ def make_plan(
     found = 0
     others = history.clips_of({*history.experts} - {"", *experts})
     whole_clips = history.clips_of([""])
-    ended = {expert: history.complete_walks(expert, *_asked(once(expert), rounds)) for expert in experts}
+    ended = {expert: history.complete_walks(expert, *_first_and_wanted(once(expert), rounds)) for expert in experts}
     for ref in refs:
         stored = listed = history.candidates.get(ref.clip_id)
         if stored is not None and _of_other_settings(stored, identity):
@@ -222,10 +222,10 @@ def make_plan(
         if listed is not None and ref.clip_id not in whole_clips and all(ref.clip_id in ended[e] for e in experts):
             found += sum(ended[expert][ref.clip_id][1] for expert in experts)
             n_samples = {expert: ended[expert][ref.clip_id][0] for expert in experts}
-            done.append(_complete(history, ref, listed, n_samples, once))
+            done.append(_completed_clip(history, ref, listed, n_samples, once))
             continue
-        walks = tuple(_walk(history, ref.clip_id, expert, on_change, once(expert)) for expert in experts)
-        whole = _walk(history, ref.clip_id, "", on_change, True)
+        walks = tuple(_walk_state(history, ref.clip_id, expert, on_change, once(expert)) for expert in experts)
+        whole = _walk_state(history, ref.clip_id, "", on_change, True)
         stays = on_change != "redo" or any(walk.known and not walk.stale for walk in walks) or ref.clip_id in others
         clip = ClipPlan(
             ref,
@@ -246,12 +246,12 @@ def make_plan(
     return RunPlan(tuple(todo), tuple(done), tuple(frozen), found)
 
 
-def _asked(once: bool, rounds: int) -> tuple[int, int]:
+def _first_and_wanted(once: bool, rounds: int) -> tuple[int, int]:
     """The first candidate of a walk, and how many samples it is to have."""
     return candidate_order(once, 1)[0], 1 if once else rounds
 
 
-def _complete(
+def _completed_clip(
     history: History, ref: ClipRef, listed: CandidateSummary, n_found: Mapping[str, int], once: Callable[[str], bool]
 ) -> ClipPlan:
     """A clip of which nothing is unpacked; n_found: expert -> samples."""
@@ -287,7 +287,7 @@ def _of_other_settings(stored: CandidateSummary, identity: RunIdentity) -> bool:
     return stored.prepare_digest not in (identity.prepare_digest, UNLISTED) and identity.prepare_digest != UNLISTED
 
 
-def _walk(history: History, clip_id: str, expert: str, on_change: OnChange, once: bool) -> WalkState:
+def _walk_state(history: History, clip_id: str, expert: str, on_change: OnChange, once: bool) -> WalkState:
     stale = history.stale_ids(clip_id, expert) if on_change == "redo" else frozenset()
     if stale:  # the walk is made anew from its first candidate; what an earlier redo failed at stands
         known = history.past_attempts(clip_id, expert)
@@ -306,7 +306,7 @@ def _has_work(clip: ClipPlan, rounds: int, may_retry: Policy) -> bool:
     if clip.listed is None:
         return True
     clip.steps = {walk.expert: walk.step(clip.n_candidates, rounds, may_retry) for walk in clip.walks}
-    return any(isinstance(clip.steps[w.expert], Try) or w.lacks_exhausted(clip.steps[w.expert]) for w in clip.walks)
+    return any(isinstance(clip.steps[w.expert], Try) or w.needs_exhausted_row(clip.steps[w.expert]) for w in clip.walks)
 
 
 def needs_prepared_clip(clip: ClipPlan) -> bool:
@@ -404,7 +404,7 @@ def count_crash(
     crash: Mapping[str, Any], plan: RunPlan, records: RunRecords, may_retry: Callable[[PastAttempt], bool]
 ) -> tuple[RunPlan, list[Outcome]]:
     """The plan that knows of a crash, and the outcome to be stored before anything is begun."""
-    suspect = next((clip for clip in plan.todo if _is_of(crash, clip, records)), None)
+    suspect = next((clip for clip in plan.todo if _is_crash_of(crash, clip, records)), None)
     if suspect is None:
         return plan, []
     what = Failure(ErrorKind.SYSTEM, f"the run died at it: {crash['what']}")
@@ -426,7 +426,7 @@ def count_crash(
     return replace(plan, todo=others, done=(*plan.done, suspect)), [outcome]
 
 
-def _is_of(crash: Mapping[str, Any], clip: ClipPlan, records: RunRecords) -> bool:
+def _is_crash_of(crash: Mapping[str, Any], clip: ClipPlan, records: RunRecords) -> bool:
     if "expert" not in crash:
         return bool(crash.get("clip_id") == clip.ref.clip_id)
     if crash["expert"] not in records.digests:

@@ -171,9 +171,9 @@ class ProgressLine(Bar):
         left_s = self.left_s(elapsed_s)
         left = "?" if left_s is None else time_text(left_s)
         counts = f"{tally.accepted} accepted, {tally.rejected} rejected, {tally.failed} failed"
-        return "  ".join(filter(None, [rate_text(rate, " clips"), counts, f"ETA {left}", self._doing()]))
+        return "  ".join(filter(None, [rate_text(rate, " clips"), counts, f"ETA {left}", self._long_task_text()]))
 
-    def _doing(self) -> str:
+    def _long_task_text(self) -> str:
         now = time.monotonic()
         if now - self._asked >= ASK_EVERY_S:
             self._asked, self._told = now, self.doing()

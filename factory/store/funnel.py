@@ -58,7 +58,7 @@ class Attempts:
         return np.array([why.startswith("failed.") for why in self.whys])[self.why]
 
     @cached_property
-    def starts(self) -> Ints:
+    def walk_starts(self) -> Ints:
         """Places at which a walk begins, one for each (expert, clip) with rows."""
         new = (np.diff(self.expert, prepend=-1) != 0) | (np.diff(self.clip, prepend=-1) != 0)
         return np.flatnonzero(new)
@@ -68,7 +68,7 @@ class Attempts:
         """That each attempt was tried for: the accepted ones before it in its walk."""
         before: Codes = np.cumsum(self.accepted, dtype=np.int32)
         before -= self.accepted
-        before -= np.repeat(before[self.starts], np.diff(self.starts, append=len(before)))
+        before -= np.repeat(before[self.walk_starts], np.diff(self.walk_starts, append=len(before)))
         return before
 
 
@@ -79,7 +79,7 @@ def attempts_from_tables(samples: pa.Table, outcomes: pa.Table, runs: Sequence[M
     clip, clip_ids = text_codes(rows["clip_id"])
     expert, experts = text_codes(rows["expert"])
     candidate = rows["candidate_index"].to_numpy()
-    why, whys, task = _whys(outcomes)
+    why, whys, task = _reasons(outcomes)
     why = np.concatenate([why, np.zeros(samples.num_rows, np.int32)])
     task = np.concatenate([task, np.full(samples.num_rows, len(ATTEMPT), np.int32)])
     age = 2 * (_ages(rows, runs) + 1)  # -1: of no record
@@ -114,10 +114,10 @@ def _last_of_each(place: Ints, n_ages: int) -> Ints:
     return order[is_last]
 
 
-def _whys(outcomes: pa.Table) -> tuple[Codes, tuple[str, ...], Codes]:
+def _reasons(outcomes: pa.Table) -> tuple[Codes, tuple[str, ...], Codes]:
     """What became of the rows of `outcomes`, in words, of which the first is for samples; the tasks they ended in."""
     found, at = distinct_texts(outcomes, ("kind", "stage", "reason", "error_kind"))
-    words = [_why(*row) for row in found]
+    words = [_reason(*row) for row in found]
     known = list(dict.fromkeys([ACCEPTED, EXHAUSTED, *words]))
     tasks = np.array([_task(stage) for _, stage, _, _ in found], np.int32)
     return np.array([known.index(word) for word in words], np.int32)[at], tuple(known), tasks[at]
@@ -128,7 +128,7 @@ def _task(stage: str) -> int:
     return next((i for i, name in enumerate(ATTEMPT) if stage == name or stage in STAGES_OF[name]), 0)
 
 
-def _why(kind: str, stage: str, reason: str, error_kind: str) -> str:
+def _reason(kind: str, stage: str, reason: str, error_kind: str) -> str:
     if kind == Kind.EXHAUSTED:
         return EXHAUSTED
     return f"failed.{error_kind}" if kind == Kind.FAILED else f"{stage}.{reason}"
@@ -209,7 +209,7 @@ def balance_sheet(plans: pa.Table, attempts: Attempts, lists: pa.Table) -> Balan
     listed[_places(clips, lists["clip_id"])] = True
     empty = np.zeros(len(clips), bool)
     empty[_places(clips, lists.filter(pc.not_equal(lists["reason"], ""))["clip_id"])] = True
-    dropped, broken, _ = _ends(attempts, "", at, len(clips))
+    dropped, broken, _ = _walk_ends(attempts, "", at, len(clips))
     read = listed & ~dropped & ~broken
     found = [
         _balance(CLIP, "", -1, np.ones(len(clips), bool), read, dropped, broken),
@@ -217,7 +217,7 @@ def balance_sheet(plans: pa.Table, attempts: Attempts, lists: pa.Table) -> Balan
     ]
     walks_pending = 0
     for expert, wanted in sorted(rounds.items()):
-        fell, broke, made = _ends(attempts, expert, at, len(clips))
+        fell, broke, made = _walk_ends(attempts, expert, at, len(clips))
         fell, broke = fell | dropped, broke | broken
         pending = int(np.count_nonzero((made < wanted) & ~fell & ~broke))
         walks_pending += pending
@@ -273,7 +273,7 @@ def _balance(
     return Balance(stage, expert, number, *(int(np.count_nonzero(which)) for which in counts))
 
 
-def _ends(attempts: Attempts, expert: str, at: Ints, n: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Ints]:
+def _walk_ends(attempts: Attempts, expert: str, at: Ints, n: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Ints]:
     """Over n planned clips: whether the expert's walk ended by rejection, whether it stands at a failure, its samples.
 
     Ended is the walk of an expert that is tried once, or the clip as a whole, by a rejection; any other by its list.
@@ -377,8 +377,8 @@ class Funnel:
         for r in self.rows:
             why = ", ".join(f"{name.removeprefix('reward.')} {n}" for name, n in r.reasons.items())
             numbers = map(str, (r.round, r.tried, r.accepted))
-            tries = map(_percent, (r.attempt_rate, r.first_try_rate))
-            clips = map(_percent, (r.clip_rate, r.clip_rate_of_all))
+            tries = map(_percent_text, (r.attempt_rate, r.first_try_rate))
+            clips = map(_percent_text, (r.clip_rate, r.clip_rate_of_all))
             table.add_row(r.expert, *numbers, *tries, f"{r.clips}/{r.clips_before}", *clips, why)
         sink = io.StringIO()
         Console(file=sink, width=width, no_color=True).print(table)
@@ -425,10 +425,10 @@ def funnel_of_tables(
             row for number, name in enumerate(attempts.experts) if name for row in expert_rows(attempts, number)
         ),
         clips_prepared=lists.num_rows,
-        clips_without_candidates=_most_first(
+        clips_without_candidates=_sorted_counts(
             {f"{row['stage']}.{row['reason']}": row["count_all"] for row in without.to_pylist()}
         ),
-        clip_outcomes=_most_first(dict(zip(attempts.whys, of_clips.tolist()))),
+        clip_outcomes=_sorted_counts(dict(zip(attempts.whys, of_clips.tolist()))),
         gates=_gates(lists["gate_counts"]),
         candidates=pc.sum(lists["n_candidates"]).as_py() or 0,
         exhausted={name: n for name, n in zip(attempts.experts, exhausted.tolist()) if n},
@@ -458,7 +458,7 @@ def expert_rows(attempts: Attempts, number: int) -> list[FunnelRow]:
     simulated = bool((attempts.candidate[tried] >= 0).any())
     rows, before = [], clips
     for round_ in range(rounds):
-        reasons = _most_first(dict(zip(attempts.whys, counts[round_].tolist())))
+        reasons = _sorted_counts(dict(zip(attempts.whys, counts[round_].tolist())))
         made = reasons.pop(ACCEPTED, 0)  # one sample per clip and round
         failed = sum(n for why, n in reasons.items() if why.startswith("failed."))
         rejected = sum(reasons.values()) - failed
@@ -481,7 +481,7 @@ def _gates(column: pa.ChunkedArray) -> dict[str, int]:
     return dict(zip(sums["gate"].to_pylist(), sums["n_sum"].to_pylist()))
 
 
-def _most_first(counts: Mapping[str, int]) -> dict[str, int]:
+def _sorted_counts(counts: Mapping[str, int]) -> dict[str, int]:
     """Without zeros; of equal counts by name."""
     return dict(sorted(((name, n) for name, n in counts.items() if n), key=lambda item: (-item[1], item[0])))
 
@@ -492,5 +492,5 @@ def _of_clips(rows: pa.Table, chosen: Collection[str] | None) -> pa.Table:
     return rows.filter(pc.is_in(rows["clip_id"], value_set=pa.array(sorted(chosen), pa.string())))
 
 
-def _percent(rate: float) -> str:
+def _percent_text(rate: float) -> str:
     return "-" if rate != rate else f"{100 * rate:.1f}"

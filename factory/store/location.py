@@ -322,7 +322,7 @@ class ClipCache:
     def load(self, key: str) -> object | None:
         """The stored value, None where there is none. Raises BadCacheFile."""
         data = self.location.read(f"{key}.npz")
-        return None if data is None else decode_tree(_whole(data, key))
+        return None if data is None else decode_tree(_unsealed(data, key))
 
     def store(self, key: str, value: object) -> None:
         """Whole or not at all."""
@@ -347,7 +347,7 @@ class SceneFiles:
         if data is None:
             raise FileNotFoundError(f"{path}: no scenes of this clip; run the factory again")
         try:
-            scenes = decode_tree(_whole(data))
+            scenes = decode_tree(_unsealed(data))
         except BadCacheFile as error:
             raise BadCacheFile(f"{path}: {error}; remove it, {_AGAIN}") from error
         if not isinstance(scenes, BenchmarkClip | GivenScenes | OneStageClip):
@@ -361,7 +361,7 @@ class SceneFiles:
         return [name.removesuffix(".npz") for name in self.location.names() if name.endswith(".npz")]
 
 
-def check_prepared(data: bytes, key: str) -> None:
+def check_prepared_clip(data: bytes, key: str) -> None:
     """Hold the file of a prepared clip against its seal. Raises BadCacheFile."""
     try:
         unsealed(data, key)
@@ -369,7 +369,7 @@ def check_prepared(data: bytes, key: str) -> None:
         raise BadCacheFile(f"{error}; the next run makes it again") from error
 
 
-def _whole(data: bytes, key: str = "") -> bytes:
+def _unsealed(data: bytes, key: str = "") -> bytes:
     try:
         return unsealed(data, key)
     except Damaged as error:

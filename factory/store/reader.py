@@ -107,7 +107,7 @@ class SampleTable:
 
     def sample(self, which: int | str, columns: Sequence[str] | None = None) -> Sample:
         """One sample, or some of its columns; reads the row group it stands in."""
-        at = self._place(which) if isinstance(which, str) else which
+        at = self._row_number(which) if isinstance(which, str) else which
         path = self._paths[self._files[at]]
         _check_columns(columns)
         with raising_damaged_file(f"{self._table.location.uri}/{path}"):
@@ -115,7 +115,7 @@ class SampleTable:
             (sample,) = read_rows(self._file(path), group, self._partitions[path], columns, slice(row, row + 1))
         return sample
 
-    def _place(self, attempt_id: str) -> int:
+    def _row_number(self, attempt_id: str) -> int:
         at = int(np.searchsorted(self._keys, attempt_id.encode()))
         if at == len(self._keys) or self._keys[at].decode() != attempt_id:
             raise KeyError(attempt_id)

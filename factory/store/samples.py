@@ -320,7 +320,7 @@ def build_history(
     made, at = distinct_rows([numbers for numbers, _ in columns])
     texts = [[words[i] for i, (_, words) in zip(row, columns)] for row in made.tolist()]
     is_current = [(s, v) == made_by and digest == expert_digests.get(e, digest) for e, digest, s, v in texts]
-    became, fates = _fates(outcomes, samples, versions, version_texts)
+    became, fates = _outcome_codes(outcomes, samples, versions, version_texts)
     place = clip * max(1, len(experts)) + expert
     order = np.argsort(place, kind="stable")
     n_walks = len(clip_ids) * max(1, len(experts))
@@ -337,7 +337,7 @@ def build_history(
     )
 
 
-def _fates(
+def _outcome_codes(
     outcomes: pa.Table, samples: pa.Table, versions: Codes, version_texts: Sequence[str]
 ) -> tuple[NDArray[np.int32], tuple[tuple[Kind, int, str, int, str], ...]]:
     """What became of each row, as a place among the few different fates."""

@@ -233,22 +233,22 @@ class CommitCopies:
         The commit itself comes last, so that where its copy is there, that of its checkpoint is as well.
         """
         since = version
-        if version and not self._copies.has(_json(version - 1)):
+        if version and not self._copies.has(_commit_name(version - 1)):
             have = set(self._copies.names())
-            since = next((number for number in range(version, 0, -1) if _json(number - 1) in have), 0)
+            since = next((number for number in range(version, 0, -1) if _commit_name(number - 1) in have), 0)
         for number in range(since, version + 1):
-            if self._log.has(_checkpoint(number)):
-                self._copy(_checkpoint(number))
+            if self._log.has(_checkpoint_name(number)):
+                self._copy(_checkpoint_name(number))
                 self._copy(LAST)
-            self._copy(_json(number))
+            self._copy(_commit_name(number))
 
     def lost_commit(self, version: int) -> int | None:
         """The number of a commit that was made and is newer than `version`, which the table says is its newest."""
-        return version + 1 if self._copies.has(_json(version + 1)) else None
+        return version + 1 if self._copies.has(_commit_name(version + 1)) else None
 
     def log_has(self, version: int, text: str = "") -> bool:
         """A commit of this number is in the log, whatever its listing says, and has a text in it."""
-        found = self._log.read(_json(version))
+        found = self._log.read(_commit_name(version))
         return found is not None and text.encode() in found
 
     def damage(self) -> list[DamagedPart]:
@@ -308,15 +308,15 @@ class CommitCopies:
             version, copied = (int(json.loads(text)["version"]) for text in (data or b"", copy))
         except (ValueError, KeyError, TypeError):
             return "is not what was written"
-        newer = version > copied and _checkpoint(version) in there  # a writer was killed before it could copy
+        newer = version > copied and _checkpoint_name(version) in there  # a writer was killed before it could copy
         return "" if newer else "is not what was written"
 
 
-def _json(version: int) -> str:
+def _commit_name(version: int) -> str:
     return f"{version:020}.json"
 
 
-def _checkpoint(version: int) -> str:
+def _checkpoint_name(version: int) -> str:
     return f"{version:020}.checkpoint.parquet"
 
 
@@ -358,7 +358,7 @@ class KeyIndex:
         numbers |= {key: self._changed[key] for key in asked if key in self._changed}
         return {key: self._paths[number] for key, number in numbers.items() if number is not None}
 
-    def change(self, drop: Iterable[str], add: Mapping[str, str]) -> None:
+    def update(self, drop: Iterable[str], add: Mapping[str, str]) -> None:
         """Keys out, and keys with their files in."""
         self._changed.update(dict.fromkeys(drop))
         for key, path in add.items():
@@ -601,7 +601,7 @@ class KeyedTable:
         for left in reversed(range(CLAIMS)):
             mine = max(self.epoch, above) + 1 if epoch is None else epoch
             if mine <= self.epoch:
-                raise self._lost()
+                raise self._another_writer_error()
             try:
                 self._transact([], mine)
                 break
@@ -629,7 +629,7 @@ class KeyedTable:
         if not add and not dropped:
             return
         live = self.live_files() if touched else {}
-        kept = [rest for path in sorted(touched) if (rest := self._without(path, live[path], dropped)) is not None]
+        kept = [rest for path in sorted(touched) if (rest := self._rewritten(path, live[path], dropped)) is not None]
         adds = {shard.path: shard for shard in (*add, *kept)}
         unchanged = touched & set(adds)  # content-addressed: the same name is the same bytes
         now_ms = int(time.time() * 1000)
@@ -641,7 +641,7 @@ class KeyedTable:
                 stats = json.dumps({"numRecords": len(shard.keys)})
                 actions.append(AddAction(path, shard.size, shard.partition, now_ms, True, stats))
         self._transact(actions)
-        index.change(dropped, {key: written.path for written in (*kept, *add) for key in written.keys})
+        index.update(dropped, {key: written.path for written in (*kept, *add) for key in written.keys})
 
     def replace_files(self, drop: Collection[str], add: Sequence[tuple[Shard, int]] = ()) -> None:
         """Files out of the table and others, with the time [ms] of their rows, into it, in one transaction.
@@ -671,7 +671,7 @@ class KeyedTable:
         change = partial(table.alter.set_table_properties, {name: value}, raise_if_not_exists=False)
         self._commit(table, 1, lambda: change(commit_properties=self._properties()))
 
-    def _without(self, path: str, partition: Mapping[str, str], dropped: set[str]) -> Shard | None:
+    def _rewritten(self, path: str, partition: Mapping[str, str], dropped: set[str]) -> Shard | None:
         rows = self.read_file(path, partition)
         rows = rows.filter(pc.invert(pc.is_in(rows[self.spec.key], value_set=pa.array(sorted(dropped), pa.string()))))
         return write_shard(self.location, self.spec, rows) if rows.num_rows else None
@@ -694,7 +694,7 @@ class KeyedTable:
             ),
         )
 
-    def _lost(self) -> AnotherWriter:
+    def _another_writer_error(self) -> AnotherWriter:
         return AnotherWriter(f"{self.spec.name}: another run has taken over {self.location.uri}")
 
     def _properties(self, *transactions: Transaction) -> CommitProperties:
@@ -717,17 +717,17 @@ class KeyedTable:
                 if may_be_made and self.copies.log_has(version, self._token):
                     return
                 if isinstance(error, CommitFailedError):
-                    raise self._lost() from error
+                    raise self._another_writer_error() from error
                 raise
 
         retry_broken_listing(once)
-        self._see(table, version)
+        self._wait_until_seen(table, version)
         if self.version != version:
-            raise self._lost()
+            raise self._another_writer_error()
         with naming_disk_errors(f"{self.location.uri}/{COPIES}", SCHEMA_BYTES):
             self.copies.copy_commit(version)
 
-    def _see(self, table: DeltaTable, version: int) -> None:
+    def _wait_until_seen(self, table: DeltaTable, version: int) -> None:
         def is_seen() -> bool:
             with suppress(TableNotFoundError):
                 retry_broken_listing(table.update_incremental)

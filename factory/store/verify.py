@@ -29,7 +29,7 @@ from factory.store.location import (
     Location,
     SceneFiles,
     Shard,
-    check_prepared,
+    check_prepared_clip,
     raising_damaged_file,
     write_shard,
 )
@@ -74,14 +74,14 @@ def verify(store: Store) -> Verdict:
     broken: list[DamagedPart] = []
     for table in store.tables:
         broken += _damaged_files(table)
-    orphans = orphaned(store)
+    orphans = orphaned_files(store)
     kept = _damaged_kept(store.location)
     if damage or broken:
         damage += [*map(str, (*broken, *kept)), "keys and rounds were not checked: fix the files first"]
         return Verdict(0, tuple(damage), tuple(orphans), tuple(found.name for found in (*broken, *kept)))
     rows: list[pa.Table] = []
     for table in store.tables:
-        damage += _twice(table, rows if table is store.samples else None)
+        damage += _duplicate_keys(table, rows if table is store.samples else None)
     try:
         damage += _broken_rows(rows, store)
     except ChangedRun as error:
@@ -92,7 +92,7 @@ def verify(store: Store) -> Verdict:
     return Verdict(len(store.samples), tuple(damage), tuple(orphans), tuple(found.name for found in kept))
 
 
-def orphaned(store: Store) -> list[str]:
+def orphaned_files(store: Store) -> list[str]:
     """Files in the tables' folders that no log names, relative to `out`."""
     orphans = []
     for table in store.tables:
@@ -165,7 +165,7 @@ def _damaged_kept(out: Location) -> list[DamagedPart]:
     found = []
     prepared, scenes = out.child(PREPARED), out.child(SCENES)
     checks: dict[str, Callable[[str], object]] = {
-        PREPARED: lambda key: check_prepared(prepared.read(f"{key}.npz") or b"", key),
+        PREPARED: lambda key: check_prepared_clip(prepared.read(f"{key}.npz") or b"", key),
         SCENES: SceneFiles(scenes).load,
     }
     for folder, check in checks.items():
@@ -185,7 +185,7 @@ def _damaged_kept(out: Location) -> list[DamagedPart]:
     return found
 
 
-def _twice(table: KeyedTable, kept: list[pa.Table] | None) -> list[str]:
+def _duplicate_keys(table: KeyedTable, kept: list[pa.Table] | None) -> list[str]:
     """Keys that stand twice; kept: takes the columns OF_WALKS, read at the same time."""
     paths, parts, key = [], [np.zeros(0, "S1")], table.spec.key
     for path, rows in table.files([key] if kept is None else [key, *OF_WALKS]):
@@ -302,10 +302,10 @@ def drop_damaged(store: Store, verdict: Verdict) -> None:
             store.location.remove(name)
 
 
-def leftovers(store: Store, older_s: float, now_s: float) -> list[str]:
+def old_leftovers(store: Store, older_s: float, now_s: float) -> list[str]:
     """Temporary files and orphans that were last written so long ago, relative to `out`."""
     ages = store.location.ages_s(now_s)
-    orphans = {*orphaned(store), *outdated_episodes(store)}
+    orphans = {*orphaned_files(store), *outdated_episodes(store)}
     inner = tuple(f"{name}/{folder}/" for name in TABLES for folder in (LOG, COPIES))
     return sorted(
         name
@@ -323,7 +323,7 @@ def compact(store: Store, full_bytes: int = FULL_BYTES) -> Iterator[CompactedTab
         facts = table.file_facts()
         drop: list[str] = []
         add: list[tuple[Shard, int]] = []
-        for group in _groups(table, full_bytes):
+        for group in _merge_groups(table, full_bytes):
             rows = pa.concat_tables([table.read_file(path, facts[path].partition) for path in group])
             shard = write_shard(table.location, table.spec, rows)
             add.append((shard, max(facts[path].written_ms for path in group)))
@@ -333,7 +333,7 @@ def compact(store: Store, full_bytes: int = FULL_BYTES) -> Iterator[CompactedTab
         yield CompactedTable(table.spec.name, len(facts), len(table.file_facts()))
 
 
-def _groups(table: KeyedTable, full_bytes: int) -> list[list[str]]:
+def _merge_groups(table: KeyedTable, full_bytes: int) -> list[list[str]]:
     """Files to be merged into one, two or more each; of a partition, in the order of their names."""
     partitions: dict[tuple[str, ...], list[tuple[str, int]]] = defaultdict(list)
     for path, file in sorted(table.file_facts().items()):

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from factory.exits import INTERRUPTED, calling_on_stop_signal
-from factory.graph.apart import run_in_own_process
 from factory.graph.execute import Execution, execute
+from factory.graph.own_process import run_in_own_process
 from factory.run import main as run_main
 from factory.store.samples import Store
 from factory.store.verify import verify
@@ -30,7 +30,7 @@ from tests.pages import REPOSITORY
 RUN = """
 import sys
 from factory.graph import driver
-from factory.graph.execute import Execution, execute, on_new_clusters
+from factory.graph.execute import Execution, execute, rerun_on_new_clusters
 from factory.graph.on_ray.graph import ray
 from factory.store.samples import Store
 from tests.chaos.killed_driver import EXPERTS
@@ -50,8 +50,8 @@ def killing(kind, name, at):
     setattr(kind, name, method)
 
 killing(driver.RunDriver, "_take_attempt", 6)
-store = Store(sys.argv[1])
-ended = on_new_clusters(lambda: execute(ToyWork(), refs(5), EXPERTS, 2, store, Execution("ray", 1, shard_seconds=0.05)))
+store, how = Store(sys.argv[1]), Execution("ray", 1, shard_seconds=0.05)
+ended = rerun_on_new_clusters(lambda: execute(ToyWork(), refs(5), EXPERTS, 2, store, how))
 sys.exit(ended.exit_code)
 """
 START = """
@@ -186,7 +186,7 @@ def waits(journal: str, begun: int, tell: Callable[[str], None]) -> int:
 APART = """
 import sys
 from functools import partial
-from factory.graph.apart import run_in_own_process
+from factory.graph.own_process import run_in_own_process
 from tests.chaos.test_killed_raylet import ends, waits
 
 if __name__ == "__main__":

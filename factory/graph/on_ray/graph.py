@@ -37,7 +37,7 @@ from factory.graph.local import (
     ClusterLacks,
     Costs,
     Limits,
-    MachineIll,
+    MachineFailure,
     Ticket,
     attempt_tasks,
     call_watched,
@@ -72,7 +72,7 @@ FORWARDED_ENV = ("NUMBA_CACHE_DIR",)
 
 
 @ray.remote(num_cpus=0)
-def _sees(out: Location, name: str, token: bytes) -> bool:
+def _can_read(out: Location, name: str, token: bytes) -> bool:
     return out.read(name) == token
 
 
@@ -90,7 +90,7 @@ def connect(workers: int | None, address: str | None) -> bool:
     if where == "local":  # Ray warns that a cluster of our own asks for a token, as it should
         logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
     try:
-        must_answer(named)
+        check_address_answers(named)
         with terminal_signals_blocked(signal.SIGHUP):  # Ray keeps SIGINT from its processes itself
             ray.init(
                 address=where,
@@ -126,7 +126,7 @@ def tasks_at_once(workers: int | None, is_ours: bool) -> int:
     return max(1, min(workers or available, available) if is_ours else workers or available)
 
 
-def dead_part() -> str:
+def dead_ray_process() -> str:
     """A process of a cluster that this one began, where it has died.
 
     Looked at before anything is asked of Ray, which ends this process when it finds the object store gone.
@@ -135,7 +135,7 @@ def dead_part() -> str:
     return next((name for name, _ in node.dead_processes() if name in VITAL), "") if node is not None else ""
 
 
-def must_answer(address: str) -> None:
+def check_address_answers(address: str) -> None:
     """Raises ConnectionError for a host:port, or ray://host:port, at which nothing listens."""
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if not (colon and port.isdecimal()):
@@ -150,7 +150,7 @@ def nodes_of_cluster(having: str = "") -> list[str]:
     return [n["NodeID"] for n in ray.nodes() if n["Alive"] and (not having or n["Resources"].get(having))]
 
 
-def of_nodes(resource: str) -> list[int]:
+def per_node(resource: str) -> list[int]:
     """Of each node that works: a head without cores does not."""
     working = [node["Resources"] for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
     return [int(resources[resource]) for resources in working if resources.get(resource)]
@@ -177,7 +177,7 @@ def on_node(node: str) -> NodeAffinitySchedulingStrategy:
     return NodeAffinitySchedulingStrategy(node, soft=False)
 
 
-def prove_shared(out: Location, setting: str, wanted: str) -> None:
+def check_shared(out: Location, setting: str, wanted: str) -> None:
     """Every node reads what the driver wrote under `out`. Raises BadLocation with what is `wanted` of the setting."""
     nodes = nodes_of_cluster()
     if len(nodes) < 2:
@@ -186,7 +186,7 @@ def prove_shared(out: Location, setting: str, wanted: str) -> None:
     out.write(name, token)
     try:
         answers = ray.get(
-            [_sees.options(scheduling_strategy=on_node(node)).remote(out, name, token) for node in nodes],
+            [_can_read.options(scheduling_strategy=on_node(node)).remote(out, name, token) for node in nodes],
             timeout=PROBE_SECONDS,
         )
     finally:
@@ -244,14 +244,14 @@ class RayGraph:
 
         More workers than a cluster has CPUs now are what makes one grow that can. A cluster without a GPU is asked for
         one where tasks claim it, and waited for; memory is claimed up to what the largest node has.
-        Raises BadLocation when some node does not see `out`, ClusterLacks when no GPU comes, NotReady or MachineIll
+        Raises BadLocation when some node does not see `out`, ClusterLacks when no GPU comes, NotReady or MachineFailure
         when a node cannot do its part, ClusterDied when a cluster of our own does not come up or dies meanwhile, and
         DiskFull when there is no space for it.
         """
         self._connected = not ray.is_initialized()
         self._is_ours = self._connected and connect(workers, address)
         self.parallelism = tasks_at_once(workers, self._is_ours)
-        self.cores = min(self.parallelism, *(of_nodes("CPU") or [1]))  # none yet where a cluster grows from nothing
+        self.cores = min(self.parallelism, *(per_node("CPU") or [1]))  # none yet where a cluster grows from nothing
         self.record_metric: Record = ray_metrics()
         self._supplied: dict[str, Any] = {
             "work": [ray.put(work)],
@@ -266,13 +266,13 @@ class RayGraph:
         self._flying = {False: 0, True: 0}  # both by whether a task claims a GPU
         try:
             self._gpu_share = claims.gpu_share if claims.gpu_share and has_gpu(wait=not self._is_ours) else 0.0
-            self._claims, self._most_memory = claims, max(of_nodes("memory"), default=None)
+            self._claims, self._most_memory = claims, max(per_node("memory"), default=None)
             self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(apart=self._gpu_share > 0.0)
             self._after_drawing = _after_drawing(self.attempt_tasks) if self._gpu_share else frozenset()
-            prove_shared(out, "out", "shared storage or a URL")
+            check_shared(out, "out", "shared storage or a URL")
             self._warm_every_node(with_gpu_only=self._gpu_share > 0.0)
         except BaseException as error:
-            dead = dead_part() if self._is_ours else ""
+            dead = dead_ray_process() if self._is_ours else ""
             self.close()
             if dead and isinstance(error, Exception):
                 raise ClusterDied(f"Ray's {dead} died", is_ours=True) from error
@@ -288,7 +288,7 @@ class RayGraph:
         ]
         waiting = reports
         while waiting:
-            self._must_live()
+            self._check_alive()
             _, waiting = ray.wait(waiting, num_returns=len(waiting), timeout=LOOK_S)
         for node, report in zip(nodes, reports):
             try:
@@ -296,18 +296,20 @@ class RayGraph:
             except RayError as error:
                 if node not in nodes_of_cluster():
                     continue  # it has left the cluster: no task goes there
-                raise _unready(error, f"node {node} could not get its kernels ready: {one_line(error)}") from error
+                raise _not_ready_error(
+                    error, f"node {node} could not get its kernels ready: {one_line(error)}"
+                ) from error
             if isinstance(answer, Failure):
                 raise not_ready_error(answer)
 
-    def _must_live(self) -> None:
+    def _check_alive(self) -> None:
         """Raises ClusterDied where a cluster of our own has lost one of its processes."""
-        if self._is_ours and (dead := dead_part()):
+        if self._is_ours and (dead := dead_ray_process()):
             raise ClusterDied(f"Ray's {dead} died", is_ours=True)
 
     def submit(self, step: str, *args: Any) -> Ticket:
         ticket = Ticket(task_name(step, args), None)
-        self._held_back[self._draws(ticket)].append((ticket, step, args))
+        self._held_back[self._claims_gpu(ticket)].append((ticket, step, args))
         self._dispatch()
         return ticket
 
@@ -317,7 +319,7 @@ class RayGraph:
             return 1
         return self._costs.tasks_in("+".join(self.attempt_tasks[0]), AHEAD_S)
 
-    def _draws(self, ticket: Ticket) -> bool:
+    def _claims_gpu(self, ticket: Ticket) -> bool:
         return self._gpu_share > 0.0 and any(task.may_draw for task in TASKS if task.name in ticket.step.split("+"))
 
     def _dispatch(self) -> None:
@@ -330,13 +332,13 @@ class RayGraph:
                 ticket, step, args = waiting.popleft()
                 supplied = [self._supplied[name] for name in STEPS[step][1]]
                 if ticket.step in self._after_drawing:
-                    args = tuple(Fetched(arg) if isinstance(arg, ray.ObjectRef) else arg for arg in args)
+                    args = tuple(FetchedResult(arg) if isinstance(arg, ray.ObjectRef) else arg for arg in args)
                 gpu = self._gpu_share if draws else None
                 memory = self._claims.memory_bytes(ticket.step)
                 memory = memory if self._most_memory is None else min(memory, self._most_memory)
                 cores = task_cores(step, args)
                 n_rows = args[-1].samples if step == "attempts" else 1
-                task = _claiming(ticket.step, cores, gpu, memory or None, 1 + n_rows)
+                task = _remote_task(ticket.step, cores, gpu, memory or None, 1 + n_rows)
                 told = task_note(step, ticket.step, args) | self._costs.limits_for(ticket.step) | {"run": self._run}
                 report, *results = task.remote(step, (self._notes, told), len(supplied), *supplied, *args)
                 ticket.result = results if step == "attempts" else results[0]
@@ -345,7 +347,7 @@ class RayGraph:
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
         """Raises ClusterDied."""
-        self._must_live()
+        self._check_alive()
         if not self._ready and self._tickets:
             pending = list(self._tickets)
             some, _ = ray.wait(pending, num_returns=1, timeout=timeout_s, fetch_local=True)
@@ -356,7 +358,7 @@ class RayGraph:
             return None
         reference = self._ready.popleft()
         ticket = self._tickets.pop(reference)
-        self._flying[self._draws(ticket)] -= 1
+        self._flying[self._claims_gpu(ticket)] -= 1
         self._dispatch()
         try:
             report, worked_s = ray.get(reference)
@@ -364,7 +366,7 @@ class RayGraph:
             said = "Ray's raylet on this machine died; run the same command again once Ray is up"
             raise ClusterDied(said, self._is_ours) from error
         except RayError as error:
-            report, worked_s = Failure(_kind_of(error), f"{type(error).__name__}: {error}"[:2000]), 0.0
+            report, worked_s = Failure(_error_kind(error), f"{type(error).__name__}: {error}"[:2000]), 0.0
         if isinstance(report, BatchReport):
             for seconds in report.seconds:
                 self._costs.add(ticket.step, seconds)
@@ -381,25 +383,25 @@ class RayGraph:
 
 
 @cache
-def _claiming(name: str, cores: int, gpu: float | None, memory: int | None, returns: int) -> Any:
+def _remote_task(name: str, cores: int, gpu: float | None, memory: int | None, returns: int) -> Any:
     """The remote function with what it claims; built once, as Ray takes its time over it."""
     return _run.options(name=name, num_cpus=cores, num_gpus=gpu, memory=memory, num_returns=returns)
 
 
-def _kind_of(error: RayError) -> ErrorKind:
+def _error_kind(error: RayError) -> ErrorKind:
     """A worker that died may have died of its clip; a node, its memory or its object store are the machine's."""
     ill = isinstance(error, ILL) or machine_fault_of(error.cause if isinstance(error, RayTaskError) else error)
     return ErrorKind.MACHINE if ill else ErrorKind.SYSTEM
 
 
-def _unready(error: RayError, said: str) -> Exception:
+def _not_ready_error(error: RayError, said: str) -> Exception:
     """Where a task that gets kernels ready did not end: its code is to blame, else Ray or the machine."""
-    is_of_code = isinstance(error, RayTaskError) and _kind_of(error) is not ErrorKind.MACHINE
-    return NotReady(said) if is_of_code else MachineIll(said)
+    is_of_code = isinstance(error, RayTaskError) and _error_kind(error) is not ErrorKind.MACHINE
+    return NotReady(said) if is_of_code else MachineFailure(said)
 
 
 @dataclass(frozen=True)
-class Fetched:
+class FetchedResult:
     """A result that a task fetches itself: Ray sends a task to the node where most of what it is given lies.
 
     What follows a picture would go to the node that drew it, and take the cores that the next pictures wait for.
@@ -419,8 +421,8 @@ def _run(step: str, watch: tuple[Path, dict[str, Any]], n_supplied: int, *args: 
     """A function of factory.graph.steps in a worker, under watch: its report with the seconds it took, its result; of
     a batch each sample's."""
     began = time.perf_counter()
-    supplied = [_held(arg) if isinstance(arg, list) else arg for arg in args[:n_supplied]]
-    given = [ray.get(arg.reference) if isinstance(arg, Fetched) else arg for arg in args[n_supplied:]]
+    supplied = [_cached_work(arg) if isinstance(arg, list) else arg for arg in args[:n_supplied]]
+    given = [ray.get(arg.reference) if isinstance(arg, FetchedResult) else arg for arg in args[n_supplied:]]
     if step == "attempts":
         report, *results = _attempt_batch(watch, *supplied, *given)
     else:
@@ -457,7 +459,7 @@ def _attempt_batch(
     return [BatchReport(tuple(reports), tuple(seconds)), *rows, *[None] * (batch.samples - len(rows))]
 
 
-def _held(reference: list[Any]) -> Any:
+def _cached_work(reference: list[Any]) -> Any:
     key = reference[0].hex()
     if key not in _HELD:
         _HELD.clear()
@@ -489,21 +491,21 @@ class RayPool(Executor):
         self._references: dict[Future[Any], Any] = {}
         try:
             if to is not None:
-                prove_shared(to, "to", "storage that all of them share")
+                check_shared(to, "to", "storage that all of them share")
         except BaseException:
             self.shutdown()
             raise
 
     def submit(self, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
         """BrokenExecutor is raised by a future whose worker died, with all of its retries."""
-        reference = _call.remote(function, args, kwargs)
+        reference = _call_function.remote(function, args, kwargs)
         future: Future[R] = Future()
         future.set_running_or_notify_cancel()
         self._references[future] = reference  # by which it could be ended
-        reference.future().add_done_callback(lambda done: self._hand_on(done, future))
+        reference.future().add_done_callback(lambda done: self._copy_result(done, future))
         return future
 
-    def _hand_on(self, done: Future[R], future: Future[R]) -> None:
+    def _copy_result(self, done: Future[R], future: Future[R]) -> None:
         self._references.pop(future, None)
         error = done.exception()
         if error is None:
@@ -524,5 +526,5 @@ class RayPool(Executor):
 
 
 @ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
-def _call(function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+def _call_function(function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
     return function(*args, **kwargs)

@@ -32,10 +32,10 @@ def handed_out(queue: BlockQueue, wanted: bool = True) -> list[str]:
 def test_clips_wait_for_their_block_while_those_of_built_ones_go_on() -> None:
     queue = BlockQueue(plans("abaabc"), lambda ref: ref.log_id, workers=2)
     assert handed_out(queue) == ["[a]", "[b]"]
-    queue.built("b")
+    queue.mark_built("b")
     assert handed_out(queue) == ["b1", "b4", "[c]"]
-    queue.built("a")
-    queue.built("c")
+    queue.mark_built("a")
+    queue.mark_built("c")
     assert handed_out(queue, wanted=False) == [] and queue
     assert handed_out(queue) == ["a0", "a2", "a3", "c5"] and not queue
 
@@ -43,7 +43,7 @@ def test_clips_wait_for_their_block_while_those_of_built_ones_go_on() -> None:
 def test_clips_without_a_block_wait_for_nothing() -> None:
     queue = BlockQueue(plans("aba"), lambda ref: None if ref.log_id == "a" else "b", workers=2)
     assert handed_out(queue) == ["a0", "[b]", "a2"]
-    queue.built("b")
+    queue.mark_built("b")
     assert handed_out(queue) == ["b1"] and not queue
 
 

@@ -95,7 +95,7 @@ def test_a_run_killed_between_commit_and_episodes_ends_in_the_same_files(
             raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(driver.Episodes, "committed", die)
+        patch.setattr(driver.Episodes, "on_commit", die)
         with pytest.raises(Killed):
             run(tmp_path, shard_seconds=0.0)
     (tmp_path / EPISODES_FOLDER).mkdir()

@@ -11,7 +11,7 @@ import pytest
 
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.files import DiskFull, naming_disk_errors, why_disk_full, why_unusable
-from factory.graph.execute import Execution, RunSummary, execute, on_new_clusters
+from factory.graph.execute import Execution, RunSummary, execute, rerun_on_new_clusters
 from factory.graph.steps import failure_from_error
 from factory.run import main as run_main
 from factory.store.samples import Store
@@ -168,7 +168,9 @@ def without_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Pa
         monkeypatch.setenv("RAY_TMPDIR", str(files))
         out, told = tmp_path / "out", list[str]()
         how = Execution("ray")
-        summary = on_new_clusters(lambda: executed(ToyWork(), refs(1), ["human"], 1, Store(out), how), told.append)
+        summary = rerun_on_new_clusters(
+            lambda: executed(ToyWork(), refs(1), ["human"], 1, Store(out), how), told.append
+        )
         assert summary.exit_code == INTERRUPTED and not out.exists()
         return summary, told
 

@@ -79,7 +79,7 @@ def test_it_finds_what_a_dict_finds(
         patch.setattr(table, "MERGED_AT", merged_at)
         index, there = KeyIndex((path, pa.chunked_array([keys])) for path, keys in files), dict(known)
         for drop, add in changes:
-            index.change(drop, add)
+            index.update(drop, add)
             there = {key: path for key, path in there.items() if key not in drop} | add
             assert index.files_of(asked) == {key: there[key] for key in asked if key in there}
         assert index.files_of(there) == there

@@ -34,7 +34,7 @@ def run_in_own_process(run: Run, is_ours: bool, say: Callable[[str], None]) -> i
     context, begun = multiprocessing.get_context("spawn"), 0
     while True:
         ours, theirs = context.Pipe(duplex=False)
-        process = context.Process(target=_work, args=(theirs, run, begun))
+        process = context.Process(target=_child_main, args=(theirs, run, begun))
         with _passing_signals(process):
             with terminal_signals_blocked():
                 process.start()
@@ -42,7 +42,7 @@ def run_in_own_process(run: Run, is_ours: bool, say: Callable[[str], None]) -> i
             process.join()
         assert process.pid is not None
         _end_session(process.pid)
-        lines, code = _said(ours)
+        lines, code = _read_messages(ours)
         if code is not None:
             return code
         ended = process.exitcode or 0
@@ -68,7 +68,7 @@ def new_cluster_text(said: str, number: int) -> str:
     return f"{said}; a new cluster is started, {number} of {NEW_CLUSTERS}"
 
 
-def _work(pipe: Connection, run: Run, begun: int) -> None:
+def _child_main(pipe: Connection, run: Run, begun: int) -> None:
     """The other process: a session of its own, so that a terminal's signals come by way of the command's alone."""
     os.setsid()
     command = multiprocessing.parent_process()
@@ -87,7 +87,7 @@ def _work(pipe: Connection, run: Run, begun: int) -> None:
     sys.exit(code)
 
 
-def _said(pipe: Connection) -> tuple[list[str], int | None]:
+def _read_messages(pipe: Connection) -> tuple[list[str], int | None]:
     """Of a process that has ended: its lines, and its exit code where it came to say it."""
     lines: list[str] = []
     with suppress(EOFError):
