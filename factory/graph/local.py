@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from itertools import count
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -202,29 +202,6 @@ class Ticket:
     queued_s: float = 0.0  # once it is finished: from submission to report, less the time at work
 
 
-class Graph(Protocol):
-    """What both executors offer: submit a function of factory.graph.steps, wait for reports."""
-
-    parallelism: int  # tasks at once
-    cores: int  # that one task can have
-    attempt_tasks: Sequence[Sequence[str]]  # the stages of an attempt, by the tasks that they are fused into
-    record_metric: Record
-
-    def submit(self, step: str, *args: Any) -> Ticket:
-        """Run `step`; arguments may be results of earlier tickets. What STEPS says is supplied to it."""
-        ...
-
-    def attempts_per_task(self) -> int:
-        """Attempts of a walk that one task is to make: 1, or more of a `attempts`, whose tasks have a list of rows."""
-        ...
-
-    def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
-        """A finished task and its report (a steps.Failure where it died); None when the time is up."""
-        ...
-
-    def close(self) -> None: ...
-
-
 STEPS: Mapping[str, tuple[Any, tuple[str, ...]]] = {  # its function, and what it is supplied with
     "reconstruct": (steps.reconstruct, ("work", "stopped")),
     "perturb": (steps.prepare, ("work", "out")),
@@ -234,11 +211,6 @@ STEPS: Mapping[str, tuple[Any, tuple[str, ...]]] = {  # its function, and what i
     "episodes": (steps.episodes, ("work", "out")),
     "warm": (steps.warm, ("work",)),
 }
-
-
-def attempt_tasks(apart: bool) -> tuple[tuple[str, ...], ...]:
-    """The stages of an attempt by task; apart: a task of each, as where `render` claims a GPU."""
-    return tuple((stage,) for stage in ATTEMPT) if apart else (ATTEMPT,)
 
 
 def task_name(step: str, args: tuple[Any, ...]) -> str:
@@ -265,16 +237,38 @@ def not_ready_error(failure: Failure) -> Exception:
     return NotReady(failure.error) if failure.kind is ErrorKind.INPUT else RuntimeError(failure.error)
 
 
-class LocalGraph:
-    """Graph in this process. Nothing ends a task here; a guard sees signals through, and says what was in hand."""
+class Graph:
+    """What both executors offer: submit a function of factory.graph.steps, wait for reports."""
 
-    parallelism = 1
+    parallelism = 1  # tasks at once
+    cores = os.cpu_count() or 1  # that one task can have
+    attempt_tasks: Sequence[Sequence[str]] = (
+        ATTEMPT,
+    )  # the stages of an attempt, by the tasks that they are fused into
+    record_metric: Record = staticmethod(record_nothing)
+
+    def submit(self, step: str, *args: Any) -> Ticket:
+        """Run `step`; arguments may be results of earlier tickets. What STEPS says is supplied to it."""
+        raise NotImplementedError
+
+    def attempts_per_task(self) -> int:
+        """Of a walk: more than 1 where `attempts` make them, whose tasks have a list of rows."""
+        return 1
+
+    def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
+        """A finished task and its report (a steps.Failure where it died); None when the time is up."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Begin and await nothing more."""
+        raise NotImplementedError
+
+
+class LocalGraph(Graph):
+    """Graph in this process. Nothing ends a task here; a guard sees signals through, and says what was in hand."""
 
     def __init__(self, work: Work, out: Location, stopped: StopCheck) -> None:
         """stopped: asked now and then by tasks that take long, as nobody else can while they are at work."""
-        self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(apart=False)
-        self.cores = os.cpu_count() or 1
-        self.record_metric: Record = record_nothing
         self._supplied = {"work": work, "out": out, "stopped": stopped}
         self._waiting: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
         self._notes = notes_folder(out)
@@ -285,9 +279,6 @@ class LocalGraph:
         ticket = Ticket(task_name(step, args), _Result())
         self._waiting.append((ticket, step, args))
         return ticket
-
-    def attempts_per_task(self) -> int:
-        return 1
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
         if not self._waiting:
@@ -329,16 +320,11 @@ class KeptResult:
         return KeptResult, (self.number,)
 
 
-class IsolatedGraph:
+class IsolatedGraph(Graph):
     """Graph in a process of its own, one task after the other."""
-
-    parallelism = 1
 
     def __init__(self, work: Work, out: Location, stopped: StopCheck, limits: Limits) -> None:
         """Raises NotReady where the process cannot be given the work, or is not ready for it."""
-        self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(apart=False)
-        self.cores = os.cpu_count() or 1
-        self.record_metric: Record = record_nothing
         self._work, self._out, self._stopped = work, out, stopped
         self._context = multiprocessing.get_context("spawn")
         with terminal_signals_blocked():  # what keeps its semaphores is a process, too
@@ -355,9 +341,6 @@ class IsolatedGraph:
         ticket.result = KeptResult(next(self._numbers))
         self._waiting.append((ticket, step, args))
         return ticket
-
-    def attempts_per_task(self) -> int:
-        return 1
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
         if self._stopped():

@@ -209,7 +209,10 @@ def make_plan(
     found = 0
     others = history.clips_of({*history.experts} - {"", *experts})
     whole_clips = history.clips_of([""])
-    ended = {expert: history.complete_walks(expert, *_first_and_wanted(once(expert), rounds)) for expert in experts}
+    ended = {
+        expert: history.complete_walks(expert, candidate_order(once(expert), 1)[0], 1 if once(expert) else rounds)
+        for expert in experts
+    }
     for ref in refs:
         stored = listed = history.candidates.get(ref.clip_id)
         if stored is not None and _of_other_settings(stored, identity):
@@ -244,11 +247,6 @@ def make_plan(
         for walk in clip.walks:
             walk.forget()
     return RunPlan(tuple(todo), tuple(done), tuple(frozen), found)
-
-
-def _first_and_wanted(once: bool, rounds: int) -> tuple[int, int]:
-    """The first candidate of a walk, and how many samples it is to have."""
-    return candidate_order(once, 1)[0], 1 if once else rounds
 
 
 def _completed_clip(

@@ -157,12 +157,6 @@ def candidates_table(rows: Sequence[ClipCandidates]) -> pa.Table:
     )
 
 
-def candidate_summaries(table: KeyedTable) -> dict[str, CandidateSummary]:
-    """clip_id -> what the table says of the clip."""
-    rows = table.read(["clip_id", *(field.name for field in fields(CandidateSummary))])
-    return {row.pop("clip_id"): CandidateSummary(**row) for row in rows.to_pylist()}
-
-
 # The table `plans`: what runs set out to do, one row for each different answer, there before its first task is begun.
 #
 # What is planned under an `out` is all of them together: for each clip and expert the most rounds that any run asked
@@ -534,10 +528,11 @@ class Store:
 
     def history(self, identity: RunIdentity, expert_digests: Mapping[str, str]) -> History:
         """Everything the tables know, samples winning over outcomes of the same attempt."""
+        listed = self.candidates.read(["clip_id", *(field.name for field in fields(CandidateSummary))]).to_pylist()
         return build_history(
             self.outcomes.read(OUTCOME_STATE, encoded=True),
             self.samples.read(SAMPLE_STATE, encoded=True),
-            candidate_summaries(self.candidates),
+            {row.pop("clip_id"): CandidateSummary(**row) for row in listed},
             (identity.settings_hash, identity.versions_json),
             expert_digests,
         )

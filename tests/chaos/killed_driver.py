@@ -52,7 +52,6 @@ MOMENTS: dict[str, Callable[[], None]] = {
         KeyedTable, "commit", nth(2, lambda self, add, *rest: self.spec.name == "samples" and bool(add))
     ),
     "everything is committed, the driver has not said so": lambda: after(driver.RunDriver, "loop", nth(1)),
-    "never": lambda: None,
 }
 
 

@@ -122,9 +122,7 @@ def test_an_interrupt_within_code_that_is_made_up_is_the_exit_code_too() -> None
 @pytest.mark.parametrize(
     ("package", "words"),
     [
-        ("factory", ["--help"]),
         ("factory.run", ["--help"]),
-        ("planners", ["--help"]),
         pytest.param("planners", ["serve", "planner=constant_velocity"], marks=pytest.mark.slow),
     ],
 )

@@ -36,10 +36,10 @@ from factory.graph.local import (
     ClusterDied,
     ClusterLacks,
     Costs,
+    Graph,
     Limits,
     MachineFailure,
     Ticket,
-    attempt_tasks,
     call_watched,
     clear_notes,
     not_ready_error,
@@ -56,7 +56,7 @@ from factory.store.location import BadLocation, Location
 from factory.store.samples import ErrorKind
 from factory.store.schema import Stamp
 from factory.wording import one_line
-from tasks.stages import TASKS
+from tasks.stages import ATTEMPT, TASKS
 
 # A Ray cluster joined, or begun on this machine: whether it answers and lives, its nodes, and what they all see.
 #
@@ -102,7 +102,8 @@ def connect(workers: int | None, address: str | None) -> bool:
     except Exception as error:  # Ray has none of its own for what keeps it from beginning
         if where == "local":
             ray.shutdown()
-            folder, free = _files_of_ray()
+            folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or tempfile.gettempdir()
+            free = shutil.disk_usage(nearest_existing(Path(folder))).free
             said = f"Ray did not begin on this machine ({one_line(error)}); its files lie in {folder}"
             if free < OWN_BYTES:
                 raise DiskFull(f"{said}: the disk is full, {free:,} bytes are free") from error
@@ -112,12 +113,6 @@ def connect(workers: int | None, address: str | None) -> bool:
         said = f"no Ray cluster answers at RAY_ADDRESS={named} ({one_line(error)})"
         raise ConnectionError(f"{said}; unset it to run on this machine alone") from error
     return where == "local"
-
-
-def _files_of_ray() -> tuple[str, int]:
-    """Where a cluster of our own has its files, and the bytes that are free there."""
-    folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or tempfile.gettempdir()
-    return folder, shutil.disk_usage(nearest_existing(Path(folder))).free
 
 
 def tasks_at_once(workers: int | None, is_ours: bool) -> int:
@@ -228,7 +223,7 @@ def _recording(metric: Metric) -> Callable[[float, dict[str, str]], None]:
             return Histogram(metric.name, metric.about, list(metric.buckets), labels).observe
 
 
-class RayGraph:
+class RayGraph(Graph):
     """Graph of Ray tasks. Connects to the cluster of RAY_ADDRESS or `address`, else starts one in this machine."""
 
     def __init__(
@@ -252,7 +247,7 @@ class RayGraph:
         self._is_ours = self._connected and connect(workers, address)
         self.parallelism = tasks_at_once(workers, self._is_ours)
         self.cores = min(self.parallelism, *(per_node("CPU") or [1]))  # none yet where a cluster grows from nothing
-        self.record_metric: Record = ray_metrics()
+        self.record_metric = ray_metrics()
         self._supplied: dict[str, Any] = {
             "work": [ray.put(work)],
             "out": out,
@@ -267,7 +262,7 @@ class RayGraph:
         try:
             self._gpu_share = claims.gpu_share if claims.gpu_share and has_gpu(wait=not self._is_ours) else 0.0
             self._claims, self._most_memory = claims, max(per_node("memory"), default=None)
-            self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(apart=self._gpu_share > 0.0)
+            self.attempt_tasks = [(stage,) for stage in ATTEMPT] if self._gpu_share else (ATTEMPT,)
             self._after_drawing = _after_drawing(self.attempt_tasks) if self._gpu_share else frozenset()
             check_shared(out, "out", "shared storage or a URL")
             self._warm_every_node(with_gpu_only=self._gpu_share > 0.0)

@@ -10,9 +10,8 @@ from typing import Any
 
 import pytest
 
-from factory.graph import local
 from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, Execution, execute
-from factory.graph.local import Claims, attempt_tasks
+from factory.graph.local import Claims, LocalGraph
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
 from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt
 from factory.pipeline import FactoryWork
@@ -32,8 +31,7 @@ def run(out: Path, work: ToyWork, **options: object):  # type: ignore[no-untyped
 
 
 def test_the_tasks_of_an_attempt() -> None:
-    assert attempt_tasks(apart=False) == (ATTEMPT,)
-    assert attempt_tasks(apart=True) == (("drive",), ("render",), ("label",))
+    assert ATTEMPT == ("drive", "render", "label")
     assert [task.name for task in TASKS if task.may_draw] == ["reconstruct", "render"]
 
 
@@ -48,7 +46,7 @@ def test_stages_as_tasks_of_their_own_make_the_same_rows_in_this_process(
     journal = str(tmp_path / "journal")
     work = ToyWork(trouble={**UNFIT, "log1:1000:recovery:1": "bug"}, journal=journal)
     fused = run(tmp_path / "fused", ToyWork(trouble=work.trouble), executor="local")
-    monkeypatch.setattr(local, "attempt_tasks", lambda apart: attempt_tasks(True))
+    monkeypatch.setattr(LocalGraph, "attempt_tasks", [(stage,) for stage in ATTEMPT])
     apart = run(tmp_path / "apart", work, executor="local")
     assert apart.exit_code == fused.exit_code == COMPLETE_WITH_FAILURES
     assert apart.counts == fused.counts and apart.executed == fused.executed
