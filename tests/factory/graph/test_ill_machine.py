@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
-from factory.files import DiskFull, PlaceRefused, machine_fault_of, raising_place_refused
+from factory.files import PlaceRefused, machine_fault_of, raising_place_refused
 from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt, failure_from_error
-from factory.store.location import ClipCache
 from factory.store.samples import ErrorKind
 from tests.factory.graph.runs import run
 from tests.factory.tables import assert_same_tables, tables_of
@@ -47,18 +46,6 @@ def test_a_result_that_cannot_be_kept_is_still_a_result(tmp_path: Path, plain: C
     note = summary.notes[-1]
     assert "4 prepared clips could not be kept" in note and str(out / "cache/prepared") in note
     assert_same_tables(out, plain())
-
-
-def test_a_full_cache_beside_a_disk_with_space_fails_nobody(
-    tmp_path: Path, plain: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(cache: ClipCache, key: str, value: object) -> None:
-        raise DiskFull(f"{key}: the disk is full: 1,000 bytes are needed, 0 are free")
-
-    monkeypatch.setattr(ClipCache, "store", full)
-    summary = run(tmp_path / "out")
-    assert summary.exit_code == COMPLETE and "the disk is full" in summary.notes[0]
-    assert_same_tables(tmp_path / "out", plain())
 
 
 def test_an_ill_machine_never_counts_against_a_clip(tmp_path: Path, plain: Callable[..., Path]) -> None:

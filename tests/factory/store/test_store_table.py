@@ -168,12 +168,3 @@ def test_jpegs_are_stored_as_they_are_and_all_else_with_dictionaries_and_zstd(lo
     assert {leaf.compression for leaf in leaves.values()} == {"ZSTD"}
     flags = {path for path, leaf in leaves.items() if leaf.physical_type == "BOOLEAN"}  # have no dictionaries
     assert {path for path, leaf in leaves.items() if "RLE_DICTIONARY" not in leaf.encodings} == flags
-
-
-def test_other_engines_read_the_same_rows(location: Location) -> None:
-    table = KeyedTable(location, SPEC)
-    table.commit([shard(location, "ab", 1.5), shard(location, "c", 2.5, round_=1)])
-    from deltalake import DeltaTable
-
-    seen = DeltaTable(location.uri).to_pyarrow_table().sort_by("key").to_pylist()
-    assert seen == table.read().sort_by("key").to_pylist()
