@@ -1,5 +1,6 @@
 """The run that experiments.chaos.kills kills: `python -m experiments.chaos.killed_run OUT EXECUTOR JOURNAL`."""
 
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,8 @@ def drive(out: str, executor: str, journal: str, seconds: float = TASK_S, notes:
 
     executor=ADDRESS, with a colon: on the cluster there.
     """
-    address = None
     if ":" in executor:
-        address, executor = executor, "ray"
+        os.environ["RAY_ADDRESS"], executor = executor, "ray"
     if executor == "node":
         from ray.cluster_utils import Cluster
 
@@ -28,18 +28,9 @@ def drive(out: str, executor: str, journal: str, seconds: float = TASK_S, notes:
         second = cluster.add_node(num_cpus=1, num_gpus=0)
         (raylet,) = second.all_processes["raylet"]
         Path(notes).write_text(str(raylet.process.pid))
-        address, executor = cluster.address, "ray"
-    work = ToyWork(journal=journal, seconds=seconds)
-    summary = execute(
-        work,
-        refs(clips),
-        EXPERTS,
-        ROUNDS,
-        Store(out),
-        Execution(executor, 2, ray_address=address, shard_seconds=0.1),
-        say=str,
-    )
-    return summary.exit_code
+        os.environ["RAY_ADDRESS"], executor = cluster.address, "ray"
+    work, how = ToyWork(journal=journal, seconds=seconds), Execution(executor, 2, shard_seconds=0.1)
+    return execute(work, refs(clips), EXPERTS, ROUNDS, Store(out), how, say=str).exit_code
 
 
 def leave(*given: Any) -> None:

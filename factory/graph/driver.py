@@ -94,19 +94,23 @@ class Episodes:
 
     @property
     def is_due(self) -> bool:
+        """Something is missing or in hand."""
         return bool(self._queue or self._writing)
 
     def start(self, graph: Graph) -> None:
+        """Have the missing ones written."""
         self._graph = graph
         self._submit()
 
     def remove_outdated(self) -> None:
+        """Drafts of killed runs, and what is of rows that are no more."""
         live = {episode_name(row) for row in self._store.samples.read(ROWS).to_pylist()}
         for name in sorted(set(self._folder.names()) - live):
             if OURS.fullmatch(name):
                 self._folder.remove(name)
 
     def on_commit(self, paths: Sequence[str]) -> None:
+        """The table has these new files."""
         live = self._store.samples.live_files()
         for path in paths:
             if path in live:
@@ -114,16 +118,18 @@ class Episodes:
         self._submit()
 
     def take_report(self, ticket: Ticket, report: Any) -> bool:
+        """Of a task; False where the ticket is not one of these."""
         if ticket not in self._writing:
             return False
         self._writing.remove(ticket)
-        told = EpisodesReport(0, (report.error,)) if isinstance(report, Failure) else report
-        self.written += told.written
-        self.errors += [error.splitlines()[-1] for error in told.errors]
+        done = EpisodesReport(0, (report.error,)) if isinstance(report, Failure) else report
+        self.written += done.written
+        self.errors += [error.splitlines()[-1] for error in done.errors]
         self._submit()
         return True
 
     def stop(self) -> None:
+        """Begin no more; the next run makes up for it."""
         self._queue.clear()
 
     def _queue_missing(self, path: str, partition: Mapping[str, str]) -> None:
@@ -268,7 +274,7 @@ class CommitQueue:
 
     def __init__(self, graph: Graph, store: Store, shard_bytes: int, shard_seconds: float) -> None:
         self._graph, self._store = graph, store
-        self.committed: Callable[[Sequence[Shard], float], None] = lambda shards, seconds: None  # told of every commit
+        self.on_commit: Callable[[Sequence[Shard], float], None] = lambda shards, seconds: None
         self._shard_bytes, self._shard_seconds = shard_bytes, shard_seconds
         self._open = PendingCommit()
         self._written_by: dict[Ticket, PendingCommit] = {}
@@ -330,7 +336,7 @@ class CommitQueue:
         licences = {row.licence for rows in batch.rows.values() for row in rows}
         began = time.perf_counter()
         self._store.commit(batch.candidates, batch.shards, batch.outcomes, batch.replaced, batch.unlisted, licences)
-        self.committed(batch.shards, time.perf_counter() - began)
+        self.on_commit(batch.shards, time.perf_counter() - began)
         batch.rows.clear()
         release_free_memory()
 
@@ -417,7 +423,7 @@ class RunDriver:
     def loop(self, graph: Graph, commits: CommitQueue, metrics: RunMetrics, episodes: Episodes | None = None) -> None:
         """Until nothing is left, or stopped and drained. Raises DiskFull once a disk is full, and MachineFailure."""
         self._graph, self._commits, self._metrics, self._episodes = graph, commits, metrics, episodes
-        commits.committed = self._committed
+        commits.on_commit = self._on_commit
         with ProgressLine(len(self._plan.todo), self._forecast.left_s, doing=self._doing) as progress:
             self._work_through(graph, commits, progress)
         if self.executed.uncached:
@@ -461,7 +467,7 @@ class RunDriver:
         progress.show(self._tally, last=True)
         self._show_state(last=True)
 
-    def _committed(self, shards: Sequence[Shard], seconds: float) -> None:
+    def _on_commit(self, shards: Sequence[Shard], seconds: float) -> None:
         self._metrics.record_commit(shards, seconds)
         if self._episodes is not None:
             self._episodes.on_commit([shard.path for shard in shards])

@@ -76,7 +76,6 @@ class Execution:
     workers: int | None = None  # processes of a Ray cluster of its own; None: one per CPU
     on_change: OnChange = "stop"
     retry: bool = False  # attempts that failed by input or a bug are tried again, too
-    ray_address: str | None = None
     claims: Claims = field(default_factory=Claims)  # on Ray
     limits: Limits = field(default_factory=Limits)  # of a task, beyond which it is ended
     isolated: bool = False  # executor=local works in a process of its own, which may die
@@ -180,7 +179,7 @@ class _Run:
             else:
                 from factory.graph.on_ray.graph import RayGraph
 
-                self._graph = RayGraph(*to, how.workers, how.ray_address, how.claims, how.limits)
+                self._graph = RayGraph(*to, how.workers, how.claims, how.limits)
         except (BadLocation, ClusterLacks, NotReady, ConnectionError) as error:
             return RunSummary(BAD_CONFIG, str(error))
         except ClusterDied as error:

@@ -314,7 +314,7 @@ def old_leftovers(store: Store, older_s: float, now_s: float) -> list[str]:
     )
 
 
-def compact(store: Store, full_bytes: int = FULL_BYTES) -> Iterator[CompactedTable]:
+def compact(store: Store) -> Iterator[CompactedTable]:
     """Merge the small files of each partition of each table. Raises DamagedFile, before anything of its table is done.
 
     The rows keep their bytes and the times at which they came into the table.
@@ -323,7 +323,7 @@ def compact(store: Store, full_bytes: int = FULL_BYTES) -> Iterator[CompactedTab
         facts = table.file_facts()
         drop: list[str] = []
         add: list[tuple[Shard, int]] = []
-        for group in _merge_groups(table, full_bytes):
+        for group in _merge_groups(table):
             rows = pa.concat_tables([table.read_file(path, facts[path].partition) for path in group])
             shard = write_shard(table.location, table.spec, rows)
             add.append((shard, max(facts[path].written_ms for path in group)))
@@ -333,17 +333,17 @@ def compact(store: Store, full_bytes: int = FULL_BYTES) -> Iterator[CompactedTab
         yield CompactedTable(table.spec.name, len(facts), len(table.file_facts()))
 
 
-def _merge_groups(table: KeyedTable, full_bytes: int) -> list[list[str]]:
+def _merge_groups(table: KeyedTable) -> list[list[str]]:
     """Files to be merged into one, two or more each; of a partition, in the order of their names."""
     partitions: dict[tuple[str, ...], list[tuple[str, int]]] = defaultdict(list)
     for path, file in sorted(table.file_facts().items()):
-        if file.n_bytes < SMALL * full_bytes:
+        if file.n_bytes < SMALL * FULL_BYTES:
             partitions[tuple(file.partition.values())].append((path, file.n_bytes))
     groups: list[list[str]] = []
     for files in partitions.values():
-        held = full_bytes  # so that the first opens a group
+        held = FULL_BYTES  # so that the first opens a group
         for path, n_bytes in files:
-            if held + n_bytes > full_bytes:
+            if held + n_bytes > FULL_BYTES:
                 groups.append([])
                 held = 0
             groups[-1].append(path)

@@ -69,7 +69,7 @@ def killing():
 
 threading.Thread(target=killing, daemon=True).start()
 try:
-    connect(1, None)
+    connect(1)
 except ClusterDied as error:
     print("our own" if error.is_ours else "another", error)
 """

@@ -76,16 +76,16 @@ def _can_read(out: Location, name: str, token: bytes) -> bool:
     return out.read(name) == token
 
 
-def connect(workers: int | None, address: str | None) -> bool:
-    """Join the cluster of `address` or RAY_ADDRESS, else start one in this machine (then True).
+def connect(workers: int | None) -> bool:
+    """Join the cluster of RAY_ADDRESS, else start one in this machine (then True).
 
     Raises ConnectionError where nothing answers there; where nothing listens at once: Ray itself tries for minutes.
     Raises ClusterDied where one of our own does not come up, DiskFull where there is no space for its files: another
     would wait half a minute in vain, as this one did.
     """
-    named = address or os.environ.get("RAY_ADDRESS", "")
+    named = os.environ.get("RAY_ADDRESS", "")
     environment = WORKER_ENV | {name: os.environ[name] for name in FORWARDED_ENV if name in os.environ}
-    where = address or ("auto" if os.environ.get("RAY_ADDRESS") else "local")
+    where = "auto" if named else "local"
     own: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if where == "local" else {}
     if where == "local":  # Ray warns that a cluster of our own asks for a token, as it should
         logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
@@ -224,14 +224,13 @@ def _recording(metric: Metric) -> Callable[[float, dict[str, str]], None]:
 
 
 class RayGraph(Graph):
-    """Graph of Ray tasks. Connects to the cluster of RAY_ADDRESS or `address`, else starts one in this machine."""
+    """Graph of Ray tasks. Connects to the cluster of RAY_ADDRESS, else starts one in this machine."""
 
     def __init__(
         self,
         work: Work,
         out: Location,
         workers: int | None,
-        address: str | None,
         claims: Claims,
         limits: Limits,
     ) -> None:
@@ -244,7 +243,7 @@ class RayGraph(Graph):
         DiskFull when there is no space for it.
         """
         self._connected = not ray.is_initialized()
-        self._is_ours = self._connected and connect(workers, address)
+        self._is_ours = self._connected and connect(workers)
         self.parallelism = tasks_at_once(workers, self._is_ours)
         self.cores = min(self.parallelism, *(per_node("CPU") or [1]))  # none yet where a cluster grows from nothing
         self.record_metric = ray_metrics()
@@ -479,7 +478,7 @@ class RayPool(Executor):
         """
         self._connected = not ray.is_initialized()
         try:
-            is_ours = self._connected and connect(workers, None)
+            is_ours = self._connected and connect(workers)
         except ClusterDied as error:
             raise ConnectionError(str(error)) from error
         self.parallelism = tasks_at_once(workers, is_ours)
