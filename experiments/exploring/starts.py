@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from factory.store.location import Location
 from planners.drive.starts import LOGGED
-from planners.drive.table import open_drives
+from planners.drive.work import open_drives
 from tasks.world.clip import HORIZON_STEPS
 from tasks.world.frames import HEADING, to_local
 

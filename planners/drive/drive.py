@@ -39,7 +39,18 @@ from planners.drive.drivers import driver_of
 from planners.drive.settings import DriveSettings, Pictures, settings_of
 from planners.drive.starts import LOGGED
 from planners.drive.summary import Row, differences_of, lines_of, summary_text, write_summary
-from planners.drive.table import FACTS, Committer, DriveRow, open_drives, write_rows
+from planners.drive.work import (
+    FACTS,
+    Committer,
+    DriveItem,
+    DriveRow,
+    DriveWork,
+    DrivingPlanner,
+    NotDriven,
+    open_drives,
+    reads_towns,
+    write_rows,
+)
 from planners.drive.work import DriveItem, DriveWork, DrivingPlanner, NotDriven
 from planners.evaluation.planner_names import planners_of
 from tasks.render.scene import engine

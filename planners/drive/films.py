@@ -24,8 +24,7 @@ from factory.views.pictures import (
     write,
     write_mp4,
 )
-from planners.drive.loop import PLAN_STEPS, ClosedLoop
-from planners.drive.measures import measures_of
+from planners.drive.loop import PLAN_STEPS, ClosedLoop, measures_of
 from tasks.world.arrays import Image
 from tasks.world.clip import STEP_S
 from tasks.world.frames import HEADING, VX

@@ -22,10 +22,9 @@ import numpy as np
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, compose, fill
 from planners.evaluation import navsim
-from planners.evaluation.aggregation import ClipResult, Measured, by_clip, check_same_clips, measured
+from planners.evaluation.aggregation import FILTERS_NOTE, ClipResult, Measured, by_clip, check_same_clips, measured
 from planners.evaluation.bootstrap import LEVELS, Interval, clusters_of, paired_interval
 from planners.evaluation.score_rows import read_record, read_rows
-from planners.evaluation.score_table import FILTERS_NOTE
 from tasks.reward.aggregate import COLUMNS
 
 

@@ -39,14 +39,13 @@ from factory.config.compose import ConfigError, fill
 from factory.config.datasets import find_function, words_of
 from factory.config.shapes import plain
 from factory.graph.progress import Counter
-from planners.evaluation.aggregation import SummaryLine, lines_of, summarise
+from planners.evaluation.aggregation import SummaryLine, lines_of, summarise, table_text, write_table
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.frames import Benchmark, FrameKey
 from planners.evaluation.navsim import write_tables
 from planners.evaluation.planner_names import EvaluatedPlanner, composed, needs_of, planners_of
 from planners.evaluation.planning import all_plans
 from planners.evaluation.score_rows import RECORD, FrameRow, is_done, read_rows, write_record, write_rows
-from planners.evaluation.score_table import table_text, write_table
 from planners.evaluation.scoring import (
     ClipFrames,
     LoneFrame,

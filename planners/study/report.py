@@ -23,6 +23,7 @@ import pyarrow.parquet as pq
 
 from planners.evaluation.aggregation import (
     BOUNDS,
+    FILTERS_NOTE,
     MEASURES,
     ClipResult,
     HumanFilter,
@@ -38,7 +39,6 @@ from planners.evaluation.benchmark_folder import logs_of
 from planners.evaluation.compare import CompareSettings, compare, difference_columns, is_clear_row
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow, read_rows
-from planners.evaluation.score_table import FILTERS_NOTE
 from planners.study.setups import Comparison, Setup, words_of
 from tasks.reward.aggregate import COLUMNS, FrameScores
 

@@ -12,7 +12,7 @@ from planners.drive import drive as command
 from planners.drive import work
 from planners.drive.drive import main
 from planners.drive.settings import settings_of
-from planners.drive.table import open_drives
+from planners.drive.work import open_drives
 from tests.planners.faults import fail_once, interrupted_after_one
 
 WITHOUT_SENSORS = ["clips.settings.cameras=[]", "clips.settings.lidar_beams=0"]

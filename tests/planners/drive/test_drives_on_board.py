@@ -10,7 +10,7 @@ from factory.store.location import Location
 from factory.store.samples import Store
 from factory.views.board.overview import SCHEMA, Drives, drives_as_json
 from factory.views.board.server import Board
-from planners.drive import table
+from planners.drive import work
 from planners.drive.drive import main
 from tests.planners.drive.test_drive import towns as towns  # the fixture
 from tests.planners.drive.test_drive import words
@@ -18,7 +18,7 @@ from tests.planners.drive.test_drive import words
 
 def test_the_board_reads_columns_that_the_table_has() -> None:
     for field in SCHEMA:
-        assert table.SCHEMA.field(field.name).type == field.type
+        assert work.SCHEMA.field(field.name).type == field.type
 
 
 @pytest.mark.slow

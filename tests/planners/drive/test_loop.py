@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from planners.drive.drivers import DriveEnd, HumanDriver, driver_of
-from planners.drive.loop import LoopSettings, drive
-from planners.drive.measures import measures_of
+from planners.drive.loop import LoopSettings, drive, measures_of
 from planners.drive.starts import logged_start
 from planners.evaluation.planner_names import planner_of
 from tasks.settings import PdmSettings, TrafficSettings

@@ -18,9 +18,8 @@ from planners.evaluation.aggregation import SummaryLine
 from planners.evaluation.evaluate import EvaluateSettings, evaluate, fallback_notes, main, settings_of
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.planner_names import EvaluatedPlanner, planner_of, planners_of
-from planners.evaluation.planning import all_plans, plans_of
+from planners.evaluation.planning import all_plans, as_shown, plans_of
 from planners.evaluation.score_rows import read_record, read_rows
-from planners.evaluation.shown import as_shown
 from planners.training.checkpoint import save_checkpoint
 from tasks.reward.aggregate import COLUMNS
 from tests.planners.small_benchmark import StreetBenchmark, straight

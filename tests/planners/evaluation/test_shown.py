@@ -11,7 +11,7 @@ from planners.data.batch import BevLayout, ImageLayout, Needs
 from planners.data.index import DataSettings, open_dataset
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
-from planners.evaluation.shown import as_shown, batch_of, columns_shown
+from planners.evaluation.planning import as_shown, batch_of, columns_shown
 from tests.planners.samples import grey_pictures, sample, write_table
 
 NEEDS = Needs(image=ImageLayout(width=48, height=12), bev=BevLayout(cell_m=1.0), n_agents=3)

@@ -10,8 +10,7 @@ import torch
 
 from factory.config.compose import ConfigError
 from planners.data.batch import COMMANDS, ImageLayout
-from planners.evaluation.planning import plans_of
-from planners.evaluation.shown import as_shown, batch_of
+from planners.evaluation.planning import as_shown, batch_of, plans_of
 from planners.models.planner import Planner
 from planners.navsim.agent import shown
 from planners.navsim.serve import FRONT, Pilot, cameras_for, seen_of

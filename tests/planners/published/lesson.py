@@ -22,8 +22,7 @@ from factory.config.compose import ConfigError
 from factory.exits import Stopped
 from planners.data.batch import Batch
 from planners.published.import_planner import imported
-from planners.training.curves import LOSSES
-from planners.training.fit import Loop, fit, step_seed
+from planners.training.fit import LOSSES, Loop, fit, step_seed
 from planners.training.optim import FACTOR, TrainingSettings, build_optimiser
 from planners.training.processes import TrainingProcess
 from tasks.world.arrays import Array

@@ -27,8 +27,7 @@ from planners.training.checkpoint import (
     newest,
     read_record,
 )
-from planners.training.curves import LOSSES, VALIDATION
-from planners.training.fit import Loop, fit, total_steps
+from planners.training.fit import LOSSES, VALIDATION, Loop, fit, total_steps
 from planners.training.optim import TrainingSettings
 from planners.training.processes import TrainingProcess
 from tasks.caches import sealed_json

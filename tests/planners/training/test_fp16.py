@@ -14,8 +14,7 @@ from factory.exits import Stopped
 from planners.data.batch import Batch
 from planners.models.planner import Planner
 from planners.training.checkpoint import load_training, newest
-from planners.training.curves import LOSSES
-from planners.training.fit import SCALER, Loop, fit
+from planners.training.fit import LOSSES, SCALER, Loop, fit
 from planners.training.optim import TrainingSettings
 from tests.planners.models import test_diffusiondrive, test_gtrs_dense, test_ltf
 from tests.planners.toy import Toy, ToyBatches, ToySettings

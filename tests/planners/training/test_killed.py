@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from planners.data.batch import Batch
 from planners.training.checkpoint import WEIGHTS, checkpoints, load_training, newest, read_record
-from planners.training.curves import LOSSES
+from planners.training.fit import LOSSES
 from tests.planners.samples import sample, write_table
 from tests.planners.toy import Toy, ToySettings
 

@@ -13,7 +13,7 @@ import torch
 
 from factory.run import main as run_factory
 from planners.training.checkpoint import load_planner, newest, read_record
-from planners.training.curves import LOSSES, VALIDATION
+from planners.training.fit import LOSSES, VALIDATION
 from planners.training.train import main
 from tests.pages import commands
 from tests.planners.samples import sample, write_table

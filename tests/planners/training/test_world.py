@@ -9,8 +9,7 @@ import pytest
 import torch
 import torch.multiprocessing as mp
 
-from planners.training.curves import LOSSES
-from planners.training.fit import Loop, fit
+from planners.training.fit import LOSSES, Loop, fit
 from planners.training.optim import TrainingSettings
 from planners.training.processes import joined
 from tests.planners.toy import Toy, ToyBatches, ToySettings
