@@ -78,7 +78,7 @@ def workers_of(driver: int, executor: str) -> list[int]:
     return sorted(pid for pid, line in below(driver).items() if "multiprocessing.spawn" in line)
 
 
-def driver_of(command: int, executor: str) -> int:
+def make_driver(command: int, executor: str) -> int:
     """The process that drives: on Ray, once it is there, the first that the command starts."""
     found = [pid for pid, line in below(command).items() if "spawn_main" in line] if executor == "ray" else []
     return min(found, default=command)
@@ -115,7 +115,7 @@ def endure(words: list[str], executor: str, every_s: float, rng: random.Random, 
                     now = time.monotonic()
                     if now - told >= SAMPLE_S:
                         told, others = now, below(process.pid)
-                        seen = [("driver", driver_of(process.pid, executor))] + [
+                        seen = [("driver", make_driver(process.pid, executor))] + [
                             ("worker", pid) for pid in workers_of(process.pid, executor)
                         ]
                         held = [

@@ -27,7 +27,7 @@ from tests.planners.published.lesson import (
     samples,
 )
 from tests.planners.published.ours import CASES, Difference, differences, planner_of, preset, read_recorded
-from tests.planners.published.start import Start, our_start, start_of
+from tests.planners.published.start import Start, our_start, start_kind
 from tests.planners.published.start import apart as spread_otherwise
 from tests.planners.published.targets import differences_in_targets
 
@@ -99,7 +99,7 @@ def begun_alike(asked: argparse.Namespace, case: str, folder: Path) -> bool:
     picture, drawn = (asked.width, asked.height), folder / "drawn.ckpt"
     run_beside(asked, "start", [case, *map(str, picture), str(drawn)], folder)
     planner = imported(preset(case, picture), read_public(drawn), case).planner
-    public, arrays = start_of(planner), {name: np.asarray(array) for name, array in planner.arrays.items()}
+    public, arrays = start_kind(planner), {name: np.asarray(array) for name, array in planner.arrays.items()}
     origin = load_tensors(drawn)["origin"]
     if asked.record is not None:
         write_start(public, case, origin, asked.record / f"{case}_start.npz")

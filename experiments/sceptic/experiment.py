@@ -16,7 +16,15 @@ from experiments.study.data import Recipe, make
 from experiments.study.settings import settings_of
 from factory.exits import Stopped
 from planners.data.index import DataSettings, open_dataset
-from planners.study.arms import HeldAgainst, against_bounds, arms_of, differences_of, drive_arms, text_of, write_arms
+from planners.study.arms import (
+    HeldAgainst,
+    against_bounds,
+    differences_of,
+    drive_arms,
+    read_arm_drives,
+    text_of,
+    write_arms,
+)
 from planners.study.setups import Comparison, Setup
 from planners.study.sweep import SweepSettings, run
 from planners.training.many import TRAININGS, Training
@@ -191,7 +199,7 @@ def report_drives(settings: ExperimentSettings, arms: Sequence[Training], wanted
     assert settings.drives
     report = Path(settings.report or settings.out)
     pairs = [HeldAgainst(one.part, one.setup.label, one.reference.label) for one in wanted if one.reference]
-    driven = arms_of(arms, settings.out, settings.drives)
+    driven = read_arm_drives(arms, settings.out, settings.drives)
     if driven:
         found = differences_of(driven, pairs)
         first = next(iter(settings.parts))

@@ -25,7 +25,7 @@ import numpy as np
 
 from experiments.study.settings import settings_of
 from factory.config.arguments import NOT_FITTING, answered
-from planners.evaluation.aggregation import name_of, scores_of_clips, shown, title_of, write_csv
+from planners.evaluation.aggregation import name_of, score_title, scores_in_percent, shown, write_csv
 from planners.study.report import FRAMES, StudyFrames, read_study
 from planners.study.setups import Budget, Comparison, Imitation, Setup, words_of
 from planners.study.sweep import SweepSettings, run
@@ -182,7 +182,7 @@ def curves_of(frames: StudyFrames, score: str) -> list[Curve]:
     curves = []
     for (planner, name), labels in _series(frames).items():
         sizes = tuple(samples[label] for label in labels)
-        values = tuple(scores_of_clips(frames.clips[label])[score] for label in labels)
+        values = tuple(scores_in_percent(frames.clips[label])[score] for label in labels)
         law = fit_scaling(sizes, values) if len(set(sizes)) >= FEWEST else None
         curves.append(Curve(planner, name, sizes, values, law))
     return curves
@@ -240,7 +240,7 @@ def scale(words: Sequence[str]) -> None:
     report, final = Path(s.report or s.out), ("final", shown(s.human_filter)["final"])
     curves = curves_of(read_study(report / FRAMES), name_of(*final))
     write_csv(report / "curves.csv", [curve.row() for curve in curves])
-    draw_curves(curves, title_of(*final), report / "scaling.png")
+    draw_curves(curves, score_title(*final), report / "scaling.png")
 
 
 if __name__ == "__main__":

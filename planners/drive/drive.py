@@ -21,7 +21,6 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 from factory.config.arguments import command
@@ -35,24 +34,23 @@ from factory.readers.base import ClipRef, painter_of
 from factory.setup.settings import choose_vocabulary, open_reader
 from factory.store.location import Location
 from factory.store.table import AnotherWriter, KeyedTable
-from planners.drive.drivers import driver_of
+from planners.drive.drivers import make_driver
 from planners.drive.settings import DriveSettings, Pictures, settings_of
 from planners.drive.starts import LOGGED
 from planners.drive.summary import Row, differences_of, lines_of, summary_text, write_summary
 from planners.drive.work import (
     FACTS,
-    Committer,
     DriveItem,
     DriveRow,
     DriveWork,
     DrivingPlanner,
-    NotDriven,
+    FailedDrive,
+    RowCommitter,
     open_drives,
     reads_towns,
-    write_rows,
 )
 from planners.drive.work import DriveItem, DriveWork, DrivingPlanner, NotDriven
-from planners.evaluation.planner_names import planners_of
+from planners.evaluation.planner_names import find_planners
 from tasks.render.scene import engine
 from tasks.render.splatting.gsplat_backend import BackendMissing
 
@@ -60,7 +58,7 @@ SHOWN_FAILURES = 5
 
 
 @dataclass(frozen=True)
-class DrivesAsked:
+class RequestedDrives:
     """Drives that a command asks for, whether they are made or not."""
 
     work: DriveWork
@@ -81,7 +79,7 @@ class DrivesAsked:
         return not self.broken and all(any(key.drive_id in done for _, key in item.keys) for item in self.items)
 
 
-def drive_all(settings: DriveSettings) -> tuple[list[Row], list[NotDriven]]:
+def drive_all(settings: DriveSettings) -> tuple[list[Row], list[FailedDrive]]:
     """Drive what is not driven yet: the rows of all that were asked for, by planner and clip, and what could not be.
 
     Raises ConfigError; Stopped where it was interrupted; Failed where a process died or another command drives here.
@@ -90,7 +88,7 @@ def drive_all(settings: DriveSettings) -> tuple[list[Row], list[NotDriven]]:
         raise ConfigError(unusable)
     asked = _asked(settings)
     table = open_drives(asked.work.out)
-    failed = [NotDriven(ref.clip_id, why) for ref, why in asked.broken.items()]
+    failed = [FailedDrive(ref.clip_id, why) for ref, why in asked.broken.items()]
     try:
         table.claim()
         failed += _drive(asked.work, asked.items, table)
@@ -111,7 +109,7 @@ def driven(settings: DriveSettings) -> tuple[list[Row], bool]:
     return asked.rows(table), asked.is_made(table)
 
 
-def _asked(settings: DriveSettings) -> DrivesAsked:
+def _asked(settings: DriveSettings) -> RequestedDrives:
     planners = _planners(settings)
     reader, index = open_reader(settings.clips)
     if any("truth" in kinds for _, kinds in planners) and painter_of(reader) is None:
@@ -124,14 +122,14 @@ def _asked(settings: DriveSettings) -> DrivesAsked:
     out = Location.parse(settings.out)
     work = DriveWork(reader, choose_vocabulary(settings.vocabulary), settings, out)
     items = list(_items(work, index.refs[: settings.limit], planners))
-    return DrivesAsked(work, items, index.broken, [who.label for who, _ in planners])
+    return RequestedDrives(work, items, index.broken, [who.label for who, _ in planners])
 
 
 def _planners(settings: DriveSettings) -> list[tuple[DrivingPlanner, tuple[Pictures, ...]]]:
     """Who drives, and which pictures each is shown. Raises ConfigError for nobody."""
     found: list[tuple[DrivingPlanner, tuple[Pictures, ...]]] = []
-    for one in planners_of(settings.planner, settings.planners, settings.bounds, settings.settings):
-        looks = driver_of(one, settings.pdm).needs_pictures
+    for one in find_planners(settings.planner, settings.planners, settings.bounds, settings.settings):
+        looks = make_driver(one, settings.pdm).needs_pictures
         found.append((DrivingPlanner(one.label, one.spec, one.digest), settings.pictures if looks else ("none",)))
     return found
 
@@ -150,13 +148,13 @@ def _items(
             yield DriveItem(ref, kind, tuple(keys))
 
 
-def _drive(work: DriveWork, items: Sequence[DriveItem], table: KeyedTable) -> list[NotDriven]:
+def _drive(work: DriveWork, items: Sequence[DriveItem], table: KeyedTable) -> list[FailedDrive]:
     """Make the drives that the table does not hold and commit them as they come; those that could not be made."""
     done = set(table)
     waiting = [replace(item, keys=left) for item in items if (left := item.missing(done))]
     total = sum(len(item.keys) for item in items)
-    failed: list[NotDriven] = []
-    settings, rows = work.settings, Committer(partial(write_rows, table))
+    failed: list[FailedDrive] = []
+    settings, rows = work.settings, RowCommitter(table)
     n_done = total - sum(len(item.keys) for item in waiting)
     try:
         with (
@@ -165,7 +163,7 @@ def _drive(work: DriveWork, items: Sequence[DriveItem], table: KeyedTable) -> li
         ):
             for made in results:
                 rows.add(row for row in made if isinstance(row, DriveRow))
-                failed += [row for row in made if isinstance(row, NotDriven)]
+                failed += [row for row in made if isinstance(row, FailedDrive)]
                 n_done += len(made)
                 progress.show(n_done)
     finally:

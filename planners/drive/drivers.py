@@ -94,7 +94,7 @@ class PlannerDriver:
         return to_world(scene.ego_state[: HEADING + 1], plans_of(self.made, [look()], self.device)[0])
 
 
-def driver_of(one: EvaluatedPlanner, pdm: PdmSettings, device: str = "cpu") -> Driver:
+def make_driver(one: EvaluatedPlanner, pdm: PdmSettings, device: str = "cpu") -> Driver:
     """The driver that an evaluated planner is, its weights read."""
     if one.privileged is human_plans:
         return HumanDriver()

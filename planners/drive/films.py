@@ -24,7 +24,7 @@ from factory.views.pictures import (
     write,
     write_mp4,
 )
-from planners.drive.loop import PLAN_STEPS, ClosedLoop, measures_of
+from planners.drive.loop import PLAN_STEPS, ClosedLoop, measure_drive
 from tasks.world.arrays import Image
 from tasks.world.clip import STEP_S
 from tasks.world.frames import HEADING, VX
@@ -69,7 +69,7 @@ def _sheet(made: ClosedLoop, rig: Rig, title: str, step: int) -> Image:
     bev = draw_bev(pose, shapes, boxes, pose, ways, f"{title}  t = {step * STEP_S:.1f} s", BEV_PX)
     sheet = np.full((BEV_PX[1], BEV_PX[0] + CAMERA_PX[0], 3), BACKGROUND, np.uint8)
     sheet[:, : BEV_PX[0]] = bev
-    images = made.looks[planned] if planned >= 0 else ()
+    images = made.images[planned] if planned >= 0 else ()
     front = front_camera({"images": images, "cameras": rig})
     if front is not None:
         seen = next(image for image in images if image["camera"] == front)
@@ -85,7 +85,7 @@ def _lines(made: ClosedLoop, front: str | None, step: int, planned: int) -> list
     told = [seen, f"{made.ego_states[step, VX]:.1f} m/s  {along:.0f} of {made.road.length_m:.0f} m of the route"]
     told.append("off the road" if made.off_road[step] else "")
     if step == made.n_steps:
-        found, hit = measures_of(made), made.hit
+        found, hit = measure_drive(made), made.hit
         whom = "" if hit is None else f": {hit.kind.lower()} {hit.track_id}, {'at' if hit.at_fault else 'not at'} fault"
         told.append(f"ended: {made.ended}{whom}")
         told.append(f"route {100.0 * found.route_completed:.0f} %, comfortable {100.0 * found.comfortable:.0f} %")

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from planners.drive.cameras import DriveCameras, Images, NoCameras, Observer
 from planners.drive.drivers import DriveEnd, Driver
-from planners.drive.eyes import Eyes, Images, NoEyes, Sight
 from planners.drive.starts import DriveStart
 from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.reward.rules.comfort import comfortable
@@ -130,7 +130,7 @@ class ClosedLoop:
     off_road: Bools  # (S + 1,)
     along_m: Array  # (S + 1,) arc length of the rear axle along the road
     plans: Array  # (P, 40, 3) world
-    looks: tuple[Images, ...]  # (P,) what the cameras saw
+    images: tuple[Images, ...]  # (P,) what the cameras saw
     ended: DriveEnd
     hit: Hit | None
 
@@ -141,28 +141,28 @@ class ClosedLoop:
 
 
 def drive(
-    start: DriveStart, driver: Driver, settings: LoopSettings | None = None, eyes: Eyes | None = None
+    start: DriveStart, driver: Driver, settings: LoopSettings | None = None, cameras: DriveCameras | None = None
 ) -> ClosedLoop:
     """Drive on from the start until something ends it.
 
-    eyes: the cameras of a driver that looks; None: there are none. Raises ValueError where the clip has too few steps
-    (`lengthened`), its map has none of the route's lanes, or the driver's answer is no plan.
+    cameras: of a driver that looks; None: there are none. Raises ValueError where the clip has too few steps
+    (`extend_clip`), its map has none of the route's lanes, or the driver's answer is no plan.
     """
-    settings, seen, scene = settings or LoopSettings(), eyes or NoEyes(), start.scene
+    settings, seen, scene = settings or LoopSettings(), cameras or NoCameras(), start.scene
     if scene.clip.agents.n_steps < settings.clip_steps(scene.step):
         raise ValueError(f"the clip must have {settings.clip_steps(scene.step)} steps, not {scene.clip.agents.n_steps}")
     finder = RouteFinder(scene.clip.road_map, scene.clip.route)
-    course, sight = _Course(start, settings), Sight(seen)
+    course, observer = _Course(start, settings), Observer(seen)
     plans: list[Array] = []
-    looks: list[Images] = []
+    images: list[Images] = []
     while course.ended is None:
-        looked = sight.look(scene)
-        plan = driver.plan(scene, looked.sample)
+        observed = observer.observe(scene)
+        plan = driver.plan(scene, observed.sample)
         if isinstance(plan, DriveEnd):
             course.ended = plan
             break
         plans.append(plan)
-        looks.append(looked.images)
+        images.append(observed.images)
         tracked = track(scene.ego_state, plan[None])[0]
         rollout = roll_out(prepare_traffic(scene, settings.traffic), tracked, PLAN_STEPS)
         steps = course.follow(rollout, score(prepare_scene(scene, rollout.agents), tracked[None]))
@@ -177,7 +177,7 @@ def drive(
         off_road=np.array(course.off_road[:n] or [False], dtype=bool),
         along_m=np.array(course.along_m),
         plans=np.stack(plans) if plans else np.empty((0, HORIZON_STEPS, 3)),
-        looks=tuple(looks),
+        images=tuple(images),
         ended=course.ended,
         hit=course.hit,
     )
@@ -264,7 +264,7 @@ class DriveMeasures:
         return self.off_road_events + self.at_fault_collision
 
 
-def measures_of(drive: ClosedLoop) -> DriveMeasures:
+def measure_drive(drive: ClosedLoop) -> DriveMeasures:
     """Comfort is judged with the start's own history, since its filters are as long as 1.5 s."""
     states, off = drive.ego_states, drive.off_road
     steps_m = np.hypot(*np.diff(states[:, [X, Y]], axis=0).T)

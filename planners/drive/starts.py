@@ -37,7 +37,7 @@ class DriveStart:
     number: int = LOGGED  # among the clip's perturbed starts; LOGGED: the log at T
 
 
-def lengthened(clip: Clip, n_steps: int, lights: TrafficLights | None = None) -> Clip:
+def extend_clip(clip: Clip, n_steps: int, lights: TrafficLights | None = None) -> Clip:
     """The clip with agents and lights of `n_steps` steps of 0.1 s, at least its own; its ego is known no longer.
 
     lights: of all these steps, where somebody knows them. Raises ValueError where they are of fewer.

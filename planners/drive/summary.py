@@ -47,7 +47,7 @@ class DriveLine:
         return float(mean), float(low), float(high)
 
 
-def start_of(row: Row) -> str:
+def start_kind(row: Row) -> str:
     """logged or perturbed."""
     return "logged" if row["start"] == LOGGED else "perturbed"
 
@@ -56,7 +56,7 @@ def lines_of(rows: Sequence[Row], confidence: float = 0.95) -> list[DriveLine]:
     """A line for each planner, kind of pictures and kind of start, in the order in which they first come."""
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
-        groups.setdefault((row["planner"], row["pictures"], start_of(row)), []).append(row)
+        groups.setdefault((row["planner"], row["pictures"], start_kind(row)), []).append(row)
     return [_line(*key, group, confidence) for key, group in groups.items()]
 
 
@@ -116,7 +116,7 @@ def differences_of(rows: Sequence[Row], confidence: float = 0.95) -> list[Pictur
     """Over the starts that were driven with both. None where there are none."""
     both: dict[tuple[str, str], dict[tuple[str, int], dict[str, Row]]] = {}
     for row in rows:
-        pairs = both.setdefault((row["planner"], start_of(row)), {})
+        pairs = both.setdefault((row["planner"], start_kind(row)), {})
         pairs.setdefault((row["clip_id"], row["start"]), {})[row["pictures"]] = row
     found = []
     for (planner, start), pairs in both.items():

@@ -4,10 +4,10 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import pyarrow as pa
 
@@ -18,12 +18,12 @@ from factory.store.location import Location
 from factory.store.parquet_file import TableSpec, write_shard
 from factory.store.schema import canonical_json, schema_of
 from factory.store.table import KeyedTable
-from planners.drive.drivers import Driver, driver_of
-from planners.drive.eyes import Eyes, NoEyes, PaintedEyes, RenderedEyes, rendered_eyes
+from planners.drive.cameras import DriveCameras, NoCameras, PaintedCameras, RenderedCameras, open_rendered_cameras
+from planners.drive.drivers import Driver, make_driver
 from planners.drive.films import write_film
-from planners.drive.loop import DRIVE_VERSION, ClosedLoop, DriveMeasures, drive, measures_of
+from planners.drive.loop import DRIVE_VERSION, ClosedLoop, DriveMeasures, drive, measure_drive
 from planners.drive.settings import DriveSettings, Pictures
-from planners.drive.starts import LOGGED, DriveStart, lengthened, logged_start, perturbed_starts
+from planners.drive.starts import LOGGED, DriveStart, extend_clip, logged_start, perturbed_starts
 from planners.evaluation.planner_names import planner_of
 from tasks.perturb import Perturbation, perturb
 from tasks.rollout.simulate import traffic_record
@@ -34,7 +34,6 @@ from tasks.world.vocabulary import Vocabulary
 # The table `drives` under `out`: one row a drive, committed as they end, so that no drive is made twice.
 
 COMMIT_EVERY_S = 10.0  # a killed command drives as much again
-Row = TypeVar("Row")
 
 
 @dataclass(frozen=True)
@@ -97,13 +96,13 @@ def write_rows(table: KeyedTable, rows: Sequence[DriveRow]) -> None:
     table.commit([write_shard(table.location, DRIVES, pa.Table.from_arrays(columns, schema=SCHEMA))])
 
 
-class Committer(Generic[Row]):
+class RowCommitter:
     """Gathers rows and writes them, a commit each time, every COMMIT_EVERY_S and when it is closed."""
 
-    def __init__(self, write: Callable[[Sequence[Row]], None]) -> None:
-        self._write, self._rows, self._last = write, list[Row](), time.monotonic()
+    def __init__(self, table: KeyedTable) -> None:
+        self._table, self._rows, self._last = table, list[DriveRow](), time.monotonic()
 
-    def add(self, rows: Iterable[Row]) -> None:
+    def add(self, rows: Iterable[DriveRow]) -> None:
         """Rows to be committed."""
         self._rows += rows
         if time.monotonic() - self._last > COMMIT_EVERY_S:
@@ -112,7 +111,7 @@ class Committer(Generic[Row]):
     def close(self) -> None:
         """Commit what is gathered."""
         if self._rows:
-            self._write(self._rows)
+            write_rows(self._table, self._rows)
         self._rows, self._last = [], time.monotonic()
 
 
@@ -143,7 +142,7 @@ class DriveItem:
 
 
 @dataclass(frozen=True)
-class NotDriven:
+class FailedDrive:
     """A drive that could not be made: tried again by the same command."""
 
     clip_id: str
@@ -182,32 +181,33 @@ class DriveWork:
             found["render"] = asdict(s.render)
         return found
 
-    def __call__(self, item: DriveItem) -> list[DriveRow | NotDriven]:
+    def __call__(self, item: DriveItem) -> list[DriveRow | FailedDrive]:
         """Drive all of it. What is wrong with a clip, its pictures or a planner's answer is told of each drive."""
         try:
             return list(self._driven(item))
         except (BadClip, ValueError) as error:
-            return [NotDriven(item.ref.clip_id, str(error))]
+            return [FailedDrive(item.ref.clip_id, str(error))]
 
-    def _driven(self, item: DriveItem) -> Iterator[DriveRow | NotDriven]:
+    def _driven(self, item: DriveItem) -> Iterator[DriveRow | FailedDrive]:
         clip = self._clip(item)
         starts = self._starts(clip, {key.start for _, key in item.keys})
-        eyes = self._eyes(clip, item.pictures)
+        cameras = self._cameras(clip, item.pictures)
         for who, key in item.keys:
             if key.start not in starts:
                 continue  # the clip has fewer
             try:
-                made = drive(starts[key.start], self._driver(who), self.settings.loop, eyes)
+                made = drive(starts[key.start], self._driver(who), self.settings.loop, cameras)
             except ValueError as error:
-                yield NotDriven(clip.clip_id, f"{who.label}: {error}")
+                yield FailedDrive(clip.clip_id, f"{who.label}: {error}")
             else:
-                yield self._row(who, key, made, eyes)
+                yield self._row(who, key, made, cameras)
 
     def _clip(self, item: DriveItem) -> Clip:
         last = NOW + HORIZON_STEPS if any(key.start != LOGGED for _, key in item.keys) else NOW
         clip, n_steps = read_clip(self.reader, item.ref), self.settings.loop.clip_steps(last)
         painter = painter_of(self.reader)
         return lengthened(clip, n_steps, None if painter is None else painter.lights(clip, n_steps))
+        return extend_clip(clip, n_steps, town_lights(clip, n_steps) if reads_towns(self.reader) else None)
 
     def _starts(self, clip: Clip, wanted: set[int]) -> dict[int, DriveStart]:
         found = [logged_start(clip)] if LOGGED in wanted else []
@@ -221,28 +221,28 @@ class DriveWork:
             )
         return {start.number: start for start in found}
 
-    def _eyes(self, clip: Clip, pictures: Pictures) -> Eyes:
-        """The cameras of drives of a clip. Raises BadClip where the engine has no scene of it."""
-        s, painter = self.settings, painter_of(self.reader)
+    def _cameras(self, clip: Clip, pictures: Pictures) -> DriveCameras:
+        """Of all drives of a clip. Raises BadClip where the engine has no scene of it."""
         if pictures == "engine":
-            return rendered_eyes(clip, s.render, s.cache or cache_folder(self.out.uri))
-        return PaintedEyes(clip, s.render, painter) if pictures == "truth" and painter else NoEyes()
+            cache_dir = self.settings.cache or cache_folder(self.out.uri)
+            return open_rendered_cameras(clip, self.settings.render, cache_dir)
+        return PaintedCameras(clip, self.settings.render) if pictures == "truth" else NoCameras()
 
     def _driver(self, who: DrivingPlanner) -> Driver:
-        return kept_driver(who, canonical_json(self.settings.settings), self.settings.pdm, self.settings.device)
+        return cached_driver(who, canonical_json(self.settings.settings), self.settings.pdm, self.settings.device)
 
-    def _film(self, who: DrivingPlanner, key: DriveKey, made: ClosedLoop, eyes: Eyes) -> str:
+    def _film(self, who: DrivingPlanner, key: DriveKey, made: ClosedLoop, cameras: DriveCameras) -> str:
         """One drive in so many has one, chosen by its id."""
         one_in = self.settings.one_film_in
         if one_in == 0 or int(key.drive_id, 16) % one_in:
             return ""
         start = "log" if key.start == LOGGED else f"start {key.start}"
-        return write_film(self.out, key.drive_id, made, eyes.rig, f"{who.label}, {key.pictures}, {start}")
+        return write_film(self.out, key.drive_id, made, cameras.rig, f"{who.label}, {key.pictures}, {start}")
 
-    def _row(self, who: DrivingPlanner, key: DriveKey, made: ClosedLoop, eyes: Eyes) -> DriveRow:
+    def _row(self, who: DrivingPlanner, key: DriveKey, made: ClosedLoop, cameras: DriveCameras) -> DriveRow:
         clip, hit = made.start.scene.clip, made.hit
         return DriveRow(
-            **vars(measures_of(made)),
+            **vars(measure_drive(made)),
             drive_id=key.drive_id,
             clip_id=clip.clip_id,
             dataset=clip.dataset,
@@ -255,12 +255,12 @@ class DriveWork:
             planner=who.label,
             planner_digest=who.digest,
             pictures=key.pictures,
-            psnr_db=eyes.asset.psnr_db if isinstance(eyes, RenderedEyes) else math.nan,
+            psnr_db=cameras.asset.psnr_db if isinstance(cameras, RenderedCameras) else math.nan,
             ended=str(made.ended),
             hit_track="" if hit is None else hit.track_id,
             hit_kind="" if hit is None else hit.kind,
             hit_speed_mps=math.nan if hit is None else hit.speed_mps,
-            film=self._film(who, key, made, eyes),
+            film=self._film(who, key, made, cameras),
             settings=key.settings,
             ego_states=tuple(map(tuple, made.ego_states.tolist())),
             plans=tuple(map(tuple, made.plans.reshape(len(made.plans), -1).tolist())),
@@ -268,9 +268,9 @@ class DriveWork:
 
 
 @lru_cache(maxsize=8)
-def kept_driver(who: DrivingPlanner, changed: str, pdm: Any, device: str) -> Driver:
+def cached_driver(who: DrivingPlanner, changed: str, pdm: Any, device: str) -> Driver:
     """A worker's own, read once. Raises ValueError where it is another than was named when the command began."""
     one = planner_of(who.spec, who.label, json.loads(changed))
     if one.digest != who.digest:
         raise ValueError(f"{who.spec} has changed since the command began: run it again when its training is through")
-    return driver_of(one, pdm, device)
+    return make_driver(one, pdm, device)

@@ -75,7 +75,7 @@ class SummaryLine:
     uniform_share_before: float
 
 
-def by_clip(rows: Sequence[FrameRow]) -> list[ClipResult]:
+def group_by_clip(rows: Sequence[FrameRow]) -> list[ClipResult]:
     """One result a clip, by clip id, whatever the order of the rows. Raises ValueError naming a lacking frame."""
     clips: dict[str, list[FrameRow]] = {}
     for row in rows:
@@ -85,10 +85,10 @@ def by_clip(rows: Sequence[FrameRow]) -> list[ClipResult]:
 
 def summarise(rows: Sequence[FrameRow]) -> Summary:
     """Means over the clips of all rows of one planner. Raises ValueError for no rows or a lacking frame."""
-    return summary_of(by_clip(rows))
+    return summarise_clips(group_by_clip(rows))
 
 
-def summary_of(clips: Sequence[ClipResult]) -> Summary:
+def summarise_clips(clips: Sequence[ClipResult]) -> Summary:
     """Means over the clips of one planner. Raises ValueError for none."""
     if not clips:
         raise ValueError("no frame was scored")
@@ -118,7 +118,7 @@ def lines_of(planner: str, summary: Summary) -> list[SummaryLine]:
     for stage, human_filter in MEASURES:
         if stage != "one_stage" and summary.two_stage is None:
             continue
-        columns = columns_at(summary.one_stage, summary.two_stage, stage, human_filter)
+        columns = stage_columns(summary.one_stage, summary.two_stage, stage, human_filter)
         n_clips = summary.n_clips if stage == "one_stage" else summary.n_two_stage
         shares = (summary.uniform_share, summary.uniform_share_before) if stage == "final" else (np.nan, np.nan)
         frames = n_frames.get(stage, follow_ups)
@@ -126,7 +126,7 @@ def lines_of(planner: str, summary: Summary) -> list[SummaryLine]:
     return lines
 
 
-def columns_at(one_stage: FrameScores, two_stage: TwoStageScores | None, stage: str, human_filter: str) -> Array:
+def stage_columns(one_stage: FrameScores, two_stage: TwoStageScores | None, stage: str, human_filter: str) -> Array:
     """COLUMNS (C,) of one of MEASURES. two_stage is needed for all but one_stage."""
     if stage == "one_stage":
         scores = one_stage
@@ -191,10 +191,10 @@ def shown(human_filter: HumanFilter) -> dict[str, str]:
     return {stage: which for stage, which in MEASURES if which in (human_filter, "none")}
 
 
-def scores_of_clips(clips: Sequence[ClipResult]) -> dict[str, float]:
+def scores_in_percent(clips: Sequence[ClipResult]) -> dict[str, float]:
     """Of one planner: name_of(stage, filter) -> EPDMS in percent, and its share of uniform fallbacks."""
     found = {}
-    for line in lines_of("", summary_of(clips)):
+    for line in lines_of("", summarise_clips(clips)):
         found[name_of(line.stage, line.human_filter)] = 100.0 * score_of(line.columns)
         if line.stage == "final":
             found["uniform_share"] = line.uniform_share
@@ -206,14 +206,14 @@ def name_of(stage: str, human_filter: str) -> str:
     return stage if human_filter == "none" else f"{stage}_{human_filter}"
 
 
-def words_of_stage(stage: str) -> str:
+def stage_title(stage: str) -> str:
     """A stage as tables call it."""
     return "follow-ups (plain mean)" if stage == "follow_ups" else stage.replace("_", " ")
 
 
-def title_of(stage: str, human_filter: str) -> str:
+def score_title(stage: str, human_filter: str) -> str:
     """A score in words, with what it may be held against."""
-    words = "two-stage EPDMS" if stage == "final" else f"EPDMS of {words_of_stage(stage)}"
+    words = "two-stage EPDMS" if stage == "final" else f"EPDMS of {stage_title(stage)}"
     return f"{words}{'' if human_filter == 'none' else f', {human_filter}'}"
 
 
@@ -255,7 +255,7 @@ def _of_stage(runs: Sequence[Sequence[ClipResult]], stage: str, human_filter: st
 
     def score(clip: ClipResult) -> float:
         two_stage = None if stage == "one_stage" else clip.two_stage
-        return float(columns_at(clip.one_stage, two_stage, stage, human_filter)[place])
+        return float(stage_columns(clip.one_stage, two_stage, stage, human_filter)[place])
 
     return Measured(
         clips=tuple(clip.clip_id for clip in runs[0]),

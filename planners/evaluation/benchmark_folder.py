@@ -165,7 +165,7 @@ class _Listed:
     left_out: int
 
 
-def logs_of(path: str) -> dict[str, str]:
+def read_clip_logs(path: str) -> dict[str, str]:
     """Clip -> log of a benchmark, from its document alone. Raises ConfigError where there is none."""
     clips = _listed(path, Location.parse(path).read(BENCHMARK_FILE) or b"").clips
     return {clip_id: clip.log_id for clip_id, clip in clips.items()}

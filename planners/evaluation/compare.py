@@ -22,7 +22,14 @@ import numpy as np
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, compose, fill
 from planners.evaluation import navsim
-from planners.evaluation.aggregation import FILTERS_NOTE, ClipResult, Measured, by_clip, check_same_clips, measured
+from planners.evaluation.aggregation import (
+    FILTERS_NOTE,
+    ClipResult,
+    Measured,
+    check_same_clips,
+    group_by_clip,
+    measured,
+)
 from planners.evaluation.bootstrap import LEVELS, Interval, clusters_of, paired_interval
 from planners.evaluation.score_rows import read_record, read_rows
 from tasks.reward.aggregate import COLUMNS
@@ -104,8 +111,8 @@ def is_clear_row(row: Mapping[str, Any]) -> bool:
 
 def compare_tables(a: Sequence[str], b: Sequence[str], settings: CompareSettings) -> dict[Measure, ByLevel]:
     """The same where a run is a table of NAVSIM's. Raises ConfigError."""
-    runs = navsim.read_side(a), navsim.read_side(b)
-    of_a, of_b = (navsim.measured_of(side, settings.column) for side in runs)
+    runs = navsim.read_tables(a), navsim.read_tables(b)
+    of_a, of_b = (navsim.table_scores(side, settings.column) for side in runs)
     navsim.check_same_tokens(of_a, of_b)
     found: dict[Measure, ByLevel] = dict(intervals(of_a, of_b, settings))
     summaries = navsim.summaries(*runs, settings.column)
@@ -152,7 +159,7 @@ def read_runs(folders: str | Sequence[str]) -> list[list[ClipResult]]:
     runs = []
     for folder in [folders] if isinstance(folders, str) else folders:
         try:
-            runs.append(by_clip(read_rows(Path(folder))))
+            runs.append(group_by_clip(read_rows(Path(folder))))
         except (OSError, ValueError) as error:
             raise ConfigError(f"{folder}: not an evaluated planner: {error}") from error
     if not runs:

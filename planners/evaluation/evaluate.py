@@ -43,7 +43,7 @@ from planners.evaluation.aggregation import SummaryLine, lines_of, summarise, ta
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.frames import Benchmark, FrameKey
 from planners.evaluation.navsim import write_tables
-from planners.evaluation.planner_names import EvaluatedPlanner, composed, needs_of, planners_of
+from planners.evaluation.planner_names import EvaluatedPlanner, composed, find_planners, needs_of
 from planners.evaluation.planning import all_plans
 from planners.evaluation.score_rows import RECORD, FrameRow, is_done, read_rows, write_record, write_rows
 from planners.evaluation.scoring import (
@@ -246,7 +246,7 @@ def main(argv: Sequence[str]) -> None:
 def evaluated(settings: EvaluateSettings) -> None:
     """Evaluate and print what settings ask for. Raises ConfigError, or OSError for a folder that is none."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    who = planners_of(settings.planner, settings.planners, settings.bounds, settings.settings)
+    who = find_planners(settings.planner, settings.planners, settings.bounds, settings.settings)
     benchmark = BenchmarkFolder(_folder(settings))
     lines = evaluate(benchmark, who, settings)
     print(table_text(lines))

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from factory.config.compose import ConfigError
-from planners.evaluation.aggregation import HumanFilter, Measured, Summary, by_clip, summary_of
+from planners.evaluation.aggregation import HumanFilter, Measured, Summary, group_by_clip, summarise_clips
 from planners.evaluation.bootstrap import Interval
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow
@@ -56,8 +56,8 @@ def write_tables(folder: Path, rows: Sequence[FrameRow], tokens: Mapping[FrameKe
     With follow-ups it is the table of two stages, else of one. A row without a score is not `valid`, as one of which
     the public script says that the agent failed.
     """
-    results = {clip.clip_id: clip for clip in by_clip(rows)}
-    summary = summary_of([results[clip_id] for clip_id in dict.fromkeys(row.key.clip_id for row in rows)])
+    results = {clip.clip_id: clip for clip in group_by_clip(rows)}
+    summary = summarise_clips([results[clip_id] for clip_id in dict.fromkeys(row.key.clip_id for row in rows)])
     two_stage = summary.two_stage is not None
     stages = ("stage_one", "stage_two") if two_stage else ("one_stage",)
     ordered = [row for stage in stages for row in rows if row.stage == stage]
@@ -223,7 +223,7 @@ def is_table(path: str) -> bool:
     return path.endswith(SUFFIXES)
 
 
-def read_side(paths: Sequence[str]) -> list[list[PublicTable]]:
+def read_tables(paths: Sequence[str]) -> list[list[PublicTable]]:
     """Of each run its table, of a folder both of its tables. Raises ConfigError naming what is none."""
     runs = []
     for path in map(Path, paths):
@@ -242,7 +242,7 @@ def read_side(paths: Sequence[str]) -> list[list[PublicTable]]:
     return runs
 
 
-def measured_of(runs: Sequence[Sequence[PublicTable]], column: str) -> dict[Measure, Measured]:
+def table_scores(runs: Sequence[Sequence[PublicTable]], column: str) -> dict[Measure, Measured]:
     """(stage, filter) -> one column of the runs over their tokens; what a run does not hold is left out.
 
     Raises ConfigError where runs are not over the same tokens, or some of a stage failed.

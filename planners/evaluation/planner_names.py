@@ -92,7 +92,7 @@ def _plugged(label: str, spec: str) -> EvaluatedPlanner:
     return EvaluatedPlanner(label, _digest_of(made), lambda: made)
 
 
-def planners_of(
+def find_planners(
     planner: str | None,
     planners: Sequence[str] | Mapping[str, str] | None,
     bounds: bool,

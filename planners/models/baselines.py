@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from planners.data.batch import Batch, BevLayout, Needs
 from planners.data.bev import BevClass
-from planners.models.planner import PlanFrom, Planner, evaluating, imitation_l1, planned_from, straight_on
+from planners.models.planner import PlanFrom, Planner, add_base_plan, evaluating, imitation_l1, straight_on
 from tasks.world.arrays import FloatArray
 
 
@@ -83,7 +83,7 @@ class EgoMlp(Planner):
 
     def _poses(self, batch: Batch) -> Tensor:
         poses = self.layers(self.features(batch)).float().view(-1, 8, 3)
-        return planned_from(self.settings.plan_from, poses, batch)
+        return add_base_plan(self.settings.plan_from, poses, batch)
 
 
 @dataclass(frozen=True)

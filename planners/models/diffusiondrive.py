@@ -42,7 +42,7 @@ from planners.models.layers import (
     NetworkSettings,
     Sizes,
     auxiliary_losses,
-    clone_first,
+    copy_first_layer,
     initialise_as_public,
 )
 from planners.models.planner import Planner, TrainingData, evaluating, read_array
@@ -106,20 +106,20 @@ def kept() -> Tensor:
     return (1.0 - betas).cumprod(0).float()
 
 
-def noised(x0: Tensor, noise: Tensor, kept_at: Tensor) -> Tensor:
-    """x_t from x_0 and e of one shape; kept_at is A_t, broadcast against them."""
-    return kept_at.sqrt() * x0 + (1.0 - kept_at).sqrt() * noise
+def add_noise(x0: Tensor, noise: Tensor, alpha_at: Tensor) -> Tensor:
+    """x_t from x_0 and e of one shape; alpha_at is A_t, broadcast against them."""
+    return alpha_at.sqrt() * x0 + (1.0 - alpha_at).sqrt() * noise
 
 
-def stepped(x_t: Tensor, x0: Tensor, kept_at: Tensor, kept_before: Tensor) -> Tensor:
+def ddim_step(x_t: Tensor, x0: Tensor, alpha_at: Tensor, alpha_before: Tensor) -> Tensor:
     """x at an earlier step from x_t and a prediction of x_0 (DDIM with eta = 0, Song et al. 2021).
 
     The prediction is clipped to -1 .. 1 for where it leads.
 
     The noise direction comes from the prediction as it is, as in diffusers (`use_clipped_model_output=False`).
     """
-    noise = (x_t - kept_at.sqrt() * x0) / (1.0 - kept_at).sqrt()
-    return noised(x0.clamp(-1.0, 1.0), noise, kept_before)
+    noise = (x_t - alpha_at.sqrt() * x0) / (1.0 - alpha_at).sqrt()
+    return add_noise(x0.clamp(-1.0, 1.0), noise, alpha_before)
 
 
 REFINEMENTS = 2  # layers of the cascade
@@ -127,7 +127,7 @@ POINT_FEATURES = 64  # of a point: sines and cosines of its two coordinates
 RARE = 0.01  # confidence that the classifiers start from
 
 
-def waves(x: Tensor, count: int, per_unit: float = 1.0, closed: bool = False) -> Tensor:
+def sinusoids(x: Tensor, count: int, per_unit: float = 1.0, closed: bool = False) -> Tensor:
     """`count` sines and cosines of (...,), their frequencies from per_unit to 1e-4 per_unit rad: (..., count).
 
     The last frequency is that of the end where the range is `closed`, else one step before it.
@@ -148,7 +148,7 @@ def mlp(*widths: int, normalise: bool = False) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear(widths[-2], widths[-1]))
 
 
-class AlongTrajectory(nn.Module):
+class TrajectoryAttention(nn.Module):
     """Attention to a map from above at a plan's own points; the plan's feature says how much each point counts."""
 
     def __init__(self, width: int, dropout: float, layout: BevLayout, centred: bool) -> None:
@@ -165,13 +165,13 @@ class AlongTrajectory(nn.Module):
 
     def forward(self, feature: Tensor, points: Tensor, above: Tensor) -> Tensor:
         """Features (B, A, width), points (B, A, 8, 2) in m, map (B, width, rows, columns); outside of it is zero."""
-        grid = on_map(points, self.layout, self.centred)
+        grid = grid_coordinates(points, self.layout, self.centred)
         seen = F.grid_sample(self.value(above).float(), grid, align_corners=False)  # (B, width, A, 8)
         seen = torch.einsum("bcap,bap->bac", seen, self.weights(feature).float().softmax(dim=-1))
         return feature + self.drop(self.out(seen))
 
 
-def on_map(points: Tensor, layout: BevLayout, centred: bool = False) -> Tensor:
+def grid_coordinates(points: Tensor, layout: BevLayout, centred: bool = False) -> Tensor:
     """Points (..., 2), x ahead and y left in m, as column and row in -1 .. 1 over a raster from above.
 
     centred: as if it reached behind as far as ahead.
@@ -189,7 +189,7 @@ class DiffusionLayer(nn.Module):
         super().__init__()
         sizes, dropout = settings.network, settings.dropout
         width, heads, hidden = sizes.width, sizes.heads, sizes.hidden
-        self.along = AlongTrajectory(width, dropout, settings.bev, centred=settings.is_public)
+        self.along = TrajectoryAttention(width, dropout, settings.bev, centred=settings.is_public)
         self.agents, self.ego = Attention(width, heads), Attention(width, heads)
         self.agents_norm, self.ego_norm, self.norm = (nn.LayerNorm(width) for _ in range(3))
         self.feedforward = mlp(width, hidden, width)
@@ -238,8 +238,8 @@ class DiffusionDecoder(nn.Module):
 
         The first layer's plans are offsets from `base`, which is the points themselves or what the noise was added to.
         """
-        feature = self.feature(waves(points, POINT_FEATURES // 2, 2.0 * math.pi).flatten(2))
-        noise = self.step(waves(step, self.width, closed=self.closed))
+        feature = self.feature(sinusoids(points, POINT_FEATURES // 2, 2.0 * math.pi).flatten(2))
+        noise = self.step(sinusoids(step, self.width, closed=self.closed))
         results = []
         for layer in self.layers:
             plans, logits = layer(feature, points, base, above, agents, ego, noise)
@@ -258,17 +258,17 @@ ANCHORS_SEED = 0
 STATUS = 8
 
 
-def to_unit(points: Tensor) -> Tensor:
+def normalise_points(points: Tensor) -> Tensor:
     """Positions (..., 2) in m to where most plans are within -1 .. 1."""
     return 2.0 * (points - points.new_tensor(LOW_M)) / points.new_tensor(SPAN_M) - 1.0
 
 
-def from_unit(points: Tensor) -> Tensor:
-    """The inverse of `to_unit`."""
+def denormalise_points(points: Tensor) -> Tensor:
+    """The inverse of `normalise_points`."""
     return (points + 1.0) / 2.0 * points.new_tensor(SPAN_M) + points.new_tensor(LOW_M)
 
 
-def focal(logits: Tensor, target: Tensor) -> Tensor:
+def focal_loss(logits: Tensor, target: Tensor) -> Tensor:
     """Sigmoid focal loss (Lin et al. 2017), elementwise."""
     chance = logits.sigmoid()
     wrong = (1.0 - chance) * target + chance * (1.0 - target)
@@ -367,7 +367,7 @@ class DiffusionDrive(Planner):
         self.bev_head = BevHead(settings.fusion.bev_channels, settings.bev.shape)
         if settings.is_public:
             initialise_as_public(self)
-            clone_first(self.decoder.layers)
+            copy_first_layer(self.decoder.layers)
 
     @classmethod
     def fixed_arrays(cls, settings: DiffusionDriveSettings, data: TrainingData) -> dict[str, FloatArray]:
@@ -393,14 +393,14 @@ class DiffusionDrive(Planner):
         anchors = self.get_buffer("anchors")
         step = torch.randint(0, TRUNCATED, (len(batch),), device=anchors.device)
         noise = torch.randn((len(batch), *anchors.shape), device=anchors.device)
-        at = noised(to_unit(anchors), noise, self.get_buffer("kept")[step].view(-1, 1, 1, 1))
+        at = add_noise(normalise_points(anchors), noise, self.get_buffer("kept")[step].view(-1, 1, 1, 1))
         decoded = self._decoded(at, step, scene)
         label = torch.where(batch.imitate[:, None, None], batch.plan_2hz, 0.0)
         nearest = (label[:, None, :, :2] - anchors).norm(dim=-1).mean(dim=-1).argmin(dim=1)
         surest = F.one_hot(nearest, len(anchors)).float()
         counted = batch.imitate / len(batch)  # (B,): a mean over the batch to which the others add nothing
         rows = torch.arange(len(batch), device=anchors.device)
-        confidence = sum((focal(logits, surest).mean(dim=1) * counted).sum() for _, logits in decoded)
+        confidence = sum((focal_loss(logits, surest).mean(dim=1) * counted).sum() for _, logits in decoded)
         apart = sum(((plans[rows, nearest] - label).abs().mean(dim=(1, 2)) * counted).sum() for plans, _ in decoded)
         return {
             "confidence": s.trajectory_weight * s.confidence_weight * torch.as_tensor(confidence),
@@ -420,7 +420,7 @@ class DiffusionDrive(Planner):
 
     def _decoded(self, at: Tensor, step: Tensor, scene: EncodedScene) -> list[tuple[Tensor, Tensor]]:
         """Plans and logits of every refinement from positions (B, A, 8, 2) in -1 .. 1 at noise step (B,)."""
-        points = from_unit(at.clamp(-1.0, 1.0))
+        points = denormalise_points(at.clamp(-1.0, 1.0))
         base = points if self.settings.offsets_from == "noisy" else self.get_buffer("anchors").expand_as(points)
         return self.decoder(points, base, step, scene.above, scene.agents, scene.ego)
 
@@ -430,10 +430,10 @@ class DiffusionDrive(Planner):
         noise = self.get_buffer("first_noise").expand(n, -1, -1, -1)
         if self.settings.is_public:
             noise = torch.randn((n, *anchors.shape), device=anchors.device)
-        at = noised(to_unit(anchors), noise, levels[NOISED_TO])
+        at = add_noise(normalise_points(anchors), noise, levels[NOISED_TO])
         for step in DENOISED_AT:
             steps = torch.full((n,), step, device=at.device)
             plans, logits = self._decoded(at, steps, scene)[-1]
             before = levels[step - 1] if step else torch.ones_like(levels[0])
-            at = stepped(at, to_unit(plans[..., :2]), levels[step], before)
+            at = ddim_step(at, normalise_points(plans[..., :2]), levels[step], before)
         return plans[torch.arange(n, device=at.device), logits.argmax(dim=1)]

@@ -254,7 +254,7 @@ class GtrsDense(Planner):
         picked = self._picked()
         trajectories = self.get_buffer("trajectories")[picked]
         logits = self.logits(batch, status, trajectories)
-        target = imitated(trajectories[:, AT_2HZ], batch.plan_2hz, batch.imitate, SIGMA_M2)
+        target = imitation_target(trajectories[:, AT_2HZ], batch.plan_2hz, batch.imitate, SIGMA_M2)
         # masked by a product, also where nothing imitates: a distributed step wants a gradient for every parameter
         apart = -(target * logits[IMITATION].log_softmax(dim=1)).sum(dim=1)
         terms = {IMITATION: (apart * batch.imitate).sum() / len(batch)}
@@ -283,7 +283,7 @@ class GtrsDense(Planner):
             raise ValueError("gtrs_dense: a batch without images")
         image = batch.image
         if self.training and not self.settings.is_public:
-            image = shifted(image, round(self.settings.image_shift * image.shape[-1]))
+            image = random_shift(image, round(self.settings.image_shift * image.shape[-1]))
         return self.scorer(trajectories, self.tokens(image), status)
 
     def _noisy(self, status: Tensor) -> Tensor:
@@ -324,7 +324,7 @@ def _choices(settings: GtrsDenseSettings, arrays: Mapping[str, FloatArray], voca
     return Vocabulary(vocabulary.trajectories[[i * len(vocabulary) // count for i in range(count)]])
 
 
-def imitated(at_2hz: Tensor, plans: Tensor, imitate: Tensor, sigma_m2: float) -> Tensor:
+def imitation_target(at_2hz: Tensor, plans: Tensor, imitate: Tensor, sigma_m2: float) -> Tensor:
     """Distribution (B, K) over trajectories (K, 8, 3): softmax of -sum((x, y, heading apart)^2) / sigma.
 
     Plans (B, 8, 3) that are not to be imitated may be anything, also NaN; their rows mean nothing.
@@ -333,7 +333,7 @@ def imitated(at_2hz: Tensor, plans: Tensor, imitate: Tensor, sigma_m2: float) ->
     return (-(at_2hz[None] - plans[:, None]).square().sum(dim=(2, 3)) / sigma_m2).softmax(dim=1)
 
 
-def shifted(image: Tensor, most: int) -> Tensor:
+def random_shift(image: Tensor, most: int) -> Tensor:
     """Pictures (B, C, h, w), each moved by up to `most` pixels along both axes, edge pixels repeated."""
     if most == 0:
         return image
@@ -345,7 +345,7 @@ def shifted(image: Tensor, most: int) -> Tensor:
     return image[sample, :, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2)
 
 
-def mean_scores(scores: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
+def average_scores(scores: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
     """Mean probabilities (B, K) by name of several models' over the same trajectories (paper, supplement)."""
     return {name: torch.stack([one[name] for one in scores]).mean(dim=0) for name in scores[0]}
 
@@ -380,7 +380,7 @@ class Ensemble(nn.Module):
 
     def scores(self, batch: Batch) -> dict[str, Tensor]:
         """Mean probabilities (B, K) by name."""
-        return mean_scores([member.scores(batch) for member in self.models])
+        return average_scores([member.scores(batch) for member in self.models])
 
     def plan(self, batch: Batch) -> Tensor:
         first = self.models[0]

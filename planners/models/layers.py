@@ -381,10 +381,10 @@ def initialise_as_public(model: nn.Module) -> None:
             _as_torch_s_attention(module)
     for module in model.modules():
         if isinstance(module, Decoder):
-            clone_first(module.layers)
+            copy_first_layer(module.layers)
 
 
-def clone_first(layers: nn.ModuleList) -> None:
+def copy_first_layer(layers: nn.ModuleList) -> None:
     """Give all layers the weights of the first."""
     for layer in layers[1:]:
         layer.load_state_dict(layers[0].state_dict())

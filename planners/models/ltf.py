@@ -27,11 +27,11 @@ from planners.models.planner import (
     PlanFrom,
     Planner,
     Status,
-    bounded_heading,
+    add_base_plan,
+    bound_heading,
     evaluating,
     imitation_l1,
-    planned_from,
-    seen_status,
+    visible_status,
 )
 from tasks.settings import fixed
 from tasks.world.arrays import FloatArray
@@ -102,10 +102,12 @@ class Ltf(Planner):
         assert batch.image is not None
         fused = self.fusion(batch.image)
         cells = self.reduce(fused.latent).flatten(2).transpose(1, 2)
-        keys = torch.cat([cells, self.status(seen_status(self.settings.status, batch))[:, None]], 1) + self.key_position
+        keys = (
+            torch.cat([cells, self.status(visible_status(self.settings.status, batch))[:, None]], 1) + self.key_position
+        )
         queries = self.decoder(self.queries.expand(len(batch), -1, -1), keys)
-        plan = bounded_heading(self.plan_head(queries[:, 0]).float().view(-1, 8, 3))
-        return planned_from(self.settings.plan_from, plan, batch), queries[:, 1:], fused.bev
+        plan = bound_heading(self.plan_head(queries[:, 0]).float().view(-1, 8, 3))
+        return add_base_plan(self.settings.plan_from, plan, batch), queries[:, 1:], fused.bev
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         s = self.settings

@@ -109,7 +109,7 @@ def evaluating(model: nn.Module) -> Iterator[None]:
 Status = Literal["all", "speed"]  # what of the ego's status is seen; speed: command and velocity, no acceleration
 
 
-def seen_status(which: Status, batch: Batch) -> Tensor:
+def visible_status(which: Status, batch: Batch) -> Tensor:
     """(B, 8) of `batch.status`, zeros for what is not seen.
 
     Acceleration tells what the log's driver is already doing, bend and brake, and a planner that drives on its own
@@ -124,7 +124,7 @@ def seen_status(which: Status, batch: Batch) -> Tensor:
 PlanFrom = Literal["zero", "constant_velocity"]  # what regressed poses are added to
 
 
-def bounded_heading(poses: Tensor) -> Tensor:
+def bound_heading(poses: Tensor) -> Tensor:
     """(..., 3) with the heading within -pi .. pi, as the public TransFuser does: tanh(h) pi."""
     return torch.cat([poses[..., :2], poses[..., 2:].tanh() * math.pi], -1)
 
@@ -138,7 +138,7 @@ def imitation_l1(plan: Tensor, batch: Batch) -> Tensor:
     return torch.where(batch.imitate, error, 0.0).mean()
 
 
-def planned_from(base: PlanFrom, regressed: Tensor, batch: Batch) -> Tensor:
+def add_base_plan(base: PlanFrom, regressed: Tensor, batch: Batch) -> Tensor:
     """The plans (B, 8, 3) of what was regressed."""
     return regressed + straight_on(batch) if base == "constant_velocity" else regressed
 

@@ -15,8 +15,8 @@ import numpy as np
 from factory.exits import Failed, Stopped
 from planners.drive.drive import drive_all, driven
 from planners.drive.settings import DriveSettings, settings_of
-from planners.drive.summary import M_PER_KM, SHARES, highest_level, start_of
-from planners.evaluation.aggregation import BOUNDS, name_of, scores_of_clips, write_csv
+from planners.drive.summary import M_PER_KM, SHARES, highest_level, start_kind
+from planners.evaluation.aggregation import BOUNDS, name_of, scores_in_percent, write_csv
 from planners.evaluation.bootstrap import Interval, paired_interval
 from planners.evaluation.compare import CompareSettings, compare, difference_columns
 from planners.study.report import FRAMES, read_study
@@ -81,7 +81,7 @@ class ArmDrives:
         return paired_interval(a, b, weights=(weight_a, weight_b), clusters=self.clusters)
 
 
-def arm_of(label: str) -> str:
+def arm_name(label: str) -> str:
     """Of a training's label."""
     return label.rpartition("-")[0]
 
@@ -109,7 +109,7 @@ def drive_arms(arms: Sequence[Training], out: str, drives: str, means: Means) ->
     return None
 
 
-def arms_of(arms: Sequence[Training], out: str, drives: str) -> list[ArmDrives]:
+def read_arm_drives(arms: Sequence[Training], out: str, drives: str) -> list[ArmDrives]:
     """What is driven so far, by kind of start: seeds with which every arm has driven, starts that all have made."""
     trained = [one for one in arms if (Path(out) / "trainings" / one.label).is_dir()]
     rows = driven(drive_settings(trained, out, drives))[0] if trained else []
@@ -117,7 +117,7 @@ def arms_of(arms: Sequence[Training], out: str, drives: str) -> list[ArmDrives]:
     for kind in KINDS:
         by_label: dict[str, dict[Start, Row]] = {}
         for row in rows:
-            if start_of(row) == kind:
+            if start_kind(row) == kind:
                 by_label.setdefault(row["planner"], {})[row["clip_id"], row["start"]] = row
         if one := _paired(kind, by_label, [one.label for one in arms]):
             found.append(one)
@@ -125,7 +125,7 @@ def arms_of(arms: Sequence[Training], out: str, drives: str) -> list[ArmDrives]:
 
 
 def _paired(kind: str, by_label: Mapping[str, Mapping[Start, Row]], labels: Sequence[str]) -> ArmDrives | None:
-    names = list(dict.fromkeys(map(arm_of, labels)))
+    names = list(dict.fromkeys(map(arm_name, labels)))
     seeds = sorted({label.rpartition("-")[2] for label in labels}, key=int)
     whole = [seed for seed in seeds if all(f"{name}-{seed}" in by_label for name in names)]
     sides = {name: [by_label[f"{name}-{seed}"] for seed in whole] for name in names}
@@ -168,7 +168,7 @@ def against_bounds(report: Path, setups: Sequence[Setup], seeds: int) -> list[di
                 continue
             intervals = compare([clips[bound]], runs, RULES)
             for stage in STAGES:
-                each = [scores_of_clips(run)[name_of(*stage)] for run in runs]
+                each = [scores_in_percent(run)[name_of(*stage)] for run in runs]
                 facts = {"arm": setup.label, "reference": bound, "seeds": len(runs), "stage": stage[0]}
                 rows.append(facts | {"epdms": float(np.mean(each))} | difference_columns(intervals.get(stage)))
     return rows

@@ -27,15 +27,15 @@ from planners.evaluation.aggregation import (
     MEASURES,
     ClipResult,
     HumanFilter,
-    by_clip,
+    group_by_clip,
     name_of,
-    scores_of_clips,
+    score_title,
+    scores_in_percent,
     shown,
-    title_of,
-    words_of_stage,
+    stage_title,
     write_csv,
 )
-from planners.evaluation.benchmark_folder import logs_of
+from planners.evaluation.benchmark_folder import read_clip_logs
 from planners.evaluation.compare import CompareSettings, compare, difference_columns, is_clear_row
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow, read_rows
@@ -79,7 +79,7 @@ class StudyFrames:
 
 def rows_of(labels: Iterable[str], evaluations: Path, benchmark: str) -> Iterator[tuple[str, list[FrameRow]]]:
     """The scored frames of each evaluated planner, with the logs of their clips as the benchmark has them."""
-    logs = logs_of(benchmark)
+    logs = read_clip_logs(benchmark)
     for label in labels:
         yield label, [replace(row, log_id=logs[row.key.clip_id]) for row in read_rows(evaluations / label)]
 
@@ -114,7 +114,7 @@ def read_study(path: Path) -> StudyFrames:
         raise ValueError(f"{path}: no rows of a study: it must have the columns {', '.join(SCHEMA.names)}")
     columns = (table[name].to_numpy(zero_copy_only=False) for name in SCHEMA.names)
     clips = {
-        str(label): by_clip([_row(*values) for _, *values in rows])
+        str(label): group_by_clip([_row(*values) for _, *values in rows])
         for label, rows in groupby(zip(*columns), key=itemgetter(0))
     }
     meta = json.loads(kept)
@@ -159,7 +159,7 @@ def write_tables(frames: Path, out: Path, human_filter: HumanFilter) -> str:
     """
     study = read_study(frames)
     out.mkdir(parents=True, exist_ok=True)
-    scores = {label: scores_of_clips(clips) for label, clips in study.clips.items()}
+    scores = {label: scores_in_percent(clips) for label, clips in study.clips.items()}
     bounds = [{"planner": name, **scores[name]} for name in BOUNDS if name in scores]
     rows = compared(study)
     write_csv(out / "comparisons.csv", rows)
@@ -176,7 +176,7 @@ def compared(frames: StudyFrames) -> list[Row]:
     for one in frames.comparisons:
         sides = [[frames.clips[setup.label_of(seed)] for seed in range(one.seeds)] for setup in one.setups]
         intervals = compare(sides[1], sides[0], RULES) if one.reference else {}
-        scores = [scores_of_clips(clips) for clips in sides[0]]
+        scores = [scores_in_percent(clips) for clips in sides[0]]
         for stage, human_filter in MEASURES:
             each = [score[name_of(stage, human_filter)] for score in scores]
             row = {**one.facts, "stage": stage, "human_filter": human_filter, "epdms": float(np.mean(each))}
@@ -195,7 +195,7 @@ def markdown_of(rows: Sequence[Row], human_filter: HumanFilter) -> str:
     """
     mine = [row for row in rows if row["human_filter"] in (human_filter, "none")]
     stages = [stage for stage in shown(human_filter) if any(row["stage"] == stage for row in mine)]
-    head = ("planner", "trained on", "equal", "seeds", *map(words_of_stage, stages), "final of each seed")
+    head = ("planner", "trained on", "equal", "seeds", *map(stage_title, stages), "final of each seed")
     lines = [*wrap(f"Scores are {human_filter}: {FILTERS_NOTE[0]}; {FILTERS_NOTE[1]}.", 120), ""]
     lines += [*wrap(INTERVALS, 120), ""]
     for part, of_part in groupby(mine, key=lambda row: row["part"]):
@@ -231,7 +231,7 @@ def _line(cells: Sequence[str]) -> str:
 
 def text_of(found: Sequence[Row], bounds: Sequence[Row], human_filter: str) -> str:
     """The two-stage scores among the rows of comparisons.csv, to be printed."""
-    lines = [f"{title_of('final', human_filter)}; {FILTERS_NOTE[0]}"]
+    lines = [f"{score_title('final', human_filter)}; {FILTERS_NOTE[0]}"]
     lines += [f"{'part':<12}{'trained':<46}{'equal':>8}{'seeds':>7}{'EPDMS':>8}{'difference':>12}   95 % over clips"]
     for row in found:
         if (row["stage"], row["human_filter"]) == ("final", human_filter):

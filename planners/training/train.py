@@ -189,12 +189,12 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
     steps = total_steps(loader, training, config.steps)
     check = validation(config.data, planner, process, config.workers) if config.data.val else None
     identity = _identity(config, dataset, steps, process)
-    resume_from = _begun(out, config, identity)
+    resume_from = _checkpoint_to_resume(out, config, identity)
     before = {} if resume_from is None else read_record(resume_from)
     backbones = _first_weights(planner, config) if resume_from is None else before["backbones"]
     record = {
         "trained": identity,
-        **_until_here(before, identity),
+        **_earlier_settings(before, identity),
         "samples": {"real": int((~dataset.rows.simulated).sum()), "simulated": int(dataset.rows.simulated.sum())},
         "backbones": backbones,
         "parameters": sum(parameter.numel() for parameter in planner.parameters()),
@@ -283,7 +283,7 @@ def _identity(config: TrainConfig, dataset: Dataset, steps: int, process: Traini
     return same
 
 
-def _begun(out: Path, config: TrainConfig, identity: Mapping[str, Any]) -> Path | None:
+def _checkpoint_to_resume(out: Path, config: TrainConfig, identity: Mapping[str, Any]) -> Path | None:
     """The checkpoint to go on from; None where there is none. Raises ConfigError where it is of another training."""
     if not checkpoints(out):
         return None
@@ -304,7 +304,7 @@ def _begun(out: Path, config: TrainConfig, identity: Mapping[str, Any]) -> Path 
     return newest(out)
 
 
-def _until_here(before: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, Any]:
+def _earlier_settings(before: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, Any]:
     """For the record: up to which step a training that goes on further was computed with other settings."""
     earlier = list(before.get("earlier", []))
     then = before["trained"] if before else identity

@@ -8,7 +8,7 @@ import numpy as np
 from factory.store.reader import Sample
 from planners.drive.drivers import DriveEnd
 from planners.drive.loop import LoopSettings
-from planners.drive.starts import DriveStart, lengthened, logged_start
+from planners.drive.starts import DriveStart, extend_clip, logged_start
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Clip, Scene
 from tasks.world.frames import HEADING, VX, to_world
 from tests.tasks.streets import street_clip
@@ -72,4 +72,4 @@ def street_with(agents: AgentTracks, speed_mps: float = 8.0) -> Clip:
 
 def start_on(clip: Clip, settings: LoopSettings) -> DriveStart:
     """From T of the clip."""
-    return logged_start(lengthened(clip, settings.clip_steps(NOW)))
+    return logged_start(extend_clip(clip, settings.clip_steps(NOW)))

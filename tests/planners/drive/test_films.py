@@ -26,17 +26,17 @@ class RedEyes:
     rig: tuple[Mapping[str, Any], ...] = ({"name": "front", "ego_from_camera": np.eye(4)[[2, 0, 1, 3]].ravel()},)
     offsets: tuple[int, ...] = (0,)
 
-    def look(self, scene: Scene, offset: int) -> list[Mapping[str, Any]]:
+    def images(self, scene: Scene, offset: int) -> list[Mapping[str, Any]]:
         red = np.full((36, 64, 3), (250, 0, 0), np.uint8)
         return [{"camera": "front", "time_s": 0.0, "jpeg": encode_jpeg(red, 95)}]
 
 
-@pytest.mark.parametrize("eyes", [None, RedEyes()])
-def test_a_film_has_a_picture_for_every_tenth_of_a_second(eyes: RedEyes | None) -> None:
-    made = drive(start_on(street_with(car(50.0)), SETTINGS), Steady(8.0), SETTINGS, eyes)
-    pictures = list(pictures_of(made, None if eyes is None else eyes.rig, "a"))
+@pytest.mark.parametrize("cameras", [None, RedEyes()])
+def test_a_film_has_a_picture_for_every_tenth_of_a_second(cameras: RedEyes | None) -> None:
+    made = drive(start_on(street_with(car(50.0)), SETTINGS), Steady(8.0), SETTINGS, cameras)
+    pictures = list(pictures_of(made, None if cameras is None else cameras.rig, "a"))
     assert len(pictures) == made.n_steps + 1 + HOLD == 23
     assert {picture.shape for picture in pictures} == {(BEV_PX[1], BEV_PX[0] + CAMERA_PX[0], 3)}
     middle = pictures[0][CAMERA_PX[1] // 2, BEV_PX[0] + CAMERA_PX[0] // 2].astype(int)
-    assert (middle[0] - middle[1] > 200) == (eyes is not None)
+    assert (middle[0] - middle[1] > 200) == (cameras is not None)
     assert (pictures[0] != pictures[5]).any()

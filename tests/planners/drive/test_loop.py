@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from planners.drive.drivers import DriveEnd, HumanDriver, driver_of
-from planners.drive.loop import LoopSettings, drive, measures_of
+from planners.drive.drivers import DriveEnd, HumanDriver, make_driver
+from planners.drive.loop import LoopSettings, drive, measure_drive
 from planners.drive.starts import logged_start
 from planners.evaluation.planner_names import planner_of
 from tasks.settings import PdmSettings, TrafficSettings
@@ -16,7 +16,7 @@ from tests.planners.drive.streets import FAR, Steady, car, nobody, start_on, str
 from tests.tasks.streets import moved, street_clip
 
 REPLAY = replace(FAR, traffic=TrafficSettings(mode="replay"))
-CONSTANT_VELOCITY = driver_of(planner_of("constant_velocity"), PdmSettings())
+CONSTANT_VELOCITY = make_driver(planner_of("constant_velocity"), PdmSettings())
 
 
 def test_constant_velocity_drives_a_straight_road_to_its_end() -> None:
@@ -24,7 +24,7 @@ def test_constant_velocity_drives_a_straight_road_to_its_end() -> None:
     made = drive(start_on(street_with(nobody()), FAR), CONSTANT_VELOCITY, FAR)
     assert made.ended is DriveEnd.ROAD_END
     assert made.n_steps == np.ceil((300.0 - PACIFICA.front_length) / 0.8) == 370
-    found = measures_of(made)
+    found = measure_drive(made)
     assert found.distance_m == pytest.approx(296.0, abs=1e-6)
     assert (found.route_completed, found.comfortable, found.collision, found.off_road_m) == (1.0, 1.0, False, 0.0)
 
@@ -36,7 +36,7 @@ def test_a_standing_vehicle_ahead_is_hit_at_the_closed_form_time() -> None:
     assert made.n_steps == np.ceil((47.7 - PACIFICA.front_length) / 0.8) == 55
     assert made.hit is not None
     assert (made.hit.track_id, made.hit.at_fault, round(made.hit.speed_mps, 6)) == ("car", True, 8.0)
-    assert measures_of(made).at_fault_collision
+    assert measure_drive(made).at_fault_collision
 
 
 def test_who_is_run_into_from_behind_is_not_at_fault() -> None:
@@ -45,7 +45,7 @@ def test_who_is_run_into_from_behind_is_not_at_fault() -> None:
     assert made.ended is DriveEnd.COLLISION
     assert made.n_steps == np.ceil((30.0 - 2.3 - PACIFICA.rear_length) / 0.8) == 34
     assert made.hit is not None and not made.hit.at_fault
-    found = measures_of(made)
+    found = measure_drive(made)
     assert found.collision and not found.at_fault_collision and found.failures == 0
 
 
@@ -71,7 +71,7 @@ def test_the_known_world_ends_a_bound_away_from_where_the_log_was() -> None:
     assert made.ended is DriveEnd.SCENE_END
     assert made.ego_states[-1, X] == pytest.approx(94.4, abs=1e-6)
     assert made.road.length_m == 94.0
-    assert measures_of(made).route_completed == 1.0
+    assert measure_drive(made).route_completed == 1.0
 
 
 def test_time_is_up_after_so_many_seconds() -> None:
@@ -90,7 +90,7 @@ def test_the_human_drives_as_its_log_and_ends_with_it() -> None:
 def test_pdm_closed_keeps_clear_of_who_stands_ahead() -> None:
     settings = LoopSettings(seconds=12.0, bound_m=1000.0)
     made = drive(
-        start_on(street_with(car(50.0)), settings), driver_of(planner_of("pdm_closed"), PdmSettings()), settings
+        start_on(street_with(car(50.0)), settings), make_driver(planner_of("pdm_closed"), PdmSettings()), settings
     )
     assert made.ended is DriveEnd.TIME
     assert made.ego_states[-1, VX] < 0.5
@@ -100,7 +100,7 @@ def test_leaving_the_road_is_one_event_and_ends_nothing() -> None:
     """The road's right edge is 3.5 m to the right, and the body 1.15 m wide on that side."""
     settings = LoopSettings(seconds=5.0, bound_m=1000.0)
     made = drive(start_on(street_with(nobody()), settings), Steady(8.0, turn_rad=-0.15), settings)
-    found = measures_of(made)
+    found = measure_drive(made)
     assert found.off_road_events == found.failures == 1
     first = int(np.argmax(made.off_road))
     assert made.ego_states[first, Y] < -1.0
@@ -112,7 +112,7 @@ def test_leaving_the_road_is_one_event_and_ends_nothing() -> None:
 def test_braking_hard_is_uncomfortable_while_it_lasts() -> None:
     settings = LoopSettings(seconds=10.0, bound_m=1000.0)
     made = drive(start_on(street_with(nobody()), settings), Steady(0.0), settings)
-    assert 0.1 < measures_of(made).comfortable < 0.99
+    assert 0.1 < measure_drive(made).comfortable < 0.99
 
 
 def test_the_same_start_is_driven_to_the_same_bytes() -> None:

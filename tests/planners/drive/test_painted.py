@@ -14,9 +14,9 @@ from factory.datasets.town.painter import TownPainter, town_log
 from factory.datasets.town.reader import SyntheticReader
 from factory.datasets.town.settings import TownSettings
 from factory.exits import BAD_CONFIG, COMPLETE
+from planners.drive.cameras import NoCameras, Observer, PaintedCameras
 from planners.drive.drive import main
-from planners.drive.eyes import NoEyes, PaintedEyes, Sight
-from planners.drive.starts import lengthened, logged_start
+from planners.drive.starts import extend_clip, logged_start
 from tasks.render.scene.asset import psnr
 from tasks.render.settings import Frames, RenderSettings
 from tasks.world.clip import CLIP_STEPS, NOW, Clip, Scene
@@ -36,6 +36,7 @@ def photographed(tmp_path_factory: pytest.TempPathFactory) -> Clip:
     reader = SyntheticReader(tmp_path_factory.mktemp("town"), 1, settings=settings)
     clip = reader.read(reader.index().refs[0])
     return lengthened(clip, 300, TownPainter().lights(clip, 300))
+    return extend_clip(clip, 300, town_lights(clip, 300))
 
 
 def unit(jpeg: bytes) -> np.ndarray:
@@ -55,23 +56,24 @@ def front(images: Any) -> bytes:
 def test_where_the_log_drives_the_painter_shows_the_log_s_photos(photographed: Clip) -> None:
     """At T and 1.5 s before; who is beyond 100 m of the log's ego is not annotated and not painted."""
     scene, eyes = logged_start(photographed).scene, PaintedEyes(photographed, SMALL, TownPainter())
+    scene, cameras = logged_start(photographed).scene, PaintedCameras(photographed, SMALL)
     files = {round(file.time_s, 2): Path(file.uri) for file in photographed.images}
     for offset in (0, -15):
-        painted = unit(front(eyes.look(scene, offset)))
+        painted = unit(front(cameras.images(scene, offset)))
         assert psnr(painted, unit(files[round((NOW + offset) * 0.1, 2)].read_bytes())) > 35.0
 
 
 @pytest.mark.slow
 def test_it_paints_what_the_simulation_has(photographed: Clip) -> None:
     """From a metre further to the left, and without anybody, other pictures."""
-    scene, eyes = logged_start(photographed).scene, PaintedEyes(photographed, SMALL, TownPainter())
-    here = unit(front(eyes.look(scene, 0)))
+    scene, cameras = logged_start(photographed).scene, PaintedCameras(photographed, SMALL)
+    here = unit(front(cameras.images(scene, 0)))
     beside = scene.ego_history.copy()
     heading = beside[-1, 2]
     beside[-1, :2] += -np.sin(heading), np.cos(heading)
     alone = replace(scene, agents=replace(scene.agents, valid=np.zeros_like(scene.agents.valid)))
     for other in (replace(scene, ego_history=beside), alone):
-        assert psnr(unit(front(eyes.look(other, 0))), here) < 35.0
+        assert psnr(unit(front(cameras.images(other, 0))), here) < 35.0
 
 
 @pytest.mark.slow
@@ -88,20 +90,20 @@ def test_only_the_town_has_a_painter() -> None:
             town_log(other)
 
 
-class Counting(NoEyes):
-    """Eyes that note when they look."""
+class Counting(NoCameras):
+    """DriveCameras that note when they look."""
 
-    def look(self, scene: Scene, offset: int) -> list[Mapping[str, Any]]:
+    def images(self, scene: Scene, offset: int) -> list[Mapping[str, Any]]:
         return [{"camera": "a", "time_s": offset * 0.1, "seen": scene.step + offset}]
 
 
 def test_what_was_seen_is_what_a_sample_s_earlier_pictures_are() -> None:
     """Two looks half a second apart: the first looks back, the second remembers."""
-    clip = lengthened(street_clip(), 200)
-    scene, sight = logged_start(clip).scene, Sight(Counting(offsets=(-15, -10, -5, 0)))
+    clip = extend_clip(street_clip(), 200)
+    scene, observer = logged_start(clip).scene, Observer(Counting(offsets=(-15, -10, -5, 0)))
     shown = []
     for step in (NOW, NOW + 5):
-        images = sight.look(replace(scene, step=step)).sample()["images"]
+        images = observer.observe(replace(scene, step=step)).sample()["images"]
         shown.append([(image["seen"], round(image["time_s"], 6)) for image in images])
     assert shown[0] == [(0, -1.5), (5, -1.0), (10, -0.5), (15, 0.0)]
     assert shown[1] == [(5, -1.5), (10, -1.0), (15, -0.5), (20, 0.0)]

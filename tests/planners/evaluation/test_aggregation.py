@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from planners.evaluation.aggregation import by_clip, lines_of, score_of, summarise
+from planners.evaluation.aggregation import group_by_clip, lines_of, score_of, summarise
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow, read_rows, write_rows
 from tasks.reward.aggregate import COLUMNS, FrameScores
@@ -49,7 +49,7 @@ def test_two_clips_and_three_follow_ups_add_up_as_on_paper() -> None:
     assert score_of(summary.two_stage.follow_ups) == pytest.approx(3.1 / 6)  # of 1, 0.4, 0.5, 0.2, 0.3, 0.7
     assert score_of(summary.two_stage.final.filtered) == pytest.approx(0.385230, abs=1e-6)
     assert (summary.n_clips, summary.n_two_stage, summary.n_follow_ups) == (2, 2, 3)
-    clip_a = by_clip(two_clips())[0].two_stage
+    clip_a = group_by_clip(two_clips())[0].two_stage
     assert clip_a is not None
     assert score_of(clip_a.final.filtered) == pytest.approx(0.445460, abs=1e-6)
 

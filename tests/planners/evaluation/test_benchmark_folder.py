@@ -9,7 +9,7 @@ import pytest
 from factory.config.compose import ConfigError
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.evaluate import EvaluateSettings, evaluate, main
-from planners.evaluation.planner_names import planners_of
+from planners.evaluation.planner_names import find_planners
 from planners.evaluation.score_rows import read_rows
 from planners.evaluation.scoring import Rules, prepare_clip, score_clip
 from tests.planners.small_benchmark import StreetBenchmark, straight, write_benchmark_folder
@@ -47,7 +47,9 @@ def test_the_command_scores_a_benchmark_on_disk(
     rows = read_rows(tmp_path / "pdm_closed")
     assert {row.key.clip_id for row in rows} == {"a"} and len(rows) == 7
     memory = StreetBenchmark(("a",))
-    evaluate(memory, planners_of("pdm_closed", None, bounds=False), EvaluateSettings("", out=str(tmp_path / "memory")))
+    evaluate(
+        memory, find_planners("pdm_closed", None, bounds=False), EvaluateSettings("", out=str(tmp_path / "memory"))
+    )
     for stored, kept in zip(rows, read_rows(tmp_path / "memory" / "pdm_closed")):
         np.testing.assert_allclose(stored.scores.filtered, kept.scores.filtered)
         assert stored.tags == kept.tags

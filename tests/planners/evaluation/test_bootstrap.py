@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from planners.evaluation.aggregation import ClipResult, by_clip, lines_of, measured, score_of, summarise
+from planners.evaluation.aggregation import ClipResult, group_by_clip, lines_of, measured, score_of, summarise
 from planners.evaluation.bootstrap import paired_interval
 from planners.evaluation.compare import CompareSettings, compare, difference_columns, is_clear, is_clear_row, text_of
 from planners.evaluation.score_rows import FrameRow
@@ -140,7 +140,7 @@ def test_nonsense_is_refused() -> None:
 
 def run(bonus: float = 0.0, n_clips: int = 6) -> list[ClipResult]:
     """Clips whose plans all end on their follow-ups, so that every weight is known."""
-    return by_clip([row for i in range(n_clips) for row in clip_of(i, bonus)])
+    return group_by_clip([row for i in range(n_clips) for row in clip_of(i, bonus)])
 
 
 def clip_of(i: int, bonus: float = 0.0) -> list[FrameRow]:

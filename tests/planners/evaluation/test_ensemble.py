@@ -9,7 +9,7 @@ import torch
 from factory.config.compose import ConfigError
 from planners.data.batch import ImageLayout
 from planners.evaluation.planner_names import planner_of
-from planners.models.gtrs_dense import Ensemble, mean_scores
+from planners.models.gtrs_dense import Ensemble, average_scores
 from planners.training.checkpoint import load_planner, save_checkpoint
 from tests.planners.models.test_gtrs_dense import TINY, labelled, planner
 from tests.planners.toy import Toy, ToySettings
@@ -23,7 +23,7 @@ def test_scores_are_averaged_as_probabilities_before_they_are_weighted() -> None
     scores = together.scores(batch)
     torch.testing.assert_close(scores["ep"], (each[0]["ep"] + each[1]["ep"] + each[2]["ep"]) / 3)
     torch.testing.assert_close(scores["imitation"].sum(dim=1), torch.ones(4))
-    assert torch.equal(together.plan(batch), models[0].choices[models[0].choose(mean_scores(each))])
+    assert torch.equal(together.plan(batch), models[0].choices[models[0].choose(average_scores(each))])
 
 
 def test_members_that_have_nothing_to_average_are_refused_by_name() -> None:

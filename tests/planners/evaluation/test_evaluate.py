@@ -17,7 +17,7 @@ from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
 from planners.evaluation.aggregation import SummaryLine
 from planners.evaluation.evaluate import EvaluateSettings, evaluate, fallback_notes, main, settings_of
 from planners.evaluation.frames import FrameKey
-from planners.evaluation.planner_names import EvaluatedPlanner, planner_of, planners_of
+from planners.evaluation.planner_names import EvaluatedPlanner, find_planners, planner_of
 from planners.evaluation.planning import all_plans, as_shown, plans_of
 from planners.evaluation.score_rows import read_record, read_rows
 from planners.training.checkpoint import save_checkpoint
@@ -92,7 +92,7 @@ def benchmark() -> StreetBenchmark:
 
 
 def named(*specs: str) -> list[EvaluatedPlanner]:
-    return planners_of(None, specs, bounds=False)
+    return find_planners(None, specs, bounds=False)
 
 
 def test_both_faces_of_a_planner_and_the_bounds_are_scored_in_one_table(
@@ -274,12 +274,12 @@ def test_a_folder_without_a_checkpoint_is_refused(tmp_path: Path) -> None:
 
 def test_labels_are_unique_and_bounds_come_once() -> None:
     with pytest.raises(ConfigError, match="planner is missing"):
-        planners_of(None, [], bounds=True)
-    found = planners_of(None, {"mine": "test_evaluate:Steady", "yours": "test_evaluate:Steady"}, bounds=False)
+        find_planners(None, [], bounds=True)
+    found = find_planners(None, {"mine": "test_evaluate:Steady", "yours": "test_evaluate:Steady"}, bounds=False)
     assert [one.label for one in found] == ["mine", "yours"]
     with pytest.raises(ConfigError, match="two are called"):
-        planners_of("test_evaluate:Steady", {"test_evaluate.Steady": "human"}, bounds=False)
-    assert [one.label for one in planners_of("human", ["human"], bounds=False)] == ["human"]
+        find_planners("test_evaluate:Steady", {"test_evaluate.Steady": "human"}, bounds=False)
+    assert [one.label for one in find_planners("human", ["human"], bounds=False)] == ["human"]
 
 
 def test_the_command_line_is_typed_and_complains_by_name(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from planners.evaluation.compare import main
 from planners.evaluation.evaluate import EvaluateSettings, evaluate
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.navsim import file_name, read_table, score_of_columns, write_tables
-from planners.evaluation.planner_names import planners_of
+from planners.evaluation.planner_names import find_planners
 from planners.evaluation.score_rows import FrameRow, read_rows
 from tasks.reward.aggregate import COLUMNS, FrameScores
 from tests.planners.small_benchmark import StreetBenchmark
@@ -206,7 +206,7 @@ def test_tables_of_other_tokens_or_stages_and_folders_without_any_are_refused(
 
 def test_evaluate_writes_them_where_frames_have_tokens(tmp_path: Path) -> None:
     streets = StreetBenchmark()
-    who, settings = planners_of("pdm_closed", None, bounds=False), EvaluateSettings("streets", out=str(tmp_path))
+    who, settings = find_planners("pdm_closed", None, bounds=False), EvaluateSettings("streets", out=str(tmp_path))
     evaluate(streets, who, settings)
     assert not (tmp_path / "pdm_closed" / file_name("filtered")).exists()
     streets.tokens = {key: str(number) for number, key in enumerate(streets.keys)}

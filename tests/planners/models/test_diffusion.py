@@ -11,16 +11,16 @@ from planners.models.diffusiondrive import (
     FOCAL_ALPHA,
     DiffusionDecoder,
     DiffusionDriveSettings,
+    add_noise,
     checked_anchors,
     cluster_anchors,
-    focal,
-    from_unit,
+    ddim_step,
+    denormalise_points,
+    focal_loss,
+    grid_coordinates,
     kept,
-    noised,
-    on_map,
-    stepped,
-    to_unit,
-    waves,
+    normalise_points,
+    sinusoids,
 )
 from planners.models.layers import Sizes
 from planners.models.planner import read_array
@@ -73,32 +73,32 @@ def test_the_noise_schedule_is_the_product_of_scaled_linear_betas() -> None:
 def test_a_step_with_the_truth_leads_to_the_same_noise_at_the_earlier_level() -> None:
     torch.manual_seed(0)
     truth, noise, levels = torch.rand(3, 8, 2) * 2 - 1, torch.randn(3, 8, 2), kept()
-    there = noised(truth, noise, levels[40])
+    there = add_noise(truth, noise, levels[40])
     torch.testing.assert_close(
-        stepped(there, truth, levels[40], levels[20]), noised(truth, noise, levels[20]), atol=1e-5, rtol=0
+        ddim_step(there, truth, levels[40], levels[20]), add_noise(truth, noise, levels[20]), atol=1e-5, rtol=0
     )
-    torch.testing.assert_close(stepped(there, truth, levels[40], torch.ones(())), truth)
+    torch.testing.assert_close(ddim_step(there, truth, levels[40], torch.ones(())), truth)
 
 
 def test_positions_become_units_and_back() -> None:
     corners = torch.tensor([[-1.2, -20.0], [55.7, 26.0]])
-    torch.testing.assert_close(to_unit(corners), torch.tensor([[-1.0, -1.0], [1.0, 1.0]]))
+    torch.testing.assert_close(normalise_points(corners), torch.tensor([[-1.0, -1.0], [1.0, 1.0]]))
     points = torch.randn(5, 2) * 20
-    torch.testing.assert_close(from_unit(to_unit(points)), points, atol=1e-4, rtol=0)
+    torch.testing.assert_close(denormalise_points(normalise_points(points)), points, atol=1e-4, rtol=0)
 
 
 def test_the_focal_loss_forgives_what_is_nearly_right() -> None:
     logits, target = torch.tensor([0.0, 0.0]), torch.tensor([1.0, 0.0])
     half = torch.tensor([FOCAL_ALPHA, 1 - FOCAL_ALPHA]) * 0.25 * np.log(2)
-    torch.testing.assert_close(focal(logits, target), half.float())
-    assert focal(torch.tensor(4.0), torch.tensor(1.0)) < 1e-4 < focal(torch.tensor(-4.0), torch.tensor(1.0))
+    torch.testing.assert_close(focal_loss(logits, target), half.float())
+    assert focal_loss(torch.tensor(4.0), torch.tensor(1.0)) < 1e-4 < focal_loss(torch.tensor(-4.0), torch.tensor(1.0))
 
 
 def test_points_fall_into_the_cells_that_the_raster_draws_them_in() -> None:
     layout = BevLayout(ahead_m=30.0, behind_m=10.0, side_m=20.0, cell_m=10.0)  # 4 x 4 cells
     raster = torch.arange(16.0).reshape(1, 1, *layout.shape)
     points = torch.tensor([[25.0, 15.0], [25.0, -15.0], [-5.0, 15.0], [5.0, -5.0]])
-    read = torch.nn.functional.grid_sample(raster, on_map(points, layout)[None, None], align_corners=False)
+    read = torch.nn.functional.grid_sample(raster, grid_coordinates(points, layout)[None, None], align_corners=False)
     assert read.flatten().tolist() == [0.0, 3.0, 12.0, 10.0]
 
 
@@ -106,7 +106,10 @@ def test_points_fall_into_the_same_cells_of_a_raster_that_is_turned() -> None:
     layout = BevLayout(ahead_m=30.0, behind_m=10.0, side_m=20.0, cell_m=10.0)
     points = torch.tensor([[25.0, 15.0], [-5.0, 15.0], [5.0, -5.0]])
     raster = torch.arange(16.0).reshape(1, 1, *layout.shape)
-    there = on_map(points, layout)[None, None], on_map(points, replace(layout, public=True))[None, None]
+    there = (
+        grid_coordinates(points, layout)[None, None],
+        grid_coordinates(points, replace(layout, public=True))[None, None],
+    )
     read = torch.nn.functional.grid_sample(raster, there[0], align_corners=False)
     turned = torch.nn.functional.grid_sample(raster.flip(2, 3), there[1], align_corners=False)
     torch.testing.assert_close(read, turned)
@@ -116,19 +119,21 @@ def test_centred_points_look_as_if_the_raster_reached_behind_as_far_as_ahead() -
     """GridSampleCrossBEVAttention: y / 32 is the column, x / 32 the row, over a raster of 0 .. 32 m."""
     layout = BevLayout(public=True)
     points = torch.randn(5, 2) * 16
-    torch.testing.assert_close(on_map(points, layout, centred=True), points.flip(-1) / 32, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(
+        grid_coordinates(points, layout, centred=True), points.flip(-1) / 32, rtol=1e-5, atol=1e-6
+    )
 
 
 def test_closed_waves_end_at_the_slowest() -> None:
     """SinusoidalPosEmb: rates 10,000^(-i / (n - 1)) for i = 0 .. n - 1; else the last one is one step before."""
     step = torch.tensor([1.0])
-    assert waves(step, 8, closed=True)[0, 3].item() == pytest.approx(1e-4)
-    assert waves(step, 8)[0, 3].item() == pytest.approx(1e-3)
+    assert sinusoids(step, 8, closed=True)[0, 3].item() == pytest.approx(1e-4)
+    assert sinusoids(step, 8)[0, 3].item() == pytest.approx(1e-3)
 
 
 def test_waves_tell_positions_apart_from_a_metre_to_kilometres() -> None:
     x = torch.tensor([0.0, 0.25, 100.0])
-    told = waves(x, 32, 2 * torch.pi)
+    told = sinusoids(x, 32, 2 * torch.pi)
     assert told.shape == (3, 32)
     torch.testing.assert_close(told[0], torch.cat([torch.zeros(16), torch.ones(16)]))
     assert told[1, 0].item() == pytest.approx(1.0)  # a quarter of the shortest wave

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from planners.data.batch import Batch, ImageLayout
-from planners.models.diffusiondrive import DiffusionDrive, DiffusionDriveSettings, from_unit, to_unit
+from planners.models.diffusiondrive import DiffusionDrive, DiffusionDriveSettings, denormalise_points, normalise_points
 from planners.models.planner import TrainingData
 from tests.planners import scenes
 
@@ -107,14 +107,16 @@ def test_planning_starts_at_noise_step_8_and_goes_by_ddim_from_10_to_9() -> None
     plan = model.plan(batch)
     betas = np.linspace(1e-4**0.5, 0.02**0.5, 1000) ** 2
     kept = torch.tensor(np.cumprod(1.0 - betas))
-    clean, noise = to_unit(model.anchors).double(), model.first_noise.double()
+    clean, noise = normalise_points(model.anchors).double(), model.first_noise.double()
     start = kept[8].sqrt() * clean + (1.0 - kept[8]).sqrt() * noise
-    answer = to_unit(told.plans[0]).double()
+    answer = normalise_points(told.plans[0]).double()
     told_noise = (start - kept[10].sqrt() * answer) / (1.0 - kept[10]).sqrt()
     second = kept[9].sqrt() * answer.clamp(-1.0, 1.0) + (1.0 - kept[9]).sqrt() * told_noise
     assert told.steps == [[10, 10], [0, 0]]
     for found, expected in zip(told.points, (start, second)):
-        torch.testing.assert_close(found[0].double(), from_unit(expected.clamp(-1.0, 1.0)), atol=1e-3, rtol=0.0)
+        torch.testing.assert_close(
+            found[0].double(), denormalise_points(expected.clamp(-1.0, 1.0)), atol=1e-3, rtol=0.0
+        )
     torch.testing.assert_close(plan, told.plans[0, -1].expand(2, -1, -1))  # the surest of the last answer
 
 
@@ -128,8 +130,8 @@ def test_an_anchor_is_learned_from_noise_of_the_step_that_the_decoder_is_told() 
     noise = torch.randn(4, *model.anchors.shape)
     assert told.steps == [steps.tolist()] and len(set(steps.tolist())) > 1
     kept = torch.tensor(np.cumprod(1.0 - np.linspace(1e-4**0.5, 0.02**0.5, 1000) ** 2)).float()[steps].view(4, 1, 1, 1)
-    noisy = kept.sqrt() * to_unit(model.anchors) + (1.0 - kept).sqrt() * noise
-    torch.testing.assert_close(told.points[0], from_unit(noisy.clamp(-1.0, 1.0)), atol=1e-3, rtol=0.0)
+    noisy = kept.sqrt() * normalise_points(model.anchors) + (1.0 - kept).sqrt() * noise
+    torch.testing.assert_close(told.points[0], denormalise_points(noisy.clamp(-1.0, 1.0)), atol=1e-3, rtol=0.0)
 
 
 @pytest.mark.parametrize("offsets_from", ["noisy", "anchors"])

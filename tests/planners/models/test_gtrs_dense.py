@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from planners.data.batch import Batch, ImageLayout
-from planners.models.gtrs_dense import GtrsDense, GtrsDenseSettings, imitated, shifted
+from planners.models.gtrs_dense import GtrsDense, GtrsDenseSettings, imitation_target, random_shift
 from planners.models.planner import TrainingData
 from tasks.subscores import LABELLED
 from tasks.world.vocabulary import Vocabulary
@@ -112,7 +112,7 @@ def test_noise_is_one_for_the_batch_or_another_for_each_sample() -> None:
 def test_the_imitated_distribution_is_a_softmax_of_squared_distances() -> None:
     at_2hz = torch.zeros(3, 8, 3)
     at_2hz[1, 0, 0], at_2hz[2, 4, 2] = 1.0, 0.5  # squared distances 0, 1, 0.25
-    target = imitated(at_2hz, torch.zeros(1, 8, 3), torch.tensor([True]), sigma_m2=0.5)
+    target = imitation_target(at_2hz, torch.zeros(1, 8, 3), torch.tensor([True]), sigma_m2=0.5)
     torch.testing.assert_close(target, torch.tensor([[0.0, -2.0, -0.5]]).softmax(dim=1))
 
 
@@ -128,11 +128,11 @@ def test_half_points_count_as_none() -> None:
 def test_pictures_move_by_whole_pixels_with_their_edges_repeated() -> None:
     image = torch.arange(12, dtype=torch.uint8).reshape(1, 1, 3, 4)
     torch.manual_seed(0)
-    seen = {tuple(shifted(image, 1).flatten().tolist()) for _ in range(60)}
+    seen = {tuple(random_shift(image, 1).flatten().tolist()) for _ in range(60)}
     assert len(seen) == 9  # one step along each axis, or none
     assert tuple(image.flatten().tolist()) in seen
     assert (1, 2, 3, 3, 5, 6, 7, 7, 9, 10, 11, 11) in seen  # one column to the left
-    assert shifted(image, 0) is image
+    assert random_shift(image, 0) is image
 
 
 def test_it_chooses_from_fewer_or_other_trajectories_than_it_was_trained_on() -> None:

@@ -30,7 +30,7 @@ class Start:
     twins: Mapping[str, str]  # parameter -> the first with the same numbers, of which it is a copy
 
 
-def start_of(planner: nn.Module) -> Start:
+def start_kind(planner: nn.Module) -> Start:
     """Of a planner as it was built."""
     spread, first, twins = {}, dict[bytes, str](), {}
     for name, parameter in planner.named_parameters():
@@ -49,7 +49,7 @@ def start_of(planner: nn.Module) -> Start:
 def our_start(case: str, picture: tuple[int, int], arrays: Mapping[str, Array]) -> Start:
     """Of the planner of conf/planner/<case>_public.yaml."""
     torch.manual_seed(1)
-    return start_of(build_planner(preset(case, picture), arrays))
+    return start_kind(build_planner(preset(case, picture), arrays))
 
 
 def apart(public: Start, ours: Start) -> list[str]:

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from factory.config.compose import ConfigError
-from planners.models.diffusiondrive import waves
+from planners.models.diffusiondrive import sinusoids
 from planners.models.layers import Decoder
 from planners.published.import_planner import Moves, _points_reordered, model_weights, read_public
 
@@ -95,5 +95,5 @@ def test_a_plan_s_points_are_told_in_the_public_order() -> None:
     rates = 2 * torch.pi / 10000.0 ** (torch.arange(16) / 16)
     angles = points.flip(-1)[..., None] * rates
     theirs = torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1)
-    ours = waves(points, 32, 2 * torch.pi).flatten(1)
+    ours = sinusoids(points, 32, 2 * torch.pi).flatten(1)
     torch.testing.assert_close(ours @ _points_reordered(weight).T, theirs @ weight.T, rtol=1e-4, atol=1e-3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from planners.study import arms as module
-from planners.study.arms import ArmDrives, HeldAgainst, arms_of, clean_route, differences_of, text_of
+from planners.study.arms import ArmDrives, HeldAgainst, clean_route, differences_of, read_arm_drives, text_of
 from planners.training.many import Training
 from tests.planners.drive.test_summary import row
 
@@ -27,7 +27,7 @@ def drives_of(
         (tmp_path / "trainings" / one.label).mkdir(parents=True, exist_ok=True)
     monkeypatch.setattr(module, "drive_settings", lambda *_: None)
     monkeypatch.setattr(module, "driven", lambda _: (rows, True))
-    return arms_of(everyone, str(tmp_path), "")
+    return read_arm_drives(everyone, str(tmp_path), "")
 
 
 def test_a_drive_with_a_failure_has_completed_nothing_cleanly() -> None:

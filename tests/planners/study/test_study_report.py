@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from planners.evaluation.aggregation import BOUNDS, MEASURES, ClipResult, by_clip, scores_of_clips
+from planners.evaluation.aggregation import BOUNDS, MEASURES, ClipResult, group_by_clip, scores_in_percent
 from planners.evaluation.compare import compare
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow, read_rows, write_rows
@@ -71,7 +71,7 @@ def test_scores_of_the_file_are_those_of_the_folders(study: Path) -> None:
     bounds = {row["planner"]: row for row in table(study / "report" / "bounds.csv")}
     assert [*trainings, *bounds] == LABELS
     for label, found in {**trainings, **bounds}.items():
-        of_folder = scores_of_clips(by_clip(read_rows(study / "evaluations" / label)))
+        of_folder = scores_in_percent(group_by_clip(read_rows(study / "evaluations" / label)))
         for name, score in of_folder.items():
             assert float(found[name]) == pytest.approx(score, abs=1e-4, nan_ok=True), (label, name)
     assert trainings[LABELS[1]]["simulated"] == "5"
@@ -177,4 +177,4 @@ def test_what_the_readme_says_of_simulated_samples_is_what_the_kept_frames_say()
     control = compare(means("pdm_closed5-epochs", "01"), means("logged5-steps", "01"), RULES)
     same = control["final", "unfiltered"]["clip"]
     assert f"{100 * same.b:.1f} against {100 * same.a:.1f} (" in readme
-    assert f"constant velocity scores {scores_of_clips(clips['constant_velocity'])['final_unfiltered']:.1f}" in readme
+    assert f"constant velocity scores {scores_in_percent(clips['constant_velocity'])['final_unfiltered']:.1f}" in readme

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from factory.exits import Stopped
-from planners.evaluation.aggregation import by_clip, scores_of_clips
+from planners.evaluation.aggregation import group_by_clip, scores_in_percent
 from planners.evaluation.evaluate import EvaluateSettings, evaluate
 from planners.evaluation.planner_names import planner_of
 from planners.evaluation.score_rows import read_rows
@@ -92,7 +92,7 @@ def test_a_sweep_stops_where_something_is_missing_and_is_reported_when_all_is_do
     assert (alone["real"], more["simulated"]) == ("3", "4")
     for row, training in ((alone, first), (more, second)):
         rows = read_rows(tmp_path / EVALUATIONS / training.label)
-        for name, found in scores_of_clips(by_clip(rows)).items():
+        for name, found in scores_in_percent(group_by_clip(rows)).items():
             assert float(row[name]) == pytest.approx(found, abs=1e-4)
     differences = [row["difference"] for row in csv.DictReader((report / "comparisons.csv").open())]
     assert "" in differences[: len(differences) // 2] and "" not in differences[len(differences) // 2 :]

@@ -28,7 +28,7 @@ Images = Sequence[Mapping[str, Any]]  # entries of the column `images`
 DRIVEN = "drive"  # where a sample names its expert
 
 
-class Eyes(Protocol):
+class DriveCameras(Protocol):
     """The cameras of a drive."""
 
     @property
@@ -46,48 +46,48 @@ class Eyes(Protocol):
         """Steps of 0.1 s, at 2 Hz up to now, of which a sample has pictures; the last is 0."""
         ...
 
-    def look(self, scene: Scene, offset: int) -> Images:
+    def images(self, scene: Scene, offset: int) -> Images:
         """What they see `offset` steps from the scene's, not after it."""
         ...
 
 
 @dataclass(frozen=True)
-class NoEyes:
+class NoCameras:
     """No cameras."""
 
     source: ImageSource = ImageSource.NONE
     rig: None = None
     offsets: tuple[int, ...] = (0,)
 
-    def look(self, scene: Scene, offset: int) -> Images:
+    def images(self, scene: Scene, offset: int) -> Images:
         """Nothing."""
         return ()
 
 
 @dataclass(frozen=True)
-class Looked:
+class Observation:
     """A look at a scene."""
 
     images: Images  # of now
     sample: Callable[[], Sample]  # the row, made when it is asked for
 
 
-class Sight:
+class Observer:
     """Looks at one scene after another, 0.5 s apart, and keeps what a sample's earlier pictures are."""
 
-    def __init__(self, eyes: Eyes) -> None:
-        self._eyes = eyes
-        self._seen: deque[tuple[int, Images]] = deque(maxlen=len(eyes.offsets))
+    def __init__(self, cameras: DriveCameras) -> None:
+        self._cameras = cameras
+        self._seen: deque[tuple[int, Images]] = deque(maxlen=len(cameras.offsets))
 
-    def look(self, scene: Scene) -> Looked:
+    def observe(self, scene: Scene) -> Observation:
         """At the first scene those before it are looked at too, from where the ego came."""
-        offsets = self._eyes.offsets if not self._seen else (0,)
-        self._seen += [(scene.step + offset, self._eyes.look(scene, offset)) for offset in offsets]
+        offsets = self._cameras.offsets if not self._seen else (0,)
+        self._seen += [(scene.step + offset, self._cameras.images(scene, offset)) for offset in offsets]
         images = [{**image, "time_s": (step - scene.step) * STEP_S} for step, taken in self._seen for image in taken]
-        return Looked(self._seen[-1][1], partial(sample_of, scene, self._eyes, images))
+        return Observation(self._seen[-1][1], partial(sample_of, scene, self._cameras, images))
 
 
-def sample_of(scene: Scene, eyes: Eyes, images: Images) -> Sample:
+def sample_of(scene: Scene, cameras: DriveCameras, images: Images) -> Sample:
     """The row of a scene nobody has driven on from: its labels are zeros."""
     pose = scene.ego_state[: HEADING + 1]
     place = pose_on_ground(scene.clip.world_from_ego, scene.ego_state[None])[0]
@@ -97,9 +97,9 @@ def sample_of(scene: Scene, eyes: Eyes, images: Images) -> Sample:
         "expert": DRIVEN,
         "label_10hz": np.zeros((HORIZON_STEPS, 3)),
         "label_2hz": np.zeros((HORIZON_STEPS // 5, 3)),
-        "cameras": eyes.rig,
+        "cameras": cameras.rig,
         "images": list(images) or None,
-        "image_source": str(eyes.source),
+        "image_source": str(cameras.source),
     }  # fmt: skip
 
 
@@ -118,7 +118,7 @@ def ground_of(clip: Clip) -> Array:
 
 
 @dataclass(frozen=True)
-class PaintedEyes:
+class PaintedCameras:
     """The cameras of a clip's rig, or the painter's own where it has none, of the render settings' size."""
 
     clip: Clip
@@ -139,7 +139,7 @@ class PaintedEyes:
     def offsets(self) -> tuple[int, ...]:
         return tuple(offset for offset in STEPS_OF[self.settings.frames] if offset <= 0)
 
-    def look(self, scene: Scene, offset: int) -> Images:
+    def images(self, scene: Scene, offset: int) -> Images:
         """Raises ValueError where the clip is not the painter's."""
         state = states_at(scene, offset)[0]
         pose, taken = self.painter.pictures(scene.clip, self.cameras, scene.agents, scene.step + offset, state)
@@ -155,7 +155,7 @@ class PaintedEyes:
 
 
 @dataclass(frozen=True)
-class RenderedEyes:
+class RenderedCameras:
     """The cameras of a clip's rig in the scene of its block, with the drive's agents where the simulation has them."""
 
     clip: Clip
@@ -172,7 +172,7 @@ class RenderedEyes:
     def offsets(self) -> tuple[int, ...]:
         return tuple(offset for offset in STEPS_OF[self.settings.frames] if offset <= 0)
 
-    def look(self, scene: Scene, offset: int) -> Images:
+    def images(self, scene: Scene, offset: int) -> Images:
         """As a sample's pictures are drawn (factory.stages.imaging)."""
         s, step = self.settings, scene.step + offset
         poses = pose_on_ground(self.asset.on_road(ground_of(self.clip)), states_at(scene, offset))
@@ -182,7 +182,7 @@ class RenderedEyes:
         return [imaging.image(c.name, offset * STEP_S, poses[0], rgb) for c, rgb in zip(self.cameras, seen)]
 
 
-def rendered_eyes(clip: Clip, settings: RenderSettings, cache_dir: str) -> RenderedEyes:
+def open_rendered_cameras(clip: Clip, settings: RenderSettings, cache_dir: str) -> RenderedCameras:
     """The scene is built where the cache does not hold it, in minutes.
 
     Raises BadClip for a clip without anything to build it from, for a broken sensor file, and for a scene whose
@@ -194,6 +194,6 @@ def rendered_eyes(clip: Clip, settings: RenderSettings, cache_dir: str) -> Rende
     if settings.psnr_gate is PsnrGate.REJECT and (why := block_fault(built, settings)) is not None:
         raise BadClip(f"log {clip.log_id}", "scene", f"{why}; render.psnr_gate=mark drives in it all the same")
     asset = scene_in_clip_time(clip, built)
-    return RenderedEyes(
+    return RenderedCameras(
         clip, settings, asset, tuple(asset.as_corrected(choose_cameras(clip.cameras, settings.cameras)))
     )
