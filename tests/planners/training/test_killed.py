@@ -1,10 +1,10 @@
 """Trainings of 1 and 2 processes, killed on their way: what the same and what other numbers of them go on to."""
 
+import multiprocessing
 import os
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -20,12 +20,12 @@ from torch import Tensor, nn
 from planners.data.batch import Batch
 from planners.training.checkpoint import WEIGHTS, checkpoints, load_training, newest, read_record
 from planners.training.fit import LOSSES
+from planners.training.train import main
 from tests.planners.samples import sample, write_table
 from tests.planners.toy import Toy, ToySettings
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # processes start one after the other
 
-ROOT = Path(__file__).resolve().parents[3]
 SAMPLES, BATCH, STEPS = 60, 8, 40  # five epochs of 7 batches and a part of the next
 EPOCH = SAMPLES // BATCH
 NUMBERS = (1, 2)
@@ -56,28 +56,45 @@ class Noting(Toy):
         return super().losses(batch)
 
 
-def started(processes: int, out: Path, table: Path, notes: Path, *more: str, nap_s: float = 0.0) -> Any:
+FORKS = multiprocessing.get_context("forkserver")  # of a process that has imported PyTorch
+FORKS.set_forkserver_preload(["planners.training.train", "tests.planners.toy", "torch.utils.tensorboard"])
+
+
+def train(arguments: list[str], environment: dict[str, str], said: Path) -> None:
+    """`python -m planners train` in a process that is there already."""
+    os.environ.update(environment)
+    torch.set_num_threads(1)
+    with said.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    sys.exit(main(arguments))
+
+
+def started(processes: int, out: Path, table: Path, notes: Path, *more: str, nap_s: float = 0.0) -> list[Any]:
     """The processes of a training, as torchrun would start them."""
     notes.mkdir()
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         place = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1]), "WORLD_SIZE": str(processes)}
-    arguments = [sys.executable, "-m", "planners", "train", "planner=custom", f"planner.name={Noting.name}"]
+    arguments = ["planner=custom", f"planner.name={Noting.name}"]
     training = ["batch_size=8", "learning_rate=0.001", "optimiser=adamw", "schedule=cosine"]
     arguments += [f"planner.training.{setting}" for setting in training]
     arguments += [f"steps={STEPS}", "checkpoint_every=6", "device=cpu"]
     arguments += [f"data.real=[{table}]", f"data.sim=[{table}]", f"out={out}", *more]
-    told = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", NOTES: str(notes), NAP_S: str(nap_s)}
-    return [
-        subprocess.Popen(
-            arguments,
-            cwd=ROOT,
-            env={**os.environ, **told, **place, "RANK": str(rank), "LOCAL_RANK": str(rank)},
-            stdout=subprocess.DEVNULL,
-            stderr=(notes.with_suffix(f".{rank}.said")).open("w"),
-        )
-        for rank in range(processes)
-    ]
+    told = {NOTES: str(notes), NAP_S: str(nap_s), **place}
+    parts = []
+    for rank in range(processes):
+        its_own = {**told, "RANK": str(rank), "LOCAL_RANK": str(rank)}
+        parts.append(FORKS.Process(target=train, args=(arguments, its_own, notes.with_suffix(f".{rank}.said"))))
+        parts[-1].start()
+    return parts
+
+
+def codes(parts: list[Any]) -> list[int]:
+    """What the processes end with."""
+    for part in parts:
+        part.join()
+    return [part.exitcode for part in parts]
 
 
 def seen(notes: Path) -> list[list[str]]:
@@ -100,8 +117,7 @@ class Trainings:
         """Trains in folder/name to the end, on from what lies there."""
         out = self.folder / name
         parts = started(processes, out, self.table, self.folder / f"{name}-notes", *more)
-        codes = [part.wait() for part in parts]
-        assert codes == [0] * processes, [path.read_text() for path in self.folder.glob(f"{name}-notes.*.said")]
+        assert codes(parts) == [0] * processes, [path.read_text() for path in self.folder.glob(f"{name}-notes.*.said")]
         return out
 
     def notes(self, out: Path) -> list[list[str]]:
@@ -120,12 +136,12 @@ class Trainings:
         name = f"killed-{processes}"
         out = self.folder / name
         parts = started(processes, out, self.table, self.folder / f"{name}-notes", nap_s=0.1)
-        while len(checkpoints(out)) < 2 and all(part.poll() is None for part in parts):
+        while len(checkpoints(out)) < 2 and all(part.exitcode is None for part in parts):
             time.sleep(0.02)
         time.sleep(0.25)  # on into steps that no checkpoint knows of
         for part in parts:
-            part.send_signal(signal.SIGKILL)
-        assert [part.wait() for part in parts] == [-signal.SIGKILL] * processes
+            part.kill()
+        assert codes(parts) == [-signal.SIGKILL] * processes
         done = int(newest(out).name)
         assert 0 < done < len(self.notes(out)) < STEPS, "it was to be killed on its way, behind a checkpoint"
         return out
