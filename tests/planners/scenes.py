@@ -1,11 +1,9 @@
-"""Batches whose pictures decide everything: small enough for a network to learn by heart in seconds."""
-
-from dataclasses import replace
+"""Small networks, and trajectories with their labels, for planners that are asked for a few steps."""
 
 import numpy as np
 import torch
 
-from planners.data.batch import Batch, BevLayout, ImageLayout
+from planners.data.batch import ImageLayout
 from planners.models.backbones import BackboneSettings
 from planners.models.layers import FusionSettings, Sizes
 from tasks.reward.label_bytes import VocabularyLabels
@@ -39,12 +37,12 @@ def vocabulary(k: int, seed: int = 0) -> np.ndarray:
     return arcs(rng.uniform(0.5, 12.0, k), rng.uniform(-0.25, 0.25, k))
 
 
-def four_ways(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Arcs (n, 40, 3), variations of slow, fast, left and right, and colours (n, 3) in 0 .. 1 that say which."""
+def four_ways(n: int, seed: int = 0) -> np.ndarray:
+    """Arcs (n, 40, 3), variations of slow, fast, left and right."""
     way, vary = np.arange(n) % 4, np.random.default_rng(seed).uniform(-1.0, 1.0, n)
     speeds = np.array([3.0, 10.0, 6.0, 6.0])[way] * (1.0 + 0.2 * vary)
     yaw_rates = np.array([0.0, 0.0, 0.2, -0.2])[way] + 0.05 * vary
-    return arcs(speeds, yaw_rates), np.stack([way % 2, way // 2, 0.5 + 0.5 * vary], axis=1)
+    return arcs(speeds, yaw_rates)
 
 
 def arcs(speeds: np.ndarray, yaw_rates: np.ndarray) -> np.ndarray:
@@ -80,45 +78,3 @@ def labels(n: int, trajectories: np.ndarray, seed: int = 0) -> tuple[dict[str, t
         final.append(one.pdm_score("masked"))
     tensors = {name: torch.tensor(np.stack(rows), dtype=torch.float32) for name, rows in named.items()}
     return tensors, torch.tensor(np.stack(final), dtype=torch.float32)
-
-
-def batch(
-    n: int, plans: np.ndarray, layout: ImageLayout = PICTURE, colours: np.ndarray | None = None, **more: object
-) -> Batch:
-    """n scenes with plans (n, 40, 3) and pictures of coarse random blocks, or of one of the colours (n, 3) each."""
-    rng = np.random.default_rng(0)
-    coarse = rng.integers(0, 256, (n, 3, layout.height // 8, layout.width // 8), dtype=np.uint8)
-    if colours is not None:
-        coarse[:] = (255 * colours).astype(np.uint8)[:, :, None, None]
-    status = np.zeros((n, 8), np.float32)
-    status[:, 1], status[:, 4] = 1.0, 5.0
-    at_10hz = torch.tensor(plans, dtype=torch.float32)
-    return Batch(
-        tuple(f"scene {i}" for i in range(n)),
-        torch.tensor(status),
-        torch.zeros(n, 4, 3),
-        at_10hz[:, 4::5],
-        at_10hz,
-        torch.zeros(n, dtype=torch.bool),
-        torch.ones(n, dtype=torch.bool),
-        image=torch.tensor(coarse.repeat(8, axis=2).repeat(8, axis=3)),
-        **more,  # type: ignore[arg-type]
-    )
-
-
-def with_surroundings(batch: Batch, layout: BevLayout, n_agents: int, seed: int = 0) -> Batch:
-    """The same with a random raster from above and random vehicles, the last of them missing."""
-    rng = np.random.default_rng(seed)
-    n = len(batch)
-    bev = rng.integers(0, 7, (n, 1, *layout.shape), dtype=np.uint8)
-    agents = np.concatenate(
-        [rng.uniform(-20, 20, (n, n_agents, 2)), rng.uniform(-3, 3, (n, n_agents, 1)), np.full((n, n_agents, 2), 3.0)],
-        axis=2,
-    )
-    valid = np.arange(n_agents)[None].repeat(n, axis=0) < n_agents - 1
-    return replace(
-        batch,
-        bev=torch.tensor(bev),
-        agents=torch.tensor(agents, dtype=torch.float32),
-        agents_valid=torch.tensor(valid),
-    )
