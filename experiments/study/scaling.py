@@ -25,7 +25,7 @@ import numpy as np
 
 from experiments.study.settings import settings_of
 from factory.config.arguments import NOT_FITTING, answered
-from planners.evaluation.aggregation import name_of, score_title, scores_in_percent, shown, write_csv
+from planners.evaluation.aggregation import name_of, scores_in_percent, shown, write_csv
 from planners.study.report import FRAMES, StudyFrames, read_study
 from planners.study.setups import Budget, Comparison, Imitation, Setup, words_of
 from planners.study.sweep import SweepSettings, run
@@ -240,7 +240,7 @@ def scale(words: Sequence[str]) -> None:
     report, final = Path(s.report or s.out), ("final", shown(s.human_filter)["final"])
     curves = curves_of(read_study(report / FRAMES), name_of(*final))
     write_csv(report / "curves.csv", [curve.row() for curve in curves])
-    draw_curves(curves, score_title(*final), report / "scaling.png")
+    draw_curves(curves, f"two-stage EPDMS, {final[1]}", report / "scaling.png")
 
 
 if __name__ == "__main__":

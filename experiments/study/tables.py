@@ -58,7 +58,7 @@ def tables(argv: Sequence[str]) -> None:
     request = parse(TablesRequest, argv)
     path = KEPT / f"{request.frames}.parquet"
     if request.out is not None:
-        print(write_tables(path, Path(request.out), request.human_filter))
+        write_tables(path, Path(request.out), request.human_filter)
     elif request.frames != "towns":
         raise ValueError("the headline is of frames=towns; of others give out=<folder> for all tables")
     else:

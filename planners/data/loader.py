@@ -14,7 +14,7 @@ once and stays.
 
 import json
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -46,18 +46,6 @@ class Window:
     key: WindowKey
     samples: Ints  # places in the data set, rising
     last: int  # batch after which it can go
-
-
-class Inline(Executor):
-    """Does at once what it is given, in the caller's thread."""
-
-    def submit(self, call: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        try:
-            future.set_result(call(*args, **kwargs))
-        except BaseException as error:
-            future.set_exception(error)
-        return future
 
 
 class _Reading:
@@ -200,7 +188,7 @@ class Loader:
         workers: int = 2,
         pinned: bool = False,
     ) -> None:
-        """batch_size: of a global batch, over all `world` processes; workers: threads that decode, 0: the caller's.
+        """batch_size: of a global batch, over all `world` processes; workers: threads that decode.
 
         pinned: batches lie in memory that a GPU copies from while others compute.
         Raises ValueError where the data is not what the planner needs or the mix asks for, or a batch does not divide.
@@ -309,10 +297,8 @@ class Loader:
         share = self.batch_size // self.world
         mine = slice(self.rank * share, (self.rank + 1) * share)
         rows, windows = order.rows[:, mine], order.window[:, mine]
-        threads = self._workers > 0
-        ahead = max(BATCHES_AHEAD, -(-2 * TASK * self._workers // share)) if threads else 1
-        readers: Executor = ThreadPoolExecutor(READERS, "read") if threads else Inline()
-        decoders: Executor = ThreadPoolExecutor(self._workers, "decode") if threads else Inline()
+        ahead = max(BATCHES_AHEAD, -(-2 * TASK * self._workers // share))
+        readers, decoders = ThreadPoolExecutor(READERS, "read"), ThreadPoolExecutor(self._workers, "decode")
         coming: deque[tuple[Ints, BatchBuffer, list[Future[None]]]] = deque()
         try:
             self._memory.begin(_windows(order, rows, windows, first), readers)

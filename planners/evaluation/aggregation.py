@@ -211,12 +211,6 @@ def stage_title(stage: str) -> str:
     return "follow-ups (plain mean)" if stage == "follow_ups" else stage.replace("_", " ")
 
 
-def score_title(stage: str, human_filter: str) -> str:
-    """A score in words, with what it may be held against."""
-    words = "two-stage EPDMS" if stage == "final" else f"EPDMS of {stage_title(stage)}"
-    return f"{words}{'' if human_filter == 'none' else f', {human_filter}'}"
-
-
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Rows of equal columns; numbers with four decimals are enough for scores in percent."""
     with path.open("w", newline="", encoding="utf-8") as file:

@@ -19,7 +19,7 @@ from planners.drive.summary import M_PER_KM, SHARES, highest_level, start_kind
 from planners.evaluation.aggregation import BOUNDS, name_of, scores_in_percent, write_csv
 from planners.evaluation.bootstrap import Interval, paired_interval
 from planners.evaluation.compare import CompareSettings, compare, difference_columns
-from planners.study.report import FRAMES, read_study
+from planners.study.report import FRAMES, markdown_table, read_study
 from planners.study.setups import Setup
 from planners.training.many import Means, Training
 from tasks.world.arrays import Array
@@ -205,12 +205,12 @@ def text_of(
         n = len(next(iter(one.rows.values()))[0])
         lines += [f"## Driving from {one.kind} starts", ""]
         lines += [f"{n} starts, {seeds} seeds; 95 % intervals over {one.level}s.", ""]
-        lines += _table(["", *map(words_of, DRIVEN)], [[name, *_means(one, name)] for name in one.rows])
+        lines += markdown_table(["", *map(words_of, DRIVEN)], [[name, *_means(one, name)] for name in one.rows])
         mine = [row for row in differences if row["start"] == one.kind]
         pairs = list(dict.fromkeys((row["arm"], row["reference"]) for row in mine))
         at = {(row["arm"], row["reference"], row["measure"]): row for row in mine}
         body = [[f"{arm} - {other}", *(_apart(at[arm, other, name]) for name in DRIVEN)] for arm, other in pairs]
-        lines += _table(["", *map(words_of, DRIVEN)], body)
+        lines += markdown_table(["", *map(words_of, DRIVEN)], body)
     if held:
         lines += [
             "## The benchmark beside the bounds",
@@ -218,7 +218,7 @@ def text_of(
             "EPDMS in percent; 95 % intervals over clips and towns.",
             "",
         ]
-        lines += _table(["", "stage", "EPDMS", "over clips", "over towns"], [_held(row) for row in held])
+        lines += markdown_table(["", "stage", "EPDMS", "over clips", "over towns"], [_held(row) for row in held])
     return "\n".join(lines)
 
 
@@ -248,11 +248,3 @@ def _held(row: Mapping[str, Any]) -> list[str]:
 
 
 _ENDS = (("low", "high"), ("low_town", "high_town"))
-
-
-def _table(head: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:
-    return [_line(head), _line(["---"] * len(head)), *map(_line, body), ""]
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"

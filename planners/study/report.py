@@ -29,7 +29,6 @@ from planners.evaluation.aggregation import (
     HumanFilter,
     group_by_clip,
     name_of,
-    score_title,
     scores_in_percent,
     shown,
     stage_title,
@@ -152,11 +151,8 @@ def _row(
     return FrameRow(stage, key, FrameScores(*scores), np.nan, start, end, log_id=log_id)
 
 
-def write_tables(frames: Path, out: Path, human_filter: HumanFilter) -> str:
-    """The tables of a file of `write_study`, into `out`; returns the two-stage scores, to be printed.
-
-    human_filter: of tables.md; the CSVs hold both.
-    """
+def write_tables(frames: Path, out: Path, human_filter: HumanFilter) -> None:
+    """The tables of a file of `write_study`, into `out`; human_filter: of tables.md, the CSVs hold both."""
     study = read_study(frames)
     out.mkdir(parents=True, exist_ok=True)
     scores = {label: scores_in_percent(clips) for label, clips in study.clips.items()}
@@ -167,7 +163,6 @@ def write_tables(frames: Path, out: Path, human_filter: HumanFilter) -> str:
         write_csv(out / "bounds.csv", bounds)
     write_csv(out / "trainings.csv", [{**facts, **scores[facts["training"]]} for facts in study.trainings])
     (out / "tables.md").write_text(markdown_of(rows, human_filter), encoding="utf-8")
-    return "\n".join([text_of(rows, bounds, shown(human_filter)["final"]), f"tables: {out}"])
 
 
 def compared(frames: StudyFrames) -> list[Row]:
@@ -200,9 +195,8 @@ def markdown_of(rows: Sequence[Row], human_filter: HumanFilter) -> str:
     lines += [*wrap(INTERVALS, 120), ""]
     for part, of_part in groupby(mine, key=lambda row: row["part"]):
         rows = list(of_part)
-        lines += [f"## {part}", "", _line(head), _line(["---"] * len(head))]
-        lines += [_line(_cells(rows[i : i + len(stages)])) for i in range(0, len(rows), len(stages))]
-        lines.append("")
+        body = [_cells(rows[i : i + len(stages)]) for i in range(0, len(rows), len(stages))]
+        lines += [f"## {part}", "", *markdown_table(head, body)]
     return "\n".join(lines)
 
 
@@ -225,21 +219,6 @@ def _score(row: Row) -> str:
     return f"{text} ({'; '.join(said)})"
 
 
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-def text_of(found: Sequence[Row], bounds: Sequence[Row], human_filter: str) -> str:
-    """The two-stage scores among the rows of comparisons.csv, to be printed."""
-    lines = [f"{score_title('final', human_filter)}; {FILTERS_NOTE[0]}"]
-    lines += [f"{'part':<12}{'trained':<46}{'equal':>8}{'seeds':>7}{'EPDMS':>8}{'difference':>12}   95 % over clips"]
-    for row in found:
-        if (row["stage"], row["human_filter"]) == ("final", human_filter):
-            line = f"{row['part']:<12}{row['setup']:<46}{row['budget']:>8}{row['seeds']:7}{row['epdms']:8.2f}"
-            if row["difference"] != "":
-                line += f"{row['difference']:+12.2f}   {row['low']:+.2f} .. {row['high']:+.2f}"
-            lines.append(line)
-    for bound in bounds:
-        score = bound[name_of("final", human_filter)]
-        lines.append(f"{bound['planner']:<73}" + (f"{score:8.2f}" if np.isfinite(score) else "       -"))
-    return "\n".join(lines)
+def markdown_table(head: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:
+    """Its lines, and an empty one behind."""
+    return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *body)] + [""]

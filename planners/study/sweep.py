@@ -80,7 +80,8 @@ def write_report(standing: Sequence[Comparison], trained: Sequence[Training], se
     labels = dict.fromkeys([*(training.label for training in trained), *compared, *bounds])
     facts = [facts_of(training, out) for training in trained]
     write_study(report / FRAMES, rows_of(labels, out / EVALUATIONS, settings.benchmark), facts, standing)
-    print(write_tables(report / FRAMES, report, settings.human_filter))
+    write_tables(report / FRAMES, report, settings.human_filter)
+    print(f"look at {report / 'tables.md'}")
 
 
 def facts_of(training: Training, out: Path) -> Mapping[str, Any]:

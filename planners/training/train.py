@@ -111,7 +111,7 @@ class TrainConfig:
     ray: RaySettings = field(default_factory=RaySettings)
 
     def __post_init__(self) -> None:
-        for name in ("accumulate", "log_every", "checkpoint_every"):
+        for name in ("accumulate", "workers", "log_every", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: must be at least 1")
         if self.keep_every < 0:

@@ -103,12 +103,12 @@ def joined(parts: list[Batch]) -> Batch:
 def test_any_number_of_workers_and_ranks_reads_the_same_batches(data: Dataset, ratio: Any) -> None:
     mix = MixSettings(sim_ratio=ratio)
     for epoch in (0, 1):
-        expected = list(Loader(data, NEEDS, mix, BATCH, workers=0).epoch(epoch))
+        expected = list(Loader(data, NEEDS, mix, BATCH, workers=1).epoch(epoch))
         assert len(expected) == Loader(data, NEEDS, mix, BATCH).n_batches(epoch) > 2
-        for workers in (1, 2, 4):
+        for workers in (2, 4):
             for a, b in zip(expected, Loader(data, NEEDS, mix, BATCH, workers=workers).epoch(epoch), strict=True):
                 assert_same(a, b)
-        ranks = [Loader(data, NEEDS, mix, BATCH, rank, 2, workers=rank).epoch(epoch) for rank in (0, 1)]
+        ranks = [Loader(data, NEEDS, mix, BATCH, rank, 2, workers=1 + rank).epoch(epoch) for rank in (0, 1)]
         for whole, *parts in zip(expected, *ranks, strict=True):
             assert_same(whole, joined(parts))
 
@@ -129,7 +129,7 @@ def test_every_sample_comes_with_what_is_its_own(data: Dataset) -> None:
 
 @pytest.mark.parametrize(("imitation", "real", "simulated"), [("all", 1, 1), ("real", 1, 0), ("none", 0, 0)])
 def test_which_plans_are_labels_is_a_setting(data: Dataset, imitation: Any, real: int, simulated: int) -> None:
-    batch = next(Loader(data, Needs(), MixSettings(imitation=imitation), 64, workers=0).epoch(0))
+    batch = next(Loader(data, Needs(), MixSettings(imitation=imitation), 64, workers=1).epoch(0))
     assert batch.image is None and batch.labels is None
     assert (batch.imitate == torch.where(batch.simulated, simulated, real).bool()).all()
 
@@ -219,11 +219,10 @@ def counted_pictures(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return decoded
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_pictures_that_fit_are_decoded_once(data: Dataset, monkeypatch: pytest.MonkeyPatch, workers: int) -> None:
+def test_pictures_that_fit_are_decoded_once(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     anew = [list(Loader(data, NEEDS, MixSettings(), BATCH).epoch(epoch)) for epoch in range(3)]
     decoded = counted_pictures(monkeypatch)
-    loader = Loader(data, NEEDS, MixSettings(), BATCH, workers=workers)
+    loader = Loader(data, NEEDS, MixSettings(), BATCH, workers=2)
     assert "of pictures stay decoded" in loader.text()
     for epoch in range(3):
         for batch, expected in zip(loader.epoch(epoch), anew[epoch], strict=True):
@@ -276,13 +275,12 @@ def test_a_loader_that_is_left_leaves_no_thread_behind(data: Dataset) -> None:
     assert len(list(loader.epoch(0))) == 8, "it can be asked again, from the start"
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_a_picture_that_cannot_be_decoded_is_named_with_its_table(tmp_path: Path, workers: int) -> None:
+def test_a_picture_that_cannot_be_decoded_is_named_with_its_table(tmp_path: Path) -> None:
     views = dict.fromkeys(FRONT_YAWS, b"no picture")
     write_table(tmp_path, [sample(i, **(pictures(views) if i == 5 else grey_pictures(9))) for i in range(8)])
     data = open_data(DataSettings(real=str(tmp_path)))
     with pytest.raises(ValueError, match=rf"{tmp_path}: sample attempt00005: .*not a JPEG"):
-        list(Loader(data, NEEDS, MixSettings(), 8, workers=workers).epoch(0))
+        list(Loader(data, NEEDS, MixSettings(), 8, workers=2).epoch(0))
 
 
 def test_damaged_labels_are_named(tmp_path: Path) -> None:

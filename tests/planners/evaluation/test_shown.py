@@ -31,7 +31,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_batch_is_the_loaders_but_for_the_plans(table: Path) -> None:
     dataset = open_dataset(DataSettings(real=str(table), sim=str(table)))
-    (loaded,) = Loader(dataset, NEEDS, MixSettings(), batch_size=8, workers=0).epoch(0)
+    (loaded,) = Loader(dataset, NEEDS, MixSettings(), batch_size=8, workers=1).epoch(0)
     rows = SampleTable(table)
     shown = batch_of([as_shown(rows.sample(name, columns_shown(NEEDS))) for name in loaded.attempt_ids], NEEDS)
     assert shown.attempt_ids == loaded.attempt_ids

@@ -79,8 +79,7 @@ def test_scores_of_the_file_are_those_of_the_folders(study: Path) -> None:
 
 
 def test_intervals_stand_over_clips_logs_and_towns_for_both_filters(study: Path) -> None:
-    text = write_tables(study / "report" / FRAMES, study / "report", "filtered")
-    assert "two-stage EPDMS, filtered" in text
+    write_tables(study / "report" / FRAMES, study / "report", "filtered")
     rows = table(study / "report" / "comparisons.csv")
     finals = [row for row in rows if row["stage"] == "final" and row["reference"]]
     assert [row["human_filter"] for row in finals] == ["unfiltered", "filtered"]

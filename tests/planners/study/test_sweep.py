@@ -86,7 +86,7 @@ def test_a_sweep_stops_where_something_is_missing_and_is_reported_when_all_is_do
         sweep_module, "evaluate_all", lambda who, out, *_: score(out, settings(out / EVALUATIONS), first, second)
     )
     run(sweep, asked, asked, wanted)
-    assert "constant_velocity" in capsys.readouterr().out
+    assert "tables.md" in capsys.readouterr().out
     alone, more = csv.DictReader((report / "trainings.csv").open())
     assert (alone["data"], alone["optimiser_steps"], more["data"]) == ("real", "1", "recovery")
     assert (alone["real"], more["simulated"]) == ("3", "4")

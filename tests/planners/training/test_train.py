@@ -138,7 +138,7 @@ def test_a_loss_that_is_not_known_yet_is_a_dash(
 def test_a_batch_is_no_larger_than_the_data_fills(
     table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], batch: int
 ) -> None:
-    assert main([*command(table, tmp_path), *more, "steps=1", "workers=0"]) == 0, capsys.readouterr().err
+    assert main([*command(table, tmp_path), *more, "steps=1", "workers=1"]) == 0, capsys.readouterr().err
     asked = int(more[0].rpartition("=")[2])
     notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
     assert len(notes) == (asked != batch) and all(f"batch_size={asked} -> {batch}:" in note for note in notes)
@@ -148,7 +148,7 @@ def test_a_batch_is_no_larger_than_the_data_fills(
 def test_a_training_that_goes_on_keeps_the_batch_that_it_began_with(
     table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    asked = [*command(table, tmp_path), "planner.training.batch_size=63", "resume=further", "workers=0"]
+    asked = [*command(table, tmp_path), "planner.training.batch_size=63", "resume=further", "workers=1"]
     assert main([*asked, "steps=1", "accumulate=7"]) == 0
     assert main([*asked, "steps=2", "accumulate=3"]) == 0, capsys.readouterr().err
     assert read_record(tmp_path)["trained"]["planner.training"]["batch_size"] == 21
