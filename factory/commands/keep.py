@@ -191,12 +191,12 @@ def clean(request: CleanRequest) -> None:
     from factory.files import why_not_written
     from factory.store.location import BadLocation
     from factory.store.table import AnotherWriter
-    from factory.store.verify import RunInProgress, claim_for_upkeep, leftovers, refuse_while_running
+    from factory.store.verify import RunInProgress, claim_for_upkeep, old_leftovers, refuse_while_running
 
     store = open_store(request.out)
     try:
         (refuse_while_running if request.say else claim_for_upkeep)(store)
-        found = leftovers(store, request.older_s, time.time())
+        found = old_leftovers(store, request.older_s, time.time())
     except (RunInProgress, AnotherWriter, BadLocation, OSError) as error:
         raise Refused(why_not_written(error) or str(error)) from error
     for name in found:

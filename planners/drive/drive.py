@@ -47,9 +47,7 @@ from planners.drive.work import (
     FailedDrive,
     RowCommitter,
     open_drives,
-    reads_towns,
 )
-from planners.drive.work import DriveItem, DriveWork, DrivingPlanner, NotDriven
 from planners.evaluation.planner_names import find_planners
 from tasks.render.scene import engine
 from tasks.render.splatting.gsplat_backend import BackendMissing

@@ -13,8 +13,8 @@ import numpy as np
 from planners.drive.cameras import DriveCameras, Images, NoCameras, Observer
 from planners.drive.drivers import DriveEnd, Driver
 from planners.drive.starts import DriveStart
+from tasks.reward.comfort import comfortable
 from tasks.reward.epdms import Scores, prepare_scene, score
-from tasks.reward.rules.comfort import comfortable
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.world.arrays import Array, Bools, Ints

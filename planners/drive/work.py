@@ -14,9 +14,8 @@ import pyarrow as pa
 from factory.readers.base import BadClip, ClipReader, ClipRef, painter_of
 from factory.readers.validate import read_clip
 from factory.setup.settings import cache_folder
-from factory.store.location import Location
-from factory.store.parquet_file import TableSpec, write_shard
-from factory.store.schema import canonical_json, schema_of
+from factory.store.location import Location, write_shard
+from factory.store.schema import TableSpec, canonical_json, schema_of
 from factory.store.table import KeyedTable
 from planners.drive.cameras import DriveCameras, NoCameras, PaintedCameras, RenderedCameras, open_rendered_cameras
 from planners.drive.drivers import Driver, make_driver
@@ -206,8 +205,7 @@ class DriveWork:
         last = NOW + HORIZON_STEPS if any(key.start != LOGGED for _, key in item.keys) else NOW
         clip, n_steps = read_clip(self.reader, item.ref), self.settings.loop.clip_steps(last)
         painter = painter_of(self.reader)
-        return lengthened(clip, n_steps, None if painter is None else painter.lights(clip, n_steps))
-        return extend_clip(clip, n_steps, town_lights(clip, n_steps) if reads_towns(self.reader) else None)
+        return extend_clip(clip, n_steps, None if painter is None else painter.lights(clip, n_steps))
 
     def _starts(self, clip: Clip, wanted: set[int]) -> dict[int, DriveStart]:
         found = [logged_start(clip)] if LOGGED in wanted else []
@@ -226,7 +224,11 @@ class DriveWork:
         if pictures == "engine":
             cache_dir = self.settings.cache or cache_folder(self.out.uri)
             return open_rendered_cameras(clip, self.settings.render, cache_dir)
-        return PaintedCameras(clip, self.settings.render) if pictures == "truth" else NoCameras()
+        if pictures == "truth":
+            painter = painter_of(self.reader)
+            assert painter is not None, "pictures=truth goes with a reader that has a painter"
+            return PaintedCameras(clip, self.settings.render, painter)
+        return NoCameras()
 
     def _driver(self, who: DrivingPlanner) -> Driver:
         return cached_driver(who, canonical_json(self.settings.settings), self.settings.pdm, self.settings.device)

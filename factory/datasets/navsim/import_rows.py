@@ -31,7 +31,7 @@ from factory.datasets.navsim.window import (
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, calling_on_stop_signal
 from factory.files import DiskFull
 from factory.graph.driver import SHARD_BYTES
-from factory.graph.execute import RunSummary, record_summary
+from factory.graph.execute import RunSummary, write_last_run
 from factory.graph.progress import Counter, RunTotals
 from factory.readers.base import BadClip, failing_as
 from factory.readers.pictures import BadPicture, jpeg_size, refuse_size, without_exif
@@ -267,7 +267,7 @@ def import_rows(store: Store, identity: RunIdentity, entries: Sequence[Entry]) -
         summary.exit_code, summary.message = INTERRUPTED, f"{error}; free disk space and run the same command again"
     summary.counts = counts
     summary.seconds = {"import": (summary.executed.attempts, time.monotonic() - began)}
-    record_summary(store, summary)
+    write_last_run(store, summary)
     return summary
 
 

@@ -35,8 +35,7 @@ def photographed(tmp_path_factory: pytest.TempPathFactory) -> Clip:
     )
     reader = SyntheticReader(tmp_path_factory.mktemp("town"), 1, settings=settings)
     clip = reader.read(reader.index().refs[0])
-    return lengthened(clip, 300, TownPainter().lights(clip, 300))
-    return extend_clip(clip, 300, town_lights(clip, 300))
+    return extend_clip(clip, 300, TownPainter().lights(clip, 300))
 
 
 def unit(jpeg: bytes) -> np.ndarray:
@@ -55,8 +54,7 @@ def front(images: Any) -> bytes:
 @pytest.mark.slow
 def test_where_the_log_drives_the_painter_shows_the_log_s_photos(photographed: Clip) -> None:
     """At T and 1.5 s before; who is beyond 100 m of the log's ego is not annotated and not painted."""
-    scene, eyes = logged_start(photographed).scene, PaintedEyes(photographed, SMALL, TownPainter())
-    scene, cameras = logged_start(photographed).scene, PaintedCameras(photographed, SMALL)
+    scene, cameras = logged_start(photographed).scene, PaintedCameras(photographed, SMALL, TownPainter())
     files = {round(file.time_s, 2): Path(file.uri) for file in photographed.images}
     for offset in (0, -15):
         painted = unit(front(cameras.images(scene, offset)))
