@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from fnmatch import fnmatchcase
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import IO, Any
 
@@ -392,3 +392,15 @@ def _why_not_remote(out: str, scheme: str) -> str:
         return ""
     said = done.stdout.strip() or (done.stderr.strip().splitlines() or ["the trial ended without a word"])[-1]
     return f"out={out}: cannot be written: {said}{hint}"
+
+
+def file_digest(path: Path) -> str:
+    """sha256 of a file, read once in a process and again where its size or time of change is another."""
+    stat = path.stat()
+    return _digest_of(path.resolve(), stat.st_size, stat.st_mtime_ns)
+
+
+@lru_cache(maxsize=64)
+def _digest_of(path: Path, _size: int, _changed_ns: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -176,24 +176,19 @@ class Request:
 
 def main(request: Request) -> None:
     """Answer until nobody asks any more. Raises Refused for a planner that cannot plan there."""
-    with suppress(BrokenPipeError):  # who asked has gone
-        answer_all(request)
-
-
-def answer_all(request: Request) -> None:
-    """The same. Raises BrokenPipeError where nobody waits for an answer."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever prints must not come between the answers
-    try:
-        pilot = Pilot(request.planner, request.cameras, request.undistort, request.device)
-    except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: a device that is not there
-        send(answers, {"error": str(error)})
-        raise Refused(str(error)) from error
-    send(answers, {"cameras": np.array(pilot.cameras, dtype=str)})
-    while (question := receive(sys.stdin.buffer)) is not None:
+    with suppress(BrokenPipeError):  # who asked has gone
         try:
-            poses = pilot.plan(seen_of(question, pilot.cameras), int(question["n_poses"]))
-        except ValueError as error:
+            pilot = Pilot(request.planner, request.cameras, request.undistort, request.device)
+        except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: a device that is not there
             send(answers, {"error": str(error)})
-        else:
-            send(answers, {"poses": poses})
+            raise Refused(str(error)) from error
+        send(answers, {"cameras": np.array(pilot.cameras, dtype=str)})
+        while (question := receive(sys.stdin.buffer)) is not None:
+            try:
+                poses = pilot.plan(seen_of(question, pilot.cameras), int(question["n_poses"]))
+            except ValueError as error:
+                send(answers, {"error": str(error)})
+            else:
+                send(answers, {"poses": poses})

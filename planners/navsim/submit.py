@@ -9,7 +9,7 @@ run_create_submission_pickle.py writes with our agent. NAVSIM is not needed. A f
 scene cannot be planned, the error names it and nothing is written.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -144,8 +144,10 @@ def scenes_of(
         if windows:
             logged[path] = tuple(windows)
             final.update(table.tokens[np.array(windows) + chosen.num_future_frames].tolist())
-    if tokens is not None:
-        _refuse_absent(tokens - {str(token) for table in tables.values() for token in table.tokens}, len(tokens), logs)
+    there = {str(token) for table in tables.values() for token in table.tokens}
+    if tokens is not None and (absent := tokens - there):
+        problem = f"{len(absent)} of the split's {len(tokens)} tokens are in no log here: {min(absent)}, ..."
+        raise ValueError(f"logs={logs}: {problem}")
     not_scenes = 0 if tokens is None or chosen.max_scenes is not None else len(tokens) - found
     return SplitScenes(logged, frozenset(final), _second_stage(selection, root), chosen, sensors, not_scenes)
 
@@ -159,13 +161,6 @@ def _tables(logs: Path, names: Sequence[str] | None, cache_dir: Path) -> dict[Pa
         )
     paths = [path for name, path in there.items() if names is None or name in set(names)]
     return {path: table_at(path, cache_dir) for path in paths}
-
-
-def _refuse_absent(absent: Collection[str], n_tokens: int, logs: Path) -> None:
-    if absent:
-        raise ValueError(
-            f"logs={logs}: {len(absent)} of the split's {n_tokens} tokens are in no log here: {min(absent)}, ..."
-        )
 
 
 def _second_stage(selection: Selection, root: Path | None) -> tuple[Path, ...]:
@@ -209,19 +204,10 @@ PUBLIC_NAMES: Mapping[type, str] = {
 }
 
 
-@dataclass(frozen=True)
-class Team:
-    """Whose submission it is, by the leaderboard's form."""
-
-    team_name: str
-    authors: str
-    email: str
-    institution: str
-    country: str
-
-
-def submission_bytes(team: Team, first_stage: Mapping[str, Array], second_stage: Mapping[str, Array]) -> bytes:
-    """The file's content. Stages: token -> (8 or 40, 3) float32 poses of 4 s; the second is empty where there is none.
+def submission_bytes(
+    team: Mapping[str, str], first_stage: Mapping[str, Array], second_stage: Mapping[str, Array]
+) -> bytes:
+    """The file's content. Stages: token -> (8, 3) float32 poses of 4 s; the second is empty where there is none.
 
     A pickle of NAVSIM's own classes, written where they are not installed: keys, nesting and types are those of
     run_create_submission_pickle.py (autonomousvision/navsim @ 0a380a9, navsim/planning/script), and
@@ -236,19 +222,10 @@ def submission_bytes(team: Team, first_stage: Mapping[str, Array], second_stage:
     first, second = (
         {token: Trajectory(plan, sampling) for token, plan in stage.items()} for stage in (first_stage, second_stage)
     )
-    content = {
-        "team_name": team.team_name,
-        "authors": team.authors,
-        "email": team.email,
-        "institution": team.institution,
-        "country / region": team.country,
-        "first_stage_predictions": [first],
-        "second_stage_predictions": [second],
-    }
-    return dumps(content, PUBLIC_NAMES)
+    return dumps({**team, "first_stage_predictions": [first], "second_stage_predictions": [second]}, PUBLIC_NAMES)
 
 
-N_POSES, N_FINE_POSES = 8, 40
+N_POSES = 8  # 0.5 s apart
 
 
 @dataclass(frozen=True)
@@ -266,7 +243,6 @@ class Request:
     sensors: str | None = None  # sensor_blobs/<split>, for a planner that looks at pictures
     root: str | None = None  # synthetic_scene_pickles and sensor_blobs of a second stage
     out: str = "submission.pkl"  # the file; the leaderboard wants it to be called so
-    fine: bool = False  # true: 40 poses 0.1 s apart, else 8 poses 0.5 s apart
     device: str = "cpu"  # as the agent takes it, cameras and undistort too: docs/training.md
     cameras: tuple[str, ...] = ()
     undistort: bool = False
@@ -281,11 +257,11 @@ def main(request: Request) -> None:
         if pilot.cameras and request.sensors is None:
             raise Refused(f"sensors=... is missing: planner={request.planner} looks at {', '.join(pilot.cameras)}")
         scenes = scenes_of(read_selection(request.split), logs, sensors, root, user_cache() / "navsim")
-        n_poses = N_FINE_POSES if request.fine else N_POSES
         with Counter("scenes planned", len(scenes)) as progress:
-            first = _planned(scenes.first_stage(), pilot, n_poses, progress, 0)
-            second = _planned(scenes.second_stage(), pilot, n_poses, progress, len(first))
-        team = Team(request.team_name, request.authors, request.email, request.institution, request.country)
+            first = _planned(scenes.first_stage(), pilot, progress, 0)
+            second = _planned(scenes.second_stage(), pilot, progress, len(first))
+        team = {name: getattr(request, name) for name in ("team_name", "authors", "email", "institution")}
+        team["country / region"] = request.country
         write_whole(Path(request.out), submission_bytes(team, first, second))
     except (BadClip, ValueError, OSError, RuntimeError) as error:  # RuntimeError: a device that is not there
         raise Refused(one_line(error)) from error
@@ -294,15 +270,13 @@ def main(request: Request) -> None:
         print(f"{left_out:,} tokens of the split are no scenes by its own rules, and NAVSIM's script plans none there")
 
 
-def _planned(
-    stage: Iterable[ShownScene | None], pilot: Pilot, n_poses: int, progress: Counter, before: int
-) -> dict[str, Array]:
+def _planned(stage: Iterable[ShownScene | None], pilot: Pilot, progress: Counter, before: int) -> dict[str, Array]:
     """Token -> plan. Raises BadClip."""
     plans: dict[str, Array] = {}
     for done, scene in enumerate(stage, start=before + 1):
         if scene is not None:
             try:
-                plans[scene.token] = pilot.plan(scene.sighting(pilot.cameras), n_poses)
+                plans[scene.token] = pilot.plan(scene.sighting(pilot.cameras), N_POSES)
             except ValueError as error:
                 raise BadClip(scene.file, f"token {scene.token}", str(error)) from error
         progress.show(done)

@@ -12,7 +12,6 @@ planner=<out>`, `train init_from=<out>` and NAVSIM's agent take it. GTRS-Dense c
 trained with unless another one is named. Nothing of the file runs: it is read as tensors and plain values.
 """
 
-import hashlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,6 +24,7 @@ from torch import Tensor
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, compose, fill
 from factory.config.words import SHOW, without_show
+from factory.files import file_digest
 from factory.readers.pickles import load_tensors
 from planners.models.diffusiondrive import POINT_FEATURES, REFINEMENTS, WAYPOINTS, DiffusionDriveSettings
 from planners.models.gtrs_dense import IMITATION, GtrsDenseSettings, inference_arrays
@@ -204,8 +204,8 @@ def ltf(moves: Moves, settings: LtfSettings) -> Arrays:
     fusion(moves, "fusion.")
     moves.layer("_bev_downscale", "reduce")
     moves.layer("_status_encoding", "status")
-    moves.one("_keyval_embedding.weight", "key_position", _batched)
-    moves.one("_query_embedding.weight", "queries", _batched)
+    moves.one("_keyval_embedding.weight", "key_position", lambda x: x[None])
+    moves.one("_query_embedding.weight", "queries", lambda x: x[None])
     moves.all("_tf_decoder.", "decoder.")
     moves.layer("_trajectory_head._mlp.0", "plan_head.0")
     moves.layer("_trajectory_head._mlp.2", "plan_head.2")
@@ -280,10 +280,6 @@ FAMILIES: Mapping[str, Callable[[Moves, Any], Arrays]] = {  # each takes its own
 }
 
 
-def _batched(embedding: Tensor) -> Tensor:
-    return embedding[None]
-
-
 def _points_reordered(weight: Tensor) -> Tensor:
     """Columns of the first map over a plan's points, from y before x and sines and cosines in turn to x, y, all sines.
 
@@ -334,8 +330,7 @@ def import_to(config: ImportConfig) -> Path:
         raise ConfigError(f"checkpoint={config.checkpoint}: there is no such file")
     public = read_public(path)
     found = imported(config.planner, public, str(path))
-    with path.open("rb") as file:
-        source = f"{path.name} {hashlib.file_digest(file, 'sha256').hexdigest()}"
+    source = f"{path.name} {file_digest(path)}"
     record = {
         "trained": {"imported": source},
         "backbones": {"all": source},
@@ -370,7 +365,8 @@ def imported(choice: PlannerChoice, public: Mapping[str, Tensor], source: str) -
         moves.done()
     except ConfigError as error:
         raise ConfigError(f"{error}; its weights look like planner={looks_like(public)}") from error
-    planner = build_planner(choice, {**arrays, **_chosen_from(settings)})
+    chosen = inference_arrays(settings) if isinstance(settings, GtrsDenseSettings) else {}
+    planner = build_planner(choice, {**arrays, **chosen})
     put_weights(planner, moves.ours, f"{source} does not fit planner={choice.name} with these settings")
     return Imported(planner.eval(), moves.aside, moves.came_from)
 
@@ -382,10 +378,6 @@ def looks_like(public: Mapping[str, Tensor]) -> str:
     if "_trajectory_head.vocab" in public:
         return "gtrs_dense_public"
     return "diffusiondrive_public" if "_trajectory_head.plan_anchor" in public else "ltf_public"
-
-
-def _chosen_from(settings: Any) -> dict[str, Any]:
-    return dict(inference_arrays(settings)) if isinstance(settings, GtrsDenseSettings) else {}
 
 
 def account(found: Imported, public: dict[str, Tensor]) -> str:

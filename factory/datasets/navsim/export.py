@@ -18,13 +18,14 @@ import numpy as np
 
 from factory.datasets.navsim.frames import (
     BLACK,
+    CONFIG,
     MOTION,
     N_FUTURE,
     N_HISTORY,
     NAMING,
+    REWARDS,
     CannotExport,
     ExportSettings,
-    Layout,
     SplitNames,
     black_picture,
     is_simulated,
@@ -201,51 +202,6 @@ def _list(key: str, values: Iterable[str]) -> str:
     return f"{key}:\n" + "".join(f'- "{value}"\n' for value in listed) if listed else f"{key}: []\n"
 
 
-# Where each file of an export lies below its folder.
-
-CONFIG = "devkit/navsim/planning/script/config"  # below NAVSIM_DEVKIT_ROOT, once devkit/ is copied over it
-REWARDS = "traj_pdm_v2"  # what NAVSIM_TRAJPDM_ROOT names
-
-
-@dataclass(frozen=True)
-class Places:
-    """The paths of one split, relative to the export's folder."""
-
-    names: SplitNames
-    layout: Layout
-
-    def log(self, name: str) -> str:
-        """A log's pickle."""
-        folder = f"navsim_logs/{self.names.folder}" if self.layout == "moved" else f"{self._unpacked}/meta_datas"
-        return f"{folder}/{name}.pkl"
-
-    def picture(self, data_path: str, frame: int) -> str:
-        """A picture of a frame; the released archives keep those of the future apart."""
-        if self.layout == "moved":
-            return f"sensor_blobs/{self.names.folder}/{data_path}"
-        return f"{self._unpacked}/sensor_blobs_{'hist' if frame < N_HISTORY else 'fut'}/{data_path}"
-
-    @property
-    def scene_filter(self) -> str:
-        return f"{CONFIG}/common/train_test_split/scene_filter/{self.names.yaml}.yaml"
-
-    @property
-    def split(self) -> str:
-        return f"{CONFIG}/common/train_test_split/{self.names.yaml}.yaml"
-
-    @property
-    def log_split(self) -> str:
-        return f"{CONFIG}/training/{self.names.log_split}.yaml"
-
-    @property
-    def rewards(self) -> str:
-        return f"{REWARDS}/{self.names.rewards}"
-
-    @property
-    def _unpacked(self) -> str:
-        return f"SimScale/{self.names.folder}"
-
-
 def vocabulary(k: int) -> str:
     """Where the released configuration looks for its trajectories (gtrs_dense_vov.yaml:23)."""
     return f"devkit/traj_final/{k}.npy"
@@ -328,7 +284,10 @@ def export(
     """
     planned = plan(table, settings)
     journal = Journal(to, asdict(settings))
-    stale = _tidy(journal, planned, settings)
+    splits: dict[SplitNames, list[Planned]] = defaultdict(list)
+    for sample in planned.values():
+        splits[sample.split].append(sample)
+    stale = _tidy(journal, planned, splits)
     todo = [sample for sample in planned.values() if not _is_whole(journal, sample)]
     say(f"{len(planned):,} samples chosen, {len(planned) - len(todo):,} of them are there already")
     if not (todo or stale or journal.interrupted) and _is_done(journal, trajectories):
@@ -337,8 +296,8 @@ def export(
     _write_logs(table, journal, settings, todo, each, say)
     logs = [journal.logs[key] for key in sorted(planned)]
     say("splits, rewards, checksums")
-    files = [*_split_files(to, settings, logs, planned)]
-    rewards, without = _reward_files(table, to, settings, planned)
+    files = [*_split_files(to, settings, logs, splits)]
+    rewards, without = _reward_files(table, to, splits)
     files += [*rewards, *_vocabulary_file(to, trajectories)]
     facts = _facts(planned, logs, without)
     journal.finish(facts, logs, files)
@@ -394,11 +353,10 @@ def write_group(table: Location, root: Path, settings: ExportSettings, group: Ro
 
 def _write_log(root: Path, settings: ExportSettings, row: Sample) -> Written:
     names, split = sample_names(row), split_names(row, settings.tag)
-    places = Places(split, settings.layout)
     seen = shown(row, names, settings)
     frames = log_frames(row, names, seen.cams, settings)
-    files = [write_file(root, places.picture(p.data_path, p.frame), p.jpeg) for p in seen.pictures]
-    files.append(write_file(root, places.log(names.log), dumps(frames)))
+    files = [write_file(root, split.picture(path), jpeg) for path, jpeg in seen.pictures]
+    files.append(write_file(root, split.log(names.log), dumps(frames)))
     return Written(
         split.folder,
         names.log,
@@ -475,65 +433,58 @@ def _is_whole(journal: Journal, sample: Planned) -> bool:
     return log is not None and log.made_of == sample.made_of and journal.whole(log.files[-1])
 
 
-def _tidy(journal: Journal, planned: Mapping[tuple[str, str], Planned], settings: ExportSettings) -> bool:
+def _tidy(journal: Journal, planned: Mapping[tuple[str, str], Planned], splits: Iterable[SplitNames]) -> bool:
     """Take away the logs of rows that are no more, and what a killed export had half written; whether there were."""
     stale = sorted(journal.logs.keys() - planned.keys())
     for key in stale:
         for file in journal.logs.pop(key).files:
             (journal.root / file.path).unlink(missing_ok=True)
     if journal.interrupted:
-        for split in {sample.split for sample in planned.values()}:
-            places = Places(split, settings.layout)
-            for path in {places.log("x"), places.picture("x", 0), places.picture("x", 11)}:
-                for draft in (journal.root / path).parent.rglob(".*.tmp"):
-                    draft.unlink()
+        for folder in (folder for split in splits for folder in (Path(split.log("")).parent, split.picture(""))):
+            for draft in (journal.root / folder).rglob(".*.tmp"):
+                draft.unlink()
     return bool(stale)
 
 
 def _split_files(
-    root: Path, settings: ExportSettings, logs: Sequence[Written], planned: Mapping[tuple[str, str], Planned]
+    root: Path, settings: ExportSettings, logs: Sequence[Written], splits: Iterable[SplitNames]
 ) -> Iterator[File]:
     """The YAML files of each split, of the logs that the public loader takes, and its black picture."""
-    for split in sorted({sample.split for sample in planned.values()}):
-        places, of_split = Places(split, settings.layout), [log for log in logs if log.folder == split.folder]
+    folder = f"{CONFIG}/common/train_test_split"
+    for split in sorted(splits):
+        of_split = [log for log in logs if log.folder == split.folder]
         taken = [log for log in of_split if log.has_route]
-        yield write_file(root, places.scene_filter, scene_filter_yaml(taken).encode())
-        yield write_file(root, places.split, split_yaml(split).encode())
-        yield write_file(root, places.log_split, log_split_yaml(taken).encode())
+        yield write_file(root, f"{folder}/scene_filter/{split.yaml}.yaml", scene_filter_yaml(taken).encode())
+        yield write_file(root, f"{folder}/{split.yaml}.yaml", split_yaml(split).encode())
+        yield write_file(root, split.log_split, log_split_yaml(taken).encode())
         if settings.missing == "black" and any(log.absent_pictures for log in of_split):
-            yield write_file(root, places.picture(BLACK, 0), black_picture())
+            yield write_file(root, split.picture(BLACK), black_picture())
 
 
 def _reward_files(
-    table: KeyedTable, root: Path, settings: ExportSettings, planned: Mapping[tuple[str, str], Planned]
+    table: KeyedTable, root: Path, splits: Mapping[SplitNames, Sequence[Planned]]
 ) -> tuple[list[File], int]:
     """The rewards of each split, those of simulated rounds with all earlier ones; how many samples have no labels."""
-    digests = {sample.row["label_vocabulary"] for sample in planned.values()} - {None}
+    digests = {sample.row["label_vocabulary"] for of_split in splits.values() for sample in of_split} - {None}
     if len(digests) > 1:
         raise CannotExport(f"the samples' labels are of {len(digests)} vocabularies: {', '.join(sorted(digests))}")
-    by_split: dict[SplitNames, list[Planned]] = defaultdict(list)
-    for sample in planned.values():
-        if sample.row["label_vocabulary"] is not None:
-            by_split[sample.split].append(sample)
     files: list[File] = []
     earlier: dict[str, Path] = {}  # by expert, of the newest round so far
-    for split in sorted({sample.split for sample in planned.values()}, key=partial(_by_round, planned)):
-        (first, *_) = (sample.row for sample in planned.values() if sample.split == split)
+    without = 0
+    for split, of_split in sorted(splits.items(), key=lambda item: (item[1][0].row["expert"], item[1][0].row["round"])):
+        first = of_split[0].row
+        labelled = [sample for sample in of_split if sample.row["label_vocabulary"] is not None]
+        without += len(of_split) - len(labelled)
         before = earlier.get(first["expert"]) if is_simulated(first) else None
-        if not by_split[split] and before is None:
+        if not labelled and before is None:
             continue
-        path = Places(split, settings.layout).rewards
-        (root / path).parent.mkdir(parents=True, exist_ok=True)
-        with atomic_file(root / path, 0) as draft:
-            write_rewards(draft, _labelled(table, by_split[split]), before)
-        files.append(file_of(root, path))
-        earlier[first["expert"]] = root / path
-    return files, len(planned) - sum(map(len, by_split.values()))
-
-
-def _by_round(planned: Mapping[tuple[str, str], Planned], split: SplitNames) -> tuple[str, int]:
-    (first, *_) = (sample.row for sample in planned.values() if sample.split == split)
-    return first["expert"], first["round"]
+        path = root / split.rewards
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path, 0) as draft:
+            write_rewards(draft, _labelled(table, labelled), before)
+        files.append(file_of(root, split.rewards))
+        earlier[first["expert"]] = path
+    return files, without
 
 
 def _labelled(table: KeyedTable, samples: Iterable[Planned]) -> Iterator[tuple[str, Sample]]:

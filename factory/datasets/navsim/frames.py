@@ -21,7 +21,6 @@ from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, YAW_RATE
 
 # What an export is asked for.
 
-Layout = Literal["moved", "released"]
 Missing = Literal["refuse", "black", "none"]
 
 MAP_LOCATIONS = ("sg-one-north", "us-ma-boston", "us-nv-las-vegas-strip", "us-pa-pittsburgh-hazelwood")
@@ -40,7 +39,6 @@ class ExportSettings:
     rounds: tuple[int, ...] = ()  # which; none: all
     splits: tuple[str, ...] = ()  # train, val, test; none: all
     tag: str = ""  # behind an expert's name, so that a split of ours stands beside the released one
-    layout: Layout = "moved"  # as after SimScale's tools/move.sh, or as its archives unpack
     resize: bool = False  # pictures of other sizes, to PUBLIC_SIZE
     missing: Missing = "refuse"  # pictures of eight cameras and four instants that a sample has not
     map_location: str = ""  # of all samples; empty: what their maps say
@@ -137,34 +135,39 @@ def sample_names(row: Mapping[str, Any]) -> SampleNames:
     return SampleNames(f"{source_log(row['dataset'], row['log_id'])}-{scene}", scene, tokens, times_s, suffix)
 
 
+CONFIG = "devkit/navsim/planning/script/config"  # below NAVSIM_DEVKIT_ROOT, once devkit/ is copied over it
+REWARDS = "traj_pdm_v2"  # what NAVSIM_TRAJPDM_ROOT names
+
+
 @dataclass(frozen=True, order=True)
 class SplitNames:
-    """What the samples of one expert and round are called, all together."""
+    """What the samples of one expert and round are called, all together; paths are below the export's folder."""
 
     folder: str  # of logs and of pictures: where SimScale's tools/move.sh puts a download
     yaml: str  # of the scene filter and the split; its cache is <yaml>_cache
-    log_split: str  # of the training's list of logs ("reation" is how the public code spells it)
-    rewards: str  # the file below NAVSIM_TRAJPDM_ROOT
+    log_split: str  # path of the training's list of logs ("reation" is how the public code spells it)
+    rewards: str  # path of the file below NAVSIM_TRAJPDM_ROOT
+
+    def log(self, name: str) -> str:
+        """The path of a log's pickle."""
+        return f"navsim_logs/{self.folder}/{name}.pkl"
+
+    def picture(self, data_path: str) -> str:
+        """The path of a picture, or of the folder of all of them."""
+        return f"sensor_blobs/{self.folder}/{data_path}"
 
 
 def split_names(row: Mapping[str, Any], tag: str = "") -> SplitNames:
     """Of a row with the columns NAMING. The rewards' file is always named 16384, whatever K is (gtrs_agent.py:232)."""
-    return _split_names(str(row["expert"]), int(row["round"]), is_simulated(row), tag)
-
-
-@cache
-def _split_names(expert: str, round_: int, simulated: bool, tag: str) -> SplitNames:
-    who = RELEASED.get(expert, expert) + (f"_{tag}" if tag else "")
-    if not simulated:
-        name = f"navtrain_{who}"
-        return SplitNames(name, name, f"default_log_split_{name}", f"ori/{name}_16384.pkl")
-    name = f"{who}_v1.0-{round_}"
-    return SplitNames(
-        f"synthetic_reaction_{name}",
-        f"navtrain_reaction_{name}",
-        f"default_log_split_synthetic_reation_{name}",
-        f"sim/simcale_16384_{name}.pkl",
-    )
+    who = RELEASED.get(row["expert"], row["expert"]) + (f"_{tag}" if tag else "")
+    if is_simulated(row):
+        name = f"{who}_v1.0-{row['round']}"
+        folder, yaml = f"synthetic_reaction_{name}", f"navtrain_reaction_{name}"
+        log_split, rewards = f"synthetic_reation_{name}", f"sim/simcale_16384_{name}.pkl"
+    else:
+        folder = yaml = log_split = f"navtrain_{who}"
+        rewards = f"ori/{folder}_16384.pkl"
+    return SplitNames(folder, yaml, f"{CONFIG}/training/default_log_split_{log_split}.yaml", f"{REWARDS}/{rewards}")
 
 
 # The ego at the twelve frames of a log: poses in the plane and in space, velocities, accelerations, yaw rates.
@@ -379,21 +382,11 @@ def slots(cameras: Sequence[Camera]) -> Mapping[str, Camera]:
     by_name = {camera.name.upper(): camera for camera in cameras}
     if by_name.keys() <= YAW_DEG.keys():
         return {name: by_name[name] for name in CAMERAS if name in by_name}
-    looks = np.array([_yaw_deg(camera) for camera in cameras])
+    looks = np.degrees([np.arctan2(*camera.ego_from_camera[1::-1, 2]) for camera in cameras])
     off = np.abs((looks[:, None] - np.array(list(YAW_DEG.values())) + 180.0) % 360.0 - 180.0)
     cost = np.where(off <= MOST_DEG, off, 1e3) ** 2
     pairs = sorted((int(slot), int(i)) for i, slot in zip(*linear_sum_assignment(cost)) if off[i, slot] <= MOST_DEG)
     return {CAMERAS[slot]: cameras[i] for slot, i in pairs}
-
-
-def nominal(name: str, size: tuple[int, int]) -> Camera:
-    """A level camera that looks where the named one does, for one that a rig has not."""
-    return pinhole(name, YAW_DEG[name], NOMINAL_VIEW_DEG, *size)
-
-
-def _yaw_deg(camera: Camera) -> float:
-    ahead = camera.ego_from_camera[:3, 2]
-    return float(np.degrees(np.arctan2(ahead[1], ahead[0])))
 
 
 JPEG_QUALITY = 95  # of resized pictures; others keep their bytes
@@ -402,19 +395,10 @@ BLACK = "black.jpg"  # beside the folders of pictures
 
 
 @dataclass(frozen=True)
-class BlobPicture:
-    """One file: where it lies below the pictures' folder, of which frame, its bytes."""
-
-    data_path: str
-    frame: int
-    jpeg: bytes
-
-
-@dataclass(frozen=True)
 class RowPictures:
     """A sample's pictures."""
 
-    pictures: tuple[BlobPicture, ...]
+    pictures: tuple[tuple[str, bytes], ...]  # where below the split's folder of pictures, and the JPEG
     cams: tuple[Mapping[str, Mapping[str, Any]], ...]  # (N_FRAMES,) the frames' `cams`
     absent: int  # of the history's 8 x 4
     left_out: tuple[str, ...]  # cameras of the rig that stand for none of the eight
@@ -439,13 +423,14 @@ def shown(row: Mapping[str, Any], names: SampleNames, settings: ExportSettings) 
     for name in CAMERAS:
         camera = chosen.get(name)
         size = written.get(name, PUBLIC_SIZE)
-        calibration = nominal(name, size) if camera is None else camera.resized(*size)
+        level = pinhole(name, YAW_DEG[name], NOMINAL_VIEW_DEG, *size)  # for one that the rig has not
+        calibration = level if camera is None else camera.resized(*size)
         for i, token in enumerate(names.tokens):
             path = f"{names.blobs}/{name}/{hex16(token.removesuffix(names.suffix), name)}{names.suffix}.jpg"
             image = stored.get(name, {}).get(i)
             if image is not None:
                 assert camera is not None
-                pictures.append(BlobPicture(path, i, _jpeg(image, camera, size)))
+                pictures.append((path, _jpeg(image, camera, size)))
             elif settings.missing == "black" and i < N_HISTORY:
                 path = BLACK
             cams[i][name] = _entry(path, calibration)

@@ -24,6 +24,7 @@ from factory.datasets.navsim.window import (
     ego_states,
     lights,
     n_steps,
+    read_jpeg,
     rig_of,
     window_agents,
     world_from_ego,
@@ -34,7 +35,8 @@ from factory.graph.driver import SHARD_BYTES
 from factory.graph.execute import RunSummary, write_last_run
 from factory.graph.progress import Counter, RunTotals
 from factory.readers.base import BadClip, failing_as
-from factory.readers.pictures import BadPicture, jpeg_size, refuse_size, without_exif
+from factory.readers.pictures import BadPicture, refuse_size, without_exif
+from factory.readers.settings import FRAME_STEPS
 from factory.stages.rows import scene_columns
 from factory.store.location import Shard, write_shard
 from factory.store.samples import IMPORTED, ChangedRun, ErrorKind, Kind, Outcome, Store
@@ -55,10 +57,10 @@ from tasks.world.clip import (
 )
 from tasks.world.frames import EGO_STATE_SIZE, HEADING, to_local
 from tasks.world.road_map import LightState, RoadMap, Route, TrafficLights
+from tasks.world.lanes import LightState, TrafficLights
 
 HISTORY_FRAMES = FRAMES_BEFORE + 1  # now among them
 SCENE_FRAMES = HISTORY_FRAMES + 8  # with the 4 s that are driven
-COARSE_STEPS = 5  # between two frames
 
 
 @dataclass(frozen=True)
@@ -73,12 +75,6 @@ class Origin:
     licence: str
     content_digest: str
     frame_tokens: tuple[str, str] | None
-
-
-def no_road(frame: Frame) -> RoadAhead:
-    """Where there are no maps: the route is known by its roadblocks alone."""
-    route = Route((), frame.roadblock_ids, frozenset())
-    return RoadAhead(RoadMap({}, (), location=frame.map_location), route, np.zeros((0, 3)))
 
 
 def scene_of(frames: Sequence[Frame], road: RoadAhead, origin: Origin, driven: int | None = None) -> Scene:
@@ -138,7 +134,7 @@ def logged_label(scene: Scene) -> dict[str, object]:
 def label_columns_of(scene: Scene, poses: Array) -> dict[str, object]:
     """The columns of a drive (40, 3) from T on, world frame."""
     label = to_local(scene.ego_state[: HEADING + 1], poses)
-    return {"label_10hz": label, "label_2hz": label[COARSE_STEPS - 1 :: COARSE_STEPS]}
+    return {"label_10hz": label, "label_2hz": label[FRAME_STEPS - 1 :: FRAME_STEPS]}
 
 
 def pictures(frames: Sequence[Frame], folder: Path, source: ImageSource, file: str) -> dict[str, object]:
@@ -149,7 +145,7 @@ def pictures(frames: Sequence[Frame], folder: Path, source: ImageSource, file: s
     images = blobs_of(frames, folder).images
     if not images:
         raise BadClip(file, "cams", f"none of its pictures is in {folder}; pictures=false imports it without")
-    now_s = (len(frames) - 1) * COARSE_STEPS * STEP_S
+    now_s = (len(frames) - 1) * FRAME_STEPS * STEP_S
     rig = {camera.name: camera for camera in rig_of(frames[-1], images, file)}
     return {
         "cameras": [
@@ -178,12 +174,9 @@ def pictures(frames: Sequence[Frame], folder: Path, source: ImageSource, file: s
 
 def _jpeg(path: Path, camera: Camera) -> bytes:
     """A whole file, without Exif. Raises BadClip where it is no JPEG of the camera's size or is cut off."""
+    data, size = read_jpeg(path)
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise BadClip(str(path), "image", f"cannot be read: {error.strerror}") from error
-    try:
-        refuse_size(jpeg_size(data), (camera.width, camera.height), camera.name)
+        refuse_size(size, (camera.width, camera.height), camera.name)
     except BadPicture as error:
         raise BadClip(str(path), error.field, str(error)) from error
     if b"\xff\xd9" not in data[-64:]:

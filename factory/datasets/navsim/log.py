@@ -123,7 +123,6 @@ class FrameBoxes:
     kinds: tuple[AgentKind, ...]  # (N,)
     velocities: Array  # (N, 3) [m/s], over ground, along the ego's axes
     track_tokens: tuple[str, ...]  # (N,) identity over time, unique within a frame
-    instance_tokens: tuple[str, ...]  # (N,)
 
 
 @dataclass(frozen=True)
@@ -304,7 +303,7 @@ def boxes_of(anns: Values, names: Mapping[str, str] | None = None) -> FrameBoxes
         raise anns.bad("track_tokens", f"{next(t for t in tracks if tracks.count(t) > 1)} stands twice in one frame")
     if (boxes[:, 3:6] <= 0.0).any():
         raise anns.bad(key["gt_boxes"], "a box has a size that is not positive")
-    return FrameBoxes(boxes, tuple(KIND_OF_NAME[kind] for kind in kinds), velocities, tracks, instances)
+    return FrameBoxes(boxes, tuple(KIND_OF_NAME[kind] for kind in kinds), velocities, tracks)
 
 
 # A scene of NAVSIM's second stage: the pickle that `Scene.save_to_disk` writes, read without nuPlan's devkit.
@@ -352,10 +351,8 @@ class SyntheticScene:
 
     file: str
     token: str  # of the fourth frame, 17 digits
-    scene_token: str
     log_name: str
     original_scene: str | None  # token of the log's frame at the same time
-    original_token: str | None  # token of the stage-one frame, 4 s before
     frames: tuple[Frame, ...]  # HISTORY_FRAMES and what follows
 
 
@@ -384,13 +381,14 @@ def scene_of_pickle(value: Any, file: str, *, as_shown: bool = False) -> Synthet
     ]
     if history[-1].token != about.text("initial_token"):
         raise about.bad("initial_token", f"is not {history[-1].token}, the token of frames[{HISTORY_FRAMES - 1}]")
+    original = "corresponding_original_scene"
+    if original not in about.items:
+        original = "corresponding_orignal_scene"  # v2.0's spelling
     return SyntheticScene(
         file=file,
         token=history[-1].token,
-        scene_token=about.text("scene_token"),
         log_name=about.text("log_name"),
-        original_scene=_token(about, "corresponding_original_scene", "corresponding_orignal_scene"),  # v2.0's spelling
-        original_token=_token(about, "corresponding_original_initial_token"),
+        original_scene=None if about.items.get(original) is None else about.text(original),
         frames=(*history, *(() if as_shown else _later(values, history[-1]))),
     )
 
@@ -459,7 +457,7 @@ def _boxes(values: Values, tracks: Any, place: str, now: Frame) -> FrameBoxes:
     inner = f"{place}.tracked_objects"
     found = _list(_fields(values, holder.get("tracked_objects"), "TrackedObjects", inner), "tracked_objects")
     poses, sizes, velocities = np.zeros((len(found), 3)), np.zeros((len(found), 3)), np.zeros((len(found), 3))
-    kinds, names, instances = [], [], []
+    kinds, names = [], []
     for k, item in enumerate(found):
         thing = _fields(values, item, None, f"{inner}[{k}]")
         number = _enum(thing, "_tracked_object_type", "TrackedObjectType")
@@ -468,7 +466,6 @@ def _boxes(values: Values, tracks: Any, place: str, now: Frame) -> FrameBoxes:
         kinds.append(KINDS[number])
         about = _fields(values, thing.get("_metadata"), "SceneObjectMetadata", f"{thing.place}_metadata")
         names.append(about.text("track_token"))
-        instances.append(about.text("token"))
         box = _fields(values, thing.get("_box"), "OrientedBox", f"{thing.place}_box")
         center = _fields(values, box.get("_center"), "StateSE2", f"{box.place}_center")
         poses[k] = [_number(center, key) for key in ("x", "y", "heading")]
@@ -484,7 +481,7 @@ def _boxes(values: Values, tracks: Any, place: str, now: Frame) -> FrameBoxes:
     c, s = np.cos(now.pose[2]), np.sin(now.pose[2])
     velocities[:, :2] = velocities[:, :2] @ np.array([[c, -s], [s, c]])
     boxes = np.column_stack([local[:, :2], np.full(len(found), np.nan), sizes, wrap_angle(local[:, 2])])
-    return FrameBoxes(boxes, tuple(kinds), velocities, tuple(names), tuple(instances))
+    return FrameBoxes(boxes, tuple(kinds), velocities, tuple(names))
 
 
 def _fields(values: Values, record: Any, name: str | None, place: str) -> Values:
@@ -513,12 +510,6 @@ def _list(values: Values, key: str) -> list[Any]:
     if not isinstance(found, list):
         raise values.bad(key, f"is a {type(found).__name__}, expected a list")
     return found
-
-
-def _token(values: Values, *keys: str) -> str | None:
-    """The first of the keys that is there; None where none is, or it is null. Raises BadClip."""
-    key = next((key for key in keys if key in values.items), None)
-    return None if key is None or values.get(key) is None else values.text(key)
 
 
 def _without_paths(value: Any) -> Any:

@@ -1,10 +1,9 @@
 """A nuPlan city, and the part of it around a drive as a RoadMap."""
 
 import hashlib
+import io
 import json
 import logging
-import secrets
-import zipfile
 from collections import defaultdict
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -19,6 +18,8 @@ from numpy.typing import NDArray
 from factory.files import matching
 from factory.readers.base import BadClip
 from tasks.caches import check, seal, user_cache
+from tasks.kernels.compiled import write_whole
+from tasks.sealed import Damaged, check, sealed
 from tasks.world.arrays import Array, Ints
 from tasks.world.road_map import Lane, MapLayer, MapPolygon, RoadMap
 from tasks.world.roadblocks import Roadblocks
@@ -236,23 +237,6 @@ def _parts(path: Path, layer: str, fids: Ints, shapes: NDArray[np.object_]) -> t
 FORMAT = 2  # raise by hand whenever a GeoPackage gives other tables, or they are kept otherwise
 
 
-class BadMapCache(ValueError):
-    """A kept map is damaged or of another make."""
-
-
-def kept_tables(path: Path) -> dict[str, Table]:
-    """The tables of a GeoPackage, from the cache where it is in order. Raises BadClip, ImportError."""
-    kept = cache_file(path)
-    if kept.is_file():
-        try:
-            return load_tables(kept)
-        except BadMapCache as error:
-            log.warning("%s: %s; %s is read again", kept, error, path)
-    tables = read_geopackage(path)
-    save_tables(kept, tables)
-    return tables
-
-
 def cache_file(path: Path) -> Path:
     """Named by the GeoPackage's place, size and time of change, and by this format."""
     told = path.stat()
@@ -260,61 +244,32 @@ def cache_file(path: Path) -> Path:
     return user_cache() / "maps" / f"{path.parent.parent.name}-{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
 
 
-def file_digest(path: Path) -> str:
-    """sha256 of a GeoPackage, read once in a process and again where its size or time of change is another."""
-    told = path.stat()
-    return _digest_of(path.resolve(), told.st_size, told.st_mtime_ns)
-
-
-@lru_cache(maxsize=8)
-def _digest_of(path: Path, _size: int, _changed_ns: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def save_tables(path: Path, tables: dict[str, Table]) -> None:
-    """Whole or not at all."""
-    arrays: dict[str, NDArray[np.generic]] = {"format": np.array(FORMAT)}
+def kept_tables(path: Path) -> dict[str, Table]:
+    """The tables of a GeoPackage, from the cache where it is in order. Raises BadClip, ImportError."""
+    kept = cache_file(path)
+    if kept.is_file():
+        try:
+            check(kept, kept.name)
+            with np.load(kept, allow_pickle=False) as stored:
+                return {layer: _kept_table(stored, layer) for layer in KEYS}
+        except (Damaged, OSError) as error:
+            log.warning("%s: damaged (%s); %s is read again", kept, error, path)
+    tables = read_geopackage(path)
+    arrays: dict[str, NDArray[np.generic]] = {}
     for layer, table in tables.items():
-        arrays[f"{layer}.fid"] = table.fid
+        arrays |= {f"{layer}.fid": table.fid, f"{layer}.xy": table.xy}
         arrays |= {f"{layer}.{name}": column for name, column in table.columns.items()}
-        arrays[f"{layer}.xy"] = table.xy
         arrays |= {f"{layer}.offsets{i}": offset for i, offset in enumerate(table.offsets)}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        with draft.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-        seal(draft, path.name)
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
-
-
-def load_tables(path: Path) -> dict[str, Table]:
-    """Raises BadMapCache."""
-    try:
-        check(path, path.name)
-        with np.load(path, allow_pickle=False) as stored:
-            if int(stored["format"]) != FORMAT:
-                raise BadMapCache(f"format {int(stored['format'])}, this version reads {FORMAT}")
-            return {layer: _kept_table(stored, layer) for layer in KEYS}
-    except BadMapCache:
-        raise
-    except (OSError, zipfile.BadZipFile, KeyError, ValueError, IndexError, EOFError) as error:
-        raise BadMapCache(f"damaged ({error})") from error
+    data = io.BytesIO()
+    np.savez(data, allow_pickle=False, **arrays)
+    write_whole(kept, sealed(data.getvalue(), kept.name))
+    return tables
 
 
 def _kept_table(stored: np.lib.npyio.NpzFile, layer: str) -> Table:
-    fid = stored[f"{layer}.fid"]
     columns = {name: stored[f"{layer}.{name}"] for name in (*KEYS[layer], *NUMBERS.get(layer, ()))}
-    xy = stored[f"{layer}.xy"]
     offsets = tuple(stored[f"{layer}.offsets{i}"] for i in range(1 if layer in LINES else 2))
-    sizes = [len(xy), *(len(offset) - 1 for offset in offsets)]
-    ends = [int(offset[-1]) for offset in offsets]
-    if sizes != [*ends, len(fid)] or any(len(column) != len(fid) for column in columns.values()):
-        raise BadMapCache(f"layer {layer}: arrays of unequal length")
-    return Table(fid, columns, xy, offsets)
+    return Table(stored[f"{layer}.fid"], columns, stored[f"{layer}.xy"], offsets)
 
 
 LANES, CONNECTORS = "lanes_polygons", "lane_connectors"
@@ -469,12 +424,13 @@ class City:
     def _lane(self, i: int) -> Lane:
         if i not in self._lanes:
             lines, row = self.tables["baseline_paths"].offsets[0], int(self._baselines[i])
+            polygons, n = self.tables[CONNECTOR_POLYGONS], self._n_lanes
             speed = float(self._speeds[i])
             self._lanes[i] = Lane(
                 lane_id=self._ids[i],
-                ring=self._ring(i),
+                ring=self.tables[LANES].outline(i) if i < n else polygons.outline(int(self._polygon_rows[i - n])),
                 centerline=self._centerlines[lines[row] : lines[row + 1]],
-                is_intersection=i >= self._n_lanes,
+                is_intersection=i >= n,
                 drives_cars=True,  # the public metric makes no difference between lanes
                 successors=self._after[i],
                 predecessors=self._before[i],
@@ -485,11 +441,6 @@ class City:
                 right_boundary=self._boundary(1, i),
             )
         return self._lanes[i]
-
-    def _ring(self, i: int) -> Array:
-        if i < self._n_lanes:
-            return self.tables[LANES].outline(i)
-        return self.tables[CONNECTOR_POLYGONS].outline(int(self._polygon_rows[i - self._n_lanes]))
 
     def _side(self, fids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Of each lane the row of its boundary, -1 where no row has that fid, and whether that runs against it."""

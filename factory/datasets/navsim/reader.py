@@ -11,7 +11,7 @@ import logging
 import sys
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.datasets.navsim.log import LogFrames, frames_of, read_frames
-from factory.datasets.navsim.maps import DOWNLOAD, file_digest, map_file
+from factory.datasets.navsim.maps import DOWNLOAD, map_file
 from factory.datasets.navsim.settings import NavsimClips
 from factory.datasets.navsim.window import (
     FRAMES_BEFORE,
@@ -36,7 +36,7 @@ from factory.datasets.navsim.window import (
     window_agents,
     world_from_ego,
 )
-from factory.files import matching
+from factory.files import file_digest, matching
 from factory.readers.apart import Apart
 from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, bytes_of, failing_as, split_of
 from factory.readers.logs import (
@@ -128,11 +128,6 @@ def read_selection(name: str, folder: str | Path | None = None) -> Selection:
     filter_path = path.parent / SUBFOLDER / f"{_filter_name(content, path)}.yaml"
     scene_filter = scene_filter_of(_mapping(filter_path), str(filter_path))
     return Selection(path.stem, scene_filter, data_split, None if mapping is None else tuple(mapping))
-
-
-def read_scene_filter(path: Path) -> SceneFilter:
-    """The scene filter in this file. Raises ValueError."""
-    return scene_filter_of(_mapping(path), str(path))
 
 
 def scene_filter_of(content: Mapping[str, Any], file: str) -> SceneFilter:
@@ -427,40 +422,23 @@ class NavsimReader:
 
     untrusted: ClassVar[bool] = True  # pickles: as of a LogReader
 
-    def __init__(
-        self,
-        root: str | Path,
-        maps: str | Path,
-        sensors: str | Path | None = NavsimClips.sensors,
-        scene_filter: str | None = NavsimClips.scene_filter,
-        scene_filters: str | Path | None = NavsimClips.scene_filters,
-        stride_s: float = NavsimClips.stride_s,
-        name: str = "navsim",
-        min_top_speed_mps: float = NavsimClips.min_top_speed_mps,
-        first_window: int = NavsimClips.first_window,
-        only: Sequence[str] = NavsimClips.only,
-        split: str | None = NavsimClips.split,
-        cache_dir: str | Path | None = NavsimClips.cache_dir,
-        traversals: int = NavsimClips.traversals,
-    ) -> None:
-        """Arguments: see NavsimClips. Raises ValueError for what is no filter, stride or split."""
-        if split is not None and split not in SPLITS:
-            raise ValueError(f"clips.split={split} is none of {', '.join(SPLITS)}; null: by the filter and the folder")
-        settings = NavsimClips(
-            str(root), str(maps), stride_s=stride_s, first_window=first_window, traversals=traversals
-        )
-        self.traversals = settings.traversals
+    def __init__(self, root: str | Path, maps: str | Path, name: str = "navsim", **settings: Any) -> None:
+        """settings: the others of NavsimClips. Raises ValueError for what is no filter, stride or split."""
+        given = NavsimClips(str(root), str(maps), **settings)
+        if given.split is not None and given.split not in SPLITS:
+            known = ", ".join(SPLITS)
+            raise ValueError(f"clips.split={given.split} is none of {known}; null: by the filter and the folder")
+        self.name, self.only, self.split, self.traversals = name, tuple(given.only), given.split, given.traversals
         self.root, self.maps = (Path(folder).expanduser().absolute() for folder in (root, maps))
-        self.sensors = None if sensors is None else Path(sensors).expanduser().absolute()
-        self.name, self.only, self.split = name, tuple(only), split
-        self.selection: Selection | None = read_selection(scene_filter, scene_filters) if scene_filter else None
+        self.sensors = None if given.sensors is None else Path(given.sensors).expanduser().absolute()
+        self.selection = read_selection(given.scene_filter, given.scene_filters) if given.scene_filter else None
         self.choice = Choice(
-            stride_frames=settings.stride_frames,
-            first_frame=first_window * settings.stride_frames,
-            min_top_speed_mps=min_top_speed_mps,
+            stride_frames=given.stride_frames,
+            first_frame=given.first_window * given.stride_frames,
+            min_top_speed_mps=given.min_top_speed_mps,
             scene_filter=self.selection.scene_filter if self.selection else None,
         )
-        self.cache_dir = Path(cache_dir or user_cache() / "navsim").expanduser().absolute()
+        self.cache_dir = Path(given.cache_dir or user_cache() / "navsim").expanduser().absolute()
         self._logs: dict[str, OpenLog] = {}
 
     def __getstate__(self) -> dict[str, Any]:

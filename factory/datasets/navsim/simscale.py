@@ -23,14 +23,13 @@ from factory.datasets.navsim.import_rows import (
     Entry,
     Origin,
     logged_label,
-    no_road,
     pictures,
     scene_of,
     world_columns,
 )
 from factory.datasets.navsim.log import bytes_of, frames_of
-from factory.datasets.navsim.pickles import RewardFile
-from factory.datasets.navsim.window import ego_states, road_around
+from factory.datasets.navsim.pickles import METRICS, RewardFile
+from factory.datasets.navsim.window import RoadAhead, ego_states, road_around
 from factory.files import folders_in, matching, matching_below
 from factory.graph.steps import HUMAN_CANDIDATE
 from factory.readers.base import BadClip
@@ -43,6 +42,7 @@ from tasks.reward.label_bytes import VocabularyLabels
 from tasks.stages import HUMAN
 from tasks.subscores import multiplied
 from tasks.world.arrays import Array
+from tasks.world.lanes import RoadMap, Route
 from tasks.world.vocabulary import Vocabulary
 
 # SimScale's rewards of one token as a sample's vocabulary labels.
@@ -54,15 +54,7 @@ from tasks.world.vocabulary import Vocabulary
 # therefore the pickle's own; progress in metres, and that of trajectories whose multiplier is 0, is lost. EC was
 # never in them.
 
-METRICS = {  # SimScale's name of a sub-score -> ours
-    "no_at_fault_collisions": "nc",
-    "drivable_area_compliance": "dac",
-    "driving_direction_compliance": "ddc",
-    "traffic_light_compliance": "tlc",
-    "time_to_collision_within_bound": "ttc",
-    "lane_keeping": "lk",
-    "history_comfort": "hc",
-}
+SCORES = {public: ours for public, ours in METRICS.items() if ours not in ("ep", "score")}
 PROGRESS = "ego_progress"
 NOMINAL_M = 256.0
 
@@ -72,9 +64,9 @@ def vocabulary_labels(rewards: Mapping[str, Array], vocabulary: str, k: int) -> 
 
     Raises ValueError naming the metric that is missing, or holds what the public code does not write.
     """
-    if missing := [name for name in (*METRICS, PROGRESS) if name not in rewards]:
+    if missing := [name for name in (*SCORES, PROGRESS) if name not in rewards]:
         raise ValueError(f"metric {missing[0]} is missing")
-    scores = {ours: rewards[name] for name, ours in METRICS.items()}
+    scores = {ours: rewards[name] for name, ours in SCORES.items()}
     ep = rewards[PROGRESS]
     if len(ep) != k:
         raise ValueError(f"rewards of {len(ep)} trajectories, the vocabulary has {k}")
@@ -261,8 +253,10 @@ class Import:
             content_digest=sha256(data).hexdigest(),
             frame_tokens=tokens,
         )
-        road = no_road(now)
-        if self.maps is not None:
+        if self.maps is None:  # the route is known by its roadblocks alone
+            route = Route((), now.roadblock_ids, frozenset())
+            road = RoadAhead(RoadMap({}, (), location=now.map_location), route, np.zeros((0, 3)))
+        else:
             road = road_around(self.maps, now, ego_states(frames)[:, :2], now.pose, str(path), at)
         scene = scene_of(frames, road, origin)
         seen: dict[str, object] = dict(NO_IMAGES)

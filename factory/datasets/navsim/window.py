@@ -295,7 +295,7 @@ def rig_of(frame: Frame, images: Sequence[SensorFile], file: str) -> tuple[Camer
     cameras = []
     for camera in frame.cameras:
         if camera.name in first:
-            width, height = _jpeg_size(Path(first[camera.name]))
+            _, (width, height) = read_jpeg(Path(first[camera.name]))
             try:
                 cameras.append(
                     Camera(camera.name, width, height, camera.intrinsics, camera.distortion, camera.ego_from_camera)
@@ -305,10 +305,11 @@ def rig_of(frame: Frame, images: Sequence[SensorFile], file: str) -> tuple[Camer
     return tuple(cameras)
 
 
-def _jpeg_size(path: Path) -> Size:
-    """Raises BadClip."""
+def read_jpeg(path: Path) -> tuple[bytes, Size]:
+    """The file and its picture's width and height [px]. Raises BadClip."""
     try:
-        return jpeg_size(path.read_bytes())
+        data = path.read_bytes()
+        return data, jpeg_size(data)
     except OSError as error:
         raise BadClip(str(path), "image", f"cannot be read: {error.strerror}") from error
     except BadPicture as error:

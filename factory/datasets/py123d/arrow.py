@@ -76,29 +76,21 @@ class ArrowFile:
         return vector
 
 
-def open_file(path: Path) -> ArrowFile:
-    """The file, checked whole. Raises BadClip where it is missing, truncated or without metadata."""
+def open_file(path: Path, rows: bool = True) -> ArrowFile:
+    """The file, checked whole, or without its rows. Raises BadClip where it is missing, cut or without metadata."""
     try:
         with pa.memory_map(str(path)) as source:
-            table = pa.ipc.open_file(source).read_all()
+            file = pa.ipc.open_file(source)
+            table = file.read_all() if rows else file.schema.empty_table()
         table.validate(full=True)
     except FileNotFoundError as error:
         raise BadClip(str(path), "file", "missing") from error
     except (pa.ArrowException, OSError, ValueError) as error:  # a name that is no text
         raise BadClip(str(path), "file", f"cannot be read as an Arrow file, truncated? {error}") from error
-    return ArrowFile(path, table, _metadata(path, table.schema))
-
-
-def open_metadata(path: Path) -> ArrowFile:
-    """The file without its rows. Raises BadClip."""
-    try:
-        with pa.memory_map(str(path)) as source:
-            schema = pa.ipc.open_file(source).schema
-    except FileNotFoundError as error:
-        raise BadClip(str(path), "file", "missing") from error
-    except (pa.ArrowException, OSError, ValueError) as error:  # a name that is no text
-        raise BadClip(str(path), "file", f"cannot be read as an Arrow file, truncated? {error}") from error
-    return ArrowFile(path, schema.empty_table(), _metadata(path, schema))
+    packed = (table.schema.metadata or {}).get(b"metadata")
+    if packed is None:
+        raise BadClip(str(path), "metadata", "missing from the schema: not a file of py123d")
+    return ArrowFile(path, table, unpacked(path, "metadata", packed))
 
 
 def check_version(file: ArrowFile) -> None:
@@ -154,13 +146,6 @@ def _array(value: dict[Any, Any]) -> dict[Any, Any] | NDArray[np.float64]:
     return np.frombuffer(value[b"data"], kind).reshape(value[b"shape"]).astype(np.float64)
 
 
-def _metadata(path: Path, schema: pa.Schema) -> Mapping[str, Any]:
-    packed = (schema.metadata or {}).get(b"metadata")
-    if packed is None:
-        raise BadClip(str(path), "metadata", "missing from the schema: not a file of py123d")
-    return unpacked(path, "metadata", packed)
-
-
 # The data sets that 123D converts and that are read: licences, classes of their boxes, what their maps hold.
 
 
@@ -169,7 +154,6 @@ class ConvertedSet:
     """What differs between the data sets."""
 
     licence: str
-    has_lanes: bool = True
     own_roadblocks: bool = False  # its lane groups are roadblocks; elsewhere 123D made them from neighbours
     own_intersections: bool = False  # polygons of its own; elsewhere 123D joined connectors
     own_centerlines: bool = True  # else 123D made them from the boundaries, as we do
@@ -183,7 +167,6 @@ SOURCES = {  # by the data set's name in a log's metadata
     "nuscenes": ConvertedSet("CC BY-NC-SA 4.0 (nuScenes via 123D)", own_intersections=True),
     "wod-perception": ConvertedSet(WAYMO),
     "wod-motion": ConvertedSet(WAYMO),
-    "kitti360": ConvertedSet("CC BY-NC-SA 3.0 (KITTI-360 via 123D)", has_lanes=False),
 }
 
 _CAR, _WALKER, _BICYCLE, _THING = AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.BICYCLE, AgentKind.GENERIC_OBJECT

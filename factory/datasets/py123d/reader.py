@@ -2,7 +2,7 @@
 
 import hashlib
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -40,11 +40,10 @@ from factory.datasets.py123d.arrow import (
     check_version,
     numbers,
     open_file,
-    open_metadata,
 )
 from factory.datasets.py123d.map import read_map
 from factory.datasets.scenarionet.tracks import FIT_STEPS, MAX_GAP_S, smooth_drive
-from factory.files import matching, matching_below
+from factory.files import file_digest, matching, matching_below
 from factory.readers.base import SPLITS, BadClip, ClipRef
 from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive, within
 from factory.readers.pickles import id_text
@@ -228,27 +227,24 @@ def _filled_s(boxes: ArrowFile, frames_s: Array) -> float:
 # 123D keeps photos by their path under the data set's own sensor root, or packed into its tables. Only files are
 # taken: photos where `sensor_root` says where they are, sweeps where they are Argoverse 2's feathers.
 
-PINHOLE, LIDAR, SWEEP_SUFFIX = "pinhole", "lidar.lidar_merged.arrow", ".feather"
-
-
-def camera_files(folder: Path) -> tuple[Path, ...]:
-    """The tables of the log's cameras, by name."""
-    return tuple(matching(folder, "camera.*.arrow"))
+CAMERAS, LIDAR, SWEEP_SUFFIX = "camera.*.arrow", "lidar.lidar_merged.arrow", ".feather"
 
 
 def read_rig(folder: Path) -> dict[Path, Camera]:
     """Table -> pinhole camera; fisheyes are left out. Raises BadClip."""
-    mount = open_metadata(folder / EGO).vector("rear_axle_to_imu_se3", 7)
+    mount = open_file(folder / EGO, rows=False).vector("rear_axle_to_imu_se3", 7)
     rear_from_imu = np.linalg.inv(matrices(folder / EGO, mount[None])[0])
-    files = {path: open_metadata(path) for path in camera_files(folder)}
+    files = {path: open_file(path, rows=False) for path in matching(folder, CAMERAS)}
     return {
-        path: _camera(file, rear_from_imu) for path, file in files.items() if file.value("camera_model", str) == PINHOLE
+        path: _camera(file, rear_from_imu)
+        for path, file in files.items()
+        if file.value("camera_model", str) == "pinhole"
     }
 
 
 def has_photos(folder: Path) -> bool:
     """Whether the log's photos are files."""
-    return any(pa.types.is_string(_data_type(open_metadata(path))) for path in camera_files(folder))
+    return any(pa.types.is_string(_data_type(open_file(path, rows=False))) for path in matching(folder, CAMERAS))
 
 
 def recorded_photos(motion: LogMotion, rig: dict[Path, Camera], sensor_root: Path) -> tuple[SensorFile, ...]:
@@ -368,20 +364,41 @@ class Py123dReader(LogReader[Py123dLog]):
     def drive(self, path: Path) -> LoggedDrive | str:
         """Ego and agents of the log in this folder; or what it lacks. Raises BadClip."""
         header = open_header(path)
-        source = source_of(header)
+        source_of(header)
         for name in (EGO, BOXES):
             if not (path / name).is_file():
                 return f"no {name}"
-        if not source.has_lanes:
-            return "its data set's maps have no lanes"
         if header.metadata.get("map_metadata") is None:
             return "converted without a map"
-        map_file(header, self.maps_root)
+        self._map_file(header)
         return drive_of(read_motion(path))
 
     def load(self, path: Path) -> Py123dLog:
-        """The log in this folder. Raises BadClip."""
-        return read_log(path, self.maps_root, self.sensor_root)
+        """The log in this folder, resampled to 0.1 s. Raises BadClip."""
+        header = open_header(path)
+        source, map_path = source_of(header), self._map_file(header)
+        motion = read_motion(path)
+        drive = drive_of(motion)
+        driven = drive.ego_states[drive.segment >= 0, :3]
+        if not len(driven):
+            raise BadClip(str(path / EGO), "imu_se3", "no continuous drive")
+        road_map = read_map(map_path, source, driven[:, :2])
+        rig, split = read_rig(path), header.value("split", str).rpartition("_")[2]  # <data set>_<split>
+        return Py123dLog(
+            file=str(path),
+            motion=motion,
+            ego_states=drive.ego_states,
+            agents=drive.agents,
+            road_map=road_map,
+            route=route_of_drive(road_map, driven, str(map_path), "lanes"),
+            lights=lights_of(motion, road_map, step_times(0, motion.n_steps)),
+            cameras=tuple(rig.values()),
+            images=recorded_photos(motion, rig, self.sensor_root) if self.sensor_root else (),
+            sweeps=recorded_sweeps(motion, self.sensor_root) if self.sensor_root else (),
+            licence=source.licence,
+            content_digest=content_digest(header, map_path),
+            split=split if split in SPLITS else None,
+        )
 
     def digest(self, ref: ClipRef) -> str:
         """The clip's content digest, from the bytes of its log's files alone. Raises BadClip."""
@@ -390,13 +407,13 @@ class Py123dReader(LogReader[Py123dLog]):
     def log_digest(self, path: Path) -> str:
         """sha256 of the log in this folder, but for pixels and points. Raises BadClip."""
         header = open_header(path)
-        return content_digest(header, map_file(header, self.maps_root))
+        return content_digest(header, self._map_file(header))
 
     def world(self, path: Path) -> str | None:
         """The map that the log shares with others; None where it has one of its own. Raises BadClip."""
         header = open_header(path)
         shares = not header.metadata["map_metadata"].get("map_is_per_log")
-        return map_file(header, self.maps_root).stem if shares else None
+        return self._map_file(header).stem if shares else None
 
     def block_steps(self, start: int) -> tuple[int, int]:
         """20 s that begin at a multiple of 10 s."""
@@ -407,14 +424,37 @@ class Py123dReader(LogReader[Py123dLog]):
         """Log and second at which the block begins that the clip is rendered from; None where there are no photos."""
         if self.sensor_root is None or not has_photos(self.path_of(ref)):
             return None
-        first = ref.start_ms // STEP_MS // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
+        first, _ = self.block_steps(ref.start_ms // STEP_MS)
         return f"{ref.log_id}@{first * STEP_S:g}s"
 
     def recorded(self, log: Py123dLog, start: int, stop: int) -> Recorded:
         """Poses, rig, photos and sweeps of a window, and the block that it is rendered from."""
         poses = world_from_ego_at(log.motion, step_times(start, stop))
+        first, end = self.block_steps(start)
+        end = min(end, log.motion.n_steps)
+        agents = present(log.agents.window(first, end))
+        block = Block(first * STEP_S, agents, within(log.images, first, end), within(log.sweeps, first, end))
         sensed = within(log.images, start, stop), within(log.sweeps, start, stop)
-        return Recorded(poses, log.cameras, *sensed, _block(log, start) if log.images else None)
+        return Recorded(poses, log.cameras, *sensed, block if log.images else None)
+
+    def _map_file(self, header: ArrowFile) -> Path:
+        """The log's map, in its folder or among the maps of its data set. Raises BadClip where it is not there."""
+        folder = header.path.parent
+        about = header.metadata.get("map_metadata")
+        if not isinstance(about, dict) or not isinstance(about.get("dataset"), str):
+            raise BadClip(str(header.path), "metadata.map_metadata", "missing, or names no data set")
+        if about.get("map_is_per_log"):
+            paths = [folder / MAP]
+        else:
+            name = f"{about['dataset']}_{about.get('location')}.arrow"
+            if Path(name).name != name:
+                raise BadClip(str(header.path), "metadata.map_metadata", f"names an impossible file {shown(name)}")
+            roots = [self.maps_root] if self.maps_root else [parent / "maps" for parent in folder.parents[1:4]]
+            paths = [root / about["dataset"] / name for root in roots]
+        found = next((path for path in paths if path.is_file()), None)
+        if found is None:
+            raise BadClip(str(paths[0]), "file", "the log's map is missing: convert it too, or give clips.maps_root")
+        return found
 
 
 def log_folders(root: Path) -> dict[str, Path]:
@@ -437,7 +477,7 @@ def log_folders(root: Path) -> dict[str, Path]:
 
 def open_header(folder: Path) -> ArrowFile:
     """What the log says of itself, its version checked. Raises BadClip."""
-    header = open_metadata(folder / SYNC)
+    header = open_file(folder / SYNC, rows=False)
     check_version(header)
     return header
 
@@ -450,83 +490,13 @@ def source_of(header: ArrowFile) -> ConvertedSet:
     return SOURCES[name]
 
 
-def map_file(header: ArrowFile, maps_root: Path | None) -> Path:
-    """The log's map, in its folder or among the maps of its data set. Raises BadClip where it is not there."""
-    folder = header.path.parent
-    told = header.metadata.get("map_metadata")
-    if not isinstance(told, dict) or not isinstance(told.get("dataset"), str):
-        raise BadClip(str(header.path), "metadata.map_metadata", "missing, or names no data set")
-    if told.get("map_is_per_log"):
-        paths = [folder / MAP]
-    else:
-        name = f"{told['dataset']}_{told.get('location')}.arrow"
-        if Path(name).name != name:
-            raise BadClip(str(header.path), "metadata.map_metadata", f"names an impossible file {shown(name)}")
-        roots = [maps_root] if maps_root else [parent / "maps" for parent in folder.parents[1:4]]
-        paths = [root / told["dataset"] / name for root in roots]
-    found = next((path for path in paths if path.is_file()), None)
-    if found is None:
-        raise BadClip(str(paths[0]), "file", "the log's map is missing: convert it too, or give clips.maps_root")
-    return found
-
-
-def read_log(folder: Path, maps_root: Path | None = None, sensor_root: Path | None = None) -> Py123dLog:
-    """The whole log, resampled to 0.1 s. Raises BadClip."""
-    header = open_header(folder)
-    source, path = source_of(header), map_file(header, maps_root)
-    motion = read_motion(folder)
-    drive = drive_of(motion)
-    driven = drive.ego_states[drive.segment >= 0, :3]
-    if not len(driven):
-        raise BadClip(str(folder / EGO), "imu_se3", "no continuous drive")
-    road_map = read_map(path, source, driven[:, :2])
-    rig = read_rig(folder)
-    return Py123dLog(
-        file=str(folder),
-        motion=motion,
-        ego_states=drive.ego_states,
-        agents=drive.agents,
-        road_map=road_map,
-        route=route_of_drive(road_map, driven, str(path), "lanes"),
-        lights=lights_of(motion, road_map, step_times(0, motion.n_steps)),
-        cameras=tuple(rig.values()),
-        images=recorded_photos(motion, rig, sensor_root) if sensor_root else (),
-        sweeps=recorded_sweeps(motion, sensor_root) if sensor_root else (),
-        licence=source.licence,
-        content_digest=content_digest(header, path),
-        split=split_named(header.value("split", str)),
-    )
-
-
-def split_named(name: str) -> str | None:
-    """train, val or test of 123D's `<data set>_<split>`; None for any other."""
-    split = name.rpartition("_")[2]
-    return split if split in SPLITS else None
-
-
 def content_digest(header: ArrowFile, path: Path) -> str:
     """sha256 over what a clip is computed from: poses, boxes, lights, map, calibration; not pixels and points."""
     folder = header.path.parent
     digest = hashlib.sha256(repr(sorted(header.metadata.items())).encode())
     for file in (folder / EGO, folder / BOXES, folder / LIGHTS, path):
         if file.exists():
-            stat = file.stat()
-            digest.update(f"{file.name}\x1f{_digest_of(file, stat.st_size, stat.st_mtime_ns)}\x1f".encode())
-    for file in camera_files(folder):
-        digest.update(f"{file.name}\x1f{sorted(open_metadata(file).metadata.items())!r}\x1f".encode())
+            digest.update(f"{file.name}\x1f{file_digest(file)}\x1f".encode())
+    for file in matching(folder, CAMERAS):
+        digest.update(f"{file.name}\x1f{sorted(open_file(file, rows=False).metadata.items())!r}\x1f".encode())
     return digest.hexdigest()
-
-
-@lru_cache(maxsize=64)
-def _digest_of(file: Path, _size: int, _mtime_ns: int) -> str:
-    """sha256 of a file, computed once: clips of a log share its files, logs a city's map."""
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def _block(log: Py123dLog, start: int) -> Block:
-    """The block of the clip that starts at step `start`: 20 s that begin at a multiple of 10 s, so that it holds it."""
-    first = start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
-    stop = min(first + BLOCK_STEPS, log.motion.n_steps)
-    sensed = within(log.images, first, stop), within(log.sweeps, first, stop)
-    return Block(first * STEP_S, present(log.agents.window(first, stop)), *sensed)

@@ -12,7 +12,7 @@ import numpy as np
 
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.navsim.log import read_frames, read_scene_pickle
-from factory.datasets.navsim.reader import read_scene_filter, table_of
+from factory.datasets.navsim.reader import read_selection, table_of
 from factory.datasets.py123d.reader import Py123dReader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.datasets.town.reader import SyntheticReader
@@ -167,7 +167,7 @@ def _picture(suffix: str, folder: Path) -> Readable:
 
 def _filter(folder: Path) -> Readable:
     path = folder / "filter.yaml"
-    return Readable(path, lambda: read_scene_filter(path), (ValueError,), of_text)
+    return Readable(path, lambda: read_selection(str(path)), (ValueError,), of_text)
 
 
 def _episode(folder: Path) -> Readable:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.datasets.navsim.reader import SceneFilter, read_scene_filter, read_selection
+from factory.datasets.navsim.reader import SceneFilter, read_selection
 
 FILTER = """
 _target_: navsim.common.dataclasses.SceneFilter
@@ -39,9 +39,9 @@ def test_a_filter_is_read_by_name_by_path_and_through_the_split_that_names_it(tm
         log_names=("2021.10.05.07.49.39_veh-52_00934_01406",),
         tokens=("0123456701234567", "8f303260e1ab51c2"),
     )
-    assert read_scene_filter(folder / "scene_filter" / "small.yaml") == wanted
     assert read_selection("small", folder).scene_filter == wanted
-    assert read_selection(str(folder / "scene_filter" / "small.yaml")).data_split is None
+    by_path = read_selection(str(folder / "scene_filter" / "small.yaml"))
+    assert (by_path.scene_filter, by_path.data_split) == (wanted, None)
     chosen = read_selection("chosen", folder)
     assert (chosen.name, chosen.data_split, chosen.scene_filter) == ("chosen", "trainval", wanted)
 

@@ -150,17 +150,6 @@ def test_experts_rounds_and_splits_choose(street_run: Path, tmp_path: Path) -> N
     assert [path.name for path in (tmp_path / "navsim_logs").iterdir()] == ["synthetic_reaction_pdm_ours_v1.0-1"]
 
 
-def test_the_released_layout_keeps_the_future_apart(street_run: Path, tmp_path: Path) -> None:
-    quiet(street_run, tmp_path, ExportSettings(experts=("recovery",), layout="released"))
-    folder = tmp_path / "SimScale/synthetic_reaction_recovery_v1.0-0"
-    (log,) = (folder / "meta_datas").iterdir()
-    for i, frame in enumerate(pickle.loads(log.read_bytes())):
-        blobs, other = ("hist", "fut") if i < 4 else ("fut", "hist")
-        for camera in frame["cams"].values():
-            assert (folder / f"sensor_blobs_{blobs}" / camera["data_path"]).is_file()
-            assert not (folder / f"sensor_blobs_{other}" / camera["data_path"]).exists()
-
-
 def test_pictures_of_another_size_are_told_of_and_resized_on_demand(tmp_path: Path) -> None:
     write_table(tmp_path / "run", [exported(0, "human", **pictures(("ring_front_center",), (0.0,)))])
     found = {}
