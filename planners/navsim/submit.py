@@ -19,14 +19,11 @@ from factory.config.arguments import Refused
 from factory.datasets.navsim.log import Frame, read_frames, read_scene_pickle
 from factory.datasets.navsim.pickles import dumps
 from factory.datasets.navsim.reader import (
-    Choice,
-    FrameTable,
     SceneFilter,
     Selection,
     log_files,
     read_selection,
-    table_at,
-    wanted_windows,
+    scene_frames,
 )
 from factory.datasets.navsim.window import blobs_of, rig_of
 from factory.graph.progress import Counter
@@ -36,7 +33,6 @@ from factory.wording import one_line
 from planners.data.batch import COMMANDS
 from planners.navsim.agent import HISTORY
 from planners.navsim.serve import CameraShot, Pilot, Sighting
-from tasks.caches import user_cache
 from tasks.kernels.compiled import write_whole
 from tasks.world.arrays import Array
 from tasks.world.frames import to_local
@@ -117,9 +113,7 @@ class SplitScenes:
             yield None if left_out else ShownScene(scene.token, scene.frames, blobs, str(path))
 
 
-def scenes_of(
-    selection: Selection, logs: Path, sensors: Path | None, root: Path | None, cache_dir: Path
-) -> SplitScenes:
+def scenes_of(selection: Selection, logs: Path, sensors: Path | None, root: Path | None) -> SplitScenes:
     """The scenes of a split among these folders; root: of the second stage, as import navhard takes it.
 
     What an agent is asked to plan, as the public loader chooses it: rules of navsim/common/dataloader.py:19-173
@@ -131,36 +125,26 @@ def scenes_of(
         raise ValueError(
             f"{selection.name}: num_history_frames is {chosen.num_history_frames}; planners take {HISTORY}"
         )
-    tables = _tables(logs, chosen.log_names, cache_dir)
-    tokens = None if chosen.tokens is None else frozenset(chosen.tokens)
-    logged: dict[Path, tuple[int, ...]] = {}
-    final: set[str] = set()
-    found = 0
-    for path, table in tables.items():
-        windows = wanted_windows(table, Choice(1, 0, 0.0, chosen), tokens)
-        if chosen.max_scenes is not None:
-            windows = windows[: max(chosen.max_scenes - found, 0)]
-        found += len(windows)
-        if windows:
-            logged[path] = tuple(windows)
-            final.update(table.tokens[np.array(windows) + chosen.num_future_frames].tolist())
-    there = {str(token) for table in tables.values() for token in table.tokens}
-    if tokens is not None and (absent := tokens - there):
-        problem = f"{len(absent)} of the split's {len(tokens)} tokens are in no log here: {min(absent)}, ..."
-        raise ValueError(f"logs={logs}: {problem}")
-    not_scenes = 0 if tokens is None or chosen.max_scenes is not None else len(tokens) - found
-    return SplitScenes(logged, frozenset(final), _second_stage(selection, root), chosen, sensors, not_scenes)
-
-
-def _tables(logs: Path, names: Sequence[str] | None, cache_dir: Path) -> dict[Path, FrameTable]:
-    """Of all logs, or of those that are named, sorted by name."""
-    there = log_files(logs)
-    if names is not None and (lacking := sorted(set(names) - there.keys())):
+    files, names = log_files(logs), chosen.log_names or ()
+    if lacking := sorted(set(names) - files.keys()):
         raise ValueError(
             f"logs={logs}: {len(lacking)} of the split's {len(names)} logs are not here, such as {lacking[0]}"
         )
-    paths = [path for name, path in there.items() if names is None or name in set(names)]
-    return {path: table_at(path, cache_dir) for path in paths}
+    logged: dict[Path, tuple[int, ...]] = {}
+    final: set[str] = set()
+    there: set[str] = set()
+    for path, table, frames in scene_frames(chosen, files):
+        there.update(table.tokens.tolist())
+        if frames:
+            logged[path] = tuple(frames)
+            final.update(table.tokens[np.array(frames) + chosen.num_future_frames].tolist())
+    tokens = frozenset(chosen.tokens or ())
+    if absent := tokens - there:
+        problem = f"{len(absent)} of the split's {len(tokens)} tokens are in no log here: {min(absent)}, ..."
+        raise ValueError(f"logs={logs}: {problem}")
+    found = sum(map(len, logged.values()))
+    not_scenes = 0 if chosen.tokens is None or chosen.max_scenes is not None else len(tokens) - found
+    return SplitScenes(logged, frozenset(final), _second_stage(selection, root), chosen, sensors, not_scenes)
 
 
 def _second_stage(selection: Selection, root: Path | None) -> tuple[Path, ...]:
@@ -256,7 +240,7 @@ def main(request: Request) -> None:
         pilot = Pilot(request.planner, request.cameras, request.undistort, request.device)
         if pilot.cameras and request.sensors is None:
             raise Refused(f"sensors=... is missing: planner={request.planner} looks at {', '.join(pilot.cameras)}")
-        scenes = scenes_of(read_selection(request.split), logs, sensors, root, user_cache() / "navsim")
+        scenes = scenes_of(read_selection(request.split), logs, sensors, root)
         with Counter("scenes planned", len(scenes)) as progress:
             first = _planned(scenes.first_stage(), pilot, progress, 0)
             second = _planned(scenes.second_stage(), pilot, progress, len(first))

@@ -27,7 +27,7 @@ from factory.datasets.navsim.import_rows import (
     world_columns,
 )
 from factory.datasets.navsim.log import read_frames, read_scene_pickle
-from factory.datasets.navsim.reader import Choice, Selection, log_files, table_at, wanted_windows
+from factory.datasets.navsim.reader import Selection, log_files, scene_frames, table_at
 from factory.datasets.navsim.window import ego_states, road_around
 from factory.files import matching
 from factory.graph.execute import RunSummary
@@ -37,7 +37,6 @@ from factory.stages.imaging import NO_IMAGES
 from factory.store.location import SceneFiles
 from factory.store.samples import Store
 from factory.store.schema import RunIdentity
-from tasks.caches import user_cache
 from tasks.experts.pdm_closed import PdmSettings, plan_for
 from tasks.hard_scenes import GivenScenes, OneStageClip
 from tasks.render.settings import ImageSource
@@ -234,8 +233,7 @@ def groups_of(selection: Selection, logs: Path) -> list[SceneGroup]:
     paths = matching(logs, "*.pkl") if names is None else [logs / f"{name}.pkl" for name in sorted(names)]
     log_of: dict[str, Path] = {}
     for path in (path for path in paths if path.is_file()):
-        there = table_at(path, user_cache() / "navsim").tokens.tolist()
-        log_of |= {token: path for token in there if token in tokens}
+        log_of |= {token: path for token in table_at(path).tokens.tolist() if token in tokens}
     if not log_of:
         raise ValueError(f"logs={logs}: none of the {len(tokens)} stage-one tokens is in the logs here")
     return [replace(group, log=log_of.get(group.now)) for group in groups]
@@ -279,23 +277,18 @@ def lone_tokens(selection: Selection, logs: Path) -> tuple[list[LoneToken], list
     A log that is named and not here is left out with its tokens. Raises BadClip for a log that is broken, and
     ValueError where nothing is chosen.
     """
-    chosen = selection.scene_filter
-    wanted = None if chosen.tokens is None else frozenset(chosen.tokens)
     found: list[LoneToken] = []
-    for name, path in log_files(logs).items():
-        if chosen.log_names is not None and name not in chosen.log_names:
-            continue
-        table = table_at(path, user_cache() / "navsim")
+    for path, table, frames in scene_frames(selection.scene_filter, log_files(logs)):
         starts = table.start_ms
-        for at in wanted_windows(table, Choice(1, 0, 0.0, chosen), wanted):
-            found.append(LoneToken(str(table.tokens[at]), path, int(table.timestamps_us[at]), int(starts[at])))
-    found = found[: chosen.max_scenes]
+        found += [
+            LoneToken(str(table.tokens[at]), path, int(table.timestamps_us[at]), int(starts[at])) for at in frames
+        ]
     if not found:
         raise ValueError(f"logs={logs}: none of the frames that {selection.name} names is in the logs here")
     for i, (last, now) in enumerate(pairwise(found), start=1):
         if now.log == last.log and 0 < now.timestamp_us - last.timestamp_us <= MOST_APART_US:
             found[i] = replace(now, before=last.token)
-    return found, sorted((wanted or frozenset()) - {one.token for one in found})
+    return found, sorted(set(selection.scene_filter.tokens or ()) - {one.token for one in found})
 
 
 def _write_benchmark(

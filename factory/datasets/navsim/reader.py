@@ -11,7 +11,7 @@ import logging
 import sys
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -281,9 +281,9 @@ class FrameTable:
 class Choice:
     """Which windows are wanted."""
 
-    stride_frames: int  # between two, where no scene filter names them
-    first_frame: int  # of each log; windows that begin before it are skipped
-    min_top_speed_mps: float  # an ego that never reaches it stands
+    stride_frames: int = 1  # between two, where no scene filter names them
+    first_frame: int = 0  # of each log; windows that begin before it are skipped
+    min_top_speed_mps: float = 0.0  # an ego that never reaches it stands
     scene_filter: SceneFilter | None = None  # its scenes, whatever the stride and the speed
 
 
@@ -316,8 +316,9 @@ def kept_table(path: Path, cache_dir: Path) -> FrameTable | None:
         return None
 
 
-def table_at(path: Path, cache_dir: Path) -> FrameTable:
+def table_at(path: Path) -> FrameTable:
     """The table of the log at `path`; one that was not kept is made in another process. Raises BadClip."""
+    cache_dir = user_cache() / "navsim"
     return kept_table(path, cache_dir) or Apart(partial(make_table, cache_dir=cache_dir))(path, str(path))
 
 
@@ -367,6 +368,17 @@ def wanted_windows(table: FrameTable, choice: Choice, tokens: Collection[str] | 
     if tokens is not None:
         now = now[[str(token) in tokens for token in table.tokens[now]]]
     return [int(frame) for frame in now]
+
+
+def scene_frames(chosen: SceneFilter, logs: Mapping[str, Path]) -> Iterator[tuple[Path, FrameTable, list[int]]]:
+    """Log by log of those that the filter names: its table, and the frames T of the scenes there. Raises BadClip."""
+    tokens, left = None if chosen.tokens is None else frozenset(chosen.tokens), chosen.max_scenes
+    for name, path in logs.items():
+        if chosen.log_names is None or name in chosen.log_names:
+            table = table_at(path)
+            frames = wanted_windows(table, Choice(scene_filter=chosen), tokens)[:left]
+            left = None if left is None else left - len(frames)
+            yield path, table, frames
 
 
 def usable(table: FrameTable, windows: list[int], choice: Choice) -> tuple[list[int], Counter[str]]:

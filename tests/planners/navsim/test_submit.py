@@ -109,7 +109,7 @@ def test_constant_velocity_is_the_public_agent_s_closed_form_in_both_stages(file
 
 def test_what_is_seen_of_a_scene_is_what_the_agent_is_shown(files: Path) -> None:
     folders = files / "navsim_logs/test", files / "sensor_blobs/test", files / "navhard_two_stage"
-    scenes = scenes_of(read_selection(str(files / "split.yaml")), *folders, files / "kept")
+    scenes = scenes_of(read_selection(str(files / "split.yaml")), *folders)
     found = {scene.token: scene for scene in (*scenes.first_stage(), *filter(None, scenes.second_stage()))}
     frames = log_frames()
     for token, k in (*((frames[k]["token"], k) for k in STAGE_ONE), *zip(TOKENS, STAGE_TWO)):
