@@ -21,7 +21,6 @@ from factory.datasets.av2.reader import read_log
 from factory.datasets.navsim.reader import NavsimReader
 from factory.datasets.town.settings import MOUNTS, TownSettings
 from factory.datasets.town.town import write_logs
-from factory.readers.pickles import load_plain
 from factory.run import main as run
 from factory.stages.sensors import decode_image, encode_jpeg
 from factory.store.reader import SampleTable, decode_stored_image
@@ -33,9 +32,9 @@ from planners.training.train import main as train
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import Clip
 from tasks.world.frames import to_world
-from tests.factory.datasets.navsim.geopackage_writer import ORIGIN, town_rows, write_root
+from tests.factory.datasets.navsim.navsim_town import frames_of, write_town
 from tests.factory.datasets.navsim.openscene_reader import Scene, read_scenes, read_split
-from tests.factory.datasets.navsim.openscene_writer import Place, Sensed, sensed_by_town, write_openscene
+from tests.factory.datasets.navsim.openscene_writer import Sensed, sensed_by_town
 from tests.planners.navsim import agent_inputs
 from tests.planners.navsim.agent_inputs import DISTORTION, AgentInput, Cameras, EgoStatus
 
@@ -103,14 +102,7 @@ def write_navsim(root: Path) -> None:
     """A log of the town in nuPlan's Boston, seen by eight cameras at 2 Hz through lenses as the rig's, and by lidar."""
     seen = TownSettings(tuple(MOUNTS), *SIZE, photo_steps=SEEN_STEPS, lidar_beams=16, lidar_azimuths=180)
     (folder,) = write_logs(root / "av2", (1,), 0, seen)
-    log = read_log(folder)
-    rows = town_rows(log.road_map)
-    write_root(root / "maps", TOWN, rows)
-    blocks = log.road_map.roadblock_of
-    number = {blocks[str(row["fid"])]: str(row["lane_group_fid"]) for row in rows["lanes_polygons"]}
-    number |= {blocks[str(row["fid"])]: str(row["lane_group_connector_fid"]) for row in rows["lane_connectors"]}
-    place = Place(TOWN, np.append(ORIGIN, 0.0), roadblock_number=number.__getitem__)
-    write_openscene(root, "mini", folder.name, log, place, through_lenses(sensed_by_town(log)))
+    write_town(root, "mini", folder, TOWN, through_lenses(sensed_by_town(read_log(folder))))
 
 
 def through_lenses(sensed: Sensed) -> Sensed:
@@ -200,9 +192,7 @@ def test_the_independent_reader_finds_in_the_export_what_the_rows_say(chain: Cha
 def _logged(chain: Chain) -> list[dict[str, Any]]:
     """The frames of NAVSIM's log, written as NumPy 1 names its parts."""
     (file,) = chain.logs.glob("*.pkl")
-    frames = load_plain(file.read_bytes(), str(file))
-    assert isinstance(frames, list)
-    return frames
+    return frames_of(file)
 
 
 def _same_pictures(row: Mapping[str, Any], scene: Scene) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from scipy.spatial.transform import Rotation
 
 from tests.factory.datasets.navsim import scene_pickles
@@ -58,15 +57,9 @@ def write_split(root: Path, frames: list[dict[str, Any]]) -> Path:
 
 
 def write_filter(root: Path, tokens: list[str], **other: Any) -> Path:
-    """split.yaml and its scene filter, with the public files' keys."""
-    chosen = {"_target_": "navsim.common.dataclasses.SceneFilter", "_convert_": "all", "num_history_frames": 4}
-    chosen |= {"num_future_frames": 8, "frame_interval": 1, "has_route": True, "max_scenes": None, "log_names": None}
-    chosen |= {"include_synthetic_scenes": True, "tokens": tokens, "reactive_synthetic_initial_tokens": list(TOKENS)}
-    (root / "scene_filter").mkdir(exist_ok=True)
-    (root / "scene_filter" / "small.yaml").write_text(yaml.safe_dump(chosen | other))
-    split = {"defaults": [{"scene_filter": "small"}], "data_split": "test", "reactive_all_mapping": None}
-    (root / "split.yaml").write_text(yaml.safe_dump(split))
-    return root / "split.yaml"
+    """split.yaml and its scene filter."""
+    synthetic = {"reactive_synthetic_initial_tokens": list(TOKENS)}
+    return scene_pickles.write_split(root, "split", tokens, None, **synthetic | other)
 
 
 if __name__ == "__main__":

@@ -19,16 +19,13 @@ from tests.factory.datasets.navsim.geopackage_writer import (
     write_geopackage,
     write_root,
 )
-from tests.factory.datasets.navsim.openscene_writer import Place, write_openscene
+from tests.factory.datasets.navsim.openscene_writer import Place, Sensed, write_openscene
 
 NOW, TOKENS = 4, ("0000000000005a00c", "0000000000005a00b")
 
 
-def write_installation(root: Path) -> Path:
-    """A log, its city and one group: frames 4 and 3 of the log, then 12 and 11."""
-    location = next(iter(CITIES))
-    write_root(root / "maps", "sg-one-north", stub_rows())
-    (folder,) = write_logs(root / "av2", (1,), 0, TownSettings(cameras=(), lidar_beams=0))
+def write_town(root: Path, split: str, folder: Path, location: str, sensed: Sensed | None = None) -> Path:
+    """A town's log in OpenScene's form, its map as that of the city; the log's pickle."""
     log = read_log(folder)
     rows = town_rows(log.road_map)
     version, zone = CITIES[location]
@@ -38,8 +35,14 @@ def write_installation(root: Path) -> Path:
     number = {blocks[str(row["fid"])]: str(row["lane_group_fid"]) for row in rows["lanes_polygons"]}
     number |= {blocks[str(row["fid"])]: str(row["lane_group_connector_fid"]) for row in rows["lane_connectors"]}
     place = Place(location, np.append(ORIGIN, 0.0), roadblock_number=number.__getitem__)
-    path = write_openscene(root, "test", folder.name, log, place)
-    frames = frames_of(path)
+    return write_openscene(root, split, folder.name, log, place, sensed)
+
+
+def write_installation(root: Path) -> Path:
+    """A log, its city and one group: frames 4 and 3 of the log, then 12 and 11."""
+    write_root(root / "maps", "sg-one-north", stub_rows())
+    (folder,) = write_logs(root / "av2", (1,), 0, TownSettings(cameras=(), lidar_beams=0))
+    frames = frames_of(write_town(root, "test", folder, next(iter(CITIES))))
     scenes = root / "navhard_two_stage" / "synthetic_scene_pickles"
     scenes.mkdir(parents=True)
     for token, at in zip(TOKENS, (NOW + 8, NOW + 7)):

@@ -6,7 +6,6 @@ OpenDriveLab/SimScale at f51ad64 (`gtrs_agent`, `dataset`, `hydra_features`). Wh
 pass by in silence, raises: KeyError for a key that it looks up, Unreadable for all else.
 """
 
-import hashlib
 import importlib
 import io
 import pickle
@@ -25,10 +24,6 @@ CAMERA_KEYS = ("data_path", "sensor2lidar_rotation", "sensor2lidar_translation",
 CAMERA_SHAPE = (1080, 1920, 3)  # the agents' crops assume it (transfuser_features)
 MAP_LOCATIONS = {"sg-one-north", "us-ma-boston", "us-nv-las-vegas-strip", "us-pa-pittsburgh-hazelwood"}
 OBJECT_NAMES = {"vehicle", "pedestrian", "bicycle", "traffic_cone", "barrier", "czone_sign", "generic_object", "ego"}
-TRAINED_ON = (  # the rewards that SimScale's GTRS looks up of every token (hydra_config, trajectory_pdm_weight)
-    *("no_at_fault_collisions", "drivable_area_compliance", "time_to_collision_within_bound", "ego_progress"),
-    *("driving_direction_compliance", "lane_keeping", "traffic_light_compliance", "history_comfort"),
-)
 SYNTHETIC_LENGTH = 17  # characters of a second stage's token (metric_cache_processor, compute_metric_cache)
 PLANNED_FRAMES = 8  # 4 s of 0.5 s
 
@@ -292,37 +287,6 @@ def read_split(file: Path) -> tuple[str, SceneFilter]:
     if len(names) != 1:
         raise Unreadable(f"{file}: defaults name {len(names)} scene filters")
     return values["data_split"], read_scene_filter(file.parent / "scene_filter" / f"{names[0]}.yaml")
-
-
-def read_log_split(file: Path) -> dict[str, list[str]]:
-    """Logs of trainings by `train_logs` and `val_logs`, which SimScale's dataset looks up."""
-    values = yaml.safe_load(file.read_text())
-    return {key: list(values[key] or ()) for key in ("train_logs", "val_logs")}
-
-
-def read_rewards(file: Path, tokens: Sequence[str], n: int) -> dict[str, dict[str, NDArray[np.float16]]]:
-    """Token -> metric -> (n,) float16 of a reward pickle; every token must have all metrics that a training takes."""
-    rewards = _load(file)
-    for token in tokens:
-        for metric in TRAINED_ON:
-            values = rewards[token][metric]
-            if not isinstance(values, np.ndarray) or values.shape != (n,) or values.dtype != np.float16:
-                raise Unreadable(f"{file}: {metric} of {token} is no float16 ({n},)")
-            if not (np.isfinite(values) & (values >= 0) & (values <= 1)).all():
-                raise Unreadable(f"{file}: {metric} of {token} leaves 0 .. 1")
-    assert isinstance(rewards, dict)
-    return rewards
-
-
-def check_sums(folder: Path, sha256: Mapping[str, str]) -> None:
-    """Relative path -> SHA-256 of a manifest against the files; a file that it does not name raises too."""
-    there = {str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file()}
-    unnamed, missing = there - sha256.keys(), sha256.keys() - there
-    if unnamed or missing:
-        raise Unreadable(f"{folder}: not in the manifest {sorted(unnamed)[:3]}, not there {sorted(missing)[:3]}")
-    for path, digest in sha256.items():
-        if hashlib.sha256((folder / path).read_bytes()).hexdigest() != digest:
-            raise Unreadable(f"{folder / path}: not the bytes that the manifest names")
 
 
 def _load(file: Path) -> Any:

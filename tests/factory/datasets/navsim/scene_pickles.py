@@ -6,13 +6,14 @@ StaticObject has no velocity.
 
 import enum
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+import yaml
 
 from tests.factory.datasets.navsim.openscene_writer import numpy_1_pickle
 
@@ -299,3 +300,15 @@ def write_scene(folder: Path, value: dict[str, Any]) -> Path:
     with importable():
         path.write_bytes(numpy_1_pickle(value))
     return path
+
+
+def write_split(folder: Path, name: str, tokens: Sequence[str], groups: Any, **other: Any) -> Path:
+    """<name>.yaml, which says what are follow-ups of what, and scene_filter/<name>.yaml with the public files' keys."""
+    chosen = {"_target_": "navsim.common.dataclasses.SceneFilter", "_convert_": "all", "num_history_frames": 4}
+    chosen |= {"num_future_frames": 8, "frame_interval": 1, "has_route": True, "max_scenes": None, "log_names": None}
+    chosen |= {"tokens": list(tokens), "include_synthetic_scenes": True} | other
+    split = {"defaults": [{"scene_filter": name}], "data_split": "test", "reactive_all_mapping": groups}
+    (folder / "scene_filter").mkdir(parents=True, exist_ok=True)
+    (folder / "scene_filter" / f"{name}.yaml").write_text(yaml.safe_dump(chosen))
+    (folder / f"{name}.yaml").write_text(yaml.safe_dump(split))
+    return folder / f"{name}.yaml"

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from factory.stages.sensors import encode_jpeg
 from tests.factory.datasets.navsim import scene_pickles
@@ -98,14 +97,13 @@ def write(root: Path, pictures: bool = False) -> None:
         write_pictures(root)
     groups = [[frames[now]["token"], frames[now - 1]["token"], pairs_of(now)] for now in GROUPS]
     synthetic = [token for _, _, pairs in groups for pair in pairs for token in pair]
-    chosen = {"_target_": "navsim.common.dataclasses.SceneFilter", "_convert_": "all", "num_history_frames": 4}
-    chosen |= {"num_future_frames": 8, "frame_interval": 1, "has_route": True, "max_scenes": None, "log_names": None}
-    chosen |= {"tokens": [token for now, before, _ in groups for token in (now, before)]}
-    chosen |= {"include_synthetic_scenes": True, "reactive_synthetic_initial_tokens": synthetic}
-    split = {"defaults": [{"scene_filter": "groups"}], "data_split": "test", "reactive_all_mapping": groups}
-    (root / "train_test_split/scene_filter").mkdir(parents=True)
-    (root / "train_test_split/scene_filter/groups.yaml").write_text(yaml.safe_dump(chosen))
-    (root / "train_test_split/groups.yaml").write_text(yaml.safe_dump(split))
+    scene_pickles.write_split(
+        root / "train_test_split",
+        "groups",
+        [token for now, before, _ in groups for token in (now, before)],
+        groups,
+        reactive_synthetic_initial_tokens=synthetic,
+    )
 
 
 def write_pictures(root: Path) -> None:

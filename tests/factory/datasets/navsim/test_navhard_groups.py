@@ -61,25 +61,37 @@ CLOSE = {"rtol": 0.0, "atol": 1e-11}
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("groups")
-    write(made, pictures=True)
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The files, and below `out` their benchmark: made once without a picture of the last group, then whole."""
+    root = tmp_path_factory.mktemp("groups")
+    write(root, pictures=True)
     version, zone = CITIES[CITY]
-    write_geopackage(made / "maps" / CITY / version / "map.gpkg", stub_rows(scale=SCALE), zone)
-    return made
+    write_geopackage(root / "maps" / CITY / version / "map.gpkg", stub_rows(scale=SCALE), zone)
+    photo = root / "sensor_blobs/test" / log_frames()[max(GROUPS) - 1]["cams"]["CAM_B0"]["data_path"]
+    photo.write_bytes(turned(photo.read_bytes(), 3))
+    lost = root / "navhard_two_stage/sensor_blobs" / log_frames()[max(GROUPS) + 8]["cams"]["CAM_B0"]["data_path"]
+    data = lost.read_bytes()
+    lost.unlink()
+    assert imported(root) == COMPLETE_WITH_FAILURES
+    document = json.loads((root / "out/benchmark.json").read_text())
+    assert [len(clip["follow_ups"]) for clip in document["clips"]] == [len(pairs_of(GROUPS[0]))]
+    errors = [row["error"] for row in Store(root / "out").outcomes.read().to_pylist()]
+    assert len(errors) == 2 + 2 * len(pairs_of(GROUPS[1])) and all(f"{lost}: image: missing" in one for one in errors)
+    lost.write_bytes(data)
+    assert imported(root) == COMPLETE
+    return root
 
 
-def imported(root: Path, out: Path, *pictures: str) -> int:
+def imported(root: Path) -> int:
     words = [f"root={root / 'navhard_two_stage'}", f"logs={root / 'navsim_logs/test'}", f"maps={root / 'maps'}"]
-    words += [f"split={root / 'train_test_split/groups.yaml'}", *pictures, f"out={out}"]
-    return factory(["import", "navhard", *words])
+    words += [f"sensors={root / 'sensor_blobs/test'}", f"split={root / 'train_test_split/groups.yaml'}"]
+    return factory(["import", "navhard", *words, f"out={root / 'out'}"])
 
 
-def test_rows_weights_and_final_score_are_the_public_code_s(root: Path, tmp_path: Path) -> None:
-    assert imported(root, tmp_path / "out", "pictures=false") == COMPLETE
+def test_rows_weights_and_final_score_are_the_public_code_s(made: Path, tmp_path: Path) -> None:
     assert COLUMNS == ("nc", "dac", "tlc", "ddc", "ep", "ttc", "lk", "hc", "ec", "score")
-    benchmark = BenchmarkFolder(str(tmp_path / "out"))
-    settings = EvaluateSettings(str(tmp_path / "out"), out=str(tmp_path / "eval"), bounds=False, tables=False)
+    benchmark = BenchmarkFolder(str(made / "out"))
+    settings = EvaluateSettings(str(made / "out"), out=str(tmp_path / "eval"), bounds=False, tables=False)
     lines = evaluate(benchmark, [planner_of("constant_velocity")], settings)
     clips = list(dict.fromkeys(key.clip_id for key in benchmark.keys))  # in the order of the split's groups
     rows = [row for row in read_rows(tmp_path / "eval/constant_velocity") if row.stage != "one_stage"]
@@ -94,16 +106,13 @@ def test_rows_weights_and_final_score_are_the_public_code_s(root: Path, tmp_path
     assert abs(found["follow_ups", "none"][-1] - STAGES["stage_two"][-1]) > 0.1, "weights matter here"
 
 
-def test_every_frame_has_the_pictures_of_its_own_history(root: Path, tmp_path: Path) -> None:
+def test_every_frame_has_the_pictures_of_its_own_history(made: Path) -> None:
     """Stage one those of the log, stage two those of the synthetic scenes, byte for byte, with their own rig.
 
     But for Exif data, by which whoever opens a row's JPEG would turn it.
     """
-    photo = root / "sensor_blobs/test" / log_frames()[max(GROUPS) - 1]["cams"]["CAM_B0"]["data_path"]
-    photo.write_bytes(turned(photo.read_bytes(), 3))
-    assert imported(root, tmp_path / "out", f"sensors={root / 'sensor_blobs/test'}") == COMPLETE
-    clips = [clip["clip_id"] for clip in json.loads((tmp_path / "out/benchmark.json").read_text())["clips"]]
-    rig, rows = log_frames()[0]["cams"], list(SampleTable(tmp_path / "out"))
+    clips = [clip["clip_id"] for clip in json.loads((made / "out/benchmark.json").read_text())["clips"]]
+    rig, rows = log_frames()[0]["cams"], list(SampleTable(made / "out"))
     assert len(rows) == 2 * len(GROUPS) + 2 * sum(map(len, FOLLOW_UPS.values()))
     for row in rows:
         logged = row["expert"].startswith("human")
@@ -120,18 +129,3 @@ def test_every_frame_has_the_pictures_of_its_own_history(root: Path, tmp_path: P
             pose = camera["ego_from_camera"].reshape(4, 4)
             np.testing.assert_array_equal(pose[:3, :3], own["sensor2lidar_rotation"])
             np.testing.assert_array_equal(pose[:3, 3], own["sensor2lidar_translation"])
-
-
-def test_a_group_that_lacks_a_picture_is_left_out_and_named(root: Path, tmp_path: Path) -> None:
-    at = max(GROUPS) + 8  # no other group's
-    lost = root / "navhard_two_stage/sensor_blobs" / log_frames()[at]["cams"]["CAM_B0"]["data_path"]
-    data = lost.read_bytes()
-    lost.unlink()
-    try:
-        assert imported(root, tmp_path / "out", f"sensors={root / 'sensor_blobs/test'}") == COMPLETE_WITH_FAILURES
-    finally:
-        lost.write_bytes(data)
-    document = json.loads((tmp_path / "out/benchmark.json").read_text())
-    assert [len(clip["follow_ups"]) for clip in document["clips"]] == [len(pairs_of(GROUPS[0]))]
-    errors = [row["error"] for row in Store(tmp_path / "out").outcomes.read().to_pylist()]
-    assert len(errors) == 2 + 2 * len(pairs_of(GROUPS[1])) and all(f"{lost}: image: missing" in one for one in errors)

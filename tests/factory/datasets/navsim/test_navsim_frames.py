@@ -26,7 +26,7 @@ from factory.datasets.navsim.frames import (
 )
 from factory.datasets.navsim.pickles import dumps
 from tasks.world.frames import to_local, to_world
-from tests.factory.datasets.navsim.navsim_samples import INSTANTS_S, ORIGIN, TOKENS, YAWS, colour, exported
+from tests.factory.datasets.navsim.navsim_samples import INSTANTS_S, TOKENS, YAWS, colour, exported
 from tests.tasks.streets import SPEED_MPS
 
 PAGE = Path(__file__).resolve().parents[4] / "docs/navsim_format.md"
@@ -267,8 +267,3 @@ def test_a_place_that_the_public_code_does_not_know_is_refused_until_it_is_named
     assert {frame["map_location"] for frame in named} == {"us-ma-boston"}
     with pytest.raises(ValueError, match="map_location=town"):
         ExportSettings(map_location="town")
-
-
-def test_the_street_lies_as_far_out_as_utm() -> None:
-    _, frames = frames_of("human")
-    assert np.abs(poses_of(frames)[3, :2] - ORIGIN[:2]).max() < 200.0

@@ -21,12 +21,6 @@ ROOT = Path(__file__).resolve().parents[4]
 main = COMMANDS["export"].load()
 
 
-EXECUTORS = [
-    pytest.param(["executor=local", "workers=2"], id="local"),
-    pytest.param(["executor=ray", "workers=2"], id="ray", marks=pytest.mark.ray),
-]
-
-
 @pytest.fixture(scope="module")
 def long_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A run of twelve rounds, a row group each, and its export without a disturbance."""
@@ -36,12 +30,10 @@ def long_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return run, to
 
 
+@pytest.mark.ray
 @pytest.mark.slow
-@pytest.mark.parametrize("how", EXECUTORS)
-def test_processes_and_ray_write_what_one_process_writes(
-    long_run: tuple[Path, Path], tmp_path: Path, how: list[str]
-) -> None:
-    assert main(["navsim", f"out={long_run[0]}", f"to={tmp_path / 'to'}", *how]) == 0
+def test_workers_on_ray_write_what_one_process_writes(long_run: tuple[Path, Path], tmp_path: Path) -> None:
+    assert main(["navsim", f"out={long_run[0]}", f"to={tmp_path / 'to'}", "executor=ray", "workers=2"]) == 0
     assert tree(tmp_path / "to") == tree(long_run[1])
 
 

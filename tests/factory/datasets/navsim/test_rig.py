@@ -2,7 +2,6 @@
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -120,35 +119,6 @@ def test_a_camera_that_the_log_gives_no_picture_of_is_not_in_the_rig(root: Path)
     write_log(root, frames)
     clip = read(reader_of(root))
     assert [camera.name for camera in clip.cameras] == [name for name in CAMERA_NAMES if name != "CAM_B0"]
-
-
-def _without_a_camera(frames: list[dict[str, Any]]) -> None:
-    del frames[5]["cams"]["CAM_R2"]
-
-
-def _without_distortion(frames: list[dict[str, Any]]) -> None:
-    del frames[5]["cams"]["CAM_R2"]["distortion"]
-
-
-@pytest.mark.parametrize(
-    ("damage", "says"),
-    [
-        (_without_a_camera, r"frames\[5\]\.cams\.CAM_R2: missing; a frame names all eight cameras"),
-        (_without_distortion, r"frames\[5\]\.cams\.CAM_R2\.distortion: missing"),
-    ],
-)
-def test_a_log_that_lacks_a_camera_is_listed_as_broken_and_hurts_no_other(root: Path, damage: Any, says: str) -> None:
-    frames = road_frames()
-    damage(frames)
-    path = write_log(root, frames)
-    reader = reader_of(root)
-    index = reader.index()
-    assert [ref.log_id for ref in index.refs] == [OTHER]
-    ((ref, problem),) = index.broken.items()
-    assert ref.log_id == NAME and problem.startswith(str(path))
-    with pytest.raises(BadClip, match=says):
-        reader.read(ref)
-    assert len(read(reader, OTHER).images) == FRAMES * 8
 
 
 @pytest.mark.parametrize("path", ["../../../secret.jpg", "/etc/secret.jpg"])

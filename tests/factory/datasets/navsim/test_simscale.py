@@ -26,19 +26,32 @@ from tests.factory.datasets.navsim.geopackage_writer import CITIES, ORIGIN, stub
 PDM, RECOVERY = "synthetic_reaction_pdm_v1.0-0", "synthetic_reaction_recovery_v1.0-2"
 HUMAN = "navtrain_human"  # of our own export
 CITY = "us-nv-las-vegas-strip"  # of the writer's logs
+Brought = tuple[Path, dict[tuple[str, int], dict[str, Any]]]
 
 
 def imported(root: Path, out: Path, *words: str) -> int:
     return factory(["import", "simscale", f"root={root}", f"out={out}", *words])
 
 
-@pytest.fixture
-def released(tmp_path: Path) -> Path:
+def write_released(root: Path) -> Path:
     """Two logs of one folder, one of another."""
-    root = tmp_path / "SimScale_data"
     for folder, seed, round in ((PDM, 1, 0), (PDM, 2, 0), (RECOVERY, 1, 2)):
         simscale.write_log(root, folder, seed, round)
     return root
+
+
+@pytest.fixture
+def released(tmp_path: Path) -> Path:
+    return write_released(tmp_path / "SimScale_data")
+
+
+@pytest.fixture(scope="module")
+def brought(tmp_path_factory: pytest.TempPathFactory) -> Brought:
+    """The same logs' folder, and their rows by expert and seed."""
+    root, out = (tmp_path_factory.mktemp("simscale") / name for name in ("SimScale_data", "out"))
+    write_released(root)
+    assert imported(root, out) == COMPLETE
+    return root, rows_of(out)
 
 
 def rows_of(out: Path) -> dict[tuple[str, int], dict[str, Any]]:
@@ -46,9 +59,8 @@ def rows_of(out: Path) -> dict[tuple[str, int], dict[str, Any]]:
     return {(row["expert"], int(row["frame_tokens"][0], 16)): row for row in SampleTable(out)}
 
 
-def test_a_row_holds_what_the_log_says(released: Path, tmp_path: Path) -> None:
-    assert imported(released, tmp_path / "out") == COMPLETE
-    rows = rows_of(tmp_path / "out")
+def test_a_row_holds_what_the_log_says(brought: Brought) -> None:
+    _, rows = brought
     assert sorted(rows) == [("pdm_closed", 1), ("pdm_closed", 2), ("recovery", 1)]
     row, frames, poses = rows["pdm_closed", 1], simscale.frames(1, 0), simscale.poses(1)
     now = frames[simscale.NOW]
@@ -68,9 +80,8 @@ def test_a_row_holds_what_the_log_says(released: Path, tmp_path: Path) -> None:
     assert row["stage2_score"] is None and row["perturbed_states"] is None and row["label_subscores"] is None
 
 
-def test_between_two_frames_poses_are_linear_and_headings_take_the_short_way(released: Path, tmp_path: Path) -> None:
-    imported(released, tmp_path / "out")
-    row = rows_of(tmp_path / "out")["pdm_closed", 1]
+def test_between_two_frames_poses_are_linear_and_headings_take_the_short_way(brought: Brought) -> None:
+    row = brought[1]["pdm_closed", 1]
     fine = np.concatenate([row["ego_history_10hz"], row["label_10hz"]])
     known = fine[::5]
     for k in range(5):  # a share of k fifths of every piece
@@ -78,9 +89,8 @@ def test_between_two_frames_poses_are_linear_and_headings_take_the_short_way(rel
         np.testing.assert_allclose(fine[k:-1:5], wanted, atol=2e-5)
 
 
-def test_objects_are_placed_by_the_ego_of_their_frame(released: Path, tmp_path: Path) -> None:
-    imported(released, tmp_path / "out")
-    row, frames, poses = rows_of(tmp_path / "out")["pdm_closed", 1], simscale.frames(1, 0), simscale.poses(1)
+def test_objects_are_placed_by_the_ego_of_their_frame(brought: Brought) -> None:
+    row, frames, poses = brought[1]["pdm_closed", 1], simscale.frames(1, 0), simscale.poses(1)
     ids, frame_steps = list(row["agent_ids"]), np.arange(0, 56, 5)
     for i, (frame, step) in enumerate(zip(frames, frame_steps)):
         anns = frame["anns"]
@@ -95,9 +105,9 @@ def test_objects_are_placed_by_the_ego_of_their_frame(released: Path, tmp_path: 
     assert list(row["agent_kinds"]) == ["VEHICLE", "TRAFFIC_CONE", "PEDESTRIAN", "BICYCLE"]
 
 
-def test_pictures_are_the_files_bytes_with_their_cameras(released: Path, tmp_path: Path) -> None:
-    imported(released, tmp_path / "out")
-    row, frames = rows_of(tmp_path / "out")["pdm_closed", 2], simscale.frames(2, 0)
+def test_pictures_are_the_files_bytes_with_their_cameras(brought: Brought) -> None:
+    released, rows = brought
+    row, frames = rows["pdm_closed", 2], simscale.frames(2, 0)
     found = {(image["camera"], round(image["time_s"], 3)): image for image in row["images"]}
     assert len(found) == 4 * 8
     for i, frame in enumerate(frames[:4]):

@@ -4,12 +4,11 @@ The native clip is thinned to 2 Hz and brought back by the slow twin; what thinn
 """
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from factory.datasets.av2.reader import AV2Reader, read_log
+from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.navsim.log import read_frames
 from factory.datasets.navsim.reader import LICENCE, NavsimReader
 from factory.datasets.town.settings import TownSettings
@@ -18,15 +17,8 @@ from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW, Clip
 from tasks.world.road_map import LightState, RoadMap, RouteFinder, driving_command
 from tasks.world.vocabulary import kinematic_trajectories
-from tests.factory.datasets.navsim.geopackage_writer import (
-    CITIES,
-    ORIGIN,
-    stub_rows,
-    town_rows,
-    write_geopackage,
-    write_root,
-)
-from tests.factory.datasets.navsim.openscene_writer import Place, write_openscene
+from tests.factory.datasets.navsim.geopackage_writer import CITIES, ORIGIN, stub_rows, write_root
+from tests.factory.datasets.navsim.navsim_town import write_town
 from tests.factory.datasets.navsim.twin import thinned
 
 LOGS = (1, 2, 3, 5)  # of the town's kinds; three windows each. None drives a full circle: nuPlan's routes end there
@@ -39,15 +31,12 @@ class Towns:
 
     native: AV2Reader
     navsim: NavsimReader
-    root: Path
-    block_number: dict[str, dict[str, str]]  # log -> our roadblock id -> nuPlan's
 
     def pairs(self) -> list[tuple[Clip, Clip]]:
         """Native clips, moved to where nuPlan has them, and NAVSIM's, window by window."""
-        names = {log: log for log in self.native.logs()}
         refs = {(ref.log_id, ref.start_ms): ref for ref in self.native.index().refs}
         return [
-            (moved(self.native.read(refs[names[ref.log_id], ref.start_ms])), self.navsim.read(ref))
+            (moved(self.native.read(refs[ref.log_id, ref.start_ms])), self.navsim.read(ref))
             for ref in self.navsim.index().refs
         ]
 
@@ -57,22 +46,11 @@ def towns(tmp_path_factory: pytest.TempPathFactory) -> Towns:
     """Each log in a city of its own, since logs carry crops of their town's map."""
     root = tmp_path_factory.mktemp("towns")
     bare = TownSettings(cameras=(), lidar_beams=0)
-    numbers: dict[str, dict[str, str]] = {}
     write_root(root / "maps", "sg-one-north", stub_rows())
     for location, folder in zip(CITIES, write_logs(root / "av2", LOGS, 0, bare)):
-        log = read_log(folder)
-        rows = town_rows(log.road_map)
-        version, zone = CITIES[location]
-        (root / "maps" / location / version / "map.gpkg").unlink()
-        write_geopackage(root / "maps" / location / version / "map.gpkg", rows, zone)
-        blocks = log.road_map.roadblock_of
-        number = {blocks[str(row["fid"])]: str(row["lane_group_fid"]) for row in rows["lanes_polygons"]}
-        number |= {blocks[str(row["fid"])]: str(row["lane_group_connector_fid"]) for row in rows["lane_connectors"]}
-        place = Place(location, np.append(ORIGIN, 0.0), roadblock_number=number.__getitem__)
-        write_openscene(root, "mini", folder.name, log, place)
-        numbers[folder.name] = number
+        write_town(root, "mini", folder, location)
     navsim = NavsimReader(root / "navsim_logs" / "mini", root / "maps", cache_dir=root / "kept")
-    return Towns(AV2Reader(root / "av2"), navsim, root, numbers)
+    return Towns(AV2Reader(root / "av2"), navsim)
 
 
 def moved(clip: Clip) -> Clip:

@@ -260,26 +260,45 @@ def _write_cameras(folder: Path, log: Path) -> None:
     mounts = _columns(log / "calibration" / "egovehicle_SE3_sensor.feather")
     intrinsics = pyarrow.feather.read_table(log / "calibration" / "intrinsics.feather").to_pylist()
     for number, one in enumerate(intrinsics):
-        name, key = one["sensor_name"], f"camera.pcam_{number}"
+        name = one["sensor_name"]
         photos = sorted((log / "sensors" / "cameras" / name).glob("*.jpg"))
-        told = {
-            "camera_model": "pinhole",
-            "camera_name": name,
-            "camera_id": number,
-            "intrinsics": [one["fx_px"], one["fy_px"], one["cx_px"], one["cy_px"], 0.0],
-            "distortion": [one["k1"], one["k2"], 0.0, 0.0, one["k3"]],
-            "width": one["width_px"],
-            "height": one["height_px"],
-            "camera_to_imu_se3": _poses(mounts)[mounts["sensor_name"] == name][0].tolist(),
-            "is_undistorted": True,
-        }
-        columns = {
-            f"{key}.timestamp_us": pa.array([int(photo.stem) // 1000 for photo in photos], pa.int64()),
-            f"{key}.data": pa.array([str(photo.relative_to(log.parent.parent)) for photo in photos], pa.string()),
-            f"{key}.camera_to_global_se3": pa.nulls(len(photos), pa.list_(pa.float64(), 7)),
-            f"{key}.exposure_factor": pa.nulls(len(photos), pa.float32()),
-        }
-        write(folder / f"{key}.arrow", columns, told)
+        write_camera(
+            folder,
+            number,
+            [int(photo.stem) // 1000 for photo in photos],
+            [str(photo.relative_to(log.parent.parent)) for photo in photos],
+            camera_name=name,
+            intrinsics=[one["fx_px"], one["fy_px"], one["cx_px"], one["cy_px"], 0.0],
+            distortion=[one["k1"], one["k2"], 0.0, 0.0, one["k3"]],
+            width=one["width_px"],
+            height=one["height_px"],
+            camera_to_imu_se3=_poses(mounts)[mounts["sensor_name"] == name][0].tolist(),
+        )
+
+
+def write_camera(
+    folder: Path, number: int, stamps_us: Sequence[int], data: Sequence[str], pose: Any = None, **changed: Any
+) -> None:
+    """The table of a camera and its photos, a small one that looks ahead but for what is `changed`; pose: of all."""
+    key, n = f"camera.pcam_{number}", len(data)
+    told = {
+        "camera_model": "pinhole",
+        "camera_name": "front",
+        "camera_id": number,
+        "intrinsics": [50.0, 50.0, 32.0, 18.0, 0.0],
+        "distortion": None,
+        "width": 64,
+        "height": 36,
+        "camera_to_imu_se3": [1.6, 0.0, 1.0, 0.5, -0.5, 0.5, -0.5],
+        "is_undistorted": True,
+    }
+    columns = {
+        f"{key}.timestamp_us": pa.array(stamps_us, pa.int64()),
+        f"{key}.data": pa.array(data, pa.string()),
+        f"{key}.camera_to_global_se3": pa.array([pose] * n, pa.list_(pa.float64(), 7)),
+        f"{key}.exposure_factor": pa.nulls(n, pa.float32()),
+    }
+    write(folder / f"{key}.arrow", columns, told | changed)
 
 
 def _write_lidar(folder: Path, log: Path) -> None:

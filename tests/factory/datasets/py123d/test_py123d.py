@@ -27,7 +27,7 @@ from tests.factory.datasets.py123d.py123d_logs import (
     lane,
     rewrite,
     surface,
-    write,
+    write_camera,
     write_lights,
 )
 
@@ -258,15 +258,8 @@ def test_photos_lie_where_the_data_set_is(tmp_path: Path) -> None:
         zip(("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"), ([v] for v in (0.5, -0.5, 0.5, -0.5, 1.6, 0, 1)))
     )
     write_table(log / "calibration" / "egovehicle_SE3_sensor.feather", {"sensor_name": ["front"], **mount})
-    numbers = {
-        "fx_px": [50.0],
-        "fy_px": [50.0],
-        "cx_px": [32.0],
-        "cy_px": [18.0],
-        "k1": [0.0],
-        "k2": [0.0],
-        "k3": [0.0],
-    }
+    names = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3")
+    numbers = {name: [value] for name, value in zip(names, (50.0, 50.0, 32.0, 18.0, 0.0, 0.0, 0.0))}
     sizes = {"height_px": pa.array([36], pa.uint16()), "width_px": pa.array([64], pa.uint16())}
     write_table(log / "calibration" / "intrinsics.feather", {"sensor_name": ["front"], **numbers, **sizes})
     for folder, suffix in (("cameras/front", ".jpg"), ("lidar", ".feather")):
@@ -294,25 +287,10 @@ def test_photos_lie_where_the_data_set_is(tmp_path: Path) -> None:
 
 def test_a_photo_s_own_pose_counts_and_a_fisheye_does_not(tmp_path: Path) -> None:
     folder = convert(write_log(tmp_path / "train" / "log-a"), tmp_path)
-    told: dict[str, Any] = {
-        "camera_name": "front",
-        "intrinsics": [50.0, 50.0, 32.0, 18.0, 0.0],
-        "distortion": [0.1, 0.0, 0.01, 0.02, 0.0],
-        "width": 64,
-        "height": 36,
-        "camera_to_imu_se3": [1.6, 0.0, 1.0, 0.5, -0.5, 0.5, -0.5],
-    }
+    pose, lens = [7.0, 8.0, 9.0, 0.5, -0.5, 0.5, -0.5], [0.1, 0.0, 0.01, 0.02, 0.0]
     for number, (model, flat) in enumerate((("pinhole", False), ("pinhole", True), ("fisheye_mei", True))):
-        key = f"camera.pcam_{number}"
-        pose = [7.0, 8.0, 9.0, 0.5, -0.5, 0.5, -0.5]
-        columns = {
-            f"{key}.timestamp_us": pa.array([START_NS // 1000 + 500_000]),
-            f"{key}.data": pa.array([f"{number}.jpg"]),
-            f"{key}.camera_to_global_se3": pa.array([pose], pa.list_(pa.float64(), 7)),
-        }
-        write(
-            folder / f"{key}.arrow", columns, told | {"camera_model": model, "is_undistorted": flat, "camera_name": key}
-        )
+        told = {"camera_model": model, "is_undistorted": flat, "camera_name": str(number), "distortion": lens}
+        write_camera(folder, number, [START_NS // 1000 + 500_000], [f"{number}.jpg"], pose, **told)
     reader = Py123dReader(folder, sensor_root=tmp_path)
     clip = reader.read(reader.index().refs[0])
     assert [camera.distortion.tolist() for camera in clip.cameras] == [[0.1, 0.0, 0.01, 0.02, 0.0], [0.0] * 5]
@@ -330,20 +308,13 @@ def test_every_label_of_123d_has_a_kind() -> None:
         "WODMotionBoxDetectionLabel": 5,
     }
     nuscenes = KINDS_OF_LABELS["NuScenesBoxDetectionLabel"]
-    assert [nuscenes[k] for k in (0, 8, 10, 17, 18, 22)] == [
-        AgentKind.VEHICLE,
-        AgentKind.BICYCLE,
-        AgentKind.PEDESTRIAN,
-        AgentKind.TRAFFIC_CONE,
-        AgentKind.BARRIER,
-        AgentKind.GENERIC_OBJECT,
-    ]
+    names = ["VEHICLE", "BICYCLE", "PEDESTRIAN", "TRAFFIC_CONE", "BARRIER", "GENERIC_OBJECT"]
+    assert [nuscenes[k] for k in (0, 8, 10, 17, 18, 22)] == [AgentKind[name] for name in names]
 
 
-@pytest.mark.parametrize("root", [".", "logs", "logs/av2-sensor_train", "logs/av2-sensor_train/log-a"])
-def test_a_root_may_be_everything_the_logs_a_split_or_one_log(tmp_path: Path, root: str) -> None:
+def test_a_root_may_be_everything_the_logs_a_split_or_one_log(tmp_path: Path) -> None:
     convert(write_log(tmp_path / "source" / "train" / "log-a"), tmp_path / "out")
-    reader = Py123dReader(tmp_path / "out" / root)
-    assert list(reader.logs()) == ["log-a"]
-    clip = reader.read(reader.index().refs[0])
-    assert clip.ego_states[NOW, 3] == pytest.approx(SPEED)
+    for root in (".", "logs", "logs/av2-sensor_train", "logs/av2-sensor_train/log-a"):
+        reader = Py123dReader(tmp_path / "out" / root)
+        assert list(reader.logs()) == ["log-a"], root
+    assert reader.read(reader.index().refs[0]).ego_states[NOW, 3] == pytest.approx(SPEED)

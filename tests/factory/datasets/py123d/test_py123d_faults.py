@@ -12,7 +12,7 @@ import pytest
 from factory.datasets.py123d.reader import Py123dReader
 from factory.readers.base import BadClip, ClipRef
 from tests.factory.datasets.av2.test_av2 import write_log
-from tests.factory.datasets.py123d.py123d_logs import Made, convert, fixed, rewrite, write
+from tests.factory.datasets.py123d.py123d_logs import Made, convert, fixed, rewrite, write, write_camera
 from tests.factory.datasets.py123d.test_py123d import NUPLAN
 
 EGO, BOXES, MAP = "ego_state_se3.arrow", "box_detections_se3.arrow", "map.arrow"
@@ -63,23 +63,7 @@ def lights(log: Path, status: int, lanes: int = 1) -> None:
 
 
 def camera(log: Path, data: str = "a.jpg", **changes: Any) -> None:
-    key = "camera.pcam_0"
-    metadata: dict[str, Any] = {
-        "camera_model": "pinhole",
-        "camera_name": "front",
-        "intrinsics": [50.0, 50.0, 32.0, 18.0, 0.0],
-        "distortion": None,
-        "width": 64,
-        "height": 36,
-        "camera_to_imu_se3": [1.6, 0.0, 1.0, 0.5, -0.5, 0.5, -0.5],
-        "is_undistorted": True,
-    }
-    columns = {
-        f"{key}.timestamp_us": pa.array([0]),
-        f"{key}.data": pa.array([data]),
-        f"{key}.camera_to_global_se3": pa.nulls(1, pa.list_(pa.float64(), 7)),
-    }
-    write(log / CAMERA, columns, metadata | changes)
+    write_camera(log, 0, [0], [data], **changes)
 
 
 WHEN_LISTED = {  # what the choice of windows meets
