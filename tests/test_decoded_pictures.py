@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from factory.datasets.kitti.reader import KittiCamera, KittiDrive
 from factory.readers.base import BadClip
 from factory.readers.pictures import header_of, without_exif
 from factory.stages.sensors import decode_image, opened_photos, read_masks
@@ -53,15 +52,6 @@ def mask(folder: Path, data: bytes) -> Pixels:
     return read_masks(str(folder), [CAMERA])["front"].astype(np.uint8)
 
 
-def kitti(folder: Path, data: bytes) -> Pixels:
-    path = folder / "image_02/data/0000000000.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
-    camera = KittiCamera("image_02", np.eye(3), (WIDTH, HEIGHT), np.eye(4))
-    (taken,) = KittiDrive(folder, {"image_02": camera}, np.eye(4)[None], np.zeros(1)).photos("image_02")
-    return taken.rgb
-
-
 def row(folder: Path, data: bytes) -> Pixels:
     return image_of(samples.pictures({"front": data}), "front", 0.0)
 
@@ -75,7 +65,7 @@ def agent(folder: Path, data: bytes) -> Pixels:
     return decode_image(data, "front.jpg")
 
 
-PLACES: dict[str, Place] = {p.__name__: p for p in (photo, mask, kitti, row, batch, agent)}
+PLACES: dict[str, Place] = {p.__name__: p for p in (photo, mask, row, batch, agent)}
 KINDS = [(name, suffix) for name in PLACES for suffix in (".jpg", ".png") if (name, suffix) != ("batch", ".png")]
 
 

@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.datasets.kitti.reader import read_drive, steadied
 from factory.stages.scene_file import write_scene
 from tasks.render.fit.corrections import apply_exposure, corrected_pose
 from tasks.render.fit.losses import ssim, target_of
@@ -39,6 +38,7 @@ from tasks.render.settings import Backend, FitSettings
 from tasks.world.clip import Pinhole
 from tests.bench.by_kernels import by_kernels
 from tests.bench.stored_scene import Look, affine_between, kept, storage_table
+from tests.bench.kitti import read_drive, steadied
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 FITTED_FRAMES = 12  # of image_03's training frames, for its affine colour and rigid correction

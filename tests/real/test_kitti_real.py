@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.datasets.kitti.reader import read_drive
+from tests.bench.kitti import read_drive
 
 FRAMES = [0, 50, 107]
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from factory.datasets.kitti.reader import read_drive
 from tasks.render.scene.build import AssetSettings, build_asset
+from tests.bench.kitti import read_drive
 
 
 @pytest.mark.slow

@@ -8,9 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factory.datasets.kitti.reader import EARTH_RADIUS_M, IMU_HEIGHT_M, KittiDrive, read_drive, steadied
-from factory.readers.base import BadClip
-from tests.factory.data_folders import add_companions
+from tests.bench.kitti import EARTH_RADIUS_M, IMU_HEIGHT_M, KittiDrive, read_drive, steadied
 
 DATE = "2011_09_26"
 WEST_OF_HERE = 8.0
@@ -43,10 +41,6 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def folder(root: Path) -> Path:
-    return root / DATE / f"{DATE}_drive_0001_sync"
-
-
 def test_photos_have_poses_in_the_world_and_intrinsics_of_their_own_size(root: Path) -> None:
     photos = read_drive(root).photos("image_02")
     assert [p.time_s for p in photos] == pytest.approx([0.0, 0.1])
@@ -59,14 +53,6 @@ def test_photos_have_poses_in_the_world_and_intrinsics_of_their_own_size(root: P
     np.testing.assert_allclose(photos[1].world_from_camera[:3, 2], [0, 1, 0], atol=1e-9)
     right = read_drive(root).photos("image_03", [0])[0]
     np.testing.assert_allclose(right.world_from_camera[:3, 3], [1.0, -0.4, 0.0], atol=1e-6)
-
-
-def test_companions_of_its_files_are_none_of_the_drive(root: Path) -> None:
-    known = read_drive(root)
-    add_companions(root)
-    found = read_drive(root)
-    np.testing.assert_array_equal(found.world_from_imu, known.world_from_imu)
-    assert len(found.sweeps()) == len(known.sweeps()) == 1
 
 
 def test_sweeps_stand_on_the_road_and_land_in_the_same_world(root: Path) -> None:
@@ -92,58 +78,3 @@ def test_poses_stamped_in_ticks_are_moved_to_when_the_cameras_were_triggered(tmp
     np.testing.assert_allclose(drive.times_s, true, atol=0.002)
     np.testing.assert_allclose(drive.world_from_imu, poses(drive.times_s), atol=1e-6)
     assert np.ptp(np.diff(drive.world_from_imu[:, 0, 3])) < 0.01
-    with pytest.raises(ValueError, match="8 or more"):
-        steadied(KittiDrive(tmp_path, {}, poses(true[:7]), true[:7]))
-
-
-def test_a_missing_image_is_named(root: Path) -> None:
-    (folder(root) / "image_02" / "data" / "0000000001.png").unlink()
-    drive = read_drive(root)
-    assert len(drive.photos("image_02", [0])) == 1
-    with pytest.raises(BadClip, match=r"0000000001.png: image: is missing"):
-        drive.photos("image_02")
-
-
-def test_a_broken_image_is_named(root: Path) -> None:
-    (folder(root) / "image_03" / "data" / "0000000000.png").write_bytes(b"no picture")
-    with pytest.raises(BadClip, match="not a JPEG or PNG picture; download the drive again"):
-        read_drive(root).photos("image_03")
-
-
-@pytest.mark.parametrize(
-    ("file", "old", "new", "message"),
-    [
-        ("calib_cam_to_cam.txt", "P_rect_02: 100 0", "P_rect_02: 100", "P_rect_02: holds 11 values, expected 12"),
-        ("calib_cam_to_cam.txt", "S_rect_03", "S_rust_03", "S_rect_03: is missing"),
-        ("calib_cam_to_cam.txt", "P_rect_01: 100", "P_rect_01: abc", "P_rect_01: is not a row of numbers"),
-        ("calib_velo_to_cam.txt", "T: 0 0 0", "T: 0 0", "T: holds 2 values, expected 3"),
-        ("calib_imu_to_velo.txt", "T: -1", "T: nan", "T: holds 3 values, expected 3 finite ones"),
-    ],
-)
-def test_a_calibration_of_the_wrong_shape_is_named(root: Path, file: str, old: str, new: str, message: str) -> None:
-    path = root / DATE / file
-    path.write_text(path.read_text().replace(old, new))
-    with pytest.raises(BadClip, match=message):
-        read_drive(root).sweeps()
-
-
-def test_a_torn_sweep_or_a_missing_pose_is_named(root: Path) -> None:
-    drive = read_drive(root)
-    path = folder(root) / "velodyne_points" / "data" / "0000000001.bin"
-    path.write_bytes(path.read_bytes()[:-4])
-    with pytest.raises(BadClip, match="3 values are not rows of four"):
-        drive.sweeps()
-    (folder(root) / "oxts" / "data" / "0000000000.txt").unlink()
-    with pytest.raises(BadClip, match="expected frame 0"):
-        read_drive(root)
-
-
-def test_what_is_not_there_is_said(root: Path) -> None:
-    with pytest.raises(BadClip, match="no such folder"):
-        read_drive(root, drive="0002")
-    with pytest.raises(BadClip, match="no such camera"):
-        read_drive(root).photos("image_07")
-    with pytest.raises(BadClip, match="no pose of frame 2"):
-        read_drive(root).photos("image_02", [2])
-    with pytest.raises(BadClip, match=r"points_fused.npz"):
-        read_drive(root).fused()

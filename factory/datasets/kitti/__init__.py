@@ -1,1 +1,0 @@
-"""KITTI raw: streets for the scene engine; no clips."""
