@@ -21,8 +21,7 @@ from factory.graph.steps import (
     StopCheck,
     never_stop,
 )
-from factory.readers.base import BadClip, ClipReader, ClipRef, Unreadable, painter_of
-from factory.readers.validate import read_clip
+from factory.readers.base import BadClip, ClipReader, ClipRef, Unreadable, painter_of, read_clip
 from factory.stages.assets import running_fits
 from factory.stages.imaging import Imaging, scene_cache_counts
 from factory.stages.rows import label_columns, sample_row

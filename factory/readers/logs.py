@@ -38,9 +38,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from factory.readers.apart import Apart
-from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, failing_as, split_of
+from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, failing_as, split_of, validate_clip
 from factory.readers.settings import LogClips, WindowSettings, check_traversals
-from factory.readers.validate import validate_clip
 from tasks.world.arrays import Array, Ints
 from tasks.world.clip import (
     CLIP_STEPS,

@@ -16,8 +16,7 @@ from factory.config.plugins import class_of
 from factory.config.run import RecoverySources, RunConfig, VocabularyChoice, photos_alone, refuse_relative_root
 from factory.files import machine_fault_of
 from factory.pipeline import BenchmarkWork, FactoryWork
-from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef
-from factory.readers.validate import read_clip
+from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef, read_clip
 from factory.setup.vocabulary import (
     Starts,
     build_recovery_table,

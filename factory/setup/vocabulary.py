@@ -16,8 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from factory.files import atomic_file
-from factory.readers.base import BadClip, ClipReader
-from factory.readers.validate import read_clip
+from factory.readers.base import BadClip, ClipReader, read_clip
 from tasks.caches import seal
 from tasks.experts.recovery import RecoveryTable
 from tasks.world.arrays import Array

@@ -11,8 +11,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from factory.readers.base import BadClip, ClipReader, ClipRef, painter_of
-from factory.readers.validate import read_clip
+from factory.readers.base import BadClip, ClipReader, ClipRef, painter_of, read_clip
 from factory.setup.settings import cache_folder
 from factory.store.location import Location, write_shard
 from factory.store.schema import TableSpec, canonical_json, schema_of

@@ -13,7 +13,7 @@ import pytest
 from pyarrow.feather import write_feather
 
 from factory.__main__ import main
-from factory.datasets.av2.folders import INTRINSICS, POSES
+from factory.datasets.av2 import INTRINSICS, POSES
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "numba", "scipy", "shapely", "pyarrow", "deltalake", "ray", "torch", "cv2")

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factory.datasets.av2.log import agents_at, ego_states_at, step_times
-from factory.datasets.av2.reader import AV2Log, AV2Reader, log_folders, read_log
+from factory.datasets.av2.reader import AV2Log, AV2Reader, agents_at, ego_states_at, log_folders, read_log, step_times
 from tasks.world.clip import MOVING_KINDS
 from tasks.world.frames import wrap_angle
 from tasks.world.road_map import centerline_from, polygons_near

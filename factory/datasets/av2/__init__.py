@@ -1,17 +1,48 @@
-"""Argoverse 2 sensor logs."""
+"""Argoverse 2 sensor logs: where they lie, and the names of their cameras. Numpy is loaded where one is opened."""
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from factory.readers.settings import LogClips
+from factory.files import folders_in
+from factory.readers.settings import LogClips, Split
 
 READERS = {"AV2Reader": LogClips}
+POSES, ANNOTATIONS = "city_SE3_egovehicle.feather", "annotations.feather"
+INTRINSICS, EXTRINSICS = "calibration/intrinsics.feather", "calibration/egovehicle_SE3_sensor.feather"
+
+
+def log_folders(root: Path) -> dict[str, Path]:
+    """Log id -> folder, sorted by id. Raises ValueError where the root is no Argoverse 2 folder."""
+    if _is_log(root):
+        return {root.name: root}
+    if not root.is_dir():
+        raise ValueError(f"{root}: no such folder")
+    there = folders_in(root)
+    parents = [root / split for split in get_args(Split) if root / split in there] or [root]
+    folders = {folder.name: folder for parent in parents for folder in folders_in(parent) if _is_log(folder)}
+    if not folders:
+        raise ValueError(
+            f"{root}: no Argoverse 2 sensor log here; expected .../sensor, its train, val or test folder, or one log"
+        )
+    return dict(sorted(folders.items()))
+
+
+def _is_log(folder: Path) -> bool:
+    return any((folder / name).exists() for name in (ANNOTATIONS, POSES))
 
 
 def camera_names(clips: Mapping[str, Any]) -> tuple[str, ...]:
-    """The rig of the chosen logs. Raises ValueError for a root without logs."""
-    from factory.datasets.av2.folders import log_folders, rig_names
+    """The rig of the first chosen log with a calibration that can be read, in file order; none where no log has one.
 
+    What is wrong with the others is told when they are read. Raises ValueError for a root without logs.
+    """
     folders = log_folders(Path(str(clips["root"])))
-    return rig_names(folder for log_id, folder in folders.items() if not clips["only"] or log_id in clips["only"])
+    from pyarrow.feather import read_table
+
+    for folder in (folder for log_id, folder in folders.items() if not clips["only"] or log_id in clips["only"]):
+        try:
+            return tuple(read_table(folder / INTRINSICS, ["sensor_name"])["sensor_name"].to_pylist())
+        except (OSError, ValueError):  # Arrow's errors are of these kinds; not there, or no feather file
+            continue
+    return ()

@@ -38,7 +38,7 @@ from factory.datasets.navsim.window import (
 )
 from factory.files import file_digest, matching
 from factory.readers.apart import Apart
-from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, bytes_of, failing_as, split_of
+from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, bytes_of, failing_as, split_of, validate_clip
 from factory.readers.logs import (
     CACHED_LOGS,
     STEP_MS,
@@ -50,7 +50,6 @@ from factory.readers.logs import (
     traversals,
 )
 from factory.readers.pickles import check_values, load_plain
-from factory.readers.validate import validate_clip
 from factory.wording import shown, time_text
 from tasks.caches import sealed, unsealed, user_cache
 from tasks.kernels.compiled import write_whole

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from factory.datasets.av2.log import KIND_OF_CATEGORY
+from factory.datasets.av2.reader import KIND_OF_CATEGORY
 from factory.readers.base import BadClip
 from factory.wording import shown
 from tasks.world.arrays import Array, Indices, Ints

@@ -29,8 +29,10 @@ from factory.datasets.av2.log import (
     tracks_of,
     world_from_ego_at,
     yaw_of,
+from factory.datasets.av2.reader import (
+    BLOCK_STEPS,
+    BLOCK_STRIDE_STEPS,
 )
-from factory.datasets.av2.reader import BLOCK_STEPS, BLOCK_STRIDE_STEPS
 from factory.datasets.py123d import Py123dClips
 from factory.datasets.py123d.arrow import (
     KINDS_OF_LABELS,

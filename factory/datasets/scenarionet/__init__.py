@@ -14,8 +14,8 @@ def camera_names(clips: Mapping[str, Any]) -> tuple[str, ...]:
     """The rig of the chosen logs' sidecars. Raises ValueError."""
     if clips["cameras"] is None:
         return ()
+    from factory.datasets.scenarionet.photos import rig_names, sidecars_of
     from factory.datasets.scenarionet.reader import scenario_files
-    from factory.datasets.scenarionet.sidecars import rig_names, sidecars_of
 
     log_ids = [log_id for log_id in scenario_files(Path(clips["root"])) if not clips["only"] or log_id in clips["only"]]
     return rig_names(sidecars_of(Path(clips["cameras"]), log_ids).values())

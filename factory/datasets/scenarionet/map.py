@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from shapely.geometry import LineString, Polygon
 
-from factory.datasets.scenarionet.tracks import floats
 from factory.readers.base import BadClip
 from factory.readers.pickles import id_text
 from factory.wording import shown
@@ -120,6 +119,14 @@ def points(feature: Mapping[str, Any], name: str, file: str, field: str) -> Arra
     if not np.isfinite(array[:, :2]).all():
         raise BadClip(file, f"{field}.{name}", "NaN or infinite coordinate")
     return array[:, :2]
+
+
+def floats(value: object, file: str, field: str) -> Array:
+    """The value as an array. Raises BadClip where it is none of numbers."""
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise BadClip(file, field, f"not numbers ({error})") from error
 
 
 def closed_ring(polygon: Array) -> Array | None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from factory.datasets.scenarionet.sidecars import NAME
+from factory.datasets.scenarionet.photos import NAME
 from factory.files import atomic_file, matching
 from factory.readers.base import BadClip
 from factory.wording import shown

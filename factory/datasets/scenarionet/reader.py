@@ -10,35 +10,380 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+from scipy.linalg import solveh_banded
+from scipy.ndimage import median_filter
+from scipy.signal import savgol_filter
 
-from factory.datasets.scenarionet.map import road_map, traffic_lights
-from factory.datasets.scenarionet.photos import NO_PHOTOGRAPHS, Photographs, in_step, read_photographs
-from factory.datasets.scenarionet.settings import ScenarioNetClips
-from factory.datasets.scenarionet.sidecars import load_sidecar, sidecars_of
-from factory.datasets.scenarionet.tracks import (
-    SOURCES,
-    Source,
-    agent_tracks,
-    ego_segments,
-    frame_positions,
-    ground_height,
-    read_track,
-    sample_times,
+from factory.datasets.scenarionet.map import floats, road_map, traffic_lights
+from factory.datasets.scenarionet.photos import (
+    NO_PHOTOGRAPHS,
+    Photographs,
+    in_step,
+    load_sidecar,
+    read_photographs,
+    sidecars_of,
 )
+from factory.datasets.scenarionet.settings import ScenarioNetClips
 from factory.files import matching_below
 from factory.readers.apart import Apart
 from factory.readers.base import BadClip, ClipIndex, ClipRef, bytes_of, folder_split, nuscenes_split, waymo_split
 from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive, within
 from factory.readers.pickles import id_text, load_plain
 from factory.wording import shown
-from tasks.world.arrays import Array
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import CLIP_STEPS, STEP_S, Block
-from tasks.world.frames import upright
+from tasks.world.frames import upright, wrap_angle
 from tasks.world.road_map import TrafficLights
+from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY, X, Y
+
+# ScenarioNet's tracks as 10 Hz arrays: a smooth ego at its rear axle, agents with velocities derived again.
+#
+# What the files hold (public converters, checked on seven nuScenes scenes) and what is done about it:
+# * Invalid frames hold zeros and the last frame's velocity is 0, so `valid` masks everything and velocities are not rea
+# * nuScenes' ego comes from the CAN bus on a clock of its own (canbus.py), or, without one, is a line between
+#   2 Hz keyframes that are in truth 0.4-0.6 s apart. A jump that is left ends a segment; no clip reaches across it.
+# * The ego is smoothed: the x(t) that minimises |x - log|^2 + lambda |third difference|^2, whose gain falls to a half
+#   at lambda^(-1/6) / 0.1 s = 3.9 rad/s for lambda = 300. On the seven scenes |a| is then at most 3.1 m/s2 and the
+#   jerk 3.7 m/s3. Speeds and accelerations are those of a quadratic over +-0.3 s, as in the metric's reference scenes.
+# * Agents: nuScenes' are lines between keyframes. Velocity = least-squares slope over +-0.5 s, below 0.1 m/s set to 0.
+
+# The clock of nuScenes' ego in ScenarioNet's files, put right.
+#
+# The converter takes the ego from the CAN bus: every fifth 50 Hz pose message, written as if they were 0.1 s apart and
+# the first one at the log's start. Neither holds, and the agents keep the log's clock:
+# * A lost message makes a step 0.02 s too long. It shows as such: on the seven scenes 37 steps are late by 0.014-0.025
+#   and one by 0.039 s, all others by 0.002 s (standard deviation). Scene 0061 lost 20 messages, 0.4 s in 19 s.
+# * Where the bus ends before the log, the converter goes on with keyframe poses, which are on the log's clock: the ego
+#   falls back by 0.2-0.3 s, 3 m at 15 m/s. That jump tells how far the bus was ahead.
+# So every message gets its time, and the ego is interpolated at the log's steps. Where the bus lasts to the log's end
+# nothing tells its start, and 0 is assumed (the three scenes that tell: -0.13, 0.06 and 0.22 s).
+
+MESSAGE_S = 0.02
+MAX_LOST = 5  # messages in one step
+TIMING_NOISE_S = 0.008
+MIN_SPEED_MPS = 0.2  # slower, a step does not tell its duration
+MAX_AHEAD_S = 0.5
+JUMP_M, JUMP_S = 0.3, 0.03  # a 0.1 s step this far (plus this long at its speed) off the median step is a jump
+
+
+def usual_steps(xy: Array) -> Array:
+    """(S - 1, 2) median of the steps around each step, component by component."""
+    return np.stack([median_filter(column, 11, mode="nearest") for column in np.diff(xy, axis=0).T], axis=1)
+
+
+def jumps(xy: Array) -> Bools:
+    """(S - 1,) True where the step to the next position is not part of the same drive."""
+    usual = usual_steps(xy)
+    return np.hypot(*(np.diff(xy, axis=0) - usual).T) > JUMP_M + JUMP_S / STEP_S * np.hypot(*usual.T)
+
+
+def on_log_clock(xy: Array, heading: Array, valid: Bools) -> tuple[Array, Array, Bools]:
+    """Positions (S, 2), unwrapped headings (S,) and valid (S,) at the log's steps, from those stored in message order.
+
+    Steps before the first message and after the last one are not valid. An ego with gaps is given back as it is.
+    """
+    if not valid.all():
+        return xy, heading, valid
+    last = int(np.argmax(jumps(xy))) if jumps(xy).any() else len(xy) - 1  # index of the last message
+    late = _late(xy)
+    times = STEP_S * np.arange(last + 1) + MESSAGE_S * np.concatenate([[0.0], np.cumsum(_lost(late[:last]))])
+    if last < len(xy) - 1:
+        ahead = -late[last]
+        if not 0.0 <= ahead <= MAX_AHEAD_S:
+            return xy, heading, valid
+        times += STEP_S * last + ahead - times[-1]
+    steps = STEP_S * np.arange(len(xy))
+    bus = slice(0, last + 1)
+    moved = np.stack([np.interp(steps, times, column) for column in xy[bus].T], axis=1)
+    told = (steps >= times[0] - 1e-9) & (steps <= times[-1] + 1e-9)
+    return moved, np.interp(steps, times, np.unwrap(heading[bus])), told
+
+
+def _late(xy: Array) -> Array:
+    """(S - 1,) seconds by which each step took longer than 0.1 s, at the speed of the steps around it; 0 when slow."""
+    usual = usual_steps(xy)
+    length = np.hypot(*usual.T)
+    excess = ((np.diff(xy, axis=0) - usual) * usual).sum(axis=1) / np.maximum(length, 1e-9)
+    return np.where(length > MIN_SPEED_MPS * STEP_S, STEP_S * excess / np.maximum(length, 1e-9), 0.0)
+
+
+def _lost(late: Array) -> Array:
+    """(S,) messages lost within each step."""
+    count = np.rint(late / MESSAGE_S)
+    sure = (count >= 1) & (count <= MAX_LOST) & (np.abs(late - MESSAGE_S * count) < TIMING_NOISE_S)
+    return np.where(sure, count, 0.0)
+
+
+KINDS = {
+    "VEHICLE": AgentKind.VEHICLE,
+    "PEDESTRIAN": AgentKind.PEDESTRIAN,
+    "CYCLIST": AgentKind.BICYCLE,  # nuScenes' motorcycles too
+    "TRAFFIC_CONE": AgentKind.TRAFFIC_CONE,
+    "TRAFFIC_BARRIER": AgentKind.BARRIER,
+    **dict.fromkeys(("TRAFFIC_OBJECT", "OTHER", "UNSET"), AgentKind.GENERIC_OBJECT),
+}
+KEYFRAME_STEPS = 5
+MAX_GAP_S = 0.55  # between two frames; longer ones cannot be filled in
+SLOPE_STEPS = 5  # +-0.55 s holds five steps to each side
+STANDING_MPS = 0.1
+FIT_STEPS = 7  # +-0.3 s
+
+
+@dataclass(frozen=True)
+class Source:
+    """What differs between the data sets that ScenarioNet converts."""
+
+    licence: str
+    origin_to_rear_axle_m: float  # from the stored ego position back along the heading
+    smoothing: float  # lambda of the ego's smoother
+    can_bus: bool  # the ego's frames are thinned 50 Hz messages
+
+
+# nuScenes stores the ego pose, whose origin is the rear axle. Waymo's converter stores the box centre, nuPlan's the
+# EgoState's waypoint, which is the centre too. The Pacifica's own offset keeps its box on the logged box.
+SOURCES = {
+    "nuscenes": Source("CC BY-NC-SA 4.0 (nuScenes via ScenarioNet)", 0.0, 300.0, True),
+    "waymo": Source(
+        "Waymo Open Dataset licence, non-commercial (via ScenarioNet)", PACIFICA.rear_axle_to_center, 10.0, False
+    ),
+    "nuplan": Source("CC BY-NC-SA 4.0 (nuPlan via ScenarioNet)", PACIFICA.rear_axle_to_center, 10.0, False),
+}
+
+
+@dataclass(frozen=True)
+class LoggedTrack:
+    """One track at the log's own frames."""
+
+    position: Array  # (T, 3)
+    heading: Array  # (T,)
+    valid: Bools  # (T,)
+    size: Array  # (3,) length, width, height, median over the valid frames; NaN where none is stored
+
+
+def sample_times(metadata: Mapping[str, Any], n_frames: int, file: str) -> Array:
+    """(T,) seconds since the first frame. Raises BadClip for missing, non-monotonic or too sparse times."""
+    if "ts" not in metadata:
+        raise BadClip(file, "metadata.ts", "missing")
+    stored = np.asarray(metadata["ts"]).reshape(-1)
+    if len(stored) == n_frames + 1:  # nuScenes' converter counts with arange(0, end, 0.1): rounding may add one
+        stored = stored[:-1]
+    times = _numbers(stored, (n_frames,), file, "metadata.ts")
+    steps = np.diff(times)
+    if not np.isfinite(times).all() or (steps <= 0.0).any():
+        raise BadClip(file, "metadata.ts", "time is not finite and strictly increasing")
+    if n_frames < 2 or steps.max() > MAX_GAP_S:
+        raise BadClip(file, "metadata.ts", f"frames further apart than {MAX_GAP_S} s cannot be resampled to 10 Hz")
+    return times - times[0]
+
+
+def frame_positions(times: Array) -> Array:
+    """(S,) fractional frame index of every 0.1 s step; whole numbers where the log runs at 10 Hz within 1 ms."""
+    if np.abs(times - STEP_S * np.arange(len(times))).max() < 1e-3:
+        return np.arange(len(times), dtype=np.float64)
+    steps = STEP_S * np.arange(int(np.floor(times[-1] / STEP_S + 1e-6)) + 1)
+    return np.interp(steps, times, np.arange(len(times)))
+
+
+def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, file: str) -> LoggedTrack:
+    """One checked track. Raises BadClip naming the field that is missing, misshapen or not finite where valid."""
+    field = f"tracks[{track_id}].state"
+    state = tracks[track_id].get("state") if isinstance(tracks[track_id], dict) else None
+    if not isinstance(state, dict):
+        raise BadClip(file, field, "missing")
+    for name in ("position", "heading", "valid"):
+        if name not in state:
+            raise BadClip(file, f"{field}.{name}", "missing")
+    valid = _numbers(state["valid"], (n_frames,), file, f"{field}.valid") > 0.5
+    position = floats(state["position"], file, f"{field}.position")
+    if position.ndim != 2 or position.shape[0] != n_frames or position.shape[1] not in (2, 3):
+        raise BadClip(file, f"{field}.position", f"shape {position.shape}, expected ({n_frames}, 3)")
+    if position.shape[1] == 2:
+        position = np.column_stack([position, np.zeros(n_frames)])
+    heading = _numbers(state["heading"], (n_frames,), file, f"{field}.heading")
+    for name, array in (("position", position), ("heading", heading)):
+        if not np.isfinite(array[valid]).all():
+            raise BadClip(file, f"{field}.{name}", "NaN pose at a valid frame")
+    size = np.full(3, np.nan)
+    for column, name in enumerate(("length", "width", "height")):
+        if name in state and valid.any():
+            size[column] = np.median(_numbers(state[name], (n_frames,), file, f"{field}.{name}")[valid])
+    return LoggedTrack(position, heading, valid, size)
+
+
+def ground_height(ego: LoggedTrack, at: Array, file: str) -> Array:
+    """(S,) height of the road under the ego: below Waymo's box centre; 0 where the file keeps the ego at z = 0."""
+    if not ego.position[ego.valid, 2].any():
+        return np.zeros(len(at))
+    if not np.isfinite(ego.size[2]):
+        raise BadClip(file, "tracks[sdc].state.height", "missing, and the ego is not at z = 0")
+    return resampled(ego, at)[0][:, 2] - ego.size[2] / 2.0
+
+
+def agent_tracks(
+    tracks: Mapping[Any, Any], sdc_id: str, at: Array, n_frames: int, ground: Array, file: str
+) -> AgentTracks:
+    """All tracks but the ego at the fractional frames `at` (S,), heights above `ground` (S,). Raises BadClip."""
+    ids, kinds, rows = [], [], []
+    for track_id in tracks:
+        name = id_text(track_id)
+        if name is None:
+            raise BadClip(file, f"tracks[{shown(track_id)}]", "is no id of a track, expected text or a number")
+        if name == sdc_id:
+            continue
+        kind = tracks[track_id].get("type") if isinstance(tracks[track_id], dict) else None
+        if not isinstance(kind, str) or kind not in KINDS:
+            raise BadClip(file, f"tracks[{name}].type", f"unknown class {shown(kind)}")
+        track = read_track(tracks, track_id, n_frames, file)
+        if not track.valid.any():
+            continue
+        if not (np.isfinite(track.size).all() and (track.size[:2] > 0.0).all()):
+            raise BadClip(file, f"tracks[{name}].state", f"length, width, height are {track.size.tolist()}")
+        ids.append(name)
+        kinds.append(KINDS[kind])
+        rows.append(track)
+    valid = np.zeros((len(at), len(rows)), bool)
+    boxes, z = np.full((*valid.shape, 5), np.nan), np.full(valid.shape, np.nan)
+    for column, track in enumerate(rows):
+        position, heading, seen = resampled(track, at)
+        flat = not track.position[track.valid, 2].any()  # nuPlan stores no height: the box stands on the ground
+        valid[:, column] = seen
+        boxes[seen, column, :2], boxes[seen, column, 2] = position[seen, :2], heading[seen]
+        boxes[seen, column, 3:] = track.size[:2]
+        z[seen, column] = track.size[2] / 2.0 if flat else (position[:, 2] - ground)[seen]
+    return AgentTracks(
+        track_ids=tuple(ids),
+        kinds=tuple(kinds),
+        boxes=boxes,
+        velocities=slope_velocities(boxes[..., :2], valid),
+        valid=valid,
+        center_z=z,
+        heights=np.array([track.size[2] for track in rows]),
+    )
+
+
+def resampled(track: LoggedTrack, at: Array) -> tuple[Array, Array, Bools]:
+    """(S, 3) position, (S,) heading in [-pi, pi), (S,) valid: both frames around the fractional one must be."""
+    before = np.floor(at).astype(int)
+    after = np.minimum(before + 1, len(track.valid) - 1)
+    share = at - before
+    after = np.where(share > 0.0, after, before)
+    position = track.position[before] + share[:, None] * (track.position[after] - track.position[before])
+    heading = track.heading[before] + share * wrap_angle(track.heading[after] - track.heading[before])
+    return position, wrap_angle(heading), track.valid[before] & track.valid[after]
+
+
+def slope_velocities(xy: Array, valid: Bools) -> Array:
+    """(S, N, 2) m/s: least-squares slope of the valid positions (S, N, 2) within five steps; NaN where not valid."""
+    n_steps = len(xy)
+    filled = np.where(valid[..., None], xy, 0.0)
+    count, time, square = (np.zeros(valid.shape) for _ in range(3))
+    total, moment = np.zeros(xy.shape), np.zeros(xy.shape)
+    for offset in range(-SLOPE_STEPS, SLOPE_STEPS + 1):
+        rows = slice(max(0, -offset), n_steps - max(0, offset))
+        shifted = slice(max(0, offset), n_steps - max(0, -offset))
+        here = valid[shifted] & valid[rows]
+        # Relative to the step's own position, so that world coordinates of kilometres cancel nothing.
+        relative = np.where(here[..., None], filled[shifted] - filled[rows], 0.0)
+        t = offset * STEP_S
+        count[rows] += here
+        time[rows] += t * here
+        square[rows] += t * t * here
+        total[rows] += relative
+        moment[rows] += t * relative
+    spread = count * square - time**2
+    known = valid & (spread > 1e-9)
+    slope = (count[..., None] * moment - time[..., None] * total) / np.where(known, spread, 1.0)[..., None]
+    slope[~known] = 0.0
+    slope[np.hypot(slope[..., 0], slope[..., 1]) < STANDING_MPS] = 0.0
+    slope[~valid] = np.nan
+    return slope
+
+
+def ego_segments(track: LoggedTrack, source: Source, at: Array) -> tuple[Array, Ints]:
+    """Ego states (S, 11), and (S,) the number of the continuous drive that a step belongs to; NaN and -1: none.
+
+    Columns 7..10 (steering and rates) are 0, as NAVSIM initialises an ego.
+    """
+    position, heading, valid = resampled(track, at)
+    xy = position[:, :2]
+    if source.can_bus and len(xy) > 1 and _keyframe_weights(xy).all():
+        xy, heading, valid = on_log_clock(xy, heading, valid)
+    states, segment = np.full((len(at), EGO_STATE_SIZE), np.nan), np.full(len(at), -1, np.int64)
+    broken = jumps(xy) | ~valid[1:] | ~valid[:-1]
+    runs = pairwise([0, *(np.flatnonzero(broken) + 1).tolist(), len(xy)])
+    long_enough = [(a, b) for a, b in runs if b - a >= FIT_STEPS and valid[a:b].all()]
+    for number, (start, stop) in enumerate(long_enough):
+        states[start:stop] = _smooth_drive(xy[start:stop], heading[start:stop], source)
+        segment[start:stop] = number
+    return states, segment
+
+
+def _smooth_drive(xy: Array, heading: Array, source: Source) -> Array:
+    """(S, 11) from logged positions (S, 2) and headings (S,) of one segment."""
+    heading = np.unwrap(heading)
+    xy = xy - source.origin_to_rear_axle_m * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    return smooth_drive(xy, heading, _keyframe_weights(xy), source.smoothing)
+
+
+def smooth_drive(xy: Array, heading: Array, weight: Array, smoothing: float) -> Array:
+    """Ego states (S, 11) of the smooth drive nearest to rear-axle positions (S, 2) and headings (S,), unwrapped.
+
+    weight: (S,) 1 where a step was observed, 0 where it only lies between two that were, three or more of them 1;
+    S >= 7. Steering and rates are 0.
+    """
+    drive = _least_third_difference(np.column_stack([xy, heading]), weight, smoothing)
+    velocity = savgol_filter(drive[:, :2], FIT_STEPS, 2, deriv=1, delta=STEP_S, axis=0)
+    acceleration = savgol_filter(drive[:, :2], FIT_STEPS, 2, deriv=2, delta=STEP_S, axis=0)
+    c, s = np.cos(drive[:, 2]), np.sin(drive[:, 2])
+    states = np.zeros((len(xy), EGO_STATE_SIZE))
+    states[:, X], states[:, Y], states[:, HEADING] = drive[:, 0], drive[:, 1], wrap_angle(drive[:, 2])
+    for (along, across), vector in (((VX, VY), velocity), ((AX, AY), acceleration)):
+        states[:, along] = c * vector[:, 0] + s * vector[:, 1]
+        states[:, across] = -s * vector[:, 0] + c * vector[:, 1]
+    return states
+
+
+def _keyframe_weights(xy: Array) -> Array:
+    """(S,) 1 at every step; only at keyframes where the steps between them are on a straight line at even speed."""
+    bend = np.concatenate([[False], np.hypot(*np.diff(xy, n=2, axis=0).T) > 1e-4, [False]])
+    phase = np.flatnonzero(bend) % KEYFRAME_STEPS
+    if len(phase) == 0 or (phase != phase[0]).any():
+        return np.ones(len(xy))
+    weight = np.zeros(len(xy))
+    weight[phase[0] :: KEYFRAME_STEPS] = 1.0
+    weight[[0, -1]] = 1.0
+    return weight
+
+
+def _least_third_difference(log: Array, weight: Array, smoothing: float) -> Array:
+    """(S, C): argmin of sum w (x - log)^2 + smoothing sum (third difference of x)^2, by a banded Cholesky solve."""
+    n = len(log)
+    kernel = np.array([-1.0, 3.0, -3.0, 1.0])
+    bands = np.zeros((4, n))  # lower form: bands[k, i] = A[i + k, i]
+    for k in range(4):
+        for j in range(4 - k):
+            bands[k, j : n - 3 + j] += smoothing * kernel[j] * kernel[j + k]
+    bands[0] += weight
+    center = log[0]  # solved about the first row: world coordinates of kilometres would cost digits
+    solved: Array = solveh_banded(bands, weight[:, None] * (log - center), lower=True)
+    return solved + center
+
+
+def _numbers(value: object, shape: tuple[int, ...], file: str, field: str) -> Array:
+    """An array of the shape given; a trailing axis of one is dropped."""
+    array = floats(value, file, field)
+    if array.ndim == len(shape) + 1 and array.shape[-1] == 1:
+        array = array[..., 0]
+    if array.shape != shape:
+        raise BadClip(file, field, f"shape {array.shape}, expected {shape}")
+    return array
+
 
 SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"
 # Of the stretches that are reconstructed: 20 s, as far apart as any clip still lies in one, so that a scene of

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from factory.__main__ import main as factory
+from factory.datasets.town.town import SUMS, make_whole, mend
 from factory.exits import COMPLETE
 from factory.files import folders_in, matching_below
-from factory.readers.whole_folder import SUMS, make_whole, mend
 from factory.store.reader import SampleTable
 from tests.factory.data_folders import add_companions, put_behind_links
 from tests.factory.datasets.navsim import simscale_writer

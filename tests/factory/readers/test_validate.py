@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factory.readers.base import BadClip, ClipIndex, ClipRef
+from factory.readers.base import BadClip, ClipIndex, ClipRef, read_clip
 from factory.readers.logs import route_of_drive
-from factory.readers.validate import read_clip
 from tasks.world.clip import Clip, SensorFile
 from tasks.world.road_map import NoRoute, RoadMap, RouteFinder, roadblocks_of
 from tests.tasks.streets import street_clip

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from examples.csv_logs import write_log
-from factory.datasets.town.painter import TownPainter, town_log
-from factory.datasets.town.reader import SyntheticReader
+from factory.datasets.town.reader import SyntheticReader, TownPainter, town_log
 from factory.datasets.town.settings import TownSettings
 from factory.exits import BAD_CONFIG, COMPLETE
 from planners.drive.cameras import NoCameras, Observer, PaintedCameras

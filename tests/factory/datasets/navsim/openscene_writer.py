@@ -17,8 +17,7 @@ import pyarrow.feather
 import shapely
 from scipy.spatial.transform import Rotation
 
-from factory.datasets.av2.log import step_times, world_from_ego_at
-from factory.datasets.av2.reader import AV2Log
+from factory.datasets.av2.reader import AV2Log, step_times, world_from_ego_at
 from factory.datasets.navsim.log import CAMERA_NAMES
 from factory.readers.logs import WholeLog
 from tasks.world.clip import STEP_S, AgentKind, Camera

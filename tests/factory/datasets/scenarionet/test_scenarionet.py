@@ -6,8 +6,14 @@ import shapely
 from shapely.geometry import Point, Polygon
 
 from factory.datasets.scenarionet.map import pieces
-from factory.datasets.scenarionet.reader import ScenarioNetReader, read_log
-from factory.datasets.scenarionet.tracks import SLOPE_STEPS, LoggedTrack, resampled, slope_velocities
+from factory.datasets.scenarionet.reader import (
+    SLOPE_STEPS,
+    LoggedTrack,
+    ScenarioNetReader,
+    read_log,
+    resampled,
+    slope_velocities,
+)
 from factory.readers.base import ClipRef
 from tasks.world.clip import CLIP_STEPS, NOW, AgentKind
 from tasks.world.frames import AX, AY, HEADING, VX, VY, X, Y
