@@ -495,6 +495,19 @@ def within(files: Sequence[SensorFile], start: int, stop: int) -> tuple[SensorFi
     return tuple(replace(file, time_s=file.time_s - first) for file in inside)
 
 
+def block_of_log(
+    log: WholeLog,
+    images: Sequence[SensorFile],
+    sweeps: Sequence[SensorFile],
+    steps: tuple[int, int],
+    ground_m: float | None = None,
+) -> Block:
+    """The block of steps first..stop-1, as far as the log goes; images, sweeps: of the log, timed since its start."""
+    first, stop = steps[0], min(steps[1], len(log.ego_states))
+    sensed = within(images, first, stop), within(sweeps, first, stop)
+    return Block(first * STEP_S, present(log.agents.window(first, stop)), *sensed, ground_m)
+
+
 def present(agents: AgentTracks) -> AgentTracks:
     """Only the tracks that are present at one of the steps or more."""
     seen = np.flatnonzero(agents.valid.any(axis=0))

@@ -34,11 +34,14 @@ def read_pcd(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
         problem = f"{len(data) - start} bytes for {n_points} points of {record.itemsize}; truncated?"
         raise BadClip(file, "DATA", problem)
     points = np.frombuffer(data, record, n_points, start)
-    out = {name: points[name].copy() for name in columns}
-    for name, values in out.items():
-        if not np.isfinite(values).all():
+    return _finite({name: points[name].copy() for name in columns}, file)
+
+
+def _finite(columns: dict[str, NDArray[Any]], file: str) -> dict[str, NDArray[Any]]:
+    for name, values in columns.items():
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
             raise BadClip(file, name, "holds NaN or infinity")
-    return out
+    return columns
 
 
 def _header(data: bytes, file: str) -> tuple[dict[str, list[str]], int]:
@@ -100,11 +103,7 @@ def read_points(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     if not data or len(data) % (4 * len(COLUMNS)):
         raise BadClip(str(path), "points", f"{len(data)} bytes are not rows of {len(COLUMNS)} float32; truncated?")
     rows = np.frombuffer(data, "<f4").reshape(-1, len(COLUMNS))
-    out = {name: rows[:, COLUMNS.index(name)].copy() for name in columns}
-    for name, values in out.items():
-        if not np.isfinite(values).all():
-            raise BadClip(str(path), name, "holds NaN or infinity")
-    return out
+    return _finite({name: rows[:, COLUMNS.index(name)].copy() for name in columns}, str(path))
 
 
 # Feather files: columns of numbers and texts, as Argoverse 2 has them.

@@ -20,7 +20,16 @@ from scipy.spatial.transform import Rotation, Slerp
 from factory.datasets.av2 import ANNOTATIONS, EXTRINSICS, INTRINSICS, POSES, log_folders
 from factory.files import matching
 from factory.readers.base import BadClip, ClipRef, folder_split
-from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive
+from factory.readers.logs import (
+    STEP_MS,
+    LoggedDrive,
+    LogReader,
+    Recorded,
+    WholeLog,
+    block_of_log,
+    route_of_drive,
+    within,
+)
 from factory.readers.pickles import id_text
 from factory.readers.points import read_feather
 from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
@@ -38,6 +47,7 @@ from tasks.world.road_map import (
     roadblocks_of,
     valid_ring,
 )
+from tasks.world.clip import STEP_S
 from tasks.world.frames import wrap_angle
 from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, X, Y
 
@@ -448,8 +458,8 @@ class AV2Log(WholeLog):
 
     motion: LogMotion
     cameras: tuple[Camera, ...]
-    images: tuple[tuple[str, Path, float], ...]  # camera, file, seconds since the first annotated frame
-    sweeps: tuple[tuple[str, Path, float], ...]
+    images: tuple[SensorFile, ...]  # timed since the first annotated frame
+    sweeps: tuple[SensorFile, ...]
 
 
 class AV2Reader(LogReader[AV2Log]):
@@ -496,8 +506,7 @@ class AV2Reader(LogReader[AV2Log]):
         """Log and second at which the block begins that the clip is rendered from; None where the log has no photos."""
         if ref.log_id not in self._photographed:
             return None
-        first = ref.start_ms // STEP_MS // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
-        return f"{ref.log_id}@{first * STEP_S:g}s"
+        return f"{ref.log_id}@{self.block_steps(ref.start_ms // STEP_MS)[0] * STEP_S:g}s"
 
     @cached_property
     def _photographed(self) -> frozenset[str]:
@@ -506,7 +515,9 @@ class AV2Reader(LogReader[AV2Log]):
     def recorded(self, log: AV2Log, start: int, stop: int) -> Recorded:
         """Poses, rig, photos and sweeps of a window, and the block that it is rendered from."""
         poses = world_from_ego_at(log.motion, step_times(start, stop))
-        return Recorded(poses, log.cameras, *_sensed(log, start, stop), _block(log, start) if log.images else None)
+        sensed = within(log.images, start, stop), within(log.sweeps, start, stop)
+        block = block_of_log(log, log.images, log.sweeps, self.block_steps(start)) if log.images else None
+        return Recorded(poses, log.cameras, *sensed, block)
 
 
 def read_log(folder: Path) -> AV2Log:
@@ -604,36 +615,13 @@ def _licence(folder: Path) -> str:
     return lines[0].strip() if lines else LICENCE
 
 
-def _stamped(motion: LogMotion, sensor: str, folder: Path, suffix: str) -> list[tuple[str, Path, float]]:
+def _stamped(motion: LogMotion, sensor: str, folder: Path, suffix: str) -> list[SensorFile]:
     """Files named <timestamp_ns><suffix>, in time order. Raises BadClip for any other name."""
     files = matching(folder, f"*{suffix}")
     for path in files:
         if not path.stem.isdecimal():
             raise BadClip(str(path), "name", f"expected <timestamp_ns>{suffix}")
     times_s = motion.seconds(np.array([int(path.stem) for path in files], dtype=np.int64))
-    return [(sensor, files[i], float(times_s[i])) for i in np.argsort(times_s, kind="stable")]
-
-
-def _block(log: AV2Log, start: int) -> Block:
-    """The block of the clip that starts at step `start`: 20 s that begin at a multiple of 10 s, so that it holds it."""
-    first = start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
-    stop = min(first + BLOCK_STEPS, log.motion.n_steps)
-    return Block(first * STEP_S, present(log.agents.window(first, stop)), *_sensed(log, first, stop))
-
-
-def _sensed(log: AV2Log, start: int, stop: int) -> tuple[tuple[SensorFile, ...], tuple[SensorFile, ...]]:
-    """Photos and sweeps of the steps start..stop-1."""
-    return _within(log.motion, log.images, start, stop), _within(log.motion, log.sweeps, start, stop)
-
-
-def _within(
-    motion: LogMotion, files: tuple[tuple[str, Path, float], ...], start: int, stop: int
-) -> tuple[SensorFile, ...]:
-    first, last = start * STEP_S, (stop - 1) * STEP_S
-    inside = [entry for entry in files if first - SAME_FRAME_S < entry[2] <= last + SAME_FRAME_S]
-    if not inside:
-        return ()
-    poses = world_from_ego_at(motion, np.array([time_s for _, _, time_s in inside]))
-    return tuple(
-        SensorFile(sensor, str(path), time_s - first, pose) for (sensor, path, time_s), pose in zip(inside, poses)
-    )
+    order = np.argsort(times_s, kind="stable")
+    poses = world_from_ego_at(motion, times_s[order]) if files else ()
+    return [SensorFile(sensor, str(files[i]), float(times_s[i]), pose) for i, pose in zip(order, poses)]

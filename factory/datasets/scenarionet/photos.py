@@ -133,7 +133,6 @@ def read_photographs(path: Path, root: Path, ego_states: Array) -> Photographs:
     }
     only = next(iter(cameras)) if len(cameras) == 1 else None
     drive = _Drive(ego_states)
-    filmed = _Filmed(root, file)
     images, seen = [], set[tuple[str, float]]()
     for i, entry in enumerate(_entries(content, "frames", file)):
         field = f"frames[{i}]"
@@ -145,14 +144,14 @@ def read_photographs(path: Path, root: Path, ego_states: Array) -> Photographs:
             raise BadClip(file, f"{field}.t_s", f"{name} took two photos at {time_s:g} s")
         seen.add((name, time_s))
         pose = _pose(entry, cameras[name], drive, time_s, file, field)
-        images.append(SensorFile(name, filmed.uri(entry.get("file"), f"{field}.file"), time_s, pose))
+        images.append(SensorFile(name, _uri(entry.get("file"), root, file, f"{field}.file"), time_s, pose))
     if not images:
         raise BadClip(file, "frames", "is empty: no photo")
     return Photographs(
         data,
         tuple(camera for name, camera in cameras.items() if any(image.sensor == name for image in images)),
         tuple(sorted(images, key=lambda image: image.time_s)),
-        _sweeps(content, filmed, drive, file),
+        _sweeps(content, root, drive, file),
     )
 
 
@@ -176,24 +175,17 @@ class _Drive:
         return upright(np.array([[x, y, wrap_angle(np.array(heading))]]))[0]
 
 
-@dataclass(frozen=True)
-class _Filmed:
-    """Finds files below a root."""
-
-    root: Path
-    sidecar: str
-
-    def uri(self, name: object, field: str) -> str:
-        """Of a picture, or of a frame of the video that stands for its folder. Raises BadClip for a path elsewhere."""
-        if not isinstance(name, str) or not name or "\0" in name:
-            raise BadClip(self.sidecar, field, f"{shown(name)} is no path of a picture")
-        path = Path(name)
-        if path.is_absolute() or ".." in path.parts:
-            raise BadClip(self.sidecar, field, f"{shown(name)}: paths are relative, below the folder of the photos")
-        video = (self.root / path.parent).with_suffix(VIDEO)
-        if path.stem.isascii() and path.stem.isdecimal() and video.is_file() and not (self.root / path.parent).is_dir():
-            return frame_uri(video, int(path.stem))
-        return str(self.root / path)
+def _uri(name: object, root: Path, sidecar: str, field: str) -> str:
+    """Of a picture below `root`, or of a frame of the video that stands for its folder. Raises BadClip for another."""
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise BadClip(sidecar, field, f"{shown(name)} is no path of a picture")
+    path = Path(name)
+    if path.is_absolute() or ".." in path.parts:
+        raise BadClip(sidecar, field, f"{shown(name)}: paths are relative, below the folder of the photos")
+    video = (root / path.parent).with_suffix(VIDEO)
+    if path.stem.isascii() and path.stem.isdecimal() and video.is_file() and not (root / path.parent).is_dir():
+        return frame_uri(video, int(path.stem))
+    return str(root / path)
 
 
 def _entries(content: Mapping[str, Any], name: str, file: str) -> Sequence[Mapping[str, Any]]:
@@ -275,7 +267,7 @@ def in_step(found: Photographs, first: int, n_steps: int) -> int:
     return min(starts, key=apart, default=first)
 
 
-def _sweeps(content: Mapping[str, Any], filmed: _Filmed, drive: _Drive, file: str) -> tuple[SensorFile, ...]:
+def _sweeps(content: Mapping[str, Any], root: Path, drive: _Drive, file: str) -> tuple[SensorFile, ...]:
     if "sweeps" not in content:
         return ()
     lidar = content.get("lidar")
@@ -288,7 +280,7 @@ def _sweeps(content: Mapping[str, Any], filmed: _Filmed, drive: _Drive, file: st
         field = f"sweeps[{i}]"
         time_s = _time(entry, file, field)
         pose = _pose(entry, None, drive, time_s, file, field)
-        out.append(SensorFile(name, filmed.uri(entry.get("file"), f"{field}.file"), time_s, pose, mount))
+        out.append(SensorFile(name, _uri(entry.get("file"), root, file, f"{field}.file"), time_s, pose, mount))
     return tuple(sorted(out, key=lambda sweep: sweep.time_s))
 
 

@@ -32,12 +32,21 @@ from factory.datasets.scenarionet.settings import ScenarioNetClips
 from factory.files import matching_below
 from factory.readers.apart import Apart
 from factory.readers.base import BadClip, ClipIndex, ClipRef, bytes_of, folder_split, nuscenes_split, waymo_split
-from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive, within
+from factory.readers.logs import (
+    STEP_MS,
+    LoggedDrive,
+    LogReader,
+    Recorded,
+    WholeLog,
+    block_of_log,
+    route_of_drive,
+    within,
+)
 from factory.readers.pickles import id_text, load_plain
 from factory.wording import shown
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools, Ints
-from tasks.world.clip import CLIP_STEPS, STEP_S, Block
+from tasks.world.clip import CLIP_STEPS, STEP_S
 from tasks.world.frames import upright, wrap_angle
 from tasks.world.road_map import TrafficLights
 from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY, X, Y
@@ -481,7 +490,12 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
         """Log and second at which the block begins that the clip is rendered from; None where the log has no photos."""
         if self.path_of(ref) not in self._sidecars:
             return None
-        return f"{ref.log_id}@{_block_start(ref.start_ms // STEP_MS) * STEP_S:g}s"
+        return f"{ref.log_id}@{self.block_steps(ref.start_ms // STEP_MS)[0] * STEP_S:g}s"
+
+    def block_steps(self, start: int) -> tuple[int, int]:
+        """20 s, which hold every window that begins in their first half."""
+        first = start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
+        return first, first + BLOCK_STEPS
 
     def recorded(self, log: ScenarioLog, start: int, stop: int) -> Recorded:
         """The ego's poses, photos and sweeps of a window. Raises BadClip where the ego's drive is broken."""
@@ -493,23 +507,12 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
         if not found.images:
             return Recorded(poses)
         sensed = within(found.images, start, stop), within(found.sweeps, start, stop)
-        return Recorded(poses, found.cameras, *sensed, _block(log, start))
+        block = block_of_log(log, found.images, found.sweeps, self.block_steps(start), GROUND_M)
+        return Recorded(poses, found.cameras, *sensed, block)
 
     def _photographs(self, path: Path, ego_states: Array) -> Photographs:
         sidecar = self._sidecars[path]
         return read_photographs(sidecar, self.sensor_root or sidecar.parent, ego_states)
-
-
-def _block_start(start: int) -> int:
-    """The step at which the block begins that a clip from step `start` on lies in."""
-    return start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
-
-
-def _block(log: ScenarioLog, start: int) -> Block:
-    first = _block_start(start)
-    stop = min(first + BLOCK_STEPS, len(log.ego_states))
-    sensed = within(log.photographs.images, first, stop), within(log.photographs.sweeps, first, stop)
-    return Block(first * STEP_S, present(log.agents.window(first, stop)), *sensed, GROUND_M)
 
 
 def _digest(scenario: str, sidecar: bytes) -> str:

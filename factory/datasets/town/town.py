@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
@@ -66,11 +67,7 @@ def finish_whole(unfinished: Path, root: Path, write: Write) -> None:
     """Has `unfinished` written and renames it to `root`; it is gone afterwards, whatever happened."""
     try:
         _fill(unfinished, write, root.name)
-        try:
-            os.rename(unfinished, root.resolve())
-        except OSError:
-            if not root.is_dir():  # else another worker was first, with the same bytes
-                raise
+        _put(unfinished, root)
     except OSError as error:
         error.filename = error.filename or str(root)  # Arrow and a flush name none
         raise
@@ -79,41 +76,30 @@ def finish_whole(unfinished: Path, root: Path, write: Write) -> None:
 
 
 def mend(root: Path, write: Write) -> None:
-    """Holds a folder that is there against its checksums; where it is damaged its files are made again.
+    """Holds a folder that is there against its checksums; where it is damaged it is made again and takes its place.
 
-    They are moved into place one by one, so that who reads beside it finds every file, before or after; what is not of
-    the folder goes. One line in the log says what was wrong.
+    One line in the log says what was wrong.
     """
     if not (wrong := _wrong(root)):
         return
     log.warning("%s is damaged (%s); it is made again", root, wrong)
-    anew = unfinished_folder(root)
+    anew, old = unfinished_folder(root), unfinished_folder(root)
     try:
         _fill(anew, write, root.name)
-        own = [*_files(anew), SUMS]
-        for name in own:
-            there = root / name
-            if not there.is_file() or _digest(there) != _digest(anew / name):
-                there.parent.mkdir(parents=True, exist_ok=True)
-                beside = Path(shutil.move(anew / name, tempfile.mkdtemp(prefix=".", dir=there.parent)))
-                os.replace(beside, there)  # from the same disk, which a linked folder's need not be the root's
-                beside.parent.rmdir()
-        _remove_others(root, own)
+        with suppress(FileNotFoundError):  # another worker is about to put the same there
+            os.rename(root.resolve(), old / root.name)
+        _put(anew, root)
     finally:
-        shutil.rmtree(anew, ignore_errors=True)
+        for folder in (anew, old):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
-def _remove_others(root: Path, own: Sequence[str]) -> None:
-    """Leaves the files `own` alone. Of a link to a folder of none of them the link goes, never what it leads to."""
-    for folder, below, files in os.walk(root, topdown=False):
-        here = Path(folder)
-        for path in (here / name for name in (*files, *below)):
-            name = path.relative_to(root).as_posix()
-            if path.is_dir() and not path.is_symlink():
-                if not any(path.iterdir()):
-                    path.rmdir()
-            elif name not in own and not any(kept.startswith(f"{name}/") for kept in own):
-                path.unlink()
+def _put(unfinished: Path, root: Path) -> None:
+    try:
+        os.rename(unfinished, root.resolve())
+    except OSError:
+        if not root.is_dir():  # else another worker was first, with the same bytes
+            raise
 
 
 def _fill(folder: Path, write: Write, named: str) -> None:

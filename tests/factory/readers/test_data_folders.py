@@ -141,5 +141,6 @@ def test_a_whole_folder_is_made_and_mended_behind_a_link_to_another_disk(tmp_pat
         mend(root, write)
         assert (tmp_path / "of_another" / "z").is_dir() and not (root / "stray").exists()
         assert [(root / name).read_text() for name in ("a/x", "y")] == [f"{n} as it was written" for n in ("a/x", "y")]
-        assert sorted(path.name for path in (*root.rglob("*"), *root.glob("a/*"))) == ["a", SUMS, "x", "y"]
+        assert {path.relative_to(root).as_posix() for path in root.rglob("*")} == {"a", "a/x", SUMS, "y"}
+        assert list(Path(other_disk).iterdir()) == [Path(other_disk) / "root"]
         assert list(tmp_path.glob(".*")) == []
