@@ -1,5 +1,6 @@
 """Files made to do harm by what they say: each costs its own clips, or is refused by name, soon and in one line."""
 
+import json
 import os
 import pickle
 import resource
@@ -46,7 +47,7 @@ def command(cwd: Path, *argv: str) -> subprocess.CompletedProcess[str]:
 
     env = os.environ | {"PYTHONPATH": os.pathsep.join([str(REPOSITORY), str(cwd)])}
     return subprocess.run(
-        [sys.executable, "-m", *argv],
+        [sys.executable, *argv],
         cwd=cwd,
         env=env,
         capture_output=True,
@@ -58,7 +59,7 @@ def command(cwd: Path, *argv: str) -> subprocess.CompletedProcess[str]:
 
 def run_of(cwd: Path, *words: str) -> subprocess.CompletedProcess[str]:
     plain = ["render=none", "experts=[human]", "executor=local", "vocabulary.k=16", "out=out"]
-    return command(cwd, "factory", "run", f"clips.root={cwd / 'logs'}", *plain, *words)
+    return command(cwd, "-m", "factory", "run", f"clips.root={cwd / 'logs'}", *plain, *words)
 
 
 @pytest.mark.slow
@@ -135,7 +136,7 @@ def test_whatever_a_reader_raises_over_a_log_fails_that_log_alone(tmp_path: Path
     assert "3 accepted, 0 rejected, 13 failed" in said  # seven logs that have no clips, two of three
     for what in kinds:
         assert f"  broken log sd_early_{what}: {tmp_path / 'logs' / f'sd_early_{what}.pkl'}: " in done.stdout
-    failed = command(tmp_path, "factory", "failed", "out=out").stdout
+    failed = command(tmp_path, "-m", "factory", "failed", "out=out").stdout
     assert f"{tmp_path / 'logs' / 'sd_late_Key.pkl'}: reader: cannot be read: KeyError: an integer of" in failed
 
 
@@ -201,16 +202,36 @@ DRIVER_READS: dict[str, tuple[Callable[[Path], None], tuple[str, ...], str]] = {
 }
 
 
+EACH = """
+import contextlib, io, json, os, sys
+from factory.__main__ import main as factory
+from planners.__main__ import main as planners
+
+answers = {}
+for what, (folder, argv) in json.loads(sys.argv[1]).items():
+    os.chdir(folder)
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = {"factory": factory, "planners": planners}[argv[0]](argv[1:])
+    answers[what] = code, out.getvalue(), err.getvalue()
+print(json.dumps(answers))
+"""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("what", DRIVER_READS)
-def test_a_crafted_file_that_a_command_reads_itself_is_refused_by_name_in_one_line(tmp_path: Path, what: str) -> None:
-    write, argv, named = DRIVER_READS[what]
-    write(tmp_path)
-    words = ("clips.root=logs", "out=out", "render=none") if argv[1] == "run" else ()
-    done = command(tmp_path, *argv, *words)
-    assert done.returncode == 2 and not done.stdout, done.stdout + done.stderr[-2000:]
-    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1, done.stderr[-2000:]
-    assert named in done.stderr and len(done.stderr) < 1000
+def test_a_crafted_file_that_a_command_reads_itself_is_refused_by_name_in_one_line(tmp_path: Path) -> None:
+    asked = {}
+    for what, (write, argv, _) in DRIVER_READS.items():
+        (folder := tmp_path / what).mkdir()
+        write(folder)
+        words = ("clips.root=logs", "out=out", "render=none") if argv[1] == "run" else ()
+        asked[what] = str(folder), [*argv, *words]
+    done = command(tmp_path, "-c", EACH, json.dumps(asked))
+    assert done.returncode == 0, done.stderr[-2000:]
+    for what, (code, out, err) in json.loads(done.stdout).items():
+        assert code == 2 and not out, (what, out, err[-2000:])
+        assert err.startswith("error: ") and err.count("\n") == 1, (what, err[-2000:])
+        assert DRIVER_READS[what][2] in err and len(err) < 1000
 
 
 def test_a_key_of_a_reward_file_that_never_hashes_is_refused(tmp_path: Path) -> None:

@@ -12,9 +12,14 @@ from pathlib import Path
 import pytest
 
 from factory.__main__ import main as factory
+from factory.config.run import load_config
+from factory.datasets.navsim.reader import NavsimReader
 from factory.datasets.town.town import SUMS, make_whole, mend
 from factory.exits import COMPLETE
 from factory.files import folders_in, matching_below
+from factory.readers.base import BadClip, ClipRef
+from factory.readers.logs import LogReader
+from factory.setup.settings import open_reader
 from factory.store.reader import SampleTable
 from tests.factory.data_folders import add_companions, put_behind_links
 from tests.factory.datasets.navsim import simscale_writer
@@ -87,6 +92,32 @@ def windows(said: str) -> str:
     found = re.search(r"(\d+) of them", said)
     assert found is not None and int(found[1]) > 0
     return found[1]
+
+
+OF_LOGS = {  # files that clips are computed from; a city's map is no part of a log
+    "av2": ("train/*/map/log_map_archive_*.json",),
+    "scenarionet": ("part/*.pkl",),
+    "py123d": ("logs/*/*/map.arrow",),
+    "navsim": ("navsim_logs/mini/*.pkl", "maps/*/*/map.gpkg"),
+}
+
+
+@pytest.mark.parametrize(("data_set", "file"), [(name, file) for name, files in OF_LOGS.items() for file in files])
+def test_the_digest_is_the_clip_s_and_follows_the_log(data_set: str, file: str, street: Path, tmp_path: Path) -> None:
+    """Told without reading a clip."""
+    words = READERS[data_set](tmp_path / "root", street)
+    reader, index = open_reader(load_config([*words, "out=nowhere"]).clips)
+    (path,), ref = (tmp_path / "root").glob(file), index.refs[0]
+    assert isinstance(reader, LogReader | NavsimReader)
+    before = reader.digest(ref)
+    assert before == reader.read(ref).content_digest
+    content = path.read_bytes()
+    path.write_bytes(content + b" ")
+    assert reader.digest(ref) != before
+    path.write_bytes(content)
+    assert reader.digest(ref) == before
+    with pytest.raises(BadClip, match="no log gone"):
+        reader.digest(ClipRef(reader.name, "gone", 0))
 
 
 @pytest.mark.parametrize("spoil", SPOILED)

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-import factory.datasets.town.town as painters_module
 from factory.datasets.town.drive import SCENARIOS
 from factory.datasets.town.reader import SyntheticTownsReader
 from factory.datasets.town.settings import LOGS_PER_TOWN, TownSettings
@@ -64,9 +63,7 @@ def test_others_of_the_same_towns_are_those_behind_the_first(folder: Path) -> No
 
 
 @pytest.mark.slow
-def test_a_town_is_written_once_and_only_where_it_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_town_is_written_once_and_only_where_it_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = reader_of(tmp_path, [0, 1])
     first = next(iter(made.towns[1].logs()))
     made.read(ClipRef("synthetic", first, 0))
@@ -74,17 +71,6 @@ def test_a_town_is_written_once_and_only_where_it_is_read(
     made.index()
     assert [town.root.is_dir() for town in made.towns] == [True, True]
     assert "town 1 of 1: seed 0, 1 logs painted" in capsys.readouterr().err
-
-    def killed(out: Path, *_rest: object) -> None:
-        (out / "half").mkdir()
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(painters_module, "write_logs", killed)
-    assert len(reader_of(tmp_path, [0, 1]).index().refs) == 6
-    unfinished = reader_of(tmp_path, [2])
-    with pytest.raises(KeyboardInterrupt):
-        unfinished.index()
-    assert not unfinished.towns[0].root.exists()
 
 
 def test_first_window_skips_the_start_of_every_log(reader: SyntheticTownsReader, folder: Path) -> None:
