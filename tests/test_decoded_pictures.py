@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from factory.readers.base import BadClip
-from factory.readers.pictures import header_of, without_exif
+from factory.readers.pictures import read_header, without_exif
 from factory.stages.sensors import decode_image, opened_photos, read_masks
 from factory.store.reader import image_of
 from planners.data.batch import ImageLayout
@@ -149,4 +149,4 @@ def test_what_turns_a_jpeg_is_taken_out_of_it_and_nothing_else() -> None:
     plain = encoded(".jpg")
     both = turned(turned(plain, 6), 3)
     assert without_exif(both) == without_exif(plain) == plain
-    assert header_of(both) == ("JPEG", (WIDTH, HEIGHT))
+    assert read_header(both) == ("JPEG", (WIDTH, HEIGHT))

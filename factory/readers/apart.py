@@ -27,7 +27,7 @@ A = TypeVar("A")
 R = TypeVar("R")
 
 
-class ReadApart:
+class ReaderProcess:
     """A process that answers one question after the other."""
 
     def __init__(self) -> None:
@@ -60,10 +60,10 @@ class ReadApart:
 
 
 _lock = Lock()
-_running: list[ReadApart] = []
+_running: list[ReaderProcess] = []
 
 
-class Apart(Generic[A, R]):
+class OtherProcess(Generic[A, R]):
     """A function, answered in the other process; it is sent there once for all arguments that follow each other."""
 
     def __init__(self, function: Callable[[A], R]) -> None:
@@ -86,7 +86,7 @@ class Apart(Generic[A, R]):
 
     def _asked(self, argument: bytes, file: str, limit_s: float) -> Any:
         if not _running:
-            _running.append(ReadApart())
+            _running.append(ReaderProcess())
         try:
             return _running[0].ask(self._function, argument, limit_s)
         except TimeoutError:

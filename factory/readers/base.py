@@ -46,7 +46,7 @@ def _cut(text: str) -> str:
 
 
 @contextmanager
-def failing_as(file: str) -> Iterator[None]:
+def failures_as_bad_clip(file: str) -> Iterator[None]:
     """Around what a reader does with one file, folder or clip: whatever it raises over that is that one's failure.
 
     Raises BadClip, Unreadable, and the OSError of another place, such as a full disk under the cache.
@@ -216,7 +216,7 @@ MAPS_REMEMBERED = 4  # clips of a log share its map, and a reader keeps the last
 def read_clip(reader: ClipReader, ref: ClipRef) -> Clip:
     """The reader's clip, looked at. Raises BadClip naming the clip and the field."""
     where = f"clip {ref.clip_id} ({ref.dataset} {ref.log_id} at {ref.start_ms / 1000:g} s)"
-    with failing_as(where):
+    with failures_as_bad_clip(where):
         clip = reader.read(ref)
     if not isinstance(clip, Clip):
         raise BadClip(where, "read", f"gave a {type(clip).__name__}, expected a tasks.world.clip.Clip")

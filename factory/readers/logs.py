@@ -37,8 +37,8 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from factory.readers.apart import Apart
-from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, failing_as, split_of, validate_clip
+from factory.readers.apart import OtherProcess
+from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, failures_as_bad_clip, split_of, validate_clip
 from factory.readers.settings import LogClips, WindowSettings, check_traversals
 from tasks.world.arrays import Array, Ints
 from tasks.world.clip import (
@@ -144,7 +144,7 @@ def digest_with(digest: str, others: Sequence[Traversal], digest_of: Callable[[s
     return hashlib.sha256("\x1f".join([digest, *told]).encode()).hexdigest()
 
 
-def joined(block: Block, others: Sequence[OtherDrive]) -> Block:
+def with_other_drives(block: Block, others: Sequence[OtherDrive]) -> Block:
     """The block with what the other drives saw."""
     agents, images, sweeps, cameras = [block.agents], list(block.images), list(block.sweeps), list[Camera]()
     first = [0]
@@ -335,10 +335,10 @@ class LogReader(ABC, Generic[Log]):
         if self.traversals:
             self._driven  # noqa: B018 - found once, before workers get the reader
         importable = type(self).__module__ != "__main__"  # else no other process knows the class
-        elsewhere = Apart(self.windows_of) if self.untrusted and importable else None
+        elsewhere = OtherProcess(self.windows_of) if self.untrusted and importable else None
         for log_id, path in chosen.items():
             try:
-                with failing_as(str(path)):
+                with failures_as_bad_clip(str(path)):
                     found = self.windows_of(path) if elsewhere is None else elsewhere(path, str(path))
             except BadClip as error:
                 broken[ClipRef(self.name, log_id, 0)] = str(error)
@@ -368,7 +368,7 @@ class LogReader(ABC, Generic[Log]):
 
     def read(self, ref: ClipRef) -> Clip:
         """The validated clip. Raises BadClip."""
-        with failing_as(str(self.path_of(ref))):
+        with failures_as_bad_clip(str(self.path_of(ref))):
             return self._read(ref)
 
     def _read(self, ref: ClipRef) -> Clip:
@@ -391,7 +391,7 @@ class LogReader(ABC, Generic[Log]):
             start_s=start * STEP_S,
             ego_states=ego_states,
             world_from_ego=recorded.world_from_ego,
-            agents=present(log.agents.window(start, stop)),
+            agents=only_present(log.agents.window(start, stop)),
             road_map=log.road_map,
             route=log.route,
             centerline=centerline,
@@ -421,10 +421,10 @@ class LogReader(ABC, Generic[Log]):
             log = self._log(replace(ref, log_id=other.log_id))
             start, stop = other.start, min(other.stop, len(log.ego_states))
             seen = self.recorded(log, start, stop)
-            agents = present(log.agents.window(start, stop))
+            agents = only_present(log.agents.window(start, stop))
             if seen.images or seen.sweeps:
                 others.append(OtherDrive(other.log_id, agents, seen.cameras, seen.images, seen.sweeps))
-        return joined(block, others) if others else block
+        return with_other_drives(block, others) if others else block
 
     @cached_property
     def _driven(self) -> dict[str, DrivenPath]:
@@ -432,7 +432,7 @@ class LogReader(ABC, Generic[Log]):
         found, worlds = {}, False
         for log_id, path in self._chosen().items():
             try:
-                with failing_as(str(path)):
+                with failures_as_bad_clip(str(path)):
                     world = self.world(path)
                     worlds = worlds or world is not None
                     drive = None if world is None else self.drive(path)
@@ -485,7 +485,7 @@ def route_of_drive(road_map: RoadMap, poses: Array, file: str, field: str) -> Ro
         raise BadClip(file, field, str(error)) from error
 
 
-def within(files: Sequence[SensorFile], start: int, stop: int) -> tuple[SensorFile, ...]:
+def files_within(files: Sequence[SensorFile], start: int, stop: int) -> tuple[SensorFile, ...]:
     """Those of the steps start..stop-1, half a step around them included, timed since step `start`.
 
     files: timed since the log's first step.
@@ -504,11 +504,11 @@ def block_of_log(
 ) -> Block:
     """The block of steps first..stop-1, as far as the log goes; images, sweeps: of the log, timed since its start."""
     first, stop = steps[0], min(steps[1], len(log.ego_states))
-    sensed = within(images, first, stop), within(sweeps, first, stop)
-    return Block(first * STEP_S, present(log.agents.window(first, stop)), *sensed, ground_m)
+    sensed = files_within(images, first, stop), files_within(sweeps, first, stop)
+    return Block(first * STEP_S, only_present(log.agents.window(first, stop)), *sensed, ground_m)
 
 
-def present(agents: AgentTracks) -> AgentTracks:
+def only_present(agents: AgentTracks) -> AgentTracks:
     """Only the tracks that are present at one of the steps or more."""
     seen = np.flatnonzero(agents.valid.any(axis=0))
     return replace(

@@ -42,7 +42,7 @@ class BadPicture(ValueError):
         self.field = field
 
 
-def header_of(data: bytes | Bytes) -> tuple[str, Size]:
+def read_header(data: bytes | Bytes) -> tuple[str, Size]:
     """JPEG or PNG, and the size that the header declares, whatever it is. Raises BadPicture."""
     view = data.data if isinstance(data, np.ndarray) else memoryview(data)
     if view[:8] == PNG:
@@ -61,14 +61,14 @@ def header_of(data: bytes | Bytes) -> tuple[str, Size]:
 
 def jpeg_size(data: bytes | Bytes) -> Size:
     """Of a JPEG alone, at most MAX_PIXELS. Raises BadPicture."""
-    name, size = header_of(data)
+    name, size = read_header(data)
     if name != "JPEG":
         raise BadPicture(f"a {name}, not a JPEG")
-    refuse_size(size)
+    check_size(size)
     return size
 
 
-def refuse_size(size: Size, wanted: Size | None = None, camera: str = "its camera") -> None:
+def check_size(size: Size, wanted: Size | None = None, camera: str = "its camera") -> None:
     """Raises BadPicture where a picture is not of its camera's size, or has more than MAX_PIXELS."""
     if wanted is not None and size != wanted:
         problem = f"but {camera} takes {_said(wanted)}: restore the picture, or correct the camera's size"
@@ -111,8 +111,8 @@ def without_exif(jpeg: bytes) -> bytes:
 def _decoded(data: bytes | Bytes, flags: int, wanted: Size | None, camera: str) -> Bytes:
     import cv2
 
-    _, size = header_of(data)
-    refuse_size(size, wanted, camera)
+    _, size = read_header(data)
+    check_size(size, wanted, camera)
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
@@ -192,12 +192,12 @@ def video_frames(video: Path, frames: Collection[int], width: int, height: int) 
             if not container.streams.video:
                 raise BadClip(file, "video", "holds no pictures")
             stream = container.streams.video[0]
-            refuse_size((stream.width, stream.height), (width, height))
+            check_size((stream.width, stream.height), (width, height))
             stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}  # whatever the pictures themselves say
             for frame in container.decode(stream):
                 if shown > last:
                     return
-                refuse_size((frame.width, frame.height), (width, height))
+                check_size((frame.width, frame.height), (width, height))
                 if shown in frames:
                     yield shown, np.asarray(frame.to_ndarray(format="rgb24", width=width, height=height), np.uint8)
                 shown += 1

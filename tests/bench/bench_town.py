@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.datasets.av2.reader import AV2Reader
-from factory.datasets.town.draw import Theatre, paint
+from factory.datasets.town.draw import TownRenderer, paint
 from factory.datasets.town.drive import TownDrive
 from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import log_name, plan_log, write_log
@@ -61,13 +61,13 @@ SHOWN = 6  # pictures of each kind
 CLASSES = ("road", "vehicles", "rest")
 
 
-def painter(theatre: Theatre) -> Painter:
+def painter(renderer: TownRenderer) -> Painter:
     """Paints what a photo's camera would see at a time since the log's start."""
 
     def painted(time_s: float, photo: Photo) -> NDArray[np.uint8]:
         height, width = photo.rgb.shape[:2]
         camera = Camera(photo.camera, width, height, photo.intrinsics, np.zeros(5), np.eye(4))
-        return paint(theatre.at(round(10.0 * time_s)), camera, photo.world_from_camera)
+        return paint(renderer.scene_at(round(10.0 * time_s)), camera, photo.world_from_camera)
 
     return painted
 
@@ -149,8 +149,10 @@ def main() -> None:
     views = Truth(
         kept(asset),
         block.agents,
-        painter(Theatre(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)),
-        painter(Theatre(town.scenery, with_moved_vehicles(drive), town.sun_azimuth, town.sun_elevation, town.sky_seed)),
+        painter(TownRenderer(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)),
+        painter(
+            TownRenderer(town.scenery, with_moved_vehicles(drive), town.sun_azimuth, town.sun_elevation, town.sky_seed)
+        ),
         problem.road,
     )
     kinds_of_view = {

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from factory.datasets.av2.reader import AV2Reader
-from factory.datasets.town.draw import Theatre
+from factory.datasets.town.draw import TownRenderer
 from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import log_name, plan_log, write_log
 from factory.stages.assets import without_other_logs
@@ -35,9 +35,9 @@ STEPS_PER_S = 10
 SIDES = {"left": 1.0, "right": -1.0}
 
 
-def _theatre(index: int) -> Theatre:
+def _renderer(index: int) -> TownRenderer:
     town, drive = plan_log(0, index)
-    return Theatre(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)
+    return TownRenderer(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)
 
 
 def _row(name: str, truth: Truth, photos: Sequence[Photo]) -> str:
@@ -65,7 +65,7 @@ def main() -> None:
         if not (root / log_name(0, index)).exists():
             write_log(root / log_name(0, index), *plan_log(0, index), sensors, index)
 
-    painted: Painter = painter(_theatre(log))
+    painted: Painter = painter(_renderer(log))
     for traversals in (0, 1):
         reader = AV2Reader(root, name="synthetic", traversals=traversals)
         refs = reader.index().refs
@@ -94,7 +94,7 @@ def main() -> None:
             seen = block_of(reader.read(theirs))
             drive = load_sensors(replace(seen, sweeps=()), clip.cameras, width, height).photos
             along = [photo for photo in drive if _near(photo, data.photos)]
-            others = Truth(replace(asset, nodes={}), seen.agents, painter(_theatre(other)), painted, problem.road)
+            others = Truth(replace(asset, nodes={}), seen.agents, painter(_renderer(other)), painted, problem.road)
             print(_row("a drive that was not seen", others, along[:: max(1, len(along) // 24)]), flush=True)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.datasets.town.draw import Theatre, paint
+from factory.datasets.town.draw import TownRenderer, paint
 from factory.datasets.town.drive import TownDrive
 from factory.datasets.town.town import log_name, plan_log
 from factory.graph.steps import PreparedClip
@@ -113,9 +113,9 @@ class Painted:
         """What the rig, in the size it has, shows at every `every`-th of the drive's instants."""
         first, town = round(drive.clip.start_s / STEP_S), self.town
         played = _with(self.drive, drive.agents, first)
-        theatre = Theatre(town.scenery, played, town.sun_azimuth, town.sun_elevation, town.sky_seed)
+        renderer = TownRenderer(town.scenery, played, town.sun_azimuth, town.sun_elevation, town.sky_seed)
         for pose, step in list(zip(drive.poses, drive.steps, strict=True))[::every]:
-            scene = theatre.at(first + step)
+            scene = renderer.scene_at(first + step)
             there = vehicles_at(drive.agents, step * STEP_S, pose[:2, 3], VISIBLE_M)
             eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, c.width, c.height) for c in rig]
             views = render(asset, eyes, there, affines=[asset.affine_of(c.name, step * STEP_S) for c in rig])

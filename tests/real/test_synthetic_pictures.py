@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.datasets.town.draw import Theatre, build_rig, paint, world_from_ego
+from factory.datasets.town.draw import TownRenderer, build_rig, paint, world_from_ego
 from factory.datasets.town.town import plan_log
 
 SIZE = (800, 450)
@@ -27,9 +27,9 @@ def test_front_pictures_have_half_the_detail_of_nuscenes_at_least(shared_root: P
     camera = build_rig(("ring_front_center",), *SIZE)[0]
     for index in (0, 2, 3):
         town, drive = plan_log(0, index)
-        theatre = Theatre(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)
+        renderer = TownRenderer(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)
         for step in (20, 90):
-            picture = paint(theatre.at(step), camera, world_from_ego(drive.ego[step]))[..., ::-1]
+            picture = paint(renderer.scene_at(step), camera, world_from_ego(drive.ego[step]))[..., ::-1]
             ours = detail(np.ascontiguousarray(picture))
             assert ours[0] >= 0.5 * gradient
             assert ours[1] >= 0.5 * bytes_per_pixel

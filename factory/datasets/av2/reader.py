@@ -27,8 +27,8 @@ from factory.readers.logs import (
     Recorded,
     WholeLog,
     block_of_log,
+    files_within,
     route_of_drive,
-    within,
 )
 from factory.readers.pickles import id_text
 from factory.readers.points import read_feather
@@ -515,7 +515,7 @@ class AV2Reader(LogReader[AV2Log]):
     def recorded(self, log: AV2Log, start: int, stop: int) -> Recorded:
         """Poses, rig, photos and sweeps of a window, and the block that it is rendered from."""
         poses = world_from_ego_at(log.motion, step_times(start, stop))
-        sensed = within(log.images, start, stop), within(log.sweeps, start, stop)
+        sensed = files_within(log.images, start, stop), files_within(log.sweeps, start, stop)
         block = block_of_log(log, log.images, log.sweeps, self.block_steps(start)) if log.images else None
         return Recorded(poses, log.cameras, *sensed, block)
 

@@ -37,8 +37,17 @@ from factory.datasets.navsim.window import (
     world_from_ego,
 )
 from factory.files import file_digest, matching
-from factory.readers.apart import Apart
-from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, bytes_of, failing_as, split_of, validate_clip
+from factory.readers.apart import OtherProcess
+from factory.readers.base import (
+    SPLITS,
+    BadClip,
+    ClipIndex,
+    ClipRef,
+    bytes_of,
+    failures_as_bad_clip,
+    split_of,
+    validate_clip,
+)
 from factory.readers.logs import (
     CACHED_LOGS,
     STEP_MS,
@@ -46,8 +55,8 @@ from factory.readers.logs import (
     OtherDrive,
     Traversal,
     digest_with,
-    joined,
     traversals,
+    with_other_drives,
 )
 from factory.readers.pickles import check_values, load_plain
 from factory.wording import shown, time_text
@@ -509,7 +518,7 @@ class NavsimReader:
 
     def read(self, ref: ClipRef) -> Clip:
         """The validated clip. Raises BadClip."""
-        with failing_as(str(self._path_of(ref))):
+        with failures_as_bad_clip(str(self._path_of(ref))):
             return self._read(ref)
 
     def _read(self, ref: ClipRef) -> Clip:
@@ -598,10 +607,10 @@ class NavsimReader:
     def _tables(self, logs: Mapping[str, Path]) -> Iterable[tuple[str, FrameTable | BadClip]]:
         """The table of each log, or what is wrong with it; what takes long is told on stderr."""
         began, made, told = time.monotonic(), 0, 0.0
-        made_apart = Apart(partial(make_table, cache_dir=self.cache_dir))
+        made_apart = OtherProcess(partial(make_table, cache_dir=self.cache_dir))
         for i, (log_id, path) in enumerate(logs.items(), start=1):
             try:
-                with failing_as(str(path)):
+                with failures_as_bad_clip(str(path)):
                     table = kept_table(path, self.cache_dir)
                     if table is None:
                         table = made_apart(path, str(path))
@@ -685,7 +694,7 @@ class NavsimReader:
             if blobs.images or blobs.sweeps:
                 cameras = rig_of(frames[len(frames) // 2], blobs.images, opened.log.file)
                 others.append(OtherDrive(other.log_id, stretch_agents(frames), cameras, blobs.images, blobs.sweeps))
-        return joined(block, others) if others else block
+        return with_other_drives(block, others) if others else block
 
     def _block(self, opened: OpenLog, start: int) -> Block:
         """Up to 20 s that begin at a multiple of 10 s of the stretch and hold the window."""

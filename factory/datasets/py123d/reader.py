@@ -47,7 +47,16 @@ from factory.datasets.py123d.map import read_map
 from factory.datasets.scenarionet.tracks import FIT_STEPS, MAX_GAP_S, smooth_drive
 from factory.files import file_digest, matching, matching_below
 from factory.readers.base import SPLITS, BadClip, ClipRef
-from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive, within
+from factory.readers.logs import (
+    STEP_MS,
+    LoggedDrive,
+    LogReader,
+    Recorded,
+    WholeLog,
+    files_within,
+    only_present,
+    route_of_drive,
+)
 from factory.readers.pickles import id_text
 from factory.wording import shown
 from tasks.world.arrays import Array, Indices
@@ -436,7 +445,7 @@ class Py123dReader(LogReader[Py123dLog]):
         end = min(end, log.motion.n_steps)
         agents = present(log.agents.window(first, end))
         block = Block(first * STEP_S, agents, within(log.images, first, end), within(log.sweeps, first, end))
-        sensed = within(log.images, start, stop), within(log.sweeps, start, stop)
+        sensed = files_within(log.images, start, stop), files_within(log.sweeps, start, stop)
         return Recorded(poses, log.cameras, *sensed, block if log.images else None)
 
     def _map_file(self, header: ArrowFile) -> Path:

@@ -121,7 +121,7 @@ def points(feature: Mapping[str, Any], name: str, file: str, field: str) -> Arra
     return array[:, :2]
 
 
-def floats(value: object, file: str, field: str) -> Array:
+def as_floats(value: object, file: str, field: str) -> Array:
     """The value as an array. Raises BadClip where it is none of numbers."""
     try:
         return np.asarray(value, dtype=np.float64)
@@ -181,7 +181,7 @@ def _half_width(feature: Mapping[str, Any], file: str, field: str) -> float:
     """Half of the lane's median width where Waymo's converter measured it to the painted lines, else the default."""
     if "width" not in feature:
         return HALF_WIDTH_M
-    widths = floats(feature["width"], file, f"{field}.width")
+    widths = as_floats(feature["width"], file, f"{field}.width")
     measured = widths[(widths > 1.0) & (widths < 3.0)]  # zeros: no line on that side; more: not this lane's line
     return float(np.median(measured)) if len(measured) else HALF_WIDTH_M
 

@@ -252,7 +252,7 @@ def _pose(
     return pose
 
 
-def in_step(found: Photographs, first: int, n_steps: int) -> int:
+def first_step_with_photos(found: Photographs, first: int, n_steps: int) -> int:
     """The step of `first` .. `first` + 4 from which on instants every 0.5 s lie nearest to photos of all cameras.
 
     Samples show such instants, and windows begin at one.
@@ -305,14 +305,14 @@ def _array(value: object, shape: tuple[int, ...], file: str, field: str) -> Arra
     try:
         array = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise BadClip(file, field, f"is not numbers, expected {_said(shape)} of them") from error
+        raise BadClip(file, field, f"is not numbers, expected {_shape_text(shape)} of them") from error
     if value is None or array.shape != shape:
         found = "missing" if value is None else f"shape {array.shape}"
-        raise BadClip(file, field, f"{found}, expected {_said(shape)} numbers")
+        raise BadClip(file, field, f"{found}, expected {_shape_text(shape)} numbers")
     if not all_within(array):
         raise BadClip(file, field, "holds NaN, infinity or numbers beyond 1e8")
     return array
 
 
-def _said(shape: tuple[int, ...]) -> str:
+def _shape_text(shape: tuple[int, ...]) -> str:
     return " x ".join(map(str, shape))

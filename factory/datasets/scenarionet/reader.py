@@ -19,18 +19,18 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter
 from scipy.signal import savgol_filter
 
-from factory.datasets.scenarionet.map import floats, road_map, traffic_lights
+from factory.datasets.scenarionet.map import as_floats, road_map, traffic_lights
 from factory.datasets.scenarionet.photos import (
     NO_PHOTOGRAPHS,
     Photographs,
-    in_step,
+    first_step_with_photos,
     load_sidecar,
     read_photographs,
     sidecars_of,
 )
 from factory.datasets.scenarionet.settings import ScenarioNetClips
 from factory.files import matching_below
-from factory.readers.apart import Apart
+from factory.readers.apart import OtherProcess
 from factory.readers.base import BadClip, ClipIndex, ClipRef, bytes_of, folder_split, nuscenes_split, waymo_split
 from factory.readers.logs import (
     STEP_MS,
@@ -39,8 +39,8 @@ from factory.readers.logs import (
     Recorded,
     WholeLog,
     block_of_log,
+    files_within,
     route_of_drive,
-    within,
 )
 from factory.readers.pickles import id_text, load_plain
 from factory.wording import shown
@@ -100,8 +100,8 @@ def on_log_clock(xy: Array, heading: Array, valid: Bools) -> tuple[Array, Array,
     if not valid.all():
         return xy, heading, valid
     last = int(np.argmax(jumps(xy))) if jumps(xy).any() else len(xy) - 1  # index of the last message
-    late = _late(xy)
-    times = STEP_S * np.arange(last + 1) + MESSAGE_S * np.concatenate([[0.0], np.cumsum(_lost(late[:last]))])
+    late = _late_seconds(xy)
+    times = STEP_S * np.arange(last + 1) + MESSAGE_S * np.concatenate([[0.0], np.cumsum(_lost_messages(late[:last]))])
     if last < len(xy) - 1:
         ahead = -late[last]
         if not 0.0 <= ahead <= MAX_AHEAD_S:
@@ -114,7 +114,7 @@ def on_log_clock(xy: Array, heading: Array, valid: Bools) -> tuple[Array, Array,
     return moved, np.interp(steps, times, np.unwrap(heading[bus])), told
 
 
-def _late(xy: Array) -> Array:
+def _late_seconds(xy: Array) -> Array:
     """(S - 1,) seconds by which each step took longer than 0.1 s, at the speed of the steps around it; 0 when slow."""
     usual = usual_steps(xy)
     length = np.hypot(*usual.T)
@@ -122,7 +122,7 @@ def _late(xy: Array) -> Array:
     return np.where(length > MIN_SPEED_MPS * STEP_S, STEP_S * excess / np.maximum(length, 1e-9), 0.0)
 
 
-def _lost(late: Array) -> Array:
+def _lost_messages(late: Array) -> Array:
     """(S,) messages lost within each step."""
     count = np.rint(late / MESSAGE_S)
     sure = (count >= 1) & (count <= MAX_LOST) & (np.abs(late - MESSAGE_S * count) < TIMING_NOISE_S)
@@ -209,7 +209,7 @@ def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, fi
         if name not in state:
             raise BadClip(file, f"{field}.{name}", "missing")
     valid = _numbers(state["valid"], (n_frames,), file, f"{field}.valid") > 0.5
-    position = floats(state["position"], file, f"{field}.position")
+    position = as_floats(state["position"], file, f"{field}.position")
     if position.ndim != 2 or position.shape[0] != n_frames or position.shape[1] not in (2, 3):
         raise BadClip(file, f"{field}.position", f"shape {position.shape}, expected ({n_frames}, 3)")
     if position.shape[1] == 2:
@@ -386,7 +386,7 @@ def _least_third_difference(log: Array, weight: Array, smoothing: float) -> Arra
 
 def _numbers(value: object, shape: tuple[int, ...], file: str, field: str) -> Array:
     """An array of the shape given; a trailing axis of one is dropped."""
-    array = floats(value, file, field)
+    array = as_floats(value, file, field)
     if array.ndim == len(shape) + 1 and array.shape[-1] == 1:
         array = array[..., 0]
     if array.shape != shape:
@@ -470,7 +470,7 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
             return drive
         found = self._photographs(path, drive.ego_states)  # told here, once, what would fail each of its clips
         first = int(np.argmax(drive.segment >= 0))
-        return replace(drive, earliest=in_step(found, first, len(drive.segment)))
+        return replace(drive, earliest=first_step_with_photos(found, first, len(drive.segment)))
 
     def load(self, path: Path) -> ScenarioLog:
         """The scenario in this file, with its photos. Raises BadClip."""
@@ -506,7 +506,7 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
         found = log.photographs
         if not found.images:
             return Recorded(poses)
-        sensed = within(found.images, start, stop), within(found.sweeps, start, stop)
+        sensed = files_within(found.images, start, stop), files_within(found.sweeps, start, stop)
         block = block_of_log(log, found.images, found.sweeps, self.block_steps(start), GROUND_M)
         return Recorded(poses, found.cameras, *sensed, block)
 
@@ -545,8 +545,8 @@ def _listed(root: Path) -> list[Path]:
     """
     summary, mapped = root / SUMMARY, root / MAPPING
     try:
-        names = Apart(_names)(summary, str(summary))
-        folders = Apart(_folders)(mapped, str(mapped)) if mapped.is_file() else {}
+        names = OtherProcess(_names)(summary, str(summary))
+        folders = OtherProcess(_folders)(mapped, str(mapped)) if mapped.is_file() else {}
     except BadClip as error:
         raise ValueError(str(error)) from error
     return [root / folders.get(name, "") / name for name in names]

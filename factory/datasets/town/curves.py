@@ -65,7 +65,7 @@ def reverse(poses: Array) -> Array:
     return out
 
 
-def at(poses: Array, query: Array | float) -> Array:
+def poses_at(poses: Array, query: Array | float) -> Array:
     """Poses at arc lengths `query` (scalar or (Q,)), linear in x, y and unwrapped heading."""
     s = arc_lengths(poses)
     return np.stack([np.interp(query, s, column) for column in (*poses[:, :2].T, np.unwrap(poses[:, 2]))], axis=-1)
@@ -77,6 +77,6 @@ def advance(pose: Array, ahead_m: float, left_m: float = 0.0, turn: float = 0.0)
     return np.array([pose[0] + ahead_m * c - left_m * s, pose[1] + ahead_m * s + left_m * c, pose[2] + turn])
 
 
-def beside(poses: Array, s: float, right_m: float, turn: float = 0.0) -> Array:
+def pose_beside(poses: Array, s: float, right_m: float, turn: float = 0.0) -> Array:
     """The pose `right_m` to the right of the curve at arc length `s`, turned by `turn` [rad]."""
-    return advance(at(poses, s), 0.0, -right_m, turn)
+    return advance(poses_at(poses, s), 0.0, -right_m, turn)

@@ -13,7 +13,7 @@ import numpy as np
 from factory.datasets.town import textures as tx
 from factory.datasets.town.drive import TownDrive, TownTrack
 from factory.datasets.town.raster import LitScene, Mesh, Sun, merged, rasterise, shade
-from factory.datasets.town.scenery import Scenery, figure, lamps_lit
+from factory.datasets.town.scenery import Scenery, lamps_lit, track_mesh
 from factory.datasets.town.settings import MOUNTS, check_cameras
 from factory.datasets.town.textures import TREELINE
 from tasks.world.arrays import F32, Array, Bytes, ShortInts
@@ -42,7 +42,7 @@ def sun_over(middle: Array, azimuth: float, elevation: float) -> Sun:
     return Sun(direction, view)
 
 
-class Theatre:
+class TownRenderer:
     """The town around one drive: standing triangles and their shadows once, what moves per instant."""
 
     def __init__(
@@ -58,17 +58,17 @@ class Theatre:
         shadow = np.full((SHADOW_SIZE, SHADOW_SIZE), -1e9, np.float32)
         standing, sun = Mesh(*(field[near] for field in mesh)), sun_over(middle, sun_azimuth, sun_elevation)
         self._standing = LitScene(standing, shadow, sun, scenery.marks, sky_seed)
-        cast(shadow, standing, sun)
+        cast_shadows(shadow, standing, sun)
 
-    def at(self, step: int) -> LitScene:
+    def scene_at(self, step: int) -> LitScene:
         """The scene at a step of the drive."""
         drive = self._drive
-        return self.among(drive.tracks, step, drive.ego[step, :2], float(drive.times_s[step]))
+        return self.scene_among(drive.tracks, step, drive.ego[step, :2], float(drive.times_s[step]))
 
-    def among(self, tracks: Sequence[TownTrack], step: int, around: Array, time_s: float) -> LitScene:
+    def scene_among(self, tracks: Sequence[TownTrack], step: int, around: Array, time_s: float) -> LitScene:
         """The scene with these tracks where they are at a step, those near a place (2,), and the lights of a time."""
         moving = [
-            figure(track, step)
+            track_mesh(track, step)
             for track in tracks
             if np.hypot(*(track.poses[step, :2] - around)) < MOVING_RANGE_M  # false where absent (NaN)
         ]
@@ -76,11 +76,11 @@ class Theatre:
             moving.append(lamps_lit(lamps, self._drive.signals.state(int(group), time_s)))
         actors, standing = merged(moving), self._standing
         shadow = standing.shadow.copy()
-        cast(shadow, actors, standing.sun)
+        cast_shadows(shadow, actors, standing.sun)
         return standing._replace(mesh=merged([standing.mesh, actors]), shadow=shadow)
 
 
-def cast(shadow: F32, mesh: Mesh, sun: Sun) -> None:
+def cast_shadows(shadow: F32, mesh: Mesh, sun: Sun) -> None:
     """Puts the mesh into the sun's depth map."""
     rasterise(mesh, sun.projection, shadow, np.zeros(shadow.shape, np.int32))
 
@@ -167,7 +167,7 @@ class LidarReturns:
     offset_ns: ShortInts  # (P,) of the beam within its turn of 0.1 s
 
 
-def scan(scene: LitScene, world_from_ego: Array, beams: int, azimuths: int) -> LidarReturns:
+def scan_lidar(scene: LitScene, world_from_ego: Array, beams: int, azimuths: int) -> LidarReturns:
     """One sweep of `beams` x `azimuths` shots from the ego at `world_from_ego` (4, 4)."""
     elevation = np.deg2rad(np.linspace(*ELEVATIONS_DEG, beams))
     turn = np.arange(azimuths) * 2 * np.pi / azimuths

@@ -99,7 +99,7 @@ def path_of_lanes(streets: Streets, lane_ids: list[int], style: DrivingStyle, sm
     line = np.vstack(parts)
     s_raw = arc_lengths(line)
     even = np.linspace(0.0, s_raw[-1], int(np.ceil(s_raw[-1])) + 1)
-    xy = curves.at(line, even)[:, :2]
+    xy = curves.poses_at(line, even)[:, :2]
     xy = xy + gaussian_filter1d(xy - _chord(xy), smooth_m / (even[1]), axis=0, mode="nearest") - (xy - _chord(xy))
     poses = curves.resample(xy, float(line[0, 2]))
     s = arc_lengths(poses)
@@ -119,7 +119,7 @@ def _chord(xy: Array) -> Array:
     return xy[0] * (1 - t) + xy[-1] * t
 
 
-def drive(
+def follow_path(
     path: TownPath, start_s: float, speed: float, style: DrivingStyle, others: Array, signals: Signals, times_s: Array
 ) -> tuple[Array, Array]:
     """Arc length (S,) [m] and speed (S,) [m/s] of a driver that sees `others` (S, J, 5): IDM with bounded jerk."""
@@ -237,7 +237,7 @@ SCENARIOS = (  # in turn, log by log; every run of seven holds every kind once
 )
 
 
-def chains(streets: Streets, road: str, forward: bool) -> list[list[int]]:
+def lane_chains(streets: Streets, road: str, forward: bool) -> list[list[int]]:
     """Lane ids of a road's VEHICLE lanes, one list per lane, inner lane first, in driving direction."""
     lanes, line = streets.lanes, next(r.line for r in streets.roads if r.name == road)
     out = []
@@ -252,7 +252,7 @@ def chains(streets: Streets, road: str, forward: bool) -> list[list[int]]:
     return out
 
 
-def way_to(streets: Streets, lane_id: int, road: str) -> list[int] | None:
+def shortest_lane_path(streets: Streets, lane_id: int, road: str) -> list[int] | None:
     """The lanes after `lane_id` on the way with the fewest lanes to `road`; None where there is none."""
     came_from: dict[int, int] = {lane_id: -1}
     queue = deque([lane_id])
@@ -270,7 +270,7 @@ def way_to(streets: Streets, lane_id: int, road: str) -> list[int] | None:
     return way[::-1]
 
 
-def on_at_random(streets: Streets, lane_ids: list[int], rng: np.random.Generator) -> list[int]:
+def extend_at_random(streets: Streets, lane_ids: list[int], rng: np.random.Generator) -> list[int]:
     """The same lanes and up to 14 more, turning at random."""
     out = list(lane_ids)
     while streets.lanes[out[-1]].successors and len(out) < len(lane_ids) + 14:
@@ -283,18 +283,18 @@ def ego_path(
 ) -> tuple[TownPath, float]:
     """The ego's path and its start on it [m]."""
     near = scenario.to_junction_m
-    starts = chains(streets, scenario.road, scenario.forward)
+    starts = lane_chains(streets, scenario.road, scenario.forward)
     for k in rng.permutation(len(starts)):
         chain = starts[k]
-        way = [] if scenario.target is None else way_to(streets, chain[-1], scenario.target)
+        way = [] if scenario.target is None else shortest_lane_path(streets, chain[-1], scenario.target)
         if way is not None:
             length = sum(float(arc_lengths(streets.lanes[lane].center)[-1]) for lane in chain)
             start = float(rng.uniform(25.0, 55.0)) if near is None else length - float(rng.uniform(*near))
-            return path_of_lanes(streets, on_at_random(streets, chain + way, rng), style, EGO_SMOOTH_M), start
+            return path_of_lanes(streets, extend_at_random(streets, chain + way, rng), style, EGO_SMOOTH_M), start
     raise ValueError(f"no way from {scenario.road!r} to {scenario.target!r}")
 
 
-def tracked(rear_axle: Array, speed: Array) -> list[tuple[int, Array]]:
+def track_ego(rear_axle: Array, speed: Array) -> list[tuple[int, Array]]:
     """What the factory's own tracker makes of the ego: (first step, states (41, 11)) for starts every second.
 
     A log is kept only if these, too, are lawful and safe: then its windows score well as human samples. (Comfort is not
@@ -383,9 +383,9 @@ class _PlannedTraffic:
     def driven(self, path: TownPath, start: float, speed: float, style: DrivingStyle) -> tuple[Array, Array]:
         """Arc length and speed (S,) of somebody who sees everybody planned so far, the ego too."""
         seen = np.concatenate([self.boxes, self.egos[0][1][:, None]], axis=1) if self.egos else self.boxes
-        return drive(path, start, speed, style, seen, self.signals, self.times)
+        return follow_path(path, start, speed, style, seen, self.signals, self.times)
 
-    def look(self) -> int:
+    def look_seed(self) -> int:
         """Of the next track."""
         return int(self.rng.integers(1 << 30))
 
@@ -400,7 +400,7 @@ def parked_cars(streets: Streets, rng: np.random.Generator) -> tuple[TownTrack, 
                 if rng.random() < 0.8:
                     size = 4.4 + rng.uniform(-0.4, 0.5), 1.8 + rng.uniform(-0.06, 0.06), rng.uniform(1.42, 1.8)
                     right = road.half_width - 0.18 - size[1] / 2 + rng.uniform(-0.04, 0.04)
-                    pose = curves.beside(line, s, right, rng.uniform(-0.012, 0.012))
+                    pose = curves.pose_beside(line, s, right, rng.uniform(-0.012, 0.012))
                     look = int(rng.integers(1 << 30))
                     cars.append(TownTrack(f"parked-{len(cars):03d}", "REGULAR_VEHICLE", size, pose[None], look))
                 s += rng.uniform(6.0, 7.2)
@@ -429,7 +429,7 @@ def _attempt(
     if start + WARM_STEPS * STEP_S * 9.0 + 60.0 > path.s[-1]:
         return None
     planned = _PlannedTraffic(streets, _signals(path, start, float(times[0]), rng), times, rng)
-    near = curves.at(path.poses, start + 70.0)[:2]
+    near = curves.poses_at(path.poses, start + 70.0)[:2]
     for car in parked:
         if np.hypot(*(car.poses[0, :2] - near)) < 220.0:
             planned.add(replace(car, poses=np.repeat(car.poses, len(times), axis=0)), 0.0)
@@ -440,11 +440,11 @@ def _attempt(
     if v.min() < SLOWEST_MPS or v[WARM_STEPS:].mean() < 4.5 or s[-1] > path.s[-1] - 40.0:
         return None
     wander = 0.07 * np.sin(s / 13.0 + rng.uniform(0, 6.28))
-    rear = curves.offset(curves.at(path.poses, s), wander)
+    rear = curves.offset(curves.poses_at(path.poses, s), wander)
     rear[:, 2] += np.gradient(wander, s)
     boxes = ego_boxes(rear, PACIFICA)
     planned.egos = [(0, boxes, v)]
-    for start_step, states in tracked(rear[WARM_STEPS:], v[WARM_STEPS:]):
+    for start_step, states in track_ego(rear[WARM_STEPS:], v[WARM_STEPS:]):
         planned.egos.append((WARM_STEPS + start_step, ego_boxes(states, PACIFICA), states[:, VX]))
     if not all(is_lawful(streets, path, b, planned.signals, times[a : a + len(b)]) for a, b, _ in planned.egos):
         return None
@@ -470,9 +470,9 @@ def _vehicle(planned: _PlannedTraffic, name: str, path: TownPath, start: float, 
     category, length, width, height, _ = FLEET[fleet]
     length *= float(planned.rng.uniform(0.96, 1.04))
     s, _v = planned.driven(path, start, speed, DrivingStyle(front_m=length / 2, half_width_m=width / 2))
-    poses = curves.at(path.poses, s)
+    poses = curves.poses_at(path.poses, s)
     poses[s > path.s[-1] - 1.0] = np.nan
-    planned.add(TownTrack(name, category, (length, width, height), poses, planned.look()), 0.35)
+    planned.add(TownTrack(name, category, (length, width, height), poses, planned.look_seed()), 0.35)
 
 
 def _lead(planned: _PlannedTraffic, path: TownPath, start: float, speed: float) -> None:
@@ -490,13 +490,13 @@ def _cars(planned: _PlannedTraffic, centre: Array) -> None:
         length = float(arc_lengths(lane.center)[-1])
         at = float(rng.uniform(0.0, 25.0))
         while at < length - 8.0:
-            if np.hypot(*(curves.at(lane.center, at)[:2] - centre)) < SPAWN_RADIUS_M:
+            if np.hypot(*(curves.poses_at(lane.center, at)[:2] - centre)) < SPAWN_RADIUS_M:
                 spawns.append((length - at, lane.lane_id, at))
             at += float(rng.uniform(16.0, 55.0))
     shares = [share for *_, share in FLEET]
     for k, (_to_end, lane_id, at) in enumerate(sorted(spawns)):
         style = DrivingStyle(float(rng.uniform(0.82, 1.02)))
-        path = path_of_lanes(streets, on_at_random(streets, [lane_id], rng), style)
+        path = path_of_lanes(streets, extend_at_random(streets, [lane_id], rng), style)
         narrow = streets.lanes[lane_id].speed_mps < 10.0
         fleet = 0 if narrow else int(rng.choice(len(FLEET), p=shares))
         speed = float(np.interp(at, path.s, path.limit)) * float(rng.uniform(0.5, 0.95))
@@ -511,11 +511,11 @@ def _cyclists(planned: _PlannedTraffic, centre: Array) -> None:
         if rng.random() > 0.45:
             continue
         style = DrivingStyle(float(rng.uniform(3.6, 5.6)) / lane.speed_mps, front_m=0.9, half_width_m=0.3, gap_m=1.0)
-        path = path_of_lanes(streets, on_at_random(streets, [lane.lane_id], rng), style)
+        path = path_of_lanes(streets, extend_at_random(streets, [lane.lane_id], rng), style)
         s, _v = planned.driven(path, float(rng.uniform(0.0, 50.0)), 4.0, style)
-        poses = curves.offset(curves.at(path.poses, s), -0.15)
+        poses = curves.offset(curves.poses_at(path.poses, s), -0.15)
         poses[s > path.s[-1] - 0.5] = np.nan
-        planned.add(TownTrack(f"cyclist-{k:02d}", "BICYCLIST", (1.75, 0.62, 1.72), poses, planned.look()), 0.3)
+        planned.add(TownTrack(f"cyclist-{k:02d}", "BICYCLIST", (1.75, 0.62, 1.72), poses, planned.look_seed()), 0.3)
 
 
 def _walkers(planned: _PlannedTraffic, centre: Array) -> None:
@@ -526,7 +526,7 @@ def _walkers(planned: _PlannedTraffic, centre: Array) -> None:
             poses = _stroll(road, side, times, rng)
             if np.nanmin(np.hypot(*(poses[:, :2] - centre).T)) < 110.0:
                 name = f"pedestrian-{road.name.replace(' ', '-')}-{int(side > 0)}-{k}"
-                planned.add(TownTrack(name, "PEDESTRIAN", size, poses, planned.look()), 0.2)
+                planned.add(TownTrack(name, "PEDESTRIAN", size, poses, planned.look_seed()), 0.2)
     for c, crossing in enumerate(planned.streets.crossings):
         if np.hypot(*(crossing.edge1.mean(0) - centre)) > 110.0:
             continue
@@ -541,7 +541,7 @@ def _walkers(planned: _PlannedTraffic, centre: Array) -> None:
             along = np.clip((times - begin) * speed, -1.2, length + 1.2)  # waits and ends on the pavement
             xy = a + along[:, None] / length * (b - a)
             poses = np.column_stack([xy, np.full(len(xy), np.arctan2(b[1] - a[1], b[0] - a[0]))])
-            planned.add(TownTrack(f"crossing-{c}-{k}", "PEDESTRIAN", size, poses, planned.look()), 0.3)
+            planned.add(TownTrack(f"crossing-{c}-{k}", "PEDESTRIAN", size, poses, planned.look_seed()), 0.3)
 
 
 def _stroll(road: TownRoad, side: float, times: Array, rng: np.random.Generator) -> Array:
@@ -551,6 +551,6 @@ def _stroll(road: TownRoad, side: float, times: Array, rng: np.random.Generator)
         edge = curves.reverse(edge)
     length = arc_lengths(edge)[-1]
     along = float(rng.uniform(6.0, length - 30.0)) + float(rng.uniform(1.0, 1.6)) * (times - times[0])
-    poses = curves.at(edge, np.minimum(along, length))
+    poses = curves.poses_at(edge, np.minimum(along, length))
     poses[along > length - 1.0] = np.nan
     return poses

@@ -169,7 +169,7 @@ def shades(percentages: str) -> Array:
     return np.array([colour.split() for colour in percentages.split(",")], np.float64) / 100
 
 
-class Builder:
+class MeshBuilder:
     """Collects faces. The `surface` of a solid: material, colour and seed, as `triangles` takes them."""
 
     def __init__(self) -> None:

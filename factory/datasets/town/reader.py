@@ -11,19 +11,19 @@ from pathlib import Path
 import numpy as np
 
 from factory.datasets.av2.reader import AV2Reader
-from factory.datasets.town.draw import Theatre, build_rig, paint, world_from_ego
+from factory.datasets.town.draw import TownRenderer, build_rig, paint, world_from_ego
 from factory.datasets.town.drive import TownDrive, TownTrack
 from factory.datasets.town.settings import LOGS_PER_TOWN, TownClips, TownsClips, TownSettings
 from factory.datasets.town.town import (
     Town,
     TownFolder,
     log_name,
-    make_whole,
-    mend,
-    mend_all,
     plan_log,
-    write_all,
+    repair_folder,
+    repair_towns,
+    write_once,
     write_town,
+    write_towns,
 )
 from factory.readers.base import ClipIndex, ClipRef
 from tasks.caches import user_cache
@@ -72,7 +72,7 @@ class TownPainter:
         log = town_log(clip.log_id)
         _, drive = _planned(*log)
         time_s = float(_time_of(drive, clip, np.array([step]))[0])
-        lit = _theatre(*log).among(_tracks(drive, agents), step, state[[X, Y]], time_s)
+        lit = _renderer(*log).scene_among(_tracks(drive, agents), step, state[[X, Y]], time_s)
         pose = world_from_ego(state[: HEADING + 1])
         return pose, [paint(lit, camera, pose) for camera in cameras]
 
@@ -95,10 +95,10 @@ def _planned(seed: int, number: int) -> tuple[Town, TownDrive]:
 
 
 @lru_cache(maxsize=1)
-def _theatre(seed: int, number: int) -> Theatre:
+def _renderer(seed: int, number: int) -> TownRenderer:
     """Hundreds of megabytes, and seconds to build: pictures of one log come one after the other."""
     town, drive = _planned(seed, number)
-    return Theatre(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)
+    return TownRenderer(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)
 
 
 TOWN_VERSION = 3  # raise by hand whenever the same seed gives other bytes
@@ -151,13 +151,13 @@ class SyntheticReader(SensedReader):
 
     def logs(self) -> dict[str, Path]:
         """Log id -> folder; writes the town if it is missing."""
-        make_whole(self.root, self._write)
+        write_once(self.root, self._write)
         return super().logs()
 
     def index(self) -> ClipIndex:
         """The first n_clips windows, in the order of the logs; a town that was damaged is mended."""
         if self.root.is_dir():
-            mend(self.root, self._write)
+            repair_folder(self.root, self._write)
         index = super().index()
         return replace(index, refs=index.refs[: self.n_clips])
 
@@ -210,19 +210,19 @@ class SyntheticTownsReader(SensedReader):
 
     def logs(self) -> dict[str, Path]:
         """Of all towns, in the order of the seeds; writes the towns that are missing."""
-        write_all(self.towns, self.settings)
+        write_towns(self.towns, self.settings)
         return {name: folder for town in self.towns for name, folder in town.logs().items()}
 
     def index(self) -> ClipIndex:
         """All windows of all towns; a town that was damaged is mended."""
-        mend_all(self.towns, self.settings)
+        repair_towns(self.towns, self.settings)
         return super().index()
 
     def path_of(self, ref: ClipRef) -> Path:
         """The folder of the clip's log; writes its town if it is missing. Raises BadClip where there is none."""
         for town in self.towns:
             if ref.log_id in town.logs() and ref.dataset == self.name:
-                write_all([town], self.settings)
+                write_towns([town], self.settings)
                 return town.logs()[ref.log_id]
         return super().path_of(ref)
 

@@ -10,7 +10,7 @@ import shapely
 from factory.datasets.town import curves
 from factory.datasets.town import textures as tx
 from factory.datasets.town.drive import GREEN, RED, YELLOW, TownTrack
-from factory.datasets.town.raster import WHITE, Builder, Mesh, lifted, shades
+from factory.datasets.town.raster import WHITE, Mesh, MeshBuilder, lifted, shades
 from factory.datasets.town.streets import CROSSING_GAP_M, CROSSING_M, PAVEMENT_M, STOP_LINE_M, Streets, TownRoad
 from tasks.world.arrays import Array, Ints
 from tasks.world.road_map import arc_lengths
@@ -26,7 +26,7 @@ CONCRETE, RAILING = (tx.ISLAND_STONE, (0.66, 0.64, 0.6)), (tx.DARK, (0.16, 0.16,
 
 
 def build_houses(
-    b: Builder, streets: Streets, taken: list[shapely.Geometry], rng: np.random.Generator
+    b: MeshBuilder, streets: Streets, taken: list[shapely.Geometry], rng: np.random.Generator
 ) -> list[shapely.Geometry]:
     """Rows of houses along both sides of every street; returns what is taken now."""
     streets_area = shapely.unary_union(taken)
@@ -39,7 +39,7 @@ def build_houses(
             while s < arc_lengths(line)[-1] - 8.0:
                 width, depth = float(rng.uniform(9.0, 19.0)), float(rng.uniform(9.0, 13.0))
                 setback = float(rng.choice([0.0, 0.0, 0.4, 2.5]))
-                front = curves.beside(line, s + width / 2, road.half_width + PAVEMENT_M + 0.15 + setback)
+                front = curves.pose_beside(line, s + width / 2, road.half_width + PAVEMENT_M + 0.15 + setback)
                 plan = ((-width / 2, 0), (width / 2, 0), (width / 2, depth), (-width / 2, depth))
                 corners = np.array([curves.advance(front, x, -y)[:2] for x, y in plan])
                 plot = shapely.Polygon(corners)
@@ -50,7 +50,7 @@ def build_houses(
     return taken + built
 
 
-def _house(b: Builder, corners: Array, height: float, seed: int, rng: np.random.Generator) -> None:
+def _house(b: MeshBuilder, corners: Array, height: float, seed: int, rng: np.random.Generator) -> None:
     """Four walls and a roof; corners (4, 2) start with the front's, from the street's left to right as driven."""
     low, top = lifted(corners, PLAIN_Z), lifted(corners, height)
     for i, j in ((0, 1), (1, 2), (2, 3), (3, 0)):
@@ -85,7 +85,7 @@ def _house(b: Builder, corners: Array, height: float, seed: int, rng: np.random.
                     _balcony(b, corners[1] - along * x, -along, outward, float(z))
 
 
-def _balcony(b: Builder, corner: Array, along: Array, outward: Array, z: float) -> None:
+def _balcony(b: MeshBuilder, corner: Array, along: Array, outward: Array, z: float) -> None:
     """A slab of 2.4 x 1.0 m with a railing."""
     p = [corner, corner + along * 2.4, corner + along * 2.4 + outward, corner + outward]
     b.face([(*q, z) for q in p], *CONCRETE)
@@ -96,7 +96,7 @@ def _balcony(b: Builder, corner: Array, along: Array, outward: Array, z: float) 
             b.post(a + (e - a) * t, z, z + 1.0, 0.012, *RAILING, sides=3)
 
 
-def plant_trees(b: Builder, streets: Streets, taken: list[shapely.Geometry], rng: np.random.Generator) -> None:
+def plant_trees(b: MeshBuilder, streets: Streets, taken: list[shapely.Geometry], rng: np.random.Generator) -> None:
     """Street trees in the pavement, garden trees and hedges between and behind the houses."""
     blocked = shapely.unary_union([g.buffer(1.5) for g in taken])
     shapely.prepare(blocked)
@@ -105,15 +105,15 @@ def plant_trees(b: Builder, streets: Streets, taken: list[shapely.Geometry], rng
             length = arc_lengths(line)[-1]
             for s in np.arange(12.0, length - 4.0, 13.0 if road.name == "narrow street" else 9.5):
                 if rng.random() < 0.62:
-                    at = curves.beside(line, s + float(rng.uniform(-2, 2)), road.half_width + 0.75)
+                    at = curves.pose_beside(line, s + float(rng.uniform(-2, 2)), road.half_width + 0.75)
                     plant_tree(b, at[:2], KERB_M, rng, float(rng.uniform(0.65, 1.0)))
             for s in np.arange(3.0, length, 7.0):
-                at = curves.beside(line, s, road.half_width + PAVEMENT_M + float(rng.uniform(2.5, 24.0)))
+                at = curves.pose_beside(line, s, road.half_width + PAVEMENT_M + float(rng.uniform(2.5, 24.0)))
                 if rng.random() < 0.8 and not blocked.contains(shapely.Point(at[:2])):
                     plant_tree(b, at[:2], PLAIN_Z, rng, float(rng.uniform(0.8, 1.5)))
 
 
-def plant_tree(b: Builder, at: Array, z: float, rng: np.random.Generator, size: float) -> None:
+def plant_tree(b: MeshBuilder, at: Array, z: float, rng: np.random.Generator, size: float) -> None:
     """A trunk and a crown of twigs: cards with leaves cut out, lit as parts of a round crown."""
     trunk = 2.5 * size**0.5 + 0.4
     bark = tx.BARK, (0.33, 0.27, 0.21), int(rng.integers(1 << 16))
@@ -165,7 +165,7 @@ def lamps_lit(lamps: Mesh, state: int) -> Mesh:
 
 def build_scenery(streets: Streets, rng: np.random.Generator) -> Scenery:
     """Everything that does not move; houses and trees by `rng`."""
-    b = Builder()
+    b = MeshBuilder()
     for k, road in enumerate(streets.roads):
         _road(b, road, k)
     for junction in streets.junctions:
@@ -185,7 +185,7 @@ def build_scenery(streets: Streets, rng: np.random.Generator) -> Scenery:
     return Scenery(b.mesh(), _road_marks(streets.roads), lamps, groups)
 
 
-def _fan(b: Builder, middle: list[float], ring: Array, material: int) -> None:
+def _fan(b: MeshBuilder, middle: list[float], ring: Array, material: int) -> None:
     """Triangles from the middle to a ring (N, 3), their coordinates those of the world."""
     fan = np.stack([np.broadcast_to(middle, ring[1:].shape), ring[:-1], ring[1:]], axis=1)
     b.triangles(fan, fan[..., :2], material)
@@ -238,7 +238,7 @@ def _marks_of(road: TownRoad) -> list[list[float]]:
     return rows
 
 
-def _road(b: Builder, road: TownRoad, index: int) -> None:
+def _road(b: MeshBuilder, road: TownRoad, index: int) -> None:
     cuts = _stations(road.line)
     s, h = arc_lengths(road.line)[cuts], road.half_width
     for left, right in itertools.pairwise(np.linspace(h, -h, 5)):
@@ -248,7 +248,7 @@ def _road(b: Builder, road: TownRoad, index: int) -> None:
     _kerb(b, curves.reverse(curves.offset(road.line, h)), PAVEMENT_M)
 
 
-def _kerb(b: Builder, edge: Array, pavement_m: float) -> None:
+def _kerb(b: MeshBuilder, edge: Array, pavement_m: float) -> None:
     """Kerb stone and pavement to the right of `edge`."""
     cuts = _stations(edge)
     line, s = edge[cuts], arc_lengths(edge)[cuts]
@@ -261,7 +261,7 @@ def _kerb(b: Builder, edge: Array, pavement_m: float) -> None:
     b.strip(far, far_low, s, 0.0, 0.2, tx.KERB)
 
 
-def _island(b: Builder, center: Array, radius: float, rng: np.random.Generator) -> None:
+def _island(b: MeshBuilder, center: Array, radius: float, rng: np.random.Generator) -> None:
     angle = np.linspace(0, 2 * np.pi, 41)
     ring = np.column_stack([center + radius * np.column_stack([np.cos(angle), np.sin(angle)]), angle - np.pi / 2])[::-1]
     foot, top = lifted(ring, 0.0), lifted(ring, 0.16)
@@ -276,7 +276,7 @@ def _island(b: Builder, center: Array, radius: float, rng: np.random.Generator) 
     b.post(center, 0.6, 5.0, 0.9, tx.ISLAND_STONE, (0.62, 0.60, 0.56), 3, sides=8, taper=0.5)
 
 
-def _plain(b: Builder, middle: Array, reach: float) -> None:
+def _plain(b: MeshBuilder, middle: Array, reach: float) -> None:
     """The lawn below everything, and a belt of far trees that ends the view."""
     ticks = np.linspace(-reach, reach, 9)
     spans = list(itertools.pairwise(ticks))
@@ -299,20 +299,20 @@ def _reserved(streets: Streets) -> list[shapely.Geometry]:
     return roads + [shapely.Polygon(j.ring).buffer(PAVEMENT_M + 0.6) for j in streets.junctions]
 
 
-def _furniture(b: Builder, streets: Streets, rng: np.random.Generator) -> None:
+def _furniture(b: MeshBuilder, streets: Streets, rng: np.random.Generator) -> None:
     """Street lamps, signs, litter bins, post boxes."""
     for road, side in itertools.product(streets.roads, (0, 1)):
         line = road.both_ways[side]
         end = arc_lengths(line)[-1] - 4.0
         for s in np.arange(10.0 + 15.0 * side, end, 30.0):
-            foot = curves.beside(line, s, road.half_width + 0.45)
+            foot = curves.pose_beside(line, s, road.half_width + 0.45)
             arm = curves.advance(foot, 0.0, 1.9)
             b.post(foot, KERB_M, 7.2, 0.09, *LAMP_POST, taper=0.6)
             b.tube((*foot[:2], 7.1), (*arm[:2], 7.5), 0.05, *LAMP_POST, sides=5)
             b.box((*arm[:2], 7.45), (0.5, 0.5, 0.14), tx.METAL, (0.5, 0.5, 0.5))
         for s in np.arange(22.0, end, 27.0):
             kind = rng.random()
-            at = curves.beside(line, s + float(rng.uniform(-5, 5)), road.half_width + 0.5)
+            at = curves.pose_beside(line, s + float(rng.uniform(-5, 5)), road.half_width + 0.5)
             if kind < 0.5:
                 b.post(at, KERB_M, 2.75, 0.035, tx.METAL, (0.55, 0.55, 0.55), sides=5)
                 facing, seed = _facing(at), int(rng.integers(99))
@@ -329,12 +329,12 @@ def _facing(pose: Array) -> Array:
     return np.array([-np.cos(pose[2]), -np.sin(pose[2]), 0.0])
 
 
-def _signal(b: Builder, pose: Array, width: float) -> Mesh:
+def _signal(b: MeshBuilder, pose: Array, width: float) -> Mesh:
     """A mast with an arm over the approach's lanes; returns its lamps, in thirds red, yellow, green per head."""
     arm_length = width + 1.2
     b.post(pose, KERB_M, 6.1, 0.12, *MAST, sides=7)
     b.tube((*pose[:2], 5.9), (*curves.advance(pose, 0.0, arm_length)[:2], 6.1), 0.07, *MAST)
-    facing, lamps = _facing(pose), Builder()
+    facing, lamps = _facing(pose), MeshBuilder()
     one = np.array([-facing[1], facing[0], 0.0])
     for left, z in ((0.0, 3.0), *((arm_length - 0.7 - 3.4 * k, 5.7) for k in range(max(1, int(width / 3.4))))):
         middle = np.array([*curves.advance(pose, 0.0, left)[:2], z]) + 0.18 * facing
@@ -364,7 +364,7 @@ STRIDE_M = 1.4  # a pedestrian's two steps
 Corners = list[tuple[float, float, float]]
 
 
-def figure(track: TownTrack, step: int) -> Mesh:
+def track_mesh(track: TownTrack, step: int) -> Mesh:
     """The track's mesh at one step, in the world."""
     look = track.look % 64
     if walker := WALKERS.get(track.category):
@@ -396,13 +396,13 @@ def _level(rear: float, front: float, half_width: float, z: float) -> Corners:
     return [(rear, -half_width, z), (front, -half_width, z), (front, half_width, z), (rear, half_width, z)]
 
 
-def _lamps(b: Builder, side: float, w: float, head: tuple[float, ...], tail: tuple[float, ...]) -> None:
+def _lamps(b: MeshBuilder, side: float, w: float, head: tuple[float, ...], tail: tuple[float, ...]) -> None:
     """Lamps: x and z below, x and z above, and from where to where inwards of half the width w."""
     for (x, z, x_high, z_high, inner, outer), light in ((head, HEAD_LIGHT), (tail, TAIL_LIGHT)):
         b.face(_panel((x, z), (x_high, z_high), (side * (w - inner), side * (w - outer))), tx.GLOW, light)
 
 
-def _ground(b: Builder, length: float, width: float, axles: tuple[float, ...], track: float, radius: float) -> None:
+def _ground(b: MeshBuilder, length: float, width: float, axles: tuple[float, ...], track: float, radius: float) -> None:
     """The dark under a vehicle, where no sky reaches, and its wheels."""
     b.face(_level(-0.48 * length, 0.48 * length, 0.48 * width, 0.02), tx.DARK, (0.10, 0.10, 0.10))
     for x, side in itertools.product(axles, SIDES):
@@ -415,7 +415,7 @@ def _ground(b: Builder, length: float, width: float, axles: tuple[float, ...], t
 
 @lru_cache(maxsize=1024)
 def _car(length: float, width: float, height: float, look: int) -> Mesh:
-    b, paint = Builder(), _pick(CAR_PAINT, look)
+    b, paint = MeshBuilder(), _pick(CAR_PAINT, look)
     f, r, w, h = length / 2, -length / 2, width / 2, height
     estate = height > 1.6 or look % 3 == 0
     belt = 0.60 * h
@@ -455,7 +455,7 @@ def _car(length: float, width: float, height: float, look: int) -> Mesh:
 
 @lru_cache(maxsize=1024)
 def _truck(length: float, width: float, height: float, look: int) -> Mesh:
-    b, paint = Builder(), _pick(CAR_PAINT, look)
+    b, paint = MeshBuilder(), _pick(CAR_PAINT, look)
     f, r, w = length / 2, -length / 2, width / 2
     cab = f - 1.9
     b.box(((cab + f) / 2, 0.0, 1.0), (1.9, width * 0.92, 1.1), tx.METAL, paint)
@@ -477,7 +477,7 @@ def _truck(length: float, width: float, height: float, look: int) -> Mesh:
 
 @lru_cache(maxsize=1024)
 def _bus(length: float, width: float, height: float, look: int) -> Mesh:
-    b, paint = Builder(), _pick(BUS_PAINT, look)
+    b, paint = MeshBuilder(), _pick(BUS_PAINT, look)
     f, r, w = length / 2, -length / 2, width / 2
     for (x0, y0), (x1, y1) in itertools.pairwise([(f, w), (r, w), (r, -w), (f, -w), (f, w)]):
         b.face([(x0, y0, 0.3), (x1, y1, 0.3), (x1, y1, height), (x0, y0, height)], tx.BUS_SIDE, paint, look)
@@ -491,7 +491,7 @@ def _bus(length: float, width: float, height: float, look: int) -> Mesh:
 @lru_cache(maxsize=1024)
 def _person(look: int, phase: int) -> Mesh:
     """A walker, 1.75 m; legs and arms swing with `phase` in sixteenths of a stride."""
-    b, shirt, trousers = Builder(), _pick(CLOTHES, look), _pick(CLOTHES, look // 8 + 2)
+    b, shirt, trousers = MeshBuilder(), _pick(CLOTHES, look), _pick(CLOTHES, look // 8 + 2)
     swing = 0.32 * np.sin(2 * np.pi * phase / 16)
     for side, s in ((-1.0, swing), (1.0, -swing)):
         y = side * 0.10
@@ -503,7 +503,7 @@ def _person(look: int, phase: int) -> Mesh:
     return b.mesh()
 
 
-def _head(b: Builder, x: float, look: int) -> None:
+def _head(b: MeshBuilder, x: float, look: int) -> None:
     b.post((x, 0.0), 1.60 - 0.14, 1.60 + 0.02, 0.085, tx.CLOTH, _pick(SKIN, look), look, sides=8, taper=1.15)
     b.post((x, 0.0), 1.60 + 0.02, 1.60 + 0.14, 0.10, tx.CLOTH, _pick(HAIR, look // 4), look, sides=8, taper=0.45)
 
@@ -511,7 +511,7 @@ def _head(b: Builder, x: float, look: int) -> None:
 @lru_cache(maxsize=1024)
 def _cyclist(look: int, phase: int) -> Mesh:
     """A rider on a bicycle; pedals turn with `phase`."""
-    b, shirt, trousers = Builder(), _pick(CLOTHES, look), _pick(CLOTHES, look // 8 + 2)
+    b, shirt, trousers = MeshBuilder(), _pick(CLOTHES, look), _pick(CLOTHES, look // 8 + 2)
     for x in (-0.52, 0.52):
         b.disc((x, 0.0, 0.345), (0.0, 1.0, 0.0), 0.345, tx.SPOKES, (0.08, 0.08, 0.08), sides=14)
     for x, z, x_high, z_high in (

@@ -120,7 +120,7 @@ class _Arm:
     outgoing: list[int]
 
 
-class _Builder:
+class _NetworkBuilder:
     def __init__(self) -> None:
         self.lanes: dict[int, TownLane] = {}
         self.roads: list[TownRoad] = []
@@ -249,7 +249,7 @@ EAST_WEST, NORTH_SOUTH = 0, 1  # signal groups
 
 def build_streets(rng: np.random.Generator) -> Streets:
     """The town's network; `rng` chooses lengths, bends, angles, and where on the map it lies."""
-    b = _Builder()
+    b = _NetworkBuilder()
     north_up = float(rng.uniform(-np.pi, np.pi))
     origin = np.array([*rng.uniform(1500.0, 4500.0, 2), north_up])
 
@@ -280,7 +280,7 @@ def build_streets(rng: np.random.Generator) -> Streets:
     return Streets(tuple(b.roads), tuple(b.junctions), b.lanes, tuple(b.areas), tuple(b.crossings), tuple(b.posts))
 
 
-def _crossroads(b: _Builder, arms: list[_Arm]) -> None:
+def _crossroads(b: _NetworkBuilder, arms: list[_Arm]) -> None:
     """Signalised; arms in the order east, north, west, south."""
     junction = b.mouth("crossroads", arms)
     b.areas.append(_ring(shapely.Polygon(junction.ring).buffer(0.4)))
@@ -302,7 +302,7 @@ def _crossroads(b: _Builder, arms: list[_Arm]) -> None:
         b.crossings.append(Crossing(edges[0], edges[1], group))
 
 
-def _y_branch(b: _Builder, stem: _Arm, rng: np.random.Generator) -> None:
+def _y_branch(b: _NetworkBuilder, stem: _Arm, rng: np.random.Generator) -> None:
     """The avenue's inner lane goes to the left branch, the outer one to the right branch."""
     inward = curves.advance(stem.pose, 0.0, turn=np.pi)
     branches = []
@@ -321,7 +321,7 @@ def _y_branch(b: _Builder, stem: _Arm, rng: np.random.Generator) -> None:
     b.connect(right.incoming[0], stem.outgoing[0], 11.0)
 
 
-def _roundabout(b: _Builder, stem: _Arm, rng: np.random.Generator) -> None:
+def _roundabout(b: _NetworkBuilder, stem: _Arm, rng: np.random.Generator) -> None:
     """Four arms around a single-lane ring, driven counter-clockwise; arcs between the arms are ordinary lanes."""
     inward = curves.advance(stem.pose, 0.0, turn=np.pi)
     center = curves.advance(inward, ROUNDABOUT_REACH_M)

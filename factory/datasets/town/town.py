@@ -27,7 +27,15 @@ import shapely
 from scipy.spatial.transform import Rotation
 
 from factory.datasets.av2.reader import POSE_COLUMNS, SIZE_COLUMNS
-from factory.datasets.town.draw import MOUNT_M, REAR_AXLE_Z_M, Theatre, build_rig, paint, scan, world_from_ego
+from factory.datasets.town.draw import (
+    MOUNT_M,
+    REAR_AXLE_Z_M,
+    TownRenderer,
+    build_rig,
+    paint,
+    scan_lidar,
+    world_from_ego,
+)
 from factory.datasets.town.drive import GREEN, RED, SCENARIOS, YELLOW, TownDrive, TownTrack, parked_cars, plan_drive
 from factory.datasets.town.scenery import Scenery, build_scenery
 from factory.datasets.town.settings import LOG_STEPS, LOGS_PER_TOWN, STEPS_PER_SWEEP, TownSettings
@@ -50,10 +58,10 @@ SUMS = "checksums.json"
 Write = Callable[[Path], object]  # fills an empty folder
 
 
-def make_whole(root: Path, write: Write) -> None:
+def write_once(root: Path, write: Write) -> None:
     """The folder `root` with what `write` writes into it, unless it is there: whole or not at all."""
     if not root.is_dir():
-        finish_whole(unfinished_folder(root), root, write)
+        fill_and_place(unfinished_folder(root), root, write)
 
 
 def unfinished_folder(root: Path) -> Path:
@@ -63,11 +71,11 @@ def unfinished_folder(root: Path) -> Path:
     return Path(tempfile.mkdtemp(prefix=f".{root.name}-", dir=root.parent))
 
 
-def finish_whole(unfinished: Path, root: Path, write: Write) -> None:
+def fill_and_place(unfinished: Path, root: Path, write: Write) -> None:
     """Has `unfinished` written and renames it to `root`; it is gone afterwards, whatever happened."""
     try:
         _fill(unfinished, write, root.name)
-        _put(unfinished, root)
+        _place(unfinished, root)
     except OSError as error:
         error.filename = error.filename or str(root)  # Arrow and a flush name none
         raise
@@ -75,12 +83,12 @@ def finish_whole(unfinished: Path, root: Path, write: Write) -> None:
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def mend(root: Path, write: Write) -> None:
+def repair_folder(root: Path, write: Write) -> None:
     """Holds a folder that is there against its checksums; where it is damaged it is made again and takes its place.
 
     One line in the log says what was wrong.
     """
-    if not (wrong := _wrong(root)):
+    if not (wrong := _find_damage(root)):
         return
     log.warning("%s is damaged (%s); it is made again", root, wrong)
     anew, old = unfinished_folder(root), unfinished_folder(root)
@@ -88,13 +96,13 @@ def mend(root: Path, write: Write) -> None:
         _fill(anew, write, root.name)
         with suppress(FileNotFoundError):  # another worker is about to put the same there
             os.rename(root.resolve(), old / root.name)
-        _put(anew, root)
+        _place(anew, root)
     finally:
         for folder in (anew, old):
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _put(unfinished: Path, root: Path) -> None:
+def _place(unfinished: Path, root: Path) -> None:
     try:
         os.rename(unfinished, root.resolve())
     except OSError:
@@ -108,7 +116,7 @@ def _fill(folder: Path, write: Write, named: str) -> None:
     (folder / SUMS).write_text(sealed_json({"folder": named, "files": sums}))
 
 
-def _wrong(root: Path) -> str:
+def _find_damage(root: Path) -> str:
     """The first file that is not as it was written, and why; empty: all are."""
     try:
         told = unsealed_json((root / SUMS).read_bytes())
@@ -266,20 +274,20 @@ def _sensors(
     kinds = [f"cameras/{camera.name}" for camera in rig] + ["lidar"] * bool(settings.lidar_beams)
     if not kinds:
         return
-    theatre = Theatre(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)
+    renderer = TownRenderer(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)
     for kind in kinds:
         (folder / "sensors" / kind).mkdir(parents=True, exist_ok=True)
     photographed = range(0, settings.photo_steps if rig else 0, settings.steps_per_photo)
     swept = range(0, LOG_STEPS if settings.lidar_beams else 0, STEPS_PER_SWEEP)
 
     def record(step: int) -> None:
-        scene, pose, stamp = theatre.at(step), world_from_ego(drive.ego[step]), int(stamps[step])
+        scene, pose, stamp = renderer.scene_at(step), world_from_ego(drive.ego[step]), int(stamps[step])
         for camera in rig if step in photographed else ():
             picture = cv2.cvtColor(paint(scene, camera, pose), cv2.COLOR_RGB2BGR)
             _ok, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality])
             (folder / "sensors" / "cameras" / camera.name / f"{stamp}.jpg").write_bytes(jpeg.tobytes())
         if step in swept:
-            sweep = scan(scene, pose, settings.lidar_beams, settings.lidar_azimuths)
+            sweep = scan_lidar(scene, pose, settings.lidar_beams, settings.lidar_azimuths)
             columns = {axis: pa.array(sweep.points[:, k]) for k, axis in enumerate("xyz")}
             columns |= {name: pa.array(getattr(sweep, name)) for name in ("intensity", "laser_number", "offset_ns")}
             _feather(folder / "sensors" / "lidar" / f"{stamp}.feather", columns)
@@ -433,19 +441,19 @@ class TownFolder:
         return {name: self.root / name for name in (log_name(self.seed, index) for index in self.indices)}
 
 
-def write_one(town: TownFolder, settings: TownSettings) -> None:
+def write_town_folder(town: TownFolder, settings: TownSettings) -> None:
     """Writes the town whole, unless it is there."""
-    make_whole(town.root, lambda folder: write_logs(folder, town.indices, town.seed, settings))
+    write_once(town.root, lambda folder: write_logs(folder, town.indices, town.seed, settings))
 
 
-def mend_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
+def repair_towns(towns: Sequence[TownFolder], settings: TownSettings) -> None:
     """Makes the files of those that are there and damaged again."""
     for town in towns:
         if town.root.is_dir():
-            mend(town.root, partial(write_logs, indices=town.indices, seed=town.seed, settings=settings))
+            repair_folder(town.root, partial(write_logs, indices=town.indices, seed=town.seed, settings=settings))
 
 
-def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
+def write_towns(towns: Sequence[TownFolder], settings: TownSettings) -> None:
     """Writes the towns that are missing, as many at once as there are cores; how far it is goes to stderr.
 
     Raises what a process was refused a file with, a full disk say, as if the town had been written here; RuntimeError
@@ -465,7 +473,7 @@ def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
 
     if at_once <= 1:
         for town in missing:
-            write_one(town, settings)
+            write_town_folder(town, settings)
             show(town)
         return
     waiting, painting, begun = deque(missing), dict[subprocess.Popen[bytes], TownFolder](), list[Path]()
@@ -476,10 +484,10 @@ def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
                 town = waiting.popleft()
                 begun.append(unfinished_folder(town.root))
                 with terminal_signals_blocked():
-                    painting[_painter(town, begun[-1], settings, lifeline)] = town
+                    painting[_start_painter(town, begun[-1], settings, lifeline)] = town
             for child in [child for child in painting if child.poll() is not None]:
                 town = painting.pop(child)
-                if refused := _refused(child):
+                if refused := _refusal_of(child):
                     raise refused
                 if child.returncode != 0:
                     ended = f"its process ended with exit {child.returncode} and said above why"
@@ -499,13 +507,15 @@ def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
             shutil.rmtree(folder, ignore_errors=True)  # where its town is whole, it is gone
 
 
-def _painter(town: TownFolder, unfinished: Path, settings: TownSettings, lifeline: int) -> "subprocess.Popen[bytes]":
+def _start_painter(
+    town: TownFolder, unfinished: Path, settings: TownSettings, lifeline: int
+) -> "subprocess.Popen[bytes]":
     told = {"seed": town.seed, "indices": town.indices, "root": str(town.root), "settings": asdict(settings)}
     command = [sys.executable, "-m", __name__, json.dumps(told | {"unfinished": str(unfinished)})]
     return subprocess.Popen(command, stdin=lifeline, stdout=subprocess.PIPE)  # noqa: S603 - a list, no shell
 
 
-def _refused(ended: "subprocess.Popen[bytes]") -> OSError | None:
+def _refusal_of(ended: "subprocess.Popen[bytes]") -> OSError | None:
     """What a painter that ended was refused, as it told."""
     told, _ = ended.communicate()
     return OSError(*json.loads(told)) if told else None
@@ -519,7 +529,7 @@ def main(told: str) -> None:
     arguments = town["indices"], town["seed"], TownSettings(**town["settings"])
     unfinished, root = Path(town["unfinished"]), Path(town["root"])
     try:
-        finish_whole(unfinished, root, lambda folder: write_logs(folder, *arguments, threads=1))
+        fill_and_place(unfinished, root, lambda folder: write_logs(folder, *arguments, threads=1))
     except OSError as error:
         if error.errno is None:
             raise

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from factory.readers.pictures import header_of
+from factory.readers.pictures import read_header
 from factory.store.location import open_parquet, with_partition_columns
 from factory.store.reader import decode_stored_image, find_row_group
 from factory.store.samples import Kind, Store
@@ -348,6 +348,7 @@ def _jpeg(image: Mapping[str, Any], small: bool) -> bytes:
         return bytes(image["jpeg"])
     try:
         pixels = decode_stored_image(image) if header_of(image["jpeg"])[1][0] > WIDE_PX else None
+        pixels = decoded(image) if read_header(image["jpeg"])[1][0] > WIDE_PX else None
     except ValueError as error:
         raise NotThere(str(error)) from error
     if pixels is None:

@@ -14,7 +14,7 @@ import pytest
 from factory.__main__ import main as factory
 from factory.config.run import load_config
 from factory.datasets.navsim.reader import NavsimReader
-from factory.datasets.town.town import SUMS, make_whole, mend
+from factory.datasets.town.town import SUMS, repair_folder, write_once
 from factory.exits import COMPLETE
 from factory.files import folders_in, matching_below
 from factory.readers.base import BadClip, ClipRef
@@ -162,14 +162,14 @@ def test_a_whole_folder_is_made_and_mended_behind_a_link_to_another_disk(tmp_pat
         assert os.stat(other_disk).st_dev != tmp_path.stat().st_dev, "a file cannot be renamed from one to the other"
         root = tmp_path / "root"
         root.symlink_to(Path(other_disk) / "root")
-        make_whole(root, write)
+        write_once(root, write)
         for name in ("a/x", "y"):
             (root / name).write_text("damaged")
         shutil.move(root / "a", tmp_path / "a")
         (root / "a").symlink_to(tmp_path / "a")
         (tmp_path / "of_another" / "z").mkdir(parents=True)
         (root / "stray").symlink_to(tmp_path / "of_another")
-        mend(root, write)
+        repair_folder(root, write)
         assert (tmp_path / "of_another" / "z").is_dir() and not (root / "stray").exists()
         assert [(root / name).read_text() for name in ("a/x", "y")] == [f"{n} as it was written" for n in ("a/x", "y")]
         assert {path.relative_to(root).as_posix() for path in root.rglob("*")} == {"a", "a/x", SUMS, "y"}

@@ -9,7 +9,7 @@ import pytest
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import log_name, plan_log, write_log
-from factory.readers.logs import DrivenPath, OtherDrive, Traversal, joined, path_of, traversals
+from factory.readers.logs import DrivenPath, OtherDrive, Traversal, path_of, traversals, with_other_drives
 from factory.readers.settings import LogClips
 from factory.stages.assets import block_id, load_or_build_scene
 from factory.stages.sensors import block_cameras, block_of, choose_cameras, load_photos
@@ -94,7 +94,7 @@ def test_drives_lie_one_after_the_other_on_the_clock_of_the_block_and_keep_their
         OtherDrive("a", tracks("car", 20, 2.0), (camera,), (photo(0.0), photo(1.9)), (photo(1.0),)),
         OtherDrive("b", tracks("van", 30, 3.0), (camera,), (photo(2.9),), ()),
     ]
-    block = joined(mine, others)
+    block = with_other_drives(mine, others)
     apart = round(DRIVES_APART_S / STEP_S)
     starts = [0, 50 + apart, 50 + apart + 20 + apart]
     assert [(f.sensor, round(f.time_s, 3)) for f in block.images] == [

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from factory.datasets.town.settings import TownSettings
-from factory.datasets.town.town import TownFolder, write_all, write_one
+from factory.datasets.town.town import TownFolder, write_town_folder, write_towns
 
 SMALL = TownSettings(cameras=("ring_front_center",), width=32, height=18, lidar_beams=0)
 PATIENCE_S = 60.0
@@ -31,16 +31,16 @@ def test_towns_painted_side_by_side_have_the_bytes_of_one_painted_here(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     towns, here = towns_in(tmp_path / "beside"), towns_in(tmp_path / "here")[1]
-    write_all(towns, SMALL)
+    write_towns(towns, SMALL)
     assert "town 2 of 2" in capfd.readouterr().err
-    write_one(here, SMALL)
+    write_town_folder(here, SMALL)
     capfd.readouterr()
     files = [path.relative_to(here.root) for path in sorted(here.root.rglob("*")) if path.is_file()]
     assert sum(path.suffix == ".jpg" for path in files) == 24
     for path in files:
         assert (here.root / path).read_bytes() == (towns[1].root / path).read_bytes()
     assert sorted(path.name for path in (tmp_path / "beside").iterdir()) == ["town-5", "town-6"]
-    write_all(towns, SMALL)
+    write_towns(towns, SMALL)
     assert not capfd.readouterr().err, "what is there is not written again"
 
 
@@ -48,7 +48,7 @@ def test_towns_painted_side_by_side_have_the_bytes_of_one_painted_here(
 def test_a_town_that_cannot_be_written_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "town-5").write_text("no folder")
     with pytest.raises(NotADirectoryError, match=f"{tmp_path}/.*town-5"):
-        write_all(towns_in(tmp_path), SMALL)
+        write_towns(towns_in(tmp_path), SMALL)
     assert "Traceback" not in capfd.readouterr().err
     assert not list(tmp_path.glob(".town-*"))
 
@@ -56,7 +56,7 @@ def test_a_town_that_cannot_be_written_is_named(tmp_path: Path, capfd: pytest.Ca
 @pytest.mark.slow
 def test_a_painter_that_dies_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(RuntimeError, match=r"town [56]: its process ended with exit 1"):
-        write_all([replace(town, indices=("no log",)) for town in towns_in(tmp_path)], SMALL)
+        write_towns([replace(town, indices=("no log",)) for town in towns_in(tmp_path)], SMALL)
     assert "TypeError" in capfd.readouterr().err
     assert not list(tmp_path.iterdir())
 

@@ -10,17 +10,17 @@ from factory.datasets.town.draw import (
     SHADOW_SIZE,
     build_rig,
     camera_view,
-    cast,
+    cast_shadows,
     paint,
     rasterise_view,
-    scan,
+    scan_lidar,
     sun_over,
     world_from_ego,
 )
 from factory.datasets.town.drive import GREEN as GREEN_LIGHT
 from factory.datasets.town.drive import RED as RED_LIGHT
 from factory.datasets.town.drive import YELLOW as YELLOW_LIGHT
-from factory.datasets.town.raster import Builder, LitScene
+from factory.datasets.town.raster import LitScene, MeshBuilder
 from factory.datasets.town.scenery import _signal as signal_mast
 from factory.datasets.town.scenery import lamps_lit
 from factory.datasets.town.settings import CAMERA_NAMES
@@ -31,20 +31,20 @@ RED = (1.0, 0.0, 0.0)
 GREEN = (0.0, 1.0, 0.0)
 
 
-def staged(builder: Builder, shadows: bool = False) -> LitScene:
+def staged(builder: MeshBuilder, shadows: bool = False) -> LitScene:
     mesh = builder.mesh()
     sun = sun_over(np.zeros(2), 0.4, 0.8)
     shadow = np.full((SHADOW_SIZE, SHADOW_SIZE), -1e9, np.float32)
     if shadows:
-        cast(shadow, mesh, sun)
+        cast_shadows(shadow, mesh, sun)
     return LitScene(mesh, shadow, sun, np.zeros((1, 1, 9)), 1)
 
 
-def lamp(builder: Builder, at: tuple[float, float, float], size: float, colour: tuple[float, float, float]) -> None:
+def lamp(builder: MeshBuilder, at: tuple[float, float, float], size: float, colour: tuple[float, float, float]) -> None:
     builder.box(at, (size, size, size), tx.GLOW, colour)
 
 
-def lawn(builder: Builder) -> None:
+def lawn(builder: MeshBuilder) -> None:
     corners = np.array([[[-80, -80], [80, -80], [80, 80], [-80, 80]]], float)
     builder.quads(np.concatenate([corners, np.zeros((1, 4, 1))], axis=-1), corners, tx.GRASS)
 
@@ -54,7 +54,7 @@ def test_a_point_is_drawn_where_the_calibration_projects_it(camera) -> None:  # 
     ego = world_from_ego(np.array([10.0, -4.0, 0.7]))
     in_camera = np.array([1.5, -0.6, 14.0, 1.0])  # right, up, ahead
     world = ego @ camera.ego_from_camera @ in_camera
-    builder = Builder()
+    builder = MeshBuilder()
     lamp(builder, tuple(world[:3]), 0.3, RED)
     picture = paint(staged(builder), camera, ego).astype(int)
     rows, columns = np.nonzero((picture[..., 0] > 150) & (picture[..., 1] < 120))
@@ -66,7 +66,7 @@ def test_a_point_is_drawn_where_the_calibration_projects_it(camera) -> None:  # 
 def test_the_nearer_of_two_things_hides_the_other() -> None:
     ego = world_from_ego(np.zeros(3))
     for first, second in (((20.0, RED), (12.0, GREEN)), ((12.0, GREEN), (20.0, RED))):
-        builder = Builder()
+        builder = MeshBuilder()
         for distance, colour in (first, second):
             lamp(builder, (distance, 0.0, 1.65), 1.0, colour)
         centre = paint(staged(builder), FRONT, ego)[90, 160]
@@ -74,7 +74,7 @@ def test_the_nearer_of_two_things_hides_the_other() -> None:
 
 
 def test_a_surface_that_passes_beside_and_behind_the_camera_is_drawn_to_the_picture_edge() -> None:
-    builder = Builder()
+    builder = MeshBuilder()
     lawn(builder)
     picture = paint(staged(builder), FRONT, world_from_ego(np.zeros(3))).astype(int)
     assert (picture[-1, :, 1] > picture[-1, :, 2]).all()  # lawn below, all along the lower edge
@@ -83,7 +83,7 @@ def test_a_surface_that_passes_beside_and_behind_the_camera_is_drawn_to_the_pict
 
 def test_a_place_has_one_colour_from_wherever_it_is_seen() -> None:
     """Big texture cells of a house front, seen from two places at the same pixel size."""
-    builder = Builder()
+    builder = MeshBuilder()
     builder.face([(30, 40, 0), (30, -40, 0), (30, -40, 12), (30, 40, 12)], tx.FACADE, seed=4)
     scene = staged(builder)
     shifted = 8.0
@@ -96,7 +96,7 @@ def test_a_place_has_one_colour_from_wherever_it_is_seen() -> None:
 
 
 def test_what_stands_in_the_sun_casts_a_shadow() -> None:
-    builder = Builder()
+    builder = MeshBuilder()
     lawn(builder)
     ego = world_from_ego(np.zeros(3))
     bright = paint(staged(builder, shadows=True), FRONT, ego)[120:].astype(float).mean()
@@ -110,7 +110,7 @@ def test_what_stands_in_the_sun_casts_a_shadow() -> None:
 
 
 def test_leaves_leave_gaps() -> None:
-    builder = Builder()
+    builder = MeshBuilder()
     corners = np.array([[(8, 0.85, 0.8), (8, -0.85, 0.8), (8, -0.85, 2.5), (8, 0.85, 2.5)]], float)
     uv = np.array([[(-0.85, -0.85), (0.85, -0.85), (0.85, 0.85), (-0.85, 0.85)]])
     builder.quads(corners, uv, tx.LEAVES, (0.2, 0.4, 0.1), 3)
@@ -122,10 +122,10 @@ def test_leaves_leave_gaps() -> None:
 
 
 def test_the_lidar_measures_the_road_and_a_wall_where_they_are() -> None:
-    builder = Builder()
+    builder = MeshBuilder()
     lawn(builder)
     builder.face([(25, 60, 0), (25, -60, 0), (25, -60, 20), (25, 60, 20)], tx.ISLAND_STONE)
-    sweep = scan(staged(builder), world_from_ego(np.zeros(3)), 24, 360)
+    sweep = scan_lidar(staged(builder), world_from_ego(np.zeros(3)), 24, 360)
     points = sweep.points
     wall = np.abs(points[:, 0] - 25.0) < 1e-3
     ground = np.abs(points[:, 2] + REAR_AXLE_Z_M) < 1e-3
@@ -140,7 +140,7 @@ def test_the_lidar_measures_the_road_and_a_wall_where_they_are() -> None:
 
 @pytest.mark.parametrize(("state", "height"), [(RED_LIGHT, 3.38), (YELLOW_LIGHT, 3.0), (GREEN_LIGHT, 2.62)])
 def test_a_signal_shows_one_lamp_red_above_yellow_above_green(state: int, height: float) -> None:
-    lamps = lamps_lit(signal_mast(Builder(), np.zeros(3), 3.5), state)
+    lamps = lamps_lit(signal_mast(MeshBuilder(), np.zeros(3), 3.5), state)
     bright = lamps.colour.max(axis=1) > 0.5
     heights = lamps.vertices[bright][..., 2].mean(axis=1)
     assert bright.sum() == len(lamps.material) / 3

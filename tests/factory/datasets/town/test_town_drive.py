@@ -16,7 +16,7 @@ from factory.datasets.town.drive import (
     DrivingStyle,
     Signals,
     TownPath,
-    drive,
+    follow_path,
     overlaps,
 )
 from factory.datasets.town.settings import LOG_STEPS, TownSettings
@@ -86,7 +86,7 @@ def test_a_driver_stops_at_a_red_light_before_the_line() -> None:
     path = TownPath(line, s, np.full(len(s), 12.0), ((100.0, 0),), ())
     times = np.arange(0.0, 15.0, 0.1)
     red_for_15_s = Signals(16.0)
-    position, speed = drive(path, 10.0, 12.0, DrivingStyle(), np.zeros((len(times), 0, 5)), red_for_15_s, times)
+    position, speed = follow_path(path, 10.0, 12.0, DrivingStyle(), np.zeros((len(times), 0, 5)), red_for_15_s, times)
     assert speed[-1] < 0.3
     assert 94.0 < position[-1] + DrivingStyle().front_m <= 100.0
 
@@ -97,7 +97,7 @@ def test_a_driver_keeps_its_distance_from_a_standing_car() -> None:
     path = TownPath(line, s, np.full(len(s), 12.0), (), ())
     times = np.arange(0.0, 20.0, 0.1)
     standing = np.broadcast_to([120.0, 0.0, 0.0, 4.0, 2.0], (len(times), 1, 5))
-    position, speed = drive(path, 10.0, 12.0, DrivingStyle(), standing, Signals(0.0), times)
+    position, speed = follow_path(path, 10.0, 12.0, DrivingStyle(), standing, Signals(0.0), times)
     assert speed[-1] < 0.3
     assert 1.0 < 118.0 - (position[-1] + DrivingStyle().front_m) < 5.0
 
