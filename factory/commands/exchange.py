@@ -35,7 +35,6 @@ class ExportRequest:
     round: tuple[str, ...] = ()
     split: tuple[str, ...] = ()
     tag: str = ""
-    layout: Literal["moved", "released"] = "moved"
     resize: bool = False
     missing: Literal["refuse", "black", "none"] = "refuse"
     map_location: str = ""
@@ -82,7 +81,6 @@ def export(request: ExportRequest) -> int:
     `sample` is an ordinal, an id or the beginning of one, `to` a folder (the current one) or, for one sample, a file.
     `navsim` takes all samples, or those of expert=a,b round=0,1 split=train,val, and goes on where it was stopped:
         tag=<word>          behind the experts' names, so that splits of ours stand beside the released ones
-        layout=released     as SimScale's archives unpack; moved (the default): as after its tools/move.sh
         resize=true         pictures of other sizes to 1920x1080, which the released agents take for granted
         missing=black|none  for pictures that a sample has not: a black one, or none; refuse is the default
         map_location=<one>  of NAVSIM's four, for logs whose map has another name

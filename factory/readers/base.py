@@ -12,13 +12,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from factory.wording import one_line, shown
-from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bytes
-from tasks.world.clip import AgentTracks, Camera, Clip
-from tasks.world.road_map import TrafficLights
-from tasks.world.clip import CLIP_STEPS, Clip
-from tasks.world.lanes import Lane, LightState, MapLayer, RoadMap, Route, TrafficLights
-from tasks.world.vehicle import EGO_STATE_SIZE
+from tasks.world.clip import CLIP_STEPS, AgentKind, AgentTracks, Camera, Clip
+from tasks.world.frames import EGO_STATE_SIZE
+from tasks.world.road_map import Lane, LightState, MapLayer, RoadMap, Route, TrafficLights
 
 SPLITS = ("train", "val", "test")
 MAX_FILE_BYTES = 1 << 30  # of a file that is read whole

@@ -37,8 +37,8 @@ from tasks.render.scene.sensed import Photo, shift_pose
 from tasks.render.settings import Backend, FitSettings
 from tasks.world.clip import Pinhole
 from tests.bench.by_kernels import by_kernels
-from tests.bench.stored_scene import Look, affine_between, kept, storage_table
 from tests.bench.kitti import read_drive, steadied
+from tests.bench.stored_scene import Look, affine_between, kept, storage_table
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 FITTED_FRAMES = 12  # of image_03's training frames, for its affine colour and rigid correction

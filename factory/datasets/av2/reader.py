@@ -32,9 +32,9 @@ from factory.readers.logs import (
 )
 from factory.readers.pickles import id_text
 from factory.readers.points import read_feather
-from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools, Indices, Ints
-from tasks.world.clip import STEP_S, Block, Camera, SensorFile
+from tasks.world.clip import MOVING_KINDS, STEP_S, AgentKind, AgentTracks, Camera, SensorFile
+from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, X, Y, wrap_angle
 from tasks.world.road_map import (
     Lane,
     LightState,
@@ -47,9 +47,6 @@ from tasks.world.road_map import (
     roadblocks_of,
     valid_ring,
 )
-from tasks.world.clip import STEP_S
-from tasks.world.frames import wrap_angle
-from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, X, Y
 
 # What moves in an Argoverse 2 sensor log: ego poses and annotated boxes, resampled to steps of 0.1 s.
 #

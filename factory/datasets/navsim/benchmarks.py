@@ -31,7 +31,7 @@ from factory.datasets.navsim.reader import Selection, log_files, scene_frames, t
 from factory.datasets.navsim.window import ego_states, road_around
 from factory.files import matching
 from factory.graph.execute import RunSummary
-from factory.readers.base import BadClip, failing_as
+from factory.readers.base import BadClip, failures_as_bad_clip
 from factory.stages.benchmark import BENCHMARK_FILE, FORMAT
 from factory.stages.imaging import NO_IMAGES
 from factory.store.location import SceneFiles
@@ -128,7 +128,7 @@ class FrameReader:
 
     def _read_group(self, group: SceneGroup) -> dict[tuple[str, int], Row] | BadClip:
         try:
-            with failing_as(f"token {group.now}"):
+            with failures_as_bad_clip(f"token {group.now}"):
                 if group.log is None:
                     raise BadClip(str(self.places.logs), f"token {group.now}", "in no log here")
                 logged = [self._logged(group.log, token, group.clip_id) for token in (group.now, group.before)]

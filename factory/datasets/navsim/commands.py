@@ -64,14 +64,14 @@ def import_one_stage(request: Any, store: Store) -> tuple[RunSummary, str]:
 
     maps = _folder(request.maps)
     assert maps is not None and request.split is not None
-    logs = Path(request.root)
-    return import_navtest(store, read_selection(request.split), logs, _folder(request.sensors), maps)
+    places = NavsimFolders(Path(request.root), _folder(request.sensors), None, maps)
+    return import_navtest(store, read_selection(request.split), places)
 
 
 def export_samples(request: Any, table: KeyedTable, to: Path, trajectories: Array | None, each: Each) -> ExportSummary:
     """All samples that the command asks for, as `factory.datasets.navsim.export.export`."""
     rounds = tuple(int(word) for word in request.round)
-    named = {name: getattr(request, name) for name in ("tag", "layout", "resize", "missing", "map_location")}
+    named = {name: getattr(request, name) for name in ("tag", "resize", "missing", "map_location")}
     return export(table, to, ExportSettings(request.expert, rounds, request.split, **named), trajectories, each)
 
 
@@ -103,7 +103,7 @@ def benchmark_by_name(
     places = _places(name, root, _maps(name, maps, root), selection, pictures)
     out = f"{made.rstrip('/')}/{name}"
     store = Location.parse(out)
-    source = {"benchmark": name, "pictures": pictures, "files": _digest(name, places, listed)}
+    source = {"benchmark": name, "pictures": pictures, "files": _digest(places, listed)}
     kept = store.read(MADE_FROM)
     whole = kept is not None and _is_whole(store)
     if not whole and (unusable := why_unusable(out)):
@@ -122,10 +122,8 @@ def benchmark_by_name(
 
 def _import(name: str, store: Store, selection: Selection, places: NavsimFolders) -> None:
     try:
-        if name == "navhard":
-            summary, told = import_navhard(store, selection, places)
-        else:
-            summary, told = import_navtest(store, selection, places.logs, places.sensors, places.maps)
+        import_to = import_navhard if name == "navhard" else import_navtest
+        summary, told = import_to(store, selection, places)
     except ValueError as error:
         raise ConfigError(f"benchmark={name}: {error}") from error
     print(told)
@@ -151,7 +149,7 @@ def _places(name: str, data: Path, maps: Path, selection: Selection, pictures: b
     for what, folder in needed.items():
         if not folder.is_dir():
             raise ConfigError(f"benchmark={name}: {folder} is missing: {what}")
-    return NavsimFolders(logs, sensors if pictures else None, scenes, maps)
+    return NavsimFolders(logs, sensors if pictures else None, scenes if name == "navhard" else None, maps)
 
 
 def _maps(name: str, given: str | None, data: Path) -> Path:
@@ -181,14 +179,15 @@ def _there(name: str, setting: str, given: str | None, variable: str, what: str)
     return path
 
 
-def _digest(name: str, places: NavsimFolders, split: Path) -> str:
+def _digest(places: NavsimFolders, split: Path) -> str:
     """Of the split's files, and of the names, sizes and times of logs, maps and scenes; pictures are not looked at."""
     found = sha256(split.read_bytes())
     filters = matching(split.parent / "scene_filter", "*.yaml")
     for path in filters:
         found.update(path.read_bytes())
     folders = [(places.logs, "*.pkl"), (places.maps, "*/*/map.gpkg")]
-    folders += [(places.scenes / "synthetic_scene_pickles", "*.pkl")] if name == "navhard" else []
+    if places.scenes is not None:
+        folders.append((places.scenes / "synthetic_scene_pickles", "*.pkl"))
     for folder, pattern in folders:
         for path in matching(folder, pattern):
             stat = path.stat()

@@ -480,7 +480,7 @@ def _reward_files(
             continue
         path = root / split.rewards
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path, 0) as draft:
+        with atomic_file(path, 0) as draft:
             write_rewards(draft, _labelled(table, labelled), before)
         files.append(file_of(root, split.rewards))
         earlier[first["expert"]] = path

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from factory.datasets.navsim.log import Frame
+from factory.datasets.navsim.settings import FRAME_STEPS
 from factory.datasets.navsim.window import (
     FRAMES_BEFORE,
     WINDOW_FRAMES,
@@ -34,9 +35,8 @@ from factory.files import DiskFull
 from factory.graph.driver import SHARD_BYTES
 from factory.graph.execute import RunSummary, write_last_run
 from factory.graph.progress import Counter, RunTotals
-from factory.readers.base import BadClip, failing_as
-from factory.readers.pictures import BadPicture, refuse_size, without_exif
-from factory.readers.settings import FRAME_STEPS
+from factory.readers.base import BadClip, failures_as_bad_clip
+from factory.readers.pictures import BadPicture, check_size, without_exif
 from factory.stages.rows import scene_columns
 from factory.store.location import Shard, write_shard
 from factory.store.samples import IMPORTED, ChangedRun, ErrorKind, Kind, Outcome, Store
@@ -56,8 +56,7 @@ from tasks.world.clip import (
     scene_of_clip,
 )
 from tasks.world.frames import EGO_STATE_SIZE, HEADING, to_local
-from tasks.world.road_map import LightState, RoadMap, Route, TrafficLights
-from tasks.world.lanes import LightState, TrafficLights
+from tasks.world.road_map import LightState, TrafficLights
 
 HISTORY_FRAMES = FRAMES_BEFORE + 1  # now among them
 SCENE_FRAMES = HISTORY_FRAMES + 8  # with the 4 s that are driven
@@ -176,7 +175,7 @@ def _jpeg(path: Path, camera: Camera) -> bytes:
     """A whole file, without Exif. Raises BadClip where it is no JPEG of the camera's size or is cut off."""
     data, size = read_jpeg(path)
     try:
-        refuse_size(size, (camera.width, camera.height), camera.name)
+        check_size(size, (camera.width, camera.height), camera.name)
     except BadPicture as error:
         raise BadClip(str(path), error.field, str(error)) from error
     if b"\xff\xd9" not in data[-64:]:
@@ -300,7 +299,7 @@ class _Batch:
 def _try(batch: _Batch, entry: Entry, stamp: Stamp) -> bool:
     """Whether it failed, as an outcome of its own."""
     try:
-        with failing_as(f"log {entry.log_id}"):
+        with failures_as_bad_clip(f"log {entry.log_id}"):
             row = entry.make()
         batch.add(sample_row_to_table([{**row, **asdict(stamp)}]), (entry.round, entry.expert), str(row["licence"]))
         return False

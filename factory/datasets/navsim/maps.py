@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from factory.files import matching
 from factory.readers.base import BadClip
-from tasks.caches import check, seal, user_cache
+from tasks.caches import Damaged, check, sealed, user_cache
 from tasks.kernels.compiled import write_whole
-from tasks.sealed import Damaged, check, sealed
 from tasks.world.arrays import Array, Ints
 from tasks.world.road_map import Lane, MapLayer, MapPolygon, RoadMap
 from tasks.world.roadblocks import Roadblocks

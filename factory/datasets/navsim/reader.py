@@ -192,7 +192,7 @@ def _filter_name(content: Mapping[str, Any], path: Path) -> str:
 def _mapping(path: Path) -> dict[str, Any]:
     """What a YAML file holds, read as logs are, in another process. Raises ValueError."""
     try:
-        return Apart(_read)(path, str(path))
+        return OtherProcess(_read)(path, str(path))
     except BadClip as error:
         raise ValueError(str(error)) from error
 
@@ -327,7 +327,7 @@ def kept_table(path: Path, cache_dir: Path) -> FrameTable | None:
 def table_at(path: Path) -> FrameTable:
     """The table of the log at `path`; one that was not kept is made in another process. Raises BadClip."""
     cache_dir = user_cache() / "navsim"
-    return kept_table(path, cache_dir) or Apart(partial(make_table, cache_dir=cache_dir))(path, str(path))
+    return kept_table(path, cache_dir) or OtherProcess(partial(make_table, cache_dir=cache_dir))(path, str(path))
 
 
 def make_table(path: Path, cache_dir: Path) -> FrameTable:

@@ -42,7 +42,7 @@ from tasks.reward.label_bytes import VocabularyLabels
 from tasks.stages import HUMAN
 from tasks.subscores import multiplied
 from tasks.world.arrays import Array
-from tasks.world.lanes import RoadMap, Route
+from tasks.world.road_map import RoadMap, Route
 from tasks.world.vocabulary import Vocabulary
 
 # SimScale's rewards of one token as a sample's vocabulary labels.

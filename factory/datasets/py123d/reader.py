@@ -11,7 +11,9 @@ import numpy as np
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
-from factory.datasets.av2.log import (
+from factory.datasets.av2.reader import (
+    BLOCK_STEPS,
+    BLOCK_STRIDE_STEPS,
     EGO_FIT_HALF_WINDOW_S,
     MIN_POSE_SPACING_S,
     ROUNDING_S,
@@ -29,9 +31,6 @@ from factory.datasets.av2.log import (
     tracks_of,
     world_from_ego_at,
     yaw_of,
-from factory.datasets.av2.reader import (
-    BLOCK_STEPS,
-    BLOCK_STRIDE_STEPS,
 )
 from factory.datasets.py123d import Py123dClips
 from factory.datasets.py123d.arrow import (
@@ -44,7 +43,7 @@ from factory.datasets.py123d.arrow import (
     open_file,
 )
 from factory.datasets.py123d.map import read_map
-from factory.datasets.scenarionet.tracks import FIT_STEPS, MAX_GAP_S, smooth_drive
+from factory.datasets.scenarionet.reader import FIT_STEPS, MAX_GAP_S, smooth_drive
 from factory.files import file_digest, matching, matching_below
 from factory.readers.base import SPLITS, BadClip, ClipRef
 from factory.readers.logs import (
@@ -53,14 +52,14 @@ from factory.readers.logs import (
     LogReader,
     Recorded,
     WholeLog,
+    block_of_log,
     files_within,
-    only_present,
     route_of_drive,
 )
 from factory.readers.pickles import id_text
 from factory.wording import shown
 from tasks.world.arrays import Array, Indices
-from tasks.world.clip import STEP_S, AgentKind, Block, Camera, SensorFile
+from tasks.world.clip import STEP_S, AgentKind, Camera, SensorFile
 from tasks.world.frames import EGO_STATE_SIZE
 from tasks.world.road_map import LightState, RoadMap, TrafficLights
 
@@ -441,12 +440,9 @@ class Py123dReader(LogReader[Py123dLog]):
     def recorded(self, log: Py123dLog, start: int, stop: int) -> Recorded:
         """Poses, rig, photos and sweeps of a window, and the block that it is rendered from."""
         poses = world_from_ego_at(log.motion, step_times(start, stop))
-        first, end = self.block_steps(start)
-        end = min(end, log.motion.n_steps)
-        agents = present(log.agents.window(first, end))
-        block = Block(first * STEP_S, agents, within(log.images, first, end), within(log.sweeps, first, end))
         sensed = files_within(log.images, start, stop), files_within(log.sweeps, start, stop)
-        return Recorded(poses, log.cameras, *sensed, block if log.images else None)
+        block = block_of_log(log, log.images, log.sweeps, self.block_steps(start)) if log.images else None
+        return Recorded(poses, log.cameras, *sensed, block)
 
     def _map_file(self, header: ArrowFile) -> Path:
         """The log's map, in its folder or among the maps of its data set. Raises BadClip where it is not there."""

@@ -27,12 +27,10 @@ from factory.datasets.town.town import (
 )
 from factory.readers.base import ClipIndex, ClipRef
 from tasks.caches import user_cache
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bytes
-from tasks.world.camera import Camera
-from tasks.world.clip import STEP_S, Clip
-from tasks.world.lanes import TrafficLights
-from tasks.world.vehicle import HEADING, X, Y
+from tasks.world.clip import STEP_S, AgentTracks, Camera, Clip
+from tasks.world.frames import HEADING, X, Y
+from tasks.world.road_map import TrafficLights
 
 # The synthetic town as its painter shows it, from wherever a simulation has come to: pictures without a scene.
 #

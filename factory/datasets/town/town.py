@@ -43,7 +43,7 @@ from factory.datasets.town.streets import Streets, TownLane, build_streets
 from factory.exits import become_worker, terminal_signals_blocked
 from factory.files import matching_below
 from factory.wording import time_text
-from tasks.sealed import Damaged, sealed_json, unsealed_json
+from tasks.caches import Damaged, sealed_json, unsealed_json
 from tasks.world.arrays import Array, Ints
 from tasks.world.clip import Camera
 

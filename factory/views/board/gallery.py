@@ -347,8 +347,7 @@ def _jpeg(image: Mapping[str, Any], small: bool) -> bytes:
     if not small:
         return bytes(image["jpeg"])
     try:
-        pixels = decode_stored_image(image) if header_of(image["jpeg"])[1][0] > WIDE_PX else None
-        pixels = decoded(image) if read_header(image["jpeg"])[1][0] > WIDE_PX else None
+        pixels = decode_stored_image(image) if read_header(image["jpeg"])[1][0] > WIDE_PX else None
     except ValueError as error:
         raise NotThere(str(error)) from error
     if pixels is None:

@@ -12,8 +12,8 @@ from factory.datasets.navsim.maps import cache_file, kept_tables
 from factory.datasets.navsim.reader import kept_table, make_table
 from factory.datasets.town.reader import SensedReader, SyntheticReader, SyntheticTownsReader
 from factory.datasets.town.settings import TownSettings
-from factory.graph.steps import PrepareReport, cache_key, prepare
 from factory.datasets.town.town import SUMS
+from factory.graph.steps import PrepareReport, cache_key, prepare
 from factory.setup.settings import _table_of
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table, save_vocabulary
 from factory.stages.assets import RIG_SUFFIX, _resumed, _write_rig_file, damaged_blocks, read_rig_file
