@@ -35,7 +35,7 @@ from tasks.perturb import NO_STARTS, Candidate, Perturbation, PerturbSettings, e
 from tasks.render.scene.engine import require_backend
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.render.splatting.gsplat_backend import BackendMissing
-from tasks.reward.labels import Labelling, vocabulary_labels
+from tasks.reward.labels import vocabulary_labels
 from tasks.rollout.simulate import TrafficSettings, refuse_another_policy
 from tasks.stages import FOLLOW_UP_BEFORE, HUMAN_BEFORE, Rejected
 from tasks.subscores import OF_ONE_PLAN
@@ -141,7 +141,7 @@ class FactoryWork:
     traffic: TrafficSettings
     pdm: PdmSettings
     gate: ExpertGate
-    labelling: Labelling | None  # None: samples have no vocabulary labels
+    labels_of: Vocabulary | None  # whose trajectories samples are labelled with; None: they have no vocabulary labels
     render: RenderSettings
     seed: int
     identity: RunIdentity
@@ -266,9 +266,9 @@ class FactoryWork:
         watch, drive = Stopwatch(), drive_of(driven)
         judged = drive.sampled
         labels: dict[str, object] = {}
-        if self.labelling is not None:
+        if self.labels_of is not None:
             with watch.timing("labels"):
-                labelled = vocabulary_labels(self.labelling, judged.scene, judged.prepared, judged.reference)
+                labelled = vocabulary_labels(self.labels_of, judged.scene, judged.prepared, judged.reference)
                 labels = label_columns(labelled)
         row = sample_row(judged.scene.clip, drive.candidate, judged)
         return Columns({**row, **drive.row_overrides, **labels}, watch.seconds)
@@ -312,8 +312,7 @@ class FactoryWork:
                 require_backend(self.render.backend)
             except BackendMissing as error:
                 raise NotReady(str(error)) from error
-        label_traffic = None if self.labelling is None else self.labelling.traffic.mode
-        compile_kernels(parts_of(self._simulates, self.traffic.mode, label_traffic, self.render, self.photos_alone))
+        compile_kernels(parts_of(self._simulates, self.traffic.mode, self.render, self.photos_alone))
 
     @property
     def names(self) -> tuple[str, ...]:

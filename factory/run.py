@@ -64,13 +64,7 @@ def kernel_parts(config: RunConfig) -> list[str]:
     from factory.setup.settings import simulates
     from factory.stages.warm import parts_of
 
-    label_traffic = None if config.reward.labels == "none" else config.reward.traffic
-    return parts_of(simulates(config), config.traffic.mode, label_traffic, config.render, photos_alone(config))
-
-
-def label_time_limits(config: RunConfig) -> dict[str, float]:
-    """Seconds that labelling may take where traffic answers to each trajectory: up to a second each, of 16,384."""
-    return {"label": 6 * 3600.0} if config.reward.traffic == "navsim" and config.reward.labels != "none" else {}
+    return parts_of(simulates(config), config.traffic.mode, config.render, photos_alone(config))
 
 
 def needs_own_process(config: RunConfig) -> bool:

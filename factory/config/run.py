@@ -20,7 +20,6 @@ from tasks.settings import ExpertGate, PdmSettings, PerturbSettings, RecoverySet
 from tasks.stages import FRAMES, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
-LabelTraffic = Literal["replay", "idm", "navsim"]
 RECOVERY = "factory.setup.settings.recovery"
 
 
@@ -46,7 +45,6 @@ class RewardSettings(ExpertGate):
     """What an expert's drive must reach, and the vocabulary labels that stand in every sample."""
 
     labels: Literal["vocabulary", "none"] = "vocabulary"  # of a whole vocabulary, for planners that learn to score
-    traffic: LabelTraffic = "replay"  # of the sample's own judged drive, or that answers to each
     label_vocabulary: str | None = None  # another .npy file (K, 40, 3); null: the run's vocabulary
 
     def __post_init__(self) -> None:

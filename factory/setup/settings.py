@@ -35,7 +35,6 @@ from tasks.render.scene import engine
 from tasks.render.settings import RenderMode
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.render.views import MAP_RIG
-from tasks.reward.labels import Labelling
 from tasks.rollout.simulate import traffic_record
 from tasks.settings import PdmSettings
 from tasks.stages import FRAMES, stage_versions
@@ -116,7 +115,7 @@ def assemble(config: RunConfig) -> Run:
 
     try:  # what takes no clips comes first
         vocabulary = choose_vocabulary(config.vocabulary)
-        labelling = choose_labelling(config, vocabulary)
+        labels_of = choose_labels_of(config, vocabulary)
         traffic_record(config.traffic)  # whether there is its policy
         starts = None if config.perturb.starts is None else load_starts(config.perturb.starts)
         experts = {
@@ -138,10 +137,10 @@ def assemble(config: RunConfig) -> Run:
         traffic=config.traffic,
         pdm=config.pdm,
         gate=config.reward,
-        labelling=labelling,
+        labels_of=labels_of,
         render=config.render,
         seed=config.seed,
-        identity=identity_of(config, vocabulary, labelling, starts),
+        identity=identity_of(config, vocabulary, labels_of, starts),
         cache_dir=cache_folder(config.out),
         photos_alone=photos_alone(config),
         starts={} if starts is None else starts.of_clip,
@@ -177,13 +176,12 @@ def choose_vocabulary(choice: VocabularyChoice) -> Vocabulary:
     return Vocabulary(kinematic_trajectories(choice.k or KINEMATIC_K, seed=0), source="kinematic")
 
 
-def choose_labelling(config: RunConfig, vocabulary: Vocabulary) -> Labelling | None:
+def choose_labels_of(config: RunConfig, vocabulary: Vocabulary) -> Vocabulary | None:
     """What samples are labelled with, None for nothing. Raises ValueError that names a vocabulary file."""
     if config.reward.labels == "none":
         return None
     named = config.reward.label_vocabulary
-    chosen = vocabulary if named is None else load_vocabulary(named)
-    return Labelling(chosen, dataclasses.replace(config.traffic, mode=config.reward.traffic, policy=None))
+    return vocabulary if named is None else load_vocabulary(named)
 
 
 def build_expert(run: RunContext) -> Expert:
@@ -228,7 +226,7 @@ def _must_have(plugged: object, members: Sequence[str], where: str, what: str) -
 
 
 def identity_of(
-    config: RunConfig, vocabulary: Vocabulary, labelling: Labelling | None, starts: Starts | None = None
+    config: RunConfig, vocabulary: Vocabulary, labels_of: Vocabulary | None, starts: Starts | None = None
 ) -> RunIdentity:
     """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it.
 
@@ -251,7 +249,7 @@ def identity_of(
         settings["perturb.starts"] = starts.digest
         digest = hashlib.sha256(canonical_json([digest, starts.digest]).encode()).hexdigest()[:16]
     settings["render.own_body"] = masks_digest(config.render.own_body)
-    settings["reward.label_vocabulary"] = None if labelling is None else labelling.vocabulary.digest
+    settings["reward.label_vocabulary"] = None if labels_of is None else labels_of.digest
     versions = stage_versions()
     early: dict[str, object] = {
         key: value for key, value in settings.items() if not key.startswith(("reward.", "render."))

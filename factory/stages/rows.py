@@ -75,7 +75,7 @@ def label_columns(labels: VocabularyLabels) -> dict[str, object]:
     subscores, progress = encode(labels)
     return {
         "label_vocabulary": labels.vocabulary,
-        "label_traffic": labels.traffic,
+        "label_traffic": "replay",
         "label_reference_progress_m": labels.reference_progress_m,
         "label_subscores": subscores,
         "label_progress": progress,

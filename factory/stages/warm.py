@@ -33,7 +33,7 @@ from tasks.render.scene.stereo import choose_partners, wide_baseline_depth
 from tasks.render.settings import FitSettings, RenderMode, RenderSettings, SceneFrom
 from tasks.render.splatting.sh import turned
 from tasks.reward.epdms import prepare_scene, score
-from tasks.reward.labels import Labelling, hit_after_s, reactive_scores, vocabulary_labels
+from tasks.reward.labels import hit_after_s, vocabulary_labels
 from tasks.rollout.simulate import SeenTraffic, TrafficSettings, prepare_traffic, simulate
 from tasks.settings import PdmSettings
 from tasks.world.arrays import Array
@@ -58,21 +58,16 @@ _one_at_a_time = Lock()
 log = logging.getLogger(__name__)
 
 
-def parts_of(
-    simulates: bool, traffic: str, label_traffic: str | None, render: RenderSettings, photos_alone: bool
-) -> list[str]:
+def parts_of(simulates: bool, traffic: str, render: RenderSettings, photos_alone: bool) -> list[str]:
     """What a run enters.
 
-    simulates: it has another expert than `human`; traffic, label_traffic: the mode of the drives' traffic and of the
-    labels' (None: it makes none). The public traffic, "navsim", has no kernels. photos_alone: clips may have photos and
-    no lidar.
+    simulates: it has another expert than `human`; traffic: the mode of the drives' traffic, of which the public one,
+    "navsim", has no kernels. photos_alone: clips may have photos and no lidar.
     """
     parts = ["judge", "plan"]
     if simulates and traffic == "custom":
         parts.append("policy")
-    if label_traffic in ("idm", "navsim"):  # scored among the answers
-        parts.append("answers")
-    elif simulates and traffic == "idm":
+    if simulates and traffic == "idm":
         parts.append("drive")
     if render.mode is RenderMode.AUTO:
         parts.append("fit" if render.scene is SceneFrom.FIT else "render")
@@ -202,8 +197,7 @@ def _judge() -> None:
     standing = np.tile(scene.ego_state, (2, HORIZON_STEPS + 1, 1))
     score(prepared, standing, normalise="pairs")
     judged = drive_and_judge(scene, Plan(ahead), REPLAY, PdmSettings())
-    labelling = Labelling(Vocabulary(kinematic_trajectories(2, 0)), REPLAY)
-    vocabulary_labels(labelling, scene, judged.prepared, judged.reference)
+    vocabulary_labels(Vocabulary(kinematic_trajectories(2, 0)), scene, judged.prepared, judged.reference)
     hit_after_s(prepare_traffic(scene, REPLAY), judged.prepared, judged.rollout.ego_states)
 
 
@@ -235,14 +229,6 @@ def _policy() -> None:
     """Traffic that a policy of a user's own drives around one ego."""
     scene, ahead = _tiny_scene()
     simulate(scene, ahead, TrafficSettings(mode="custom", policy=f"{__name__}:{_Stands.__name__}"))
-
-
-def _answers() -> None:
-    """The same, and traffic around each of several egos, scored."""
-    _drive()
-    scene, ahead = _tiny_scene()
-    states = simulate(scene, ahead, REPLAY).ego_states
-    reactive_scores(scene, np.stack([states] * 2), TrafficSettings())
 
 
 # Every kernel of the render package, on the smallest scene that reaches all of them.
@@ -316,13 +302,12 @@ PARTS = {
     "judge": _judge,
     "plan": _plan,
     "drive": _drive,
-    "answers": _answers,
     "policy": _policy,
     "render": compile_render_kernels,
     "fit": _fit,
     "rig": compile_rig_kernels,
 }
-INCLUDED = {"judge": ("plan",), "answers": ("drive",), "fit": ("render",)}
+INCLUDED = {"judge": ("plan",), "fit": ("render",)}
 DISK_FULL = 5  # exit code of a part whose files could not be kept
 
 

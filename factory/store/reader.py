@@ -219,7 +219,6 @@ def labels_of(sample: Mapping[str, Any], vocabulary: str | None = None) -> Vocab
             sample["label_subscores"],
             sample["label_progress"],
             vocabulary=digest,
-            traffic=sample["label_traffic"],
             reference_progress_m=sample["label_reference_progress_m"],
         )
     except ValueError as error:

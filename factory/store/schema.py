@@ -402,7 +402,7 @@ def _labels() -> tuple[Column, ...]:
     planes = " ".join((*HALVES, *WHOLES)).upper()
     return (
         Column("label_vocabulary", "string", about="digest of the K trajectories that are labelled", nullable=True),
-        Column("label_traffic", "string", about="replay: the row's own; else it answers to each", nullable=True),
+        Column("label_traffic", "string", about="replay: the row's own", nullable=True),
         Column(
             "label_reference_progress_m",
             "float64",

@@ -26,7 +26,6 @@ from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bools, Indices, Ints
 from tasks.world.clip import AgentKind, AgentTracks, Scene
 from tasks.world.frames import (
-    EGO_STATE_SIZE,
     HALF_LENGTH,
     HALF_WIDTH,
     PACIFICA,
@@ -73,13 +72,9 @@ def path_length_m(poses: Array) -> float:
 def drive_paths(centerline: Array, offsets_m: Sequence[float]) -> DrivePaths:
     """`centerline` (P >= 2, 3) moved sideways by each of the L offsets, to the left where positive; headings stay.
 
-    Raises ValueError where the centerline is no such array, is not finite, or one of the paths has no length.
+    Raises ValueError where one of the paths has no length.
     """
     centerline = np.array(centerline, dtype=np.float64)  # a copy: kernels compile once more for read-only arrays
-    if centerline.ndim != 2 or centerline.shape[1] != 3 or len(centerline) < 2:
-        raise ValueError(f"centerline must be (P >= 2, 3) x, y, heading, got {centerline.shape}")
-    if not np.isfinite(centerline).all():
-        raise ValueError("centerline holds NaN or infinite values; leave such points out")
     paths = _moved_sideways(centerline, np.asarray(offsets_m, dtype=np.float64))
     if paths.progress[:, -1].min() <= MIN_PROGRESS_M:
         raise ValueError("centerline needs a length: all its points are one")
@@ -487,7 +482,7 @@ def proposals(
     """The proposals from `ego_state` (11,) along `centerline` (N, 3) through the forecast traffic.
 
     Each starts at the projection of the rear axle on its path with the ego's longitudinal speed.
-    Raises ValueError where the centerline is misshapen, not finite or without length, or the speed limit not positive.
+    Raises ValueError where the centerline is without length or the speed limit not positive.
     """
     if speed_limit_mps is not None and not 0.0 < speed_limit_mps < math.inf:
         raise ValueError(
@@ -660,10 +655,8 @@ def plan_pdm_closed(
 
     agents: only their first step is looked at; polygons: the map within 100 m; red_lane_ids: connectors that are red
     now, of which the on-route ones matter; speed_limit_mps: of the lane the centerline starts on, None where unknown.
-    Raises ValueError where the ego state, the centerline or a valid agent is misshapen or not finite, the centerline
-    has no length, or the speed limit is not positive.
+    Raises ValueError where the centerline has no length or the speed limit is not positive.
     """
-    _refuse_nonsense(ego_state, agents)
     red, lights = red_connectors(polygons, red_lane_ids & route_lane_ids)
     seen = forecast(ego_state, agents, lights)
     candidates = proposals(ego_state, centerline, seen, speed_limit_mps, settings)
@@ -675,24 +668,11 @@ def plan_pdm_closed(
         polygons=polygons,
         route_lane_ids=route_lane_ids,
         objects=seen.tracks(agents, SCORED_STEPS + 1),
-        red_lanes=red,
+        red_lanes=(red, np.ones((SCORED_STEPS + 1, len(red)), dtype=bool)),
         drop_touching=False,  # the forecast's tracks are without them
     )
     scores = score(prepared, simulated)
     return PdmPlan(candidates, simulated, scores, int(np.argmax(scores.pdm_score)))
-
-
-def _refuse_nonsense(ego_state: Array, agents: AgentTracks) -> None:
-    if np.shape(ego_state) != (EGO_STATE_SIZE,) or not np.isfinite(ego_state).all():
-        raise ValueError(f"ego_state must be ({EGO_STATE_SIZE},) finite numbers, got {np.asarray(ego_state).tolist()}")
-    n = len(agents)
-    shapes = agents.boxes.shape[1:], agents.velocities.shape[1:], agents.valid.shape[1:]
-    if agents.n_steps < 1 or shapes != ((n, 5), (n, 2), (n,)):
-        raise ValueError(f"agents: {n} tracks need boxes (S >= 1, {n}, 5), velocities, valid; got {shapes} per step")
-    known = np.isfinite(agents.boxes[0]).all(axis=1) & np.isfinite(agents.velocities[0]).all(axis=1)
-    if (agents.valid[0] & ~known).any():
-        unknown = agents.track_ids[np.flatnonzero(agents.valid[0] & ~known)[0]]
-        raise ValueError(f"agents: track {unknown} is valid at the first step but its box or velocity is not finite")
 
 
 def plan_for(scene: Scene, settings: PdmSettings = PDM_DEFAULTS) -> PdmPlan:

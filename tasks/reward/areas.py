@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tasks.kernels.compiled import kernel
 from tasks.reward.centerline import CENTER_IN_INTERSECTION, MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, Body
 from tasks.world.arrays import Array, Bools, Bytes, Ints, ShortInts
-from tasks.world.geometry import LARGEST, all_within
+from tasks.world.frames import LARGEST, all_within
 from tasks.world.road_map import MapLayer, MapPolygon
 
 # Map polygons as edges, and what is refused of them.

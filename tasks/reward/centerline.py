@@ -8,10 +8,9 @@ from numba.extending import register_jitable
 
 from tasks.kernels.compiled import kernel
 from tasks.kernels.trig import sincos
-from tasks.world.arrays import Array, Bytes, ShortInts
+from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import HORIZON_STEPS
 from tasks.world.frames import EGO_STATE_SIZE, HEADING, VX, VY, X, Y
-from tasks.world.geometry import LARGEST, all_within
 
 # Bits of an instant's flags (docs/reward.md 2a)
 MULTIPLE_LANES = 1  # corners in more than one lane, and no lane holds all four
@@ -38,19 +37,6 @@ def shaped(name: str, states: Array) -> Array:
     if states.ndim != 3 or states.shape[1:] != (HORIZON_STEPS + 1, EGO_STATE_SIZE) or len(states) == 0:
         raise ValueError(f"{name} must be (K >= 1, {HORIZON_STEPS + 1}, {EGO_STATE_SIZE}), got {states.shape}")
     return states if states.flags.writeable else states.copy()
-
-
-def checked(name: str, states: Array) -> Array:
-    """As `shaped`, and of drives. Raises ValueError."""
-    states = shaped(name, states)
-    if not all_within(states):
-        raise no_drive(name)
-    return states
-
-
-def no_drive(name: str) -> ValueError:
-    """The error that states are refused with."""
-    return ValueError(f"{name} must be finite and at most {LARGEST:g}: leave out what is not a drive")
 
 
 @register_jitable
@@ -80,99 +66,39 @@ def place(states: Array, rear_axle_to_center: float, body: Body) -> None:
 
 # The centreline, indexed once: where along it a point lies, whether points are off it. Both answers are GEOS' to the
 # last bit: the same differences, products and quotients, on the segments that can matter. Which can, circles around
-# chunks of segments say for the place along the line, and a grid of cells for "off it".
+# chunks of segments say.
 
 DEVIATION_M = 0.5  # farther than this is off the centreline
 CHUNK = 8  # segments within one circle
-CELL_M = 1.0
-MAX_CELLS = 1 << 16  # the cells of a longer centreline are larger
-SLACK_M = 1e-6  # circles and cells reach farther by this: far more than rounding
+SLACK_M = 1e-6  # circles reach farther by this: far more than rounding
 SLACK = 1.0 + 1e-9  # and by this factor, for points far away
 
 
 class Centerline(NamedTuple):
-    """S segments in C chunks, and a grid (rows along y, columns along x) around all that is not off them; world frame.
-
-    Few arrays, as compiled calls pay for each.
-    """
+    """S segments in C chunks, world frame. Few arrays, as compiled calls pay for each."""
 
     segments: Array  # (S, 6) [m] start x, y; end x, y; length, 0 where a point repeats; arc length at the start
     circles: Array  # (C, 3) [m] a point of the chunk, x and y, about its middle; radius that holds the chunk
-    grid: Array  # (3,) [m] lower left corner x, y; size of a cell
-    cell_start: ShortInts  # (rows, columns + 1): cell (r, c) has near[cell_start[r, c] : cell_start[r, c + 1]]
-    near: ShortInts  # the segments within DEVIATION_M of any point of the cell
 
 
 def index_centerline(points: Array) -> Centerline:
     """Index the points (P >= 2, >= 2) of a centreline: world x, y [m], then any other columns. Points may repeat.
 
-    Raises ValueError for another shape, a point that is NaN, infinite or absurdly far, and a line without length.
+    Raises ValueError for a line without length.
     """
-    points = np.asarray(points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[0] < 2 or points.shape[1] < 2:
-        raise ValueError(f"centerline must be (P >= 2, >= 2) points, got {points.shape}")
-    xy = points[:, :2]
-    bad = np.nonzero(~(np.abs(xy) <= LARGEST).all(axis=1))[0]
-    if bad.size:
-        raise ValueError(
-            f"centerline must be finite and within {LARGEST:g} m, point {bad[0]} is {xy[bad[0]]}; "
-            "leave out what is not known"
-        )
+    xy = np.asarray(points, dtype=np.float64)[:, :2]
     length = np.sqrt((np.diff(xy, axis=0) ** 2).sum(axis=1))
     if length.sum() == 0.0:
         raise ValueError("centerline must have a length, got 0 m; give it two points that differ")
     start = np.concatenate([[0.0], np.cumsum(length[:-1])])
     segments = np.column_stack([xy[:-1], xy[1:], length, start])
-    grid, shape = _grid(xy)
-    near = np.zeros(0, dtype=np.int32)
-    n_near = np.zeros(shape, dtype=np.int32)
-    _enter_cells(segments, grid, n_near, near)
-    cell_start = np.zeros((shape[0], shape[1] + 1), dtype=np.int32)
-    cell_start[:, 1:] = np.cumsum(n_near).reshape(shape)
-    cell_start[1:, 0] = cell_start[:-1, -1]
-    near = np.empty(cell_start[-1, -1], dtype=np.int32)
-    _enter_cells(segments, grid, cell_start[:, :-1].copy(), near)
-    return Centerline(segments, _circles(xy), grid, cell_start, near)
-
-
-def _circles(xy: Array) -> Array:
     first = np.arange(0, len(xy) - 1, CHUNK)
     n_points = np.minimum(len(xy) - first, CHUNK + 1)
     members = np.minimum(first[:, None] + np.arange(CHUNK + 1), len(xy) - 1)  # a short chunk repeats the line's end
     centers = xy[first + n_points // 2]
     away = xy[members] - centers[:, None]
     radii = np.hypot(away[..., 0], away[..., 1]).max(axis=1)
-    return np.column_stack([centers, radii * SLACK + SLACK_M])
-
-
-def _grid(xy: Array) -> tuple[Array, tuple[int, int]]:
-    """Corner and cell size (3,) of a grid around the points, and its rows and columns."""
-    low = xy.min(axis=0) - 2.0 * DEVIATION_M
-    extent = xy.max(axis=0) + 2.0 * DEVIATION_M - low
-    cell_m = CELL_M
-    while np.prod(extent // cell_m + 1.0) > MAX_CELLS:
-        cell_m *= 2.0
-    columns, rows = extent // cell_m + 1.0
-    return np.array([*low, cell_m]), (int(rows), int(columns))
-
-
-@kernel
-def _enter_cells(segments: Array, grid: Array, cursor: ShortInts, near: ShortInts) -> None:
-    """Where `near` is empty, count into cursor (rows, columns) the segments near each cell; else write them at the
-    cursors, which move on."""
-    cell_m = grid[2]
-    reach = DEVIATION_M + cell_m * math.sqrt(0.5) + SLACK_M  # from a cell's centre
-    for i in range(len(segments)):
-        x0, y0, x1, y1 = segments[i, 0], segments[i, 1], segments[i, 2], segments[i, 3]
-        left, right = int((min(x0, x1) - reach - grid[0]) / cell_m), int((max(x0, x1) + reach - grid[0]) / cell_m)
-        low, high = int((min(y0, y1) - reach - grid[1]) / cell_m), int((max(y0, y1) + reach - grid[1]) / cell_m)
-        for row in range(max(0, low), min(high + 1, cursor.shape[0])):
-            for column in range(max(0, left), min(right + 1, cursor.shape[1])):
-                x, y = grid[0] + (column + 0.5) * cell_m, grid[1] + (row + 0.5) * cell_m
-                if nearest_on_segment(segments, i, x, y)[0] <= reach:
-                    if len(near) > 0:
-                        near[cursor[row, column]] = i
-                    cursor[row, column] += 1
+    return Centerline(segments, np.column_stack([centers, radii * SLACK + SLACK_M]))
 
 
 @kernel
@@ -221,14 +147,13 @@ def progress_m(line: Centerline, x0: float, y0: float, x1: float, y1: float) -> 
 @kernel
 def is_off(line: Centerline, x: float, y: float) -> bool:
     """Whether (x, y) is more than DEVIATION_M from the centreline."""
-    grid, cell_start, near, segments = line.grid, line.cell_start, line.near, line.segments
-    column, row = (x - grid[0]) / grid[2], (y - grid[1]) / grid[2]
-    if not (0.0 <= column < cell_start.shape[1] - 1 and 0.0 <= row < cell_start.shape[0]):
-        return True
-    r, c = int(row), int(column)
-    for k in range(cell_start[r, c], cell_start[r, c + 1]):
-        if nearest_on_segment(segments, near[k], x, y)[0] <= DEVIATION_M:
-            return False
+    circles, segments = line.circles, line.segments
+    for c in range(len(circles)):
+        dx, dy, reach = x - circles[c, 0], y - circles[c, 1], DEVIATION_M + circles[c, 2]
+        if dx * dx + dy * dy <= reach * reach:
+            for i in range(c * CHUNK, min((c + 1) * CHUNK, len(segments))):
+                if nearest_on_segment(segments, i, x, y)[0] <= DEVIATION_M:
+                    return False
     return True
 
 

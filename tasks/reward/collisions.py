@@ -9,13 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tasks.kernels.compiled import inlined, kernel
+from tasks.kernels.compiled import kernel
 from tasks.reward.areas import MapIndex, in_intersection
 from tasks.reward.centerline import OFF_LANE, Body
 from tasks.world.arrays import Array, Bools, ShortInts
 from tasks.world.clip import HORIZON_STEPS
 from tasks.world.frames import HALF_LENGTH, HALF_WIDTH, HEADING, X, Y
-from tasks.world.geometry import LARGEST
 
 # Oriented boxes in the plane, one pair at a time: whether they touch, and where their centroid is.
 
@@ -115,15 +114,12 @@ def obstacles_of(boxes: Array, is_stopped: Bools, collision_score: Array) -> Obs
 
 
 @kernel
-def lay_out(
-    boxes: Array, velocities: Array, valid: Bools, collision_score: Array, ego_box: Array
-) -> tuple[bool, Obstacles]:
-    """The obstacles that tracks of N objects are over their first 41 steps; False where one is not well.
+def lay_out(boxes: Array, velocities: Array, valid: Bools, collision_score: Array, ego_box: Array) -> Obstacles:
+    """The obstacles that tracks of N objects are over their first 41 steps.
 
     boxes (S >= 41, N, 5), velocities (S, N, 2) and valid (S, N) as in AgentTracks; collision_score: (N,). Left out for
-    good is who is never there, and who touches the ego's box (5,) at first (one of NaN: nobody). Not well is who is
-    there with a size below zero or a number that is infinite or above LARGEST; with a NaN in the box it is not there.
-    Whether it stands its velocity at its first appearance says (docs/reward.md 2).
+    good is who is never there, and who touches the ego's box (5,) at first (one of NaN: nobody). Whether one stands its
+    velocity at its first appearance says (docs/reward.md 2).
     """
     first_seen, column, n_kept = np.full(valid.shape[1], -1), np.full(valid.shape[1], -1), 0
     for t in range(N_TIMES - 1, -1, -1):
@@ -134,37 +130,18 @@ def lay_out(
         if first_seen[i] > 0 or (first_seen[i] == 0 and not touching(ego, _box(boxes[0, i]))):
             column[i] = n_kept
             n_kept += 1
-    met, n_wrong = np.full((N_TIMES, n_kept, 5), np.nan), 0
-    for t in range(valid.shape[0]):
+    met = np.full((N_TIMES, n_kept, 5), np.nan)
+    for t in range(N_TIMES):
         for i in range(valid.shape[1]):
-            if valid[t, i] and _is_known(boxes, t, i):
-                n_wrong += not _is_well(boxes, velocities, t, i)
-                if t < N_TIMES and column[i] >= 0:
-                    for c in range(5):
-                        met[t, column[i], c] = boxes[t, i, c]
+            if valid[t, i] and column[i] >= 0:
+                for c in range(5):
+                    met[t, column[i], c] = boxes[t, i, c]
     kept = np.flatnonzero(column >= 0)
     is_stopped, score = np.empty(n_kept, np.bool_), collision_score[kept]
     for k in range(n_kept):
         vx, vy = velocities[first_seen[kept[k]], kept[k]]
         is_stopped[k] = score[k] > 0.0 or np.hypot(vx, vy) <= STOPPED_SPEED_MPS
-    return n_wrong == 0, obstacles_of(met, is_stopped, score)
-
-
-@inlined
-def _is_known(boxes: Array, t: int, i: int) -> bool:
-    """Whether no number of a box is NaN."""
-    return not math.isnan(
-        abs(boxes[t, i, 0]) + abs(boxes[t, i, 1]) + abs(boxes[t, i, 2]) + abs(boxes[t, i, 3]) + abs(boxes[t, i, 4])
-    )
-
-
-@inlined
-def _is_well(boxes: Array, velocities: Array, t: int, i: int) -> bool:
-    """Whether an object's numbers are finite and at most LARGEST, and its sizes not negative."""
-    well = (boxes[t, i, 3] >= 0.0) & (boxes[t, i, 4] >= 0.0)
-    for c in range(5):
-        well &= abs(boxes[t, i, c]) <= LARGEST
-    return well & (abs(velocities[t, i, 0]) <= LARGEST) & (abs(velocities[t, i, 1]) <= LARGEST)
+    return obstacles_of(met, is_stopped, score)
 
 
 @kernel

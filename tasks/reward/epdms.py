@@ -22,7 +22,6 @@ from tasks.reward.centerline import (
     empty_body,
     index_centerline,
     lane_keeping,
-    no_drive,
     place,
     progress_m,
     shaped,
@@ -33,7 +32,6 @@ from tasks.reward.collisions import (
     first_collision,
     first_time_to_collision,
     lay_out,
-    obstacles_of,
     within_reach,
 )
 from tasks.reward.comfort import N_FLAGS, comfort_along, comfort_history, comfort_scratch
@@ -51,13 +49,21 @@ from tasks.subscores import (
 )
 from tasks.world.arrays import Array, Bools, Bytes
 from tasks.world.clip import MOVING_KINDS, AgentKind, AgentTracks, Clip, Scene
-from tasks.world.frames import EGO_STATE_SIZE, HALF_LENGTH, HALF_WIDTH, PACIFICA, REAR_AXLE_TO_CENTER
-from tasks.world.geometry import LARGEST, all_within, ego_boxes
+from tasks.world.frames import (
+    EGO_STATE_SIZE,
+    HALF_LENGTH,
+    HALF_WIDTH,
+    LARGEST,
+    PACIFICA,
+    REAR_AXLE_TO_CENTER,
+)
+from tasks.world.geometry import ego_boxes
 from tasks.world.road_map import LightState, MapLayer, MapPolygon, polygons_near
 
 # Everything the reward asks of a scene, made once and used for any number of ego trajectories (docs/reward.md 2).
 
 PAST_STEPS = (0, 5, 10, 15)  # of the 1.5 s history at 10 Hz: -1.5, -1.0, -0.5, 0 s
+NO_RED: tuple[tuple[str, ...], Bools] = (), np.zeros((N_TIMES, 0), dtype=bool)
 _NOBODY = read_only(np.full(5, np.nan))
 LANE_LAYERS = frozenset({MapLayer.LANE, MapLayer.LANE_CONNECTOR})
 
@@ -99,7 +105,7 @@ def prepare(
     polygons: Sequence[MapPolygon],
     route_lane_ids: frozenset[str],
     objects: AgentTracks,
-    red_lanes: tuple[str, ...] | tuple[tuple[str, ...], Bools] = (),
+    red_lanes: tuple[tuple[str, ...], Bools] = NO_RED,
     ego_state0: Array | None = None,
     drop_touching: bool = True,
 ) -> PreparedScene:
@@ -107,21 +113,14 @@ def prepare(
 
     past_states: (4, 11) ego at -1.5, -1.0, -0.5, 0 s, or None to leave history comfort out; centerline: (P, >= 2) of
     the route ahead; polygons: the map around the ego; objects: tracks of at least 41 steps, row 0 is now; red_lanes:
-    lane connectors that are red at all times, or (ids, (41, L) mask); lanes that are not among `polygons` are out of
+    lane connectors, and when they are red (41, L); lanes that are not among `polygons` are out of
     reach and left out; ego_state0: (11,), by default the last past state.
     drop_touching: objects whose box touches the ego's at step 0 are left out for good, as the public log replay does.
-    Raises ValueError, naming the argument, for wrong shapes, ego states or a centreline that are not finite, a
-    centreline without length, polygons that bound no area or cross themselves, and when drop_touching has no ego
-    state to look at.
+    Raises ValueError, naming the argument, for a centreline without length and polygons that bound no area or cross
+    themselves.
     """
-    if past_states is not None:
-        _check_states("past_states", past_states, (len(PAST_STEPS), EGO_STATE_SIZE))
-    if ego_state0 is not None:
-        _check_states("ego_state0", ego_state0, (EGO_STATE_SIZE,))
     if ego_state0 is None and past_states is not None:
         ego_state0 = past_states[-1]
-    if ego_state0 is None and drop_touching:
-        raise ValueError("drop_touching needs ego_state0 or past_states")
     return PreparedScene(
         history=None if past_states is None else comfort_history(read_only(past_states)),
         centerline=_indexed_line(np.shape(centerline), np.ascontiguousarray(centerline, np.float64).tobytes()),
@@ -151,8 +150,7 @@ def prepare_scene(scene: Scene, agents: AgentTracks, drop_touching: bool = True)
 def among(prepared: PreparedScene, objects: AgentTracks, ego_state0: Array | None) -> PreparedScene:
     """The same scene among other objects: tracks of at least 41 steps, row 0 is now.
 
-    Those that touch the ego at `ego_state0` (11,) are left out for good; None: nobody is. Raises ValueError for tracks
-    of other shapes.
+    Those that touch the ego at `ego_state0` (11,) are left out for good; None: nobody is.
     """
     return replace(prepared, obstacles=_obstacles(objects, ego_state0))
 
@@ -167,53 +165,19 @@ def _red_connectors(clip: Clip, step: int) -> tuple[tuple[str, ...], Bools]:
         if lane_id in lit and lane_id in lanes and lanes[lane_id].is_intersection
     ]
     if not governed:
-        return (), np.zeros((N_TIMES, 0), dtype=bool)
+        return NO_RED
     states = lights.states[step : step + N_TIMES, governed]
     return tuple(lights.lane_ids[i] for i in governed), states == LightState.RED
 
 
-def _check_states(name: str, states: Array, shape: tuple[int, ...]) -> None:
-    if states.shape != shape:
-        raise ValueError(f"{name} must be {shape}, got {states.shape}")
-    if not all_within(states):
-        raise ValueError(f"{name} must be finite and at most {LARGEST:g}, it holds NaN, infinity or more")
-
-
 def _obstacles(objects: AgentTracks, ego_state0: Array | None) -> Obstacles:
-    """The objects but those that touch an ego at `ego_state0`. Raises ValueError where they are none."""
-    if objects.n_steps < N_TIMES:
-        raise ValueError(f"objects must span at least {N_TIMES} steps, got {objects.n_steps}")
-    shape = (objects.n_steps, len(objects))
-    for name, wanted in (("valid", shape), ("boxes", (*shape, 5)), ("velocities", (*shape, 2))):
-        found = getattr(objects, name).shape
-        if found != wanted:
-            raise ValueError(f"objects.{name} must be {wanted} for {len(objects)} objects, got {found}")
-    if len(objects.kinds) != len(objects):
-        raise ValueError(f"objects.kinds must name {len(objects)} objects, got {len(objects.kinds)}")
-    all_well, obstacles = lay_out(
+    """The objects but those that touch an ego at `ego_state0`."""
+    return lay_out(
         read_only(objects.boxes),
         read_only(objects.velocities),
         read_only(objects.valid, np.bool_),
         collision_scores(objects.kinds),
         _NOBODY if ego_state0 is None else read_only(ego_boxes(ego_state0, PACIFICA)),
-    )
-    if not all_well:
-        raise _refused(objects)
-    return obstacles
-
-
-def _refused(objects: AgentTracks) -> ValueError:
-    """The error that names the first object that is there and not well."""
-    there = objects.valid.astype(bool) & ~np.isnan(objects.boxes).any(axis=-1)
-    wrong = {
-        "boxes": ~(np.abs(objects.boxes) <= LARGEST).all(axis=-1) | (objects.boxes[..., 3:] < 0.0).any(axis=-1),
-        "velocities": ~(np.abs(objects.velocities) <= LARGEST).all(axis=-1),
-    }
-    name = next(name for name, where in wrong.items() if (where & there).any())
-    step, i = np.argwhere(wrong[name] & there)[0]
-    return ValueError(
-        f"objects.{name} of {objects.track_ids[i]} at step {step} are {getattr(objects, name)[step, i]}: they "
-        f"must be finite, at most {LARGEST:g}, sizes not negative; where it is absent its box is NaN"
     )
 
 
@@ -223,15 +187,8 @@ def collision_scores(kinds: tuple[AgentKind, ...]) -> Array:
     return read_only(np.array([0.0 if kind in MOVING_KINDS else 0.5 for kind in kinds]))
 
 
-def _red(red_lanes: tuple[str, ...] | tuple[tuple[str, ...], Bools], polygons: Sequence[MapPolygon]) -> RedLanes:
-    if len(red_lanes) == 2 and isinstance(red_lanes[1], np.ndarray):
-        lane_ids, is_red = red_lanes
-    else:
-        lane_ids, is_red = red_lanes, np.ones((N_TIMES, len(red_lanes)), dtype=bool)
-    if is_red.shape != (N_TIMES, len(lane_ids)):
-        raise ValueError(f"the mask of red lanes must be ({N_TIMES}, {len(lane_ids)}), got {is_red.shape}")
-    if is_red.dtype != np.bool_:
-        raise ValueError(f"the mask of red lanes must be bool, got {is_red.dtype}")
+def _red(red_lanes: tuple[tuple[str, ...], Bools], polygons: Sequence[MapPolygon]) -> RedLanes:
+    lane_ids, is_red = red_lanes
     if not lane_ids:  # the usual case, and half the cost of preparing a pair's lights
         return NEVER_RED
     lanes = {polygon.token: polygon for polygon in polygons if polygon.layer in LANE_LAYERS}
@@ -336,7 +293,6 @@ def _first_with(flags: Bytes, bit: int) -> float:
 
 Normalise = Literal["batch", "pairs"]
 _NORMALISE = get_args(Normalise)
-_NO_BOXES, _NO_FLAGS = np.empty((0, N_TIMES, 0, 5)), np.empty((0, 0), np.bool_)
 _COLUMNS = (*LABELLED, *INDEX.values())
 _Columns: Any = make_dataclass("_Columns", [(name, Array) for name in _COLUMNS], frozen=True)
 
@@ -382,52 +338,15 @@ def score(
     as if alone. with_history=False leaves history comfort at 1, as the public passes over the human and PDM-Closed do.
     Raises ValueError for other shapes or non-finite states.
     """
-    context = context_of(prepared, with_history)
-    return _scored(context, prepared.obstacles, _NO_BOXES, _NO_FLAGS, states, _in_pairs(normalise))
-
-
-def score_among(
-    prepared: PreparedScene, boxes: Array, is_stopped: Bools, collision_score: Array, states: Array
-) -> Scores:
-    """The same in pairs where every trajectory meets its own objects, those of the scene set aside.
-
-    boxes: (K, 41, N, 5), NaN when absent; is_stopped: (K, N) and collision_score: (N,) as in Obstacles; states:
-    (K, 41, 11). Raises ValueError for other shapes, non-finite states.
-    """
-    n_objects = len(collision_score)
-    if boxes.shape != (len(states), N_TIMES, n_objects, 5) or is_stopped.shape != (len(states), n_objects):
-        raise ValueError(
-            f"boxes must be ({len(states)}, {N_TIMES}, {n_objects}, 5) and is_stopped ({len(states)}, {n_objects}), "
-            f"got {boxes.shape} and {is_stopped.shape}"
-        )
-    nobody = obstacles_of(np.full((N_TIMES, n_objects, 5), np.nan), np.zeros(n_objects, np.bool_), collision_score)
-    boxes, is_stopped = np.require(boxes, None, ["C", "W"]), np.require(is_stopped, None, ["C", "W"])
-    return _scored(context_of(prepared, with_history=True), nobody, boxes, is_stopped, states, True)
-
-
-def joined(parts: Sequence[Scores], normalise: Normalise) -> Scores:
-    """The rows of all parts, their progress related anew; `normalise` as in `score`."""
-    *numbers, areas, comfort = (np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Scores))
-    table = np.stack(numbers)
-    _add_up(table, _in_pairs(normalise))
-    return Scores(*[*table, areas, comfort])
-
-
-def _scored(
-    context: RuleContext, obstacles: Obstacles, boxes: Array, is_stopped: Bools, states: Array, in_pairs: bool
-) -> Scores:
+    if normalise not in _NORMALISE:
+        raise ValueError(f"normalise must be one of {_NORMALISE}, got {normalise!r}")
     states = shaped("states", states)
     table = np.empty((N_ROWS, len(states)))
     areas, comfort = np.empty((len(states), N_TIMES, 3), np.bool_), np.empty((len(states), N_FLAGS), np.bool_)
-    if not _score_all(context, obstacles, boxes, is_stopped, states, in_pairs, table, areas, comfort):
-        raise no_drive("states")
+    context, in_pairs = context_of(prepared, with_history), normalise == "pairs"
+    if not _score_all(context, prepared.obstacles, states, in_pairs, table, areas, comfort):
+        raise ValueError(f"states must be finite and at most {LARGEST:g}: leave out what is not a drive")
     return Scores(*[*table, areas, comfort])
-
-
-def _in_pairs(normalise: Normalise) -> bool:
-    if normalise not in _NORMALISE:
-        raise ValueError(f"normalise must be one of {_NORMALISE}, got {normalise!r}")
-    return normalise == "pairs"
 
 
 def score_with_ec(scores: Scores, ec: Array) -> Array:
@@ -462,8 +381,6 @@ def rows(scores: Scores, index: slice | NDArray[np.integer] | Bools) -> Scores:
 def _score_all(
     context: RuleContext,
     obstacles: Obstacles,
-    boxes: Array,  # (K, 41, N, 5) of each trajectory's own objects, or none: all meet `obstacles`
-    is_stopped: Bools,  # (K, N)
     states: Array,  # (K, 41, 11)
     in_pairs: bool,
     table: Array,
@@ -483,10 +400,7 @@ def _score_all(
     out = Verdicts(table[:_N_SCORES], table[_N_SCORES:_EP_RAW_M], table[_EP_RAW_M], areas, comfort)
     scratch = scratch_for(obstacles.boxes.shape[1])
     for k in range(states.shape[0]):
-        met = obstacles
-        if boxes.shape[0] > 0:
-            met = obstacles_of(boxes[k], is_stopped[k], obstacles.collision_score)
-        judge_one(context, met, states[k], scratch, k, out)
+        judge_one(context, obstacles, states[k], scratch, k, out)
     _add_up(table, in_pairs)
     return True
 

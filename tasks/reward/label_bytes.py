@@ -26,7 +26,7 @@ MAX_PROGRESS_M = 65535 / UNITS_PER_M
 CRC_BYTES = 4
 
 
-_HEADER = (("vocabulary", str), ("traffic", str), ("reference_progress_m", float))
+_HEADER = (("vocabulary", str), ("reference_progress_m", float))
 _FIELDS = [*_HEADER, *((name, Array) for name in ARRAYS)]
 _Labels: Any = make_dataclass("_Labels", _FIELDS, frozen=True, eq=False)  # types are known where the record is read
 
@@ -35,9 +35,8 @@ _Labels: Any = make_dataclass("_Labels", _FIELDS, frozen=True, eq=False)  # type
 class VocabularyLabels(_Labels):
     """What every trajectory of a vocabulary scores when it is driven from one scene.
 
-    First the vocabulary's digest (tasks.world.vocabulary.trajectories_digest), the traffic (replay: one for all; idm:
-    it answers to each) and the compliant progress of PDM-Closed [m]; then ARRAYS (K,): the sub-scores that fail at an
-    instant, and `ep_raw_m`, progress along the route.
+    First the vocabulary's digest (tasks.world.vocabulary.trajectories_digest) and the compliant progress of PDM-Closed
+    [m]; then ARRAYS (K,): the sub-scores that fail at an instant, and `ep_raw_m`, progress along the route.
     """
 
     def __len__(self) -> int:
@@ -83,9 +82,7 @@ def encode(labels: VocabularyLabels) -> tuple[bytes, bytes]:
     return _sealed(planes.tobytes()), _sealed(np.stack(low_high).astype(np.uint8).tobytes())
 
 
-def decode(
-    subscores: bytes, progress: bytes, *, vocabulary: str, traffic: str, reference_progress_m: float
-) -> VocabularyLabels:
+def decode(subscores: bytes, progress: bytes, *, vocabulary: str, reference_progress_m: float) -> VocabularyLabels:
     """The labels that `encode` made the bytes of, progress rounded up to 1/128 m.
 
     Raises ValueError for bytes of a wrong length or with a wrong checksum, naming the field.
@@ -103,7 +100,7 @@ def decode(
     scores = dict(zip((*HALVES, *WHOLES), (*(whole + 0.5 * half), *planes[2 * len(HALVES) :])))
     low, high = counts.reshape(2, k).astype(np.float64)
     ep_raw_m = (low + 256.0 * high) / UNITS_PER_M
-    return VocabularyLabels(vocabulary, traffic, reference_progress_m, ep_raw_m=ep_raw_m, **scores)
+    return VocabularyLabels(vocabulary, reference_progress_m, ep_raw_m=ep_raw_m, **scores)
 
 
 def _planes(labels: VocabularyLabels) -> Iterator[Bools]:

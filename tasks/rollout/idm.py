@@ -104,7 +104,6 @@ def stop_line_gap(paths: Paths, m: int, step: int, nose: float, speed: float, de
 # No tuple holds another one: taking a tuple out of a tuple counts a reference to each of its arrays.
 
 ABSENT, REPLAYED, DRIVEN, STANDING, EGO = 0, 1, 2, 3, 4  # what moves one at the moment
-NOBODY = -1
 
 
 class Roles(NamedTuple):
@@ -157,7 +156,7 @@ class RolloutRows(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """How each agent moves at every row, those due having switched to IDM, and what it decides there, for whom."""
+    """How each agent moves at every row, those due having switched to IDM."""
 
     mode: Ints  # (T, N) ABSENT, REPLAYED, DRIVEN, STANDING
     path: Ints  # (T, N) of one that is driven, -1: not driven
@@ -169,23 +168,6 @@ class Motion(NamedTuple):
     turn: Array  # (T, N) against the path, when it switched to IDM [rad]
     base_z: Array  # (T, N) its centre's height above the path's [m]
     was_driven: Bools  # (T, N) moved by IDM before
-    switch: Ints  # (T, N) the path on which it switches to IDM here, -1: it does not
-    switch_for: Ints  # (T, N) the driven one it had to brake for, NOBODY: it was due
-    accel: Array  # (T, N) of one that is driven [m/s2]
-    leader: Ints  # (T, N) whom that is for, NOBODY: the road, a stop line
-    blocked: Bools  # (T, N) a driven one is where the next step of its log is
-    waits: Bools  # (T, N) for it
-    enters: Bools  # (T, N) appears at the end of the step
-
-
-class Diverged(NamedTuple):
-    """The agents that do not do what a recorded rollout says; the ego, as number N, is the first of them."""
-
-    found: Bools  # (N + 1,)
-    listed: Ints  # (N + 1,) in the order they left the record
-    size: Ints  # (1,) how many they are
-    everyone: Ints  # (N + 1,) 0 .. N
-    mode: Ints  # (N + 1,) of everyone, diverged or not, at this row
 
 
 @kernel
@@ -202,31 +184,16 @@ def empty_rows(n_rows: int, n: int) -> RolloutRows:
 
 @kernel
 def empty_motion(n_rows: int, n: int) -> Motion:
-    """Nobody moves, for nobody."""
+    """Nobody moves."""
     shape = (n_rows, n)
     return Motion(
         np.zeros(shape, np.int64), np.full(shape, -1), np.zeros(shape, np.int64),
         np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape),
-        np.zeros(shape, np.bool_), np.full(shape, -1), np.full(shape, NOBODY), np.zeros(shape),
-        np.full(shape, NOBODY), np.zeros(shape, np.bool_), np.zeros(shape, np.bool_), np.zeros(shape, np.bool_),
+        np.zeros(shape, np.bool_),
     )  # fmt: skip
 
 
-@kernel
-def nobody_diverged(n: int) -> Diverged:
-    return Diverged(
-        np.zeros(n + 1, np.bool_),
-        np.zeros(n + 1, np.int64),
-        np.zeros(1, np.int64),
-        np.arange(n + 1),
-        np.zeros(n + 1, np.int64),
-    )
-
-
 # The traffic's rules for one agent: when it switches to IDM, how hard it drives, when it waits, when it enters.
-#
-# Each rule is an "or" or a "hardest of" over others, and is asked about a list of them: all, or only those who are
-# not where an earlier answer saw them. Compiled.
 
 LARGEST_OFFSET_M = SNAP_M + 2.0  # a start farther from the path stays on its log
 CORRIDOR_MARGIN_M = 0.1  # beside the body, each side
@@ -292,22 +259,18 @@ def gap_to(
 
 
 @inner_kernel
-def braked_for(
-    roles: Roles, paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int,
-    mode: Ints, others: Ints, n_others: int,
-) -> int:  # fmt: skip
-    """The driven one that asks agent i, on its logged path, for more than the comfortable deceleration, or NOBODY."""
+def must_brake(roles: Roles, paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int, mode: Ints) -> bool:
+    """Does a driven one ask agent i, on its logged path, for more than the comfortable deceleration?"""
     m = roles.logged_path[i]
     if m < 0:
-        return NOBODY
+        return False
     speed = _forward_speed(rows, t, i)
     if 0.5 * speed * speed <= driver.decel_max * SMALLEST_GAP_M:
-        return NOBODY  # too slow to need it at any gap
+        return False  # too slow to need it at any gap
     s, left, turn, _ = start_on(paths, m, rows, t, i, driver)
     way = way_of(rows, t, i, m, s, 0.0, left, turn)
     view = look_ahead(paths, way, driver.blend_length_m, driver.lookahead_m)
-    for a in range(n_others):
-        j = others[a]
+    for j in range(len(mode)):
         if (
             j == i
             or mode[j] != DRIVEN
@@ -318,8 +281,8 @@ def braked_for(
         if gap < np.inf:
             lead_speed = rows.velocities[t, j, 0] * math.cos(h) + rows.velocities[t, j, 1] * math.sin(h)
             if needed_deceleration(speed, gap, lead_speed, driver) > driver.decel_max:
-                return j
-    return NOBODY
+                return True
+    return False
 
 
 @inner_kernel
@@ -336,15 +299,14 @@ def road_acceleration(paths: Paths, driver: IdmDriver, t: int, m: int, s: float,
 @inner_kernel
 def hardest_acceleration(
     paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int, way: Way, speed: float,
-    others: Ints, n_others: int, accel: float, leader: int, yielding: Yielding | None,
-) -> tuple[float, int]:  # fmt: skip
-    """(acceleration [m/s2], leader) of agent i, driven, for the others on the list; `accel` without them.
+    accel: float, yielding: Yielding | None,
+) -> float:  # fmt: skip
+    """Acceleration [m/s2] of agent i, driven, for the others; `accel` without them.
 
     One that keeps its intent slows down for a leader from what it could do at most, not from what it means to do.
     """
     view = look_ahead(paths, way, driver.blend_length_m, driver.lookahead_m)
-    for a in range(n_others):
-        j = others[a]
+    for j in range(rows.valid.shape[1]):
         if (
             j == i
             or not rows.valid[t, j]
@@ -360,19 +322,16 @@ def hardest_acceleration(
                 free = driver.accel_max
             behind = following_acceleration(free, speed, gap, lead_speed, driver)
             if behind < accel:
-                accel, leader = behind, j
-    return accel, leader
+                accel = behind
+    return accel
 
 
 @inner_kernel
-def touches_driven(
-    boxes: Array, k: int, i: int, rows: RolloutRows, t: int, mode: Ints, others: Ints, n_others: int
-) -> bool:
-    """Does agent i at boxes[k, i] share area with a driven one of the list in row t?"""
+def touches_driven(boxes: Array, k: int, i: int, rows: RolloutRows, t: int, mode: Ints) -> bool:
+    """Does agent i at boxes[k, i] share area with a driven one in row t?"""
     box = box_of(boxes, k, i)
     radius = 0.5 * math.hypot(box[3], box[4])
-    for a in range(n_others):
-        j = others[a]
+    for j in range(len(mode)):
         if j == i or mode[j] != DRIVEN:
             continue
         dx, dy, reach = rows.boxes[t, j, 0] - box[0], rows.boxes[t, j, 1] - box[1], radius + rows.radius[t, j]
@@ -384,17 +343,16 @@ def touches_driven(
 @inner_kernel
 def is_clear(
     roles: Roles, driver: IdmDriver, log: AgentStates, k: int, i: int,
-    rows: RolloutRows, t: int, mode: Ints, others: Ints, n_others: int, yielding: Yielding | None,
+    rows: RolloutRows, t: int, mode: Ints, yielding: Yielding | None,
 ) -> bool:  # fmt: skip
-    """May agent i appear as in step k of its log, as far as those of the list, already there in row t, let it?
+    """May agent i appear as in step k of its log, as far as those already there in row t let it?
 
     A vehicle needs the minimum gap at both ends; one that keeps its intent its headway too, and room to brake.
     """
     if not roles.enters_clear[i]:
-        return not (roles.moving_kind[i] and touches_driven(log.boxes, k, i, rows, t, mode, others, n_others))
+        return not (roles.moving_kind[i] and touches_driven(log.boxes, k, i, rows, t, mode))
     x, y, heading, length, width = box_of(log.boxes, k, i)
-    for a in range(n_others):
-        j = others[a]
+    for j in range(len(mode)):
         if mode[j] == ABSENT:
             continue
         margin = driver.min_gap_m

@@ -26,6 +26,7 @@ from tasks.world.frames import (
     AY,
     EGO_STATE_SIZE,
     HEADING,
+    LARGEST,
     PACIFICA,
     STEERING,
     STEERING_RATE,
@@ -37,7 +38,6 @@ from tasks.world.frames import (
     X,
     Y,
 )
-from tasks.world.geometry import LARGEST
 
 # Kinematic bicycle with first-order actuators: the ego's motion model (docs/reward.md 1b).
 #

@@ -52,13 +52,13 @@ from tasks.rollout.lane_following import (
 )
 from tasks.rollout.lqr import track
 from tasks.rollout.navsim import NavsimAgents, answer, navsim_agents
-from tasks.rollout.traffic import begin_step, drive, drive_many, finish_step, first_row
+from tasks.rollout.traffic import begin_step, drive, finish_step, first_row
 from tasks.rollout.yielding import yielding_in
 from tasks.settings import MOST, TrafficSettings
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import HORIZON_STEPS, MOVING_KINDS, PER_STEP, STEP_S, AgentKind, AgentTracks, Rollout, Scene
-from tasks.world.frames import EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY
-from tasks.world.geometry import LARGEST, all_within, ego_boxes
+from tasks.world.frames import EGO_STATE_SIZE, HEADING, LARGEST, PACIFICA, VX, VY, all_within
+from tasks.world.geometry import ego_boxes
 from tasks.world.road_map import RoadMap
 
 # Traffic that a policy of a user's own drives: what it is shown and answers, how it is named, how it is stepped.
@@ -144,14 +144,14 @@ def drive_by_policy(
     past: the agents over the SEEN_ROWS rows up to `start`; ego_past: the ego's boxes and velocities in them. Raises
     BadPolicy where the policy answers no states.
     """
-    rows, motion, diverged = first_row(now, roles, *ego)
+    rows, motion = first_row(now, roles, *ego)
     boxes, velocities = (
         np.concatenate([agents, of_ego[:, None]], axis=1)
         for agents, of_ego in ((past.boxes, ego_past[0]), (past.velocities, ego_past[1]))
     )
     valid = np.concatenate([past.valid, np.ones((SEEN_ROWS, 1), bool)], axis=1)
     for t in range(len(rows.boxes) - 1):
-        asked = begin_step(start, roles, paths, driver, t, rows, diverged, motion)
+        asked, mode = begin_step(start, roles, paths, driver, t, rows, motion)
         answer = np.zeros((len(asked), 4))
         if asked.any():
             seen = SeenTraffic(
@@ -165,7 +165,7 @@ def drive_by_policy(
                 ways=paths._replace(line_state=paths.line_state[t : t + 1]),
             )
             answer = _checked(policy, policy.next_states(seen), asked)
-        finish_step(start, log, roles, paths, driver, t, asked, answer, rows, diverged, motion)
+        finish_step(start, log, roles, paths, driver, t, asked, answer, rows, mode, motion)
     return rows, motion
 
 
@@ -200,16 +200,6 @@ class TrafficScene:
     paths: Paths | None
     navsim: NavsimAgents | None = None  # None: another mode
     yielding: Yielding | None = None  # None: drivers give way to nobody, or another mode
-
-
-@dataclass(frozen=True)
-class Rollouts:
-    """The traffic's answers to B egos, N agents of the scene; row 0 is the scene."""
-
-    boxes: Array  # (B, 41, N, 5) centre x [m], centre y [m], heading [rad], length [m], width [m]; NaN where absent
-    velocities: Array  # (B, 41, N, 2) world frame [m/s]
-    valid: Bools  # (B, 41, N)
-    simulated: Bools  # (B, N) True: driven at some step, False: replayed or standing
 
 
 def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
@@ -318,29 +308,6 @@ def _lasting(agents: AgentTracks, n_steps: int) -> AgentTracks:
     out: dict[str, Any] = {name: getattr(agents, name)[steps] for name in PER_STEP}
     out["boxes"][-more:, :, :2] += STEP_S * np.arange(1, more + 1)[:, None, None] * out["velocities"][-more:]
     return replace(agents, **out)
-
-
-def roll_out_many(traffic: TrafficScene, ego_states: Array) -> Rollouts:
-    """The traffic's answers to B egos whose states (B, 41, 11) are known, each to the last bit as `roll_out` gives it.
-
-    The result takes 2.3 kB per agent and ego: split B to bound memory. With replayed traffic it is one log, seen B
-    times. ValueError where the states are not (B, 41, 11) or not finite.
-    """
-    _check_states(ego_states, HORIZON_STEPS + 1)
-    start = traffic.scene.step
-    window = traffic.scene.agents.window(start, start + HORIZON_STEPS + 1)
-    many, n = len(ego_states), len(window)
-    if traffic.settings.mode in ("navsim", "custom"):
-        shape = (many, HORIZON_STEPS + 1, n)
-        out = Rollouts(np.empty((*shape, 5)), np.empty((*shape, 2)), np.empty(shape, bool), np.empty((many, n), bool))
-        for b, states in enumerate(ego_states):
-            agents, out.simulated[b] = _answer(traffic, states, HORIZON_STEPS)
-            out.boxes[b], out.velocities[b], out.valid[b] = agents.boxes, agents.velocities, agents.valid
-        return out
-    if traffic.roles is None or traffic.paths is None or n == 0:
-        alike: Any = [np.broadcast_to(a, (many, *a.shape)) for a in (window.boxes, window.velocities, window.valid)]
-        return Rollouts(alike[0], alike[1], alike[2], np.zeros((many, n), dtype=bool))
-    return Rollouts(*drive_many(*_script(traffic, window), *_ego_boxes(ego_states), _yielding(traffic)))
 
 
 def _policy_answer(

@@ -11,7 +11,6 @@ from tasks.rollout.idm import (
     DRIVEN,
     REPLAYED,
     AgentStates,
-    Diverged,
     IdmDriver,
     Motion,
     Roles,
@@ -581,26 +580,22 @@ def is_committed(speed: float, ahead: float, driver: IdmDriver) -> bool:
 @inner_kernel
 def yields_for(
     yielding: Yielding, driver: IdmDriver, start: int, t: int, i: int,
-    m: int, s: float, speed: float, rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion,
-    afresh: bool, accel: float, leader: int,
-) -> tuple[float, int]:  # fmt: skip
-    """(acceleration [m/s2], whom for) of agent i, driven, for those that it gives way to; `accel` without them.
-
-    afresh: everyone is asked about, else those that have diverged.
-    """
+    m: int, s: float, speed: float, rows: RolloutRows, mode: Ints, motion: Motion, accel: float,
+) -> float:  # fmt: skip
+    """Acceleration [m/s2] of agent i, driven, for those that it gives way to; `accel` without them."""
     front = 0.5 * rows.boxes[t, i, 3]
     for z in range(yielding.zone_start[m], yielding.zone_start[m + 1]):
         j = yielding.zone_agent[z]
-        if not (afresh or diverged.found[j]) or not rows.valid[t, j]:
+        if not rows.valid[t, j]:
             continue
         ahead = yielding.zone_in[z] - s - front
         if is_committed(speed, ahead, driver):
             continue
-        o, own = yielding.zone_path[z], motion if diverged.found[j] else record
+        o = yielding.zone_path[z]
         if o >= 0:
-            if diverged.mode[j] != DRIVEN or own.path[t, j] != o:
+            if mode[j] != DRIVEN or motion.path[t, j] != o:
                 continue
-            other_s, other_speed, other_front = own.s[t, j], own.speed[t, j], 0.5 * rows.boxes[t, j, 3]
+            other_s, other_speed, other_front = motion.s[t, j], motion.speed[t, j], 0.5 * rows.boxes[t, j, 3]
             if other_s - other_front > yielding.other_out[z]:
                 continue
             other_ahead = yielding.other_in[z] - other_s - other_front
@@ -610,10 +605,10 @@ def yields_for(
             comes = seconds_to(yielding, o, other_s, other_speed, start + t, nose_s, driver.accel_max)
             leaves = seconds_to(yielding, o, other_s, other_speed, start + t, rear_s, driver.accel_max)
         else:
-            if diverged.mode[j] != REPLAYED:
+            if mode[j] != REPLAYED:
                 continue
-            comes = (yielding.other_in[z] - own.clock[t, j]) * STEP_S
-            leaves = (yielding.other_out[z] - own.clock[t, j]) * STEP_S
+            comes = (yielding.other_in[z] - motion.clock[t, j]) * STEP_S
+            leaves = (yielding.other_out[z] - motion.clock[t, j]) * STEP_S
             if leaves < 0.0:
                 continue
         gone = seconds_to(yielding, m, s, speed, start + t, yielding.zone_out[z] + front, driver.accel_max)
@@ -624,14 +619,14 @@ def yields_for(
             continue
         waits = following_acceleration(driver.accel_max, speed, ahead, 0.0, driver)
         if waits < accel:
-            accel, leader = waits, j
-    return accel, leader
+            accel = waits
+    return accel
 
 
 @inner_kernel
 def has_way(
     yielding: Yielding, driver: IdmDriver, m: int, k: int, t: int, log: AgentStates, i: int,
-    rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion, afresh: bool,
+    rows: RolloutRows, mode: Ints, motion: Motion,
 ) -> bool:  # fmt: skip
     """May agent i appear in row t on path m as in step k of its log: is in every zone one of two able to wait?
 
@@ -643,13 +638,13 @@ def has_way(
         return False
     for z in range(yielding.zone_start[m], yielding.zone_start[m + 1]):
         j, o = yielding.zone_agent[z], yielding.zone_path[z]
-        if o < 0 or not (afresh or diverged.found[j]) or diverged.mode[j] != DRIVEN:
+        if o < 0 or mode[j] != DRIVEN:
             continue
-        own, other_front = motion if diverged.found[j] else record, 0.5 * rows.boxes[t, j, 3]
-        if own.path[t, j] != o or own.s[t, j] - other_front > yielding.other_out[z]:
+        other_front = 0.5 * rows.boxes[t, j, 3]
+        if motion.path[t, j] != o or motion.s[t, j] - other_front > yielding.other_out[z]:
             continue
-        if is_committed(own.speed[t, j], yielding.other_in[z] - own.s[t, j] - other_front, driver) and is_committed(
-            speed, yielding.zone_in[z] - s - front, driver
-        ):
+        if is_committed(
+            motion.speed[t, j], yielding.other_in[z] - motion.s[t, j] - other_front, driver
+        ) and is_committed(speed, yielding.zone_in[z] - s - front, driver):
             return False
     return True

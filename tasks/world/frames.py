@@ -1,7 +1,6 @@
 """SE(2) poses, arrays whose last axis is x [m], y [m], heading [rad]; the ego's body and the columns of its state."""
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -71,8 +70,7 @@ EGO_STATE_SIZE = 11
 class Vehicle:
     """Body of a car; lengths in metres. Defaults: Chrysler Pacifica, docs/reward.md 0.
 
-    It is used on every data set by default, so that scores are comparable. Raises ValueError for a length that is not
-    finite and positive, naming the field.
+    It is used on every data set, so that scores are comparable.
     """
 
     width: float = 2.297
@@ -80,12 +78,6 @@ class Vehicle:
     rear_length: float = 1.127  # rear axle to rear bumper
     rear_axle_to_center: float = 1.461
     wheel_base: float = 3.089
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            length_m = getattr(self, field.name)
-            if not (math.isfinite(length_m) and length_m > 0.0):
-                raise ValueError(f"vehicle.{field.name} must be finite and positive [m], got {length_m}")
 
     @property
     def length(self) -> float:
@@ -123,3 +115,12 @@ def pose_on_ground(logged: Array, ego_states: Array) -> Array:
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     out[:, :3, 0], out[:, :3, 1], out[:, :3, 2] = forward, np.cross(up, forward), up
     return out
+
+# How large a number of a scene may be: no road has a length [m], heading [rad] or speed [m/s] like it; kernels number
+# cells and turns of a circle, which stops working far above it.
+LARGEST = 1e8
+
+
+def all_within(values: Array) -> bool:
+    """Whether all values are finite and at most LARGEST in size; takes no memory of the values' own size."""
+    return bool(values.max(initial=0.0) <= LARGEST and values.min(initial=0.0) >= -LARGEST)  # NaN is neither

@@ -130,15 +130,3 @@ def touching(first: Array, second: Array) -> Bools:
         near &= 2.0 * np.abs(along) <= one[..., 3] + other[..., 3] * c + other[..., 4] * s
         near &= 2.0 * np.abs(across) <= one[..., 4] + other[..., 3] * s + other[..., 4] * c
     return near
-
-
-# How large a number of a scene may be.
-
-# No road has a length [m], heading [rad] or speed [m/s] like it; kernels number cells and turns of a circle, which
-# stops working far above it.
-LARGEST = 1e8
-
-
-def all_within(values: Array) -> bool:
-    """Whether all values are finite and at most LARGEST in size; takes no memory of the values' own size."""
-    return bool(values.max(initial=0.0) <= LARGEST and values.min(initial=0.0) >= -LARGEST)  # NaN is neither

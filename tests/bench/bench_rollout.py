@@ -13,12 +13,12 @@ import numpy as np
 
 from factory.datasets.av2.reader import AV2Reader
 from tasks.rollout.lqr import track
-from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out, roll_out_many
+from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tasks.world.clip import NOW, Scene, scene_of_clip
 from tasks.world.vocabulary import kinematic_trajectories
 from tests.bench.timing import cpu_milliseconds
 
-N_EGOS, NEAREST = 256, 25
+NEAREST = 25
 
 
 def among_nearest(scene: Scene) -> Scene:
@@ -43,9 +43,9 @@ def main(root: Path) -> None:
     """Rows of every third clip, 25 agents and all, of each kind of traffic: who is there, and milliseconds."""
     kinds = {"yields=false": TrafficSettings(yields=False), "idm": TrafficSettings()}
     reader = AV2Reader(root)
-    trajectories = kinematic_trajectories(N_EGOS, 0)
-    print(f"| log | start s | agents now | with a path | traffic | prepare ms | one ego ms | {N_EGOS} egos ms |")
-    print("|---|---|---|---|---|---|---|---|")
+    trajectories = kinematic_trajectories(1, 0)
+    print("| log | start s | agents now | with a path | traffic | prepare ms | one ego ms |")
+    print("|---|---|---|---|---|---|---|")
     for ref in reader.index().refs[::3]:
         whole = scene_of_clip(reader.read(ref))
         for scene, (name, settings) in product((among_nearest(whole), whole), kinds.items()):
@@ -56,8 +56,7 @@ def main(root: Path) -> None:
                 f"| {ref.log_id[:8]} | {ref.start_ms / 1e3:.0f} | {int(scene.agents.valid[NOW].sum())} | {paths} "
                 f"| {name} "
                 f"| {cpu_milliseconds(partial(prepare_traffic, scene, settings), 5):.1f} "
-                f"| {cpu_milliseconds(partial(roll_out, traffic, states[0]), 40):.2f} "
-                f"| {cpu_milliseconds(partial(roll_out_many, traffic, states), 5):.0f} |",
+                f"| {cpu_milliseconds(partial(roll_out, traffic, states[0]), 40):.2f} |",
                 flush=True,
             )
 

@@ -70,7 +70,6 @@ MISTYPED = [  # told before anything heavy is imported
     run("pdm.shared_lead_memory=maybe", says=["pdm.shared_lead_memory: must be true or false"]),
     run("benchmark.min_follow_ups=many", says=["benchmark.min_follow_ups: must be a whole number"]),
     run("dry_run=true", says=["dry_run: there is no such setting"]),
-    run("reward.traffic=x", says=["reward.traffic: must be replay, idm or navsim"]),
     run("reward.full=[nc,comfort]", says=["full names comfort"]),
     run("perturb.epdms_min=1.5", says=["epdms_min must be from 0 to 1"]),
     run("traffic.headway_s=-1", says=["headway_s must be positive"]),

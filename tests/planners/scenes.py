@@ -72,7 +72,7 @@ def labels(n: int, trajectories: np.ndarray, seed: int = 0) -> tuple[dict[str, t
             "lk": (off < 2.0).astype(float),
             "hc": np.ones(len(x)),
         }
-        one = VocabularyLabels("v", "idm", 20.0, ep_raw_m=np.maximum(x, 0.0), **scores)
+        one = VocabularyLabels("v", 20.0, ep_raw_m=np.maximum(x, 0.0), **scores)
         for name, score in (scores | {"ep": one.ep("masked")}).items():
             named.setdefault(name, []).append(score)
         final.append(one.pdm_score("masked"))

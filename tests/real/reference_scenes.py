@@ -66,7 +66,7 @@ def prepared_scene(
         polygons=map_polygons(inputs),
         route_lane_ids=frozenset(inputs["route_lane_ids"]),
         objects=logged_tracks(inputs) if objects is None else objects,
-        red_lanes=red_lanes,
+        red_lanes=(red_lanes, np.ones((41, len(red_lanes)), dtype=bool)),
         ego_state0=inputs["ego_state0"],
     )
 

@@ -28,7 +28,7 @@ def test_recorded_scores_come_back_from_the_table_and_take_few_bytes(
 ) -> None:
     metrics = loader(shared_root).metrics(scene, k)
     scores = {name: metrics[column].astype(np.float64) for name, column in COLUMN.items()}
-    labels = VocabularyLabels("reference", "replay", 0.0, **scores)
+    labels = VocabularyLabels("reference", 0.0, **scores)
     row = row_of(stream(scene)) | label_columns(labels) | vars(Stamp("a", "human", "d", 0, -1, "v", "s", "{}"))
     store = Store(tmp_path)
     shard = write_shard(store.samples.location, SAMPLES, sample_row_to_table([row]))

@@ -46,7 +46,7 @@ def scored() -> Scores:
 
 def stored(scores: Scores) -> None:
     """Label bytes and columns of both drives."""
-    labels = VocabularyLabels("v", "replay", 20.0, **{name: getattr(scores, name) for name in ARRAYS})
+    labels = VocabularyLabels("v", 20.0, **{name: getattr(scores, name) for name in ARRAYS})
     assert N_PLANES == 10
     columns = label_columns(labels)
     assert len(columns["label_subscores"]) == 10 + 4 and labels_of(columns).sl.tolist() == [1.0, 0.0]

@@ -540,6 +540,3 @@ def _notes(facts: Mapping[str, Any], files: Sequence[str]) -> Iterator[str]:
         yield f"{n:,} samples have no labels: GTRS would stop at their tokens"
     if rewards and not any(path.endswith(".npy") for path in files):
         yield f"the trajectories of vocabulary {facts['vocabulary']} are not known here: give vocabulary=<its .npy>"
-    if answers := [mode for mode in facts["label_traffic"] if mode != "replay"]:
-        answering = f"label_traffic={', '.join(answers)}"
-        yield f"rewards are of traffic that answers ({answering}); SimScale's are of traffic that replays its log"

@@ -13,8 +13,7 @@ from factory.readers.pictures import frame_uri
 from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.clip import ROTATION_SLACK, STEP_S, Camera, Fisheye, SensorFile
-from tasks.world.frames import HEADING, X, Y, upright, wrap_angle
-from tasks.world.geometry import all_within
+from tasks.world.frames import HEADING, X, Y, all_within, upright, wrap_angle
 
 # Where the photos of ScenarioNet's logs are said to be: `cameras.json`, one of each log. Format: docs/photos.md.
 #

@@ -126,7 +126,6 @@ def test_a_policy_that_is_changed_under_a_run_makes_no_row_by_the_name_of_the_ol
     [
         (["traffic=custom"], r"traffic\.policy is missing"),
         (["traffic.policy=my:Policy"], r"traffic\.policy=my:Policy with traffic=idm: traffic=custom takes one"),
-        (["reward.traffic=custom"], r"reward\.traffic: must be replay, idm or navsim"),
         (["traffic=custom", "traffic.policy=nothing:At"], r"traffic\.policy=nothing:At: name one as"),
     ],
 )

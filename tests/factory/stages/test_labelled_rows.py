@@ -95,11 +95,6 @@ def test_labels_can_be_switched_off() -> None:
     assert not set(LABEL_COLUMNS) & set(accepted.row) and "labels" not in accepted.seconds
 
 
-def test_traffic_that_reacts_is_asked_for_by_name() -> None:
-    accepted, _ = sample(street("reward.traffic=idm", "vocabulary.k=6").work, HUMAN)
-    assert accepted.row["label_traffic"] == "idm" and len(labels_of(accepted.row)) == 6
-
-
 def test_another_vocabulary_can_be_labelled_wherever_its_file_lies(tmp_path: Path) -> None:
     other = Vocabulary(kinematic_trajectories(9, 5))
     for name in ("a.npy", "b.npy"):

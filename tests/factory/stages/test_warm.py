@@ -101,7 +101,7 @@ def test_a_block_whose_rig_is_corrected_compiles_nothing(tmp_path: Path) -> None
 def test_kernels_of_the_rig_s_correction_are_compiled_where_it_may_be_corrected() -> None:
     def asked(photos_alone: bool, **how: object) -> bool:
         render = RenderSettings(**how)  # type: ignore[arg-type]
-        return "rig" in parts_of(True, "idm", None, render, photos_alone)
+        return "rig" in parts_of(True, "idm", render, photos_alone)
 
     assert asked(photos_alone=True) and not asked(photos_alone=False)
     assert asked(photos_alone=False, rig=RigSettings(adjust=Adjust.ON))
@@ -136,14 +136,6 @@ def test_replayed_traffic_needs_no_idm(tmp_path: Path, towns: str) -> None:
     before, after = run_with_these(["judge", "plan"], tmp_path, *TOWN, *BLIND, *replay, towns, "executor=local")
     assert after == before
     assert not any(name.startswith("tasks/rollout/traffic") for name in after)
-
-
-def test_labels_among_traffic_that_answers_compile_nothing(tmp_path: Path, towns: str) -> None:
-    answers = ("reward.traffic=idm", "experts=[human]")
-    before, after = run_with_these(
-        ["judge", "plan", "answers"], tmp_path, *TOWN, *BLIND, *answers, towns, "executor=local"
-    )
-    assert after == before
 
 
 @pytest.mark.ray

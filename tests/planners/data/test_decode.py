@@ -121,7 +121,7 @@ def test_progress_is_normalised_as_the_planner_asks(tmp_path: Path, normalise: s
     """PDM-Closed gets 20 m far. The first drives 40 m and is faultless, the second 5 m, the third 15 m off the road."""
     one = np.ones(3)
     made = VocabularyLabels(
-        "vocabulary-1", "idm", 20.0, one, np.array([1.0, 1.0, 0.0]), *[one] * 5, ep_raw_m=np.array([40.0, 5.0, 15.0])
+        "vocabulary-1", 20.0, one, np.array([1.0, 1.0, 0.0]), *[one] * 5, ep_raw_m=np.array([40.0, 5.0, 15.0])
     )
     write_table(tmp_path / "out", [sample(0, **label_columns(made))])
     (file,) = files_of(tmp_path / "out")

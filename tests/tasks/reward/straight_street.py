@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.reward.epdms import PreparedScene, prepare
+from tasks.reward.epdms import NO_RED, PreparedScene, prepare
 from tasks.world.clip import AgentKind, AgentTracks
 from tasks.world.frames import HEADING, VX, X, Y, to_world
 from tasks.world.road_map import MapLayer, MapPolygon
@@ -88,7 +88,7 @@ STREET = (
 def street(
     things: Sequence[Thing] | AgentTracks = (),
     extra: Sequence[MapPolygon] = (),
-    red_lanes: tuple = (),
+    red_lanes: tuple = NO_RED,
     past: np.ndarray | None = None,
     origin: np.ndarray = ORIGIN,
     ego0: np.ndarray | None = None,

@@ -29,14 +29,13 @@ from tasks.subscores import MULTIPLIERS
 def labels_from(rng: np.random.Generator, k: int, reference_m: float = 20.0) -> VocabularyLabels:
     scores = {name: rng.integers(0, 3, k) / 2.0 for name in HALVES}
     scores |= {name: rng.integers(0, 2, k) * 1.0 for name in WHOLES}
-    return VocabularyLabels("abc", "replay", reference_m, ep_raw_m=rng.random(k) * 80.0, **scores)
+    return VocabularyLabels("abc", reference_m, ep_raw_m=rng.random(k) * 80.0, **scores)
 
 
 def through_bytes(labels: VocabularyLabels) -> VocabularyLabels:
     return decode(
         *encode(labels),
         vocabulary=labels.vocabulary,
-        traffic=labels.traffic,
         reference_progress_m=labels.reference_progress_m,
     )
 
@@ -48,13 +47,13 @@ def any_labels(draw: st.DrawFn) -> VocabularyLabels:
     wholes = {name: draw(arrays(float, k, elements=st.sampled_from([0.0, 1.0]))) for name in WHOLES}
     edges = st.sampled_from([0.0, 5.0, np.nextafter(5.0, 9.0), np.nextafter(5.0, 0.0), 10.0, 256.0 / UNITS_PER_M])
     metres = draw(arrays(float, k, elements=st.one_of(st.floats(0.0, MAX_PROGRESS_M), edges)))
-    return VocabularyLabels("abc", "idm", draw(st.floats(0.0, 80.0)), ep_raw_m=metres, **halves, **wholes)
+    return VocabularyLabels("abc", draw(st.floats(0.0, 80.0)), ep_raw_m=metres, **halves, **wholes)
 
 
 @given(any_labels())
 def test_sub_scores_come_back_as_they_went_in_and_progress_up_to_its_unit(labels: VocabularyLabels) -> None:
     back = through_bytes(labels)
-    assert (back.vocabulary, back.traffic, back.reference_progress_m) == ("abc", "idm", labels.reference_progress_m)
+    assert (back.vocabulary, back.reference_progress_m) == ("abc", labels.reference_progress_m)
     for name in (*HALVES, *WHOLES):
         np.testing.assert_array_equal(getattr(back, name), getattr(labels, name))
     rounded_up = back.ep_raw_m - labels.ep_raw_m
@@ -89,7 +88,7 @@ def test_masked_progress_is_that_of_the_compliant_metres() -> None:
     """Rows: compliant, half a collision, off the road, more than the reference, half of more; then a short scene."""
     nc, dac, metres = [1.0, 0.5, 1.0, 1.0, 0.5], [1.0, 1.0, 0.0, 1.0, 1.0], [10.0, 16.0, 30.0, 40.0, 60.0]
     ones = np.ones(5)
-    labels = VocabularyLabels("v", "replay", 20.0, np.array(nc), np.array(dac), *[ones] * 5, np.array(metres))
+    labels = VocabularyLabels("v", 20.0, np.array(nc), np.array(dac), *[ones] * 5, np.array(metres))
     np.testing.assert_array_equal(labels.ep("masked"), [0.5, 0.4, 0.0, 1.0, 1.0])
     np.testing.assert_array_equal(labels.ep("pairs"), [0.5, 0.8, 1.0, 1.0, 1.0])
     np.testing.assert_allclose(labels.pdm_score("masked")[:3], [11.5 / 14.0, 5.5 / 14.0, 0.0], rtol=0, atol=1e-15)
@@ -121,13 +120,13 @@ def test_one_flipped_bit_is_seen(place: int, bit: int, in_progress: bool) -> Non
     damaged = made[in_progress]
     damaged[place % len(damaged)] ^= 1 << bit
     with pytest.raises(ValueError, match="^progress: " if in_progress else "^subscores: "):
-        decode(*map(bytes, made), vocabulary="abc", traffic="replay", reference_progress_m=1.0)
+        decode(*map(bytes, made), vocabulary="abc", reference_progress_m=1.0)
 
 
 @pytest.mark.parametrize("cut", [0, 1, 3, 4, 20])
 def test_bytes_of_another_length_are_refused(cut: int) -> None:
     subscores, progress = encode(labels_from(np.random.default_rng(2), 50))
-    header = {"vocabulary": "abc", "traffic": "replay", "reference_progress_m": 1.0}
+    header = {"vocabulary": "abc", "reference_progress_m": 1.0}
     for a, b in ((subscores[:cut], progress), (subscores, progress[:cut])):
         with pytest.raises(ValueError, match="checksum"):
             decode(a, b, **header)  # type: ignore[arg-type]
@@ -162,7 +161,7 @@ def test_columns_of_different_lengths_are_refused_by_name() -> None:
 
 
 def test_every_array_of_the_labels_is_in_the_bytes() -> None:
-    arrays_of = {f.name for f in fields(VocabularyLabels)} - {"vocabulary", "traffic", "reference_progress_m"}
+    arrays_of = {f.name for f in fields(VocabularyLabels)} - {"vocabulary", "reference_progress_m"}
     assert arrays_of == {*HALVES, *WHOLES, "ep_raw_m"}
 
 

@@ -1,4 +1,4 @@
-"""Vocabulary labels of a scene: the reward's own scores, whatever the chunks, among the traffic that was asked for."""
+"""Vocabulary labels of a scene: the reward's own scores, whatever the chunks, among the sample's own traffic."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Human, Plan
 from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
-from tasks.reward.labels import Labelling, vocabulary_labels
+from tasks.reward.labels import vocabulary_labels
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.world.clip import NOW, Scene, scene_of_clip
@@ -19,7 +19,7 @@ from tasks.world.frames import to_world
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.tasks.streets import street_clip
 
-REPLAY, IDM = TrafficSettings(mode="replay"), TrafficSettings(yields=False)  # who yields does as in the log here
+IDM = TrafficSettings(yields=False)  # who yields does as in the log here
 VOCABULARY = Vocabulary(kinematic_trajectories(60, 3))
 KEPT = (*HALVES, *WHOLES, "ep_raw_m")
 
@@ -28,12 +28,6 @@ def ahead(scene: Scene, speed_mps: float) -> NDArray[np.float64]:
     """(40, 3) straight on from the scene's ego."""
     way = speed_mps * 0.1 * np.arange(1, 41)
     return to_world(scene.ego_state[:3], np.column_stack([way, np.zeros((40, 2))]))
-
-
-def straight_on(speeds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(S, 40, 3) at constant speeds (S,) [m/s]."""
-    way = speeds[:, None] * 0.1 * np.arange(1, 41)
-    return np.stack([way, np.zeros_like(way), np.zeros_like(way)], axis=-1)
 
 
 @pytest.fixture(scope="module")
@@ -49,10 +43,8 @@ def human() -> Judged:
     return human_sample(scene_of_clip(street_clip()), Human(), PdmSettings(), np.random.default_rng(0))
 
 
-def labelled(
-    judged: Judged, traffic: TrafficSettings = REPLAY, vocabulary: Vocabulary = VOCABULARY
-) -> VocabularyLabels:
-    return vocabulary_labels(Labelling(vocabulary, traffic), judged.scene, judged.prepared, judged.reference)
+def labelled(judged: Judged, vocabulary: Vocabulary = VOCABULARY) -> VocabularyLabels:
+    return vocabulary_labels(vocabulary, judged.scene, judged.prepared, judged.reference)
 
 
 def in_pairs(judged: Judged, agents_of: str) -> Scores:
@@ -74,7 +66,7 @@ def assert_labels_are(labels: VocabularyLabels, scores: Scores) -> None:
 def test_labels_are_the_reward_s_scores_in_pairs_with_pdm_closed(simulated: Judged) -> None:
     labels = labelled(simulated)
     assert_labels_are(labels, in_pairs(simulated, "rollout"))
-    assert labels.vocabulary == VOCABULARY.digest and labels.traffic == "replay"
+    assert labels.vocabulary == VOCABULARY.digest
     assert len({*np.round(labels.pdm_score(), 3)}) > 10, "a vocabulary of all kinds of drives"
 
 
@@ -105,22 +97,6 @@ def test_chunks_leave_every_label_as_it_is(simulated: Judged, monkeypatch: pytes
     for name in KEPT:
         np.testing.assert_array_equal(getattr(chunked, name), getattr(whole, name))
     assert chunked.reference_progress_m == whole.reference_progress_m
-
-
-def test_reacting_traffic_answers_to_each_trajectory(human: Judged) -> None:
-    """Each label is that of a rollout of its own; the car ahead, free to go, makes way that the log's does not."""
-    scene = human.scene
-    some = Vocabulary(np.concatenate([VOCABULARY.trajectories[:6], straight_on(np.arange(14.0, 22.0))]))
-    labels = labelled(human, IDM, some)
-    assert labels.traffic == "idm"
-    poses = to_world(scene.ego_state[:3], some.trajectories)
-    for i, pose in enumerate(poses):
-        rollout = simulate(scene, pose, IDM)
-        alone = score(prepare_scene(scene, rollout.agents), rollout.ego_states[None])
-        for name in KEPT:
-            assert getattr(labels, name)[i] == getattr(alone, name)[0], (i, name)
-    replayed = labelled(human, REPLAY, some)
-    assert (labels.nc[6:] > replayed.nc[6:]).any() and (labels.ttc[6:] > replayed.ttc[6:]).any()
 
 
 def test_a_reference_at_fault_leaves_no_progress_to_be_held_against(human: Judged) -> None:

@@ -39,20 +39,12 @@ Array = NDArray[np.float64]
 @kernel
 def project_on_path(paths: Paths, m: int, x: float, y: float) -> tuple[float, float]:
     """(path length, offset to the left) of the point of path m nearest to (x, y): of all of its edges."""
-    xy = paths.xy[m]
-    best, best_s, best_offset = np.inf, 0.0, 0.0
-    for k in range(xy.shape[0] - 1):
-        ex, ey = xy[k + 1, 0] - xy[k, 0], xy[k + 1, 1] - xy[k, 1]
-        dx, dy = x - xy[k, 0], y - xy[k, 1]
-        f = (dx * ex + dy * ey) / (ex * ex + ey * ey)
-        f = min(max(f, 0.0), 1.0)
-        rx, ry = dx - f * ex, dy - f * ey
-        square = rx * rx + ry * ry
-        if square < best:
-            best = square
-            best_s = (k + f) * PATH_SPACING_M
-            best_offset = math.copysign(math.sqrt(square), ex * dy - ey * dx)
-    return best_s, best_offset
+    x0, y0 = paths.xy[m, :-1, 0], paths.xy[m, :-1, 1]
+    ex, ey, dx, dy = paths.xy[m, 1:, 0] - x0, paths.xy[m, 1:, 1] - y0, x - x0, y - y0
+    f = np.minimum(np.maximum((dx * ex + dy * ey) / (ex * ex + ey * ey), 0.0), 1.0)
+    squares = (dx - f * ex) ** 2 + (dy - f * ey) ** 2
+    k = np.argmin(squares)
+    return (k + f[k]) * PATH_SPACING_M, math.copysign(math.sqrt(squares[k]), ex[k] * dy[k] - ey[k] * dx[k])
 
 
 @kernel

@@ -12,7 +12,7 @@ from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Ro
 from tasks.world.frames import box_corners
 from tasks.world.road_map import Lane, LightState, TrafficLights
 from tests.tasks.rollout import worlds
-from tests.tasks.rollout.test_batched_traffic import stages
+from tests.tasks.rollout.test_traffic_twin import stages
 from tests.tasks.rollout.worlds import Track, lane
 
 Array = NDArray[np.float64]

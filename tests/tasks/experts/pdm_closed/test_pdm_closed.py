@@ -193,25 +193,6 @@ def test_a_speed_limit_of_zero_is_an_error_and_not_a_division(road: Road) -> Non
         plan_for(road(limit=0.0))
 
 
-def test_an_ego_state_with_a_nan_is_an_error(road: Road) -> None:
-    scene = road()
-    history = scene.ego_history.copy()
-    history[-1, 3] = np.nan
-    with pytest.raises(ValueError, match=r"ego_state must be \(11,\) finite numbers"):
-        plan_for(replace(scene, ego_history=history))
-    with pytest.raises(ValueError, match=r"ego_state must be \(11,\) finite numbers"):
-        plan_for(replace(scene, ego_history=history[:, :4]))
-
-
-def test_a_valid_object_without_a_box_is_an_error_that_names_it(road: Road, objects: Objects) -> None:
-    agents = objects([[80.0, 0.0, 0.0, *CAR], [90.0, 0.0, 0.0, *CAR]], [0.0, 0.0], [AgentKind.VEHICLE] * 2)
-    agents.boxes[:, 1, 3] = np.nan
-    with pytest.raises(ValueError, match="agents: track track1 is valid"):
-        plan_for(road(agents=agents))
-    with pytest.raises(ValueError, match="agents: 2 tracks need boxes"):
-        plan_for(road(agents=replace(agents, boxes=agents.boxes[..., :4])))
-
-
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [

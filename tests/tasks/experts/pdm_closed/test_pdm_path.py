@@ -51,17 +51,3 @@ def test_projection_and_interpolation_equal_their_slow_twin(seed: int) -> None:
         along = np.array([project(paths, index, x, y) for x, y in points])
         np.testing.assert_allclose(along, slow.project(points), rtol=0.0, atol=1e-9)
         np.testing.assert_allclose(poses_at(paths, along, index), slow.at(along), rtol=0.0, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("line", "wrong"),
-    [
-        (np.zeros((4, 3)), "centerline needs a length"),
-        (np.zeros((1, 3)), r"centerline must be \(P >= 2, 3\)"),
-        (np.zeros((4, 2)), r"centerline must be \(P >= 2, 3\)"),
-        (np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [2.0, 0.0, 0.0]]), "centerline holds NaN"),
-    ],
-)
-def test_a_centerline_that_cannot_be_driven_is_an_error(line: Array, wrong: str) -> None:
-    with pytest.raises(ValueError, match=wrong):
-        drive_paths(line, [0.0])

@@ -108,7 +108,7 @@ def test_a_track_that_appears_later_is_hit_only_then():
 def test_standing_on_a_red_connector_fails_and_a_green_one_does_not():
     connector = rectangle("turn", MapLayer.LANE_CONNECTOR, (15, -2), (30, 2))
     assert score(street(extra=[connector]), drive(6.0)).tlc[0] == 1.0
-    red = score(street(extra=[connector], red_lanes=("turn",)), drive(6.0))
+    red = score(street(extra=[connector], red_lanes=(("turn",), np.ones((41, 1), dtype=bool))), drive(6.0))
     assert red.tlc[0] == 0.0
     assert red.tlc_index[0] == np.ceil((15 - FRONT) / 0.6)
     phase = np.zeros((41, 1), dtype=bool)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tasks.reward.comfort import comfort_history, extended_comfort
+from tasks.reward.comfort import comfort_history
 from tasks.reward.epdms import score
 from tasks.world.frames import AX, AY, HEADING, X
 from tests.tasks.reward.straight_street import drive, past_of, street
@@ -56,8 +56,3 @@ def test_history_is_interpolated_across_the_heading_jump_and_ends_at_minus_0_2_s
     assert rows.shape == (14, 11)
     np.testing.assert_allclose(rows[:, X], np.arange(14.0), atol=1e-12)
     assert np.abs(np.diff(rows[:, HEADING])).max() < 0.03
-
-
-def test_frames_more_than_half_a_second_apart_have_no_extended_comfort():
-    with pytest.raises(ValueError, match="interval_s"):
-        extended_comfort(drive(5.0), drive(5.0), interval_s=0.6)

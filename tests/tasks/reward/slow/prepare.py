@@ -73,7 +73,7 @@ def prepare(
     polygons: Sequence[MapPolygon],
     route_lane_ids: frozenset[str],
     objects: AgentTracks,
-    red_lanes: tuple[str, ...] | tuple[tuple[str, ...], Bools] = (),
+    red_lanes: tuple[tuple[str, ...], Bools],
     vehicle: Vehicle = PACIFICA,
     ego_state0: Array | None = None,
     drop_touching: bool = True,
@@ -144,11 +144,8 @@ def _obstacles(objects: AgentTracks, ego_state0: Array | None, vehicle: Vehicle)
     )
 
 
-def _red_lanes(red_lanes: tuple[str, ...] | tuple[tuple[str, ...], Bools], polygons: Sequence[MapPolygon]) -> RedLanes:
-    if len(red_lanes) == 2 and isinstance(red_lanes[1], np.ndarray):
-        lane_ids, is_red = red_lanes
-    else:
-        lane_ids, is_red = red_lanes, np.ones((N_TIMES, len(red_lanes)), dtype=bool)
+def _red_lanes(red_lanes: tuple[tuple[str, ...], Bools], polygons: Sequence[MapPolygon]) -> RedLanes:
+    lane_ids, is_red = red_lanes
     shape_of = {polygon.token: polygon for polygon in polygons if polygon.layer in LANE_LAYERS}
     columns = [i for i, lane_id in enumerate(lane_ids) if lane_id in shape_of and is_red[:, i].any()]
     shapes = np.array([_shape(shape_of[lane_ids[i]]) for i in columns], dtype=object)

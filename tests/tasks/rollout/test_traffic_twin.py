@@ -1,4 +1,4 @@
-"""The traffic against its slow twin, and against many egos at once: the same to the last bit."""
+"""The traffic against its slow twin: the same to the last bit."""
 
 from dataclasses import replace
 
@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 from tasks.rollout.idm import AgentStates, IdmDriver
 from tasks.rollout.simulate import (
     SHORTEST_HEADWAY_S,
-    Rollouts,
     TrafficScene,
     TrafficSettings,
     next_scene,
     prepare_traffic,
     roll_out,
-    roll_out_many,
 )
 from tasks.world.clip import NOW, AgentTracks, Rollout
 from tasks.world.frames import HEADING, PACIFICA, VX, X, Y
@@ -80,12 +78,6 @@ def assert_same(rollout: Rollout, other: Rollout) -> None:
     assert rollout.simulated.tolist() == other.simulated.tolist()
 
 
-def assert_row_is(rollouts: Rollouts, b: int, rollout: Rollout) -> None:
-    for name in ("boxes", "velocities", "valid"):
-        assert getattr(rollouts, name)[b].tobytes() == getattr(rollout.agents, name).tobytes(), name
-    assert rollouts.simulated[b].tolist() == rollout.simulated.tolist()
-
-
 @BOTH
 @given(seed=seeds)
 @settings(max_examples=25)
@@ -107,16 +99,6 @@ def test_so_it_does_under_other_settings(yields: bool, seed: int, blend_length_m
     )
     for traffic, egos in stages(seed, of):
         assert_same(roll_out(traffic, egos[0]), slow_roll_out(traffic, egos[0]))
-
-
-@BOTH
-@given(seed=seeds)
-@settings(max_examples=12)
-def test_each_of_many_rollouts_is_that_of_its_ego_alone(yields: bool, seed: int) -> None:
-    for traffic, egos in stages(seed, TrafficSettings(yields=yields)):
-        rollouts = roll_out_many(traffic, egos)
-        for b, ego in enumerate(egos):
-            assert_row_is(rollouts, b, roll_out(traffic, ego))
 
 
 def test_the_random_worlds_reach_every_rule() -> None:
@@ -143,33 +125,18 @@ def test_the_random_worlds_reach_every_rule() -> None:
     assert min(braked, waited, kept_out, answers) > 20
 
 
-def test_replay_answers_no_ego_and_copies_nothing() -> None:
+def test_replay_answers_no_ego() -> None:
     scene = worlds.random_scene(1)
-    rollouts = roll_out_many(prepare_traffic(scene, TrafficSettings(mode="replay")), worlds.random_egos(scene, 1, 5))
-    assert np.shares_memory(rollouts.boxes, scene.agents.boxes)
-    for name in ("boxes", "velocities", "valid"):
-        logged = getattr(scene.agents, name)[NOW : NOW + 41]
-        assert all(row.tobytes() == logged.tobytes() for row in getattr(rollouts, name))
-    assert rollouts.simulated.shape == (5, len(scene.agents)) and not rollouts.simulated.any()
-
-
-def test_an_empty_street_and_no_ego_at_all() -> None:
-    empty = worlds.scene(worlds.straight_road())
-    assert roll_out_many(prepare_traffic(empty, IDM), worlds.random_egos(empty, 0, 3)).boxes.shape == (3, 41, 0, 5)
-    scene = worlds.random_scene(0)
-    none = roll_out_many(prepare_traffic(scene, IDM), np.zeros((0, 41, 11)))
-    assert none.boxes.shape == (0, 41, len(scene.agents), 5)
+    (ego,) = worlds.random_egos(scene, 1, 1)
+    rollout = roll_out(prepare_traffic(scene, TrafficSettings(mode="replay")), ego)
+    assert np.shares_memory(rollout.agents.boxes, scene.agents.boxes) and not rollout.simulated.any()
+    np.testing.assert_array_equal(rollout.agents.boxes, scene.agents.boxes[NOW : NOW + 41])
 
 
 def test_states_that_are_none_are_refused_by_name() -> None:
     scene = worlds.random_scene(0)
     traffic, egos = prepare_traffic(scene, IDM), worlds.random_egos(scene, 0, 2)
-    for wrong in (egos[0], egos[:, :40], egos[..., :10]):
-        with pytest.raises(ValueError, match="ego_states"):
-            roll_out_many(traffic, wrong)
     egos[1, 3, X] = np.nan
-    with pytest.raises(ValueError, match="ego_states of ego 1"):
-        roll_out_many(traffic, egos)
     for one in (egos[1], egos[0, :40], egos[0, :, :10]):
         with pytest.raises(ValueError, match="ego_states"):
             roll_out(traffic, one)
