@@ -27,20 +27,20 @@ from factory.stages.imaging import Imaging, scene_cache_counts
 from factory.stages.rows import label_columns, sample_row
 from factory.store.samples import CandidateRow
 from factory.store.schema import UNLISTED, RunIdentity
-from tasks.attempt import ExpertGate, Judged, Timed, attempt, has_route, human_sample, perturbed_scene
+from tasks.attempt import ExpertGate, Judged, Timed, attempt, drive_as_human, has_route, perturbed_scene
 from tasks.experts.pdm_closed import PdmSettings
-from tasks.experts.protocol import Expert, Human, tried_once
-from tasks.hard_scenes import BEFORE_STEPS, BenchmarkClip, follow_up, frame_digest, half_a_second_before
+from tasks.experts.protocol import Expert, Human, drives_once_per_clip
+from tasks.hard_scenes import BEFORE_STEPS, BenchmarkClip, drive_follow_up, frame_digest, seen_half_a_second_earlier
 from tasks.perturb import NO_STARTS, Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
 from tasks.render.scene.engine import require_backend
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import vocabulary_labels
-from tasks.rollout.simulate import TrafficSettings, refuse_another_policy
+from tasks.rollout.simulate import TrafficSettings, check_same_policy
 from tasks.stages import FOLLOW_UP_BEFORE, HUMAN_BEFORE, Rejected
 from tasks.subscores import OF_ONE_PLAN
 from tasks.world.arrays import Array
-from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip, stream
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, random_stream, scene_of_clip
 from tasks.world.frames import HEADING
 from tasks.world.vocabulary import Vocabulary
 
@@ -189,7 +189,7 @@ class FactoryWork:
             blocked = self.imaging.block_verdict(clip) if asked else None
         self._refuse_another_policy()
         with watch.timing("perturb"):
-            rng, starts = stream(self.seed, clip.clip_id, "perturb"), self.starts.get(clip.clip_id, NO_STARTS)
+            rng, starts = random_stream(self.seed, clip.clip_id, "perturb"), self.starts.get(clip.clip_id, NO_STARTS)
             found = blocked or perturb(clip, self.vocabulary, self.perturb, self.traffic, self.pdm, rng, starts)
         return WholeClip(clip, found, watch.seconds)
 
@@ -219,9 +219,9 @@ class FactoryWork:
     def trace(self, prepared: PreparedClip, candidate: int, expert: str, timed: Timed = nullcontext) -> Drive:
         """The same with nothing left out."""
         payload, driver = perturbed_clip_of(prepared), self.experts[expert]
-        rng = stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
-        if tried_once(driver):
-            judged = human_sample(scene_of_clip(payload.clip), driver, self.pdm, rng, timed)
+        rng = random_stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
+        if drives_once_per_clip(driver):
+            judged = drive_as_human(scene_of_clip(payload.clip), driver, self.pdm, rng, timed)
             return Drive(payload.ref, None, judged, None)
         chosen = payload.candidates[candidate]
         self._refuse_another_policy()
@@ -321,7 +321,7 @@ class FactoryWork:
 
     def once(self, expert: str) -> bool:
         """Whether the expert says so itself."""
-        return tried_once(self.experts[expert])
+        return drives_once_per_clip(self.experts[expert])
 
     def expert_digest(self, expert: str) -> str:
         """Of the expert's inputs and settings."""
@@ -334,7 +334,7 @@ class FactoryWork:
 
     def _refuse_another_policy(self) -> None:
         """Raises OSError where the policy that drives is another one than the rows say."""
-        refuse_another_policy(self.traffic, self.identity.settings.get("traffic.policy"))
+        check_same_policy(self.traffic, self.identity.settings.get("traffic.policy"))
 
     @property
     def _simulates(self) -> bool:
@@ -469,14 +469,14 @@ class BenchmarkWork(FactoryWork):
         payload = perturbed_clip_of(prepared)
         if expert == HUMAN_BEFORE:
             assert prepared.scenes is not None, "prepared by a run without frames"
-            rng = stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
-            judged = human_sample(scene_of_clip(prepared.scenes.before), Human(), self.pdm, rng, timed)
+            rng = random_stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
+            judged = drive_as_human(scene_of_clip(prepared.scenes.before), Human(), self.pdm, rng, timed)
             return Drive(_earlier_ref(payload.ref), None, judged, None, row_overrides=_earlier_lineage(payload.clip))
         chosen = payload.candidates[candidate]
-        led_to = follow_up(payload.clip, chosen.rollout, self.traffic, self.pdm, timed)
+        led_to = drive_follow_up(payload.clip, chosen.rollout, self.traffic, self.pdm, timed)
         if isinstance(led_to, Rejected):
             return Drive(payload.ref, chosen, None, led_to)
-        shown = half_a_second_before(led_to, chosen.rollout, self.pdm) if expert == FOLLOW_UP_BEFORE else None
+        shown = seen_half_a_second_earlier(led_to, chosen.rollout, self.pdm) if expert == FOLLOW_UP_BEFORE else None
         now = led_to.scene.step
         return Drive(payload.ref, chosen, led_to, None, shared=(now - BEFORE_STEPS, now), sampled_instead=shown)
 

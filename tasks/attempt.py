@@ -12,7 +12,7 @@ import numpy as np
 from tasks.experts.pdm_closed import MIN_PROGRESS_M, PdmClosed, PdmPlan, PdmSettings, path_length_m, plan_for
 from tasks.experts.protocol import Expert, Plan
 from tasks.reward.epdms import PreparedScene, Scores, prepare_scene, score
-from tasks.reward.labels import end_fault
+from tasks.reward.labels import check_end
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.settings import ExpertGate
@@ -96,7 +96,7 @@ def verdict(scores: Scores, gate: ExpertGate) -> Rejected | None:
 
 def end_verdict(judged: Judged, traffic: TrafficScene, gate: ExpertGate) -> Rejected | None:
     """None where a drive's end leads on as the gate asks (docs/reward.md 2m); traffic: as the drive met it."""
-    return end_fault(traffic, judged.prepared, judged.rollout.ego_states, gate)
+    return check_end(traffic, judged.prepared, judged.rollout.ego_states, gate)
 
 
 def attempt(
@@ -127,7 +127,7 @@ def attempt(
         return judged, verdict(judged.scores, gate) or end_verdict(judged, ready, gate)
 
 
-def human_sample(
+def drive_as_human(
     scene: Scene, expert: Expert, planner: PdmSettings, rng: np.random.Generator, timed: Timed = nullcontext
 ) -> Judged:
     """The drive from the log at T, scored under log replay and never filtered."""

@@ -30,19 +30,19 @@ class Damaged(ValueError):
     """A file is not as it was written: cut, or overwritten."""
 
 
-def sealed(content: bytes, key: str = "") -> bytes:
+def with_checksum(content: bytes, key: str = "") -> bytes:
     """What to write."""
     return content + SEAL + _keyed(hashlib.sha256(content), key)
 
 
-def unsealed(data: bytes, key: str = "") -> bytes:
+def without_checksum(data: bytes, key: str = "") -> bytes:
     """The content of what was read under a key. Raises Damaged."""
     content = data[:-SEAL_BYTES]
     _compare(hashlib.sha256(content), data[-SEAL_BYTES:], key)
     return content
 
 
-def seal(path: Path, key: str = "") -> None:
+def append_checksum(path: Path, key: str = "") -> None:
     """Appends the seal to a file that is written."""
     with path.open("rb") as file:
         sha = hashlib.file_digest(file, "sha256")
@@ -50,7 +50,7 @@ def seal(path: Path, key: str = "") -> None:
         file.write(SEAL + _keyed(sha, key))
 
 
-def check(path: Path, key: str = "") -> None:
+def verify_checksum(path: Path, key: str = "") -> None:
     """Holds a large file against its seal without having it in memory. Raises Damaged, OSError."""
     left, sha = path.stat().st_size - SEAL_BYTES, hashlib.sha256()
     with path.open("rb") as file:
@@ -63,17 +63,17 @@ def check(path: Path, key: str = "") -> None:
         _compare(sha, file.read(), key)
 
 
-def sealed_json(members: Mapping[str, Any]) -> str:
+def json_with_checksum(members: Mapping[str, Any]) -> str:
     """As text for people too, the checksum last."""
     return json.dumps({**members, MEMBER: _json_digest(members)}, indent=1)
 
 
-def unsealed_json(text: bytes) -> dict[str, Any]:
+def parse_json_with_checksum(text: bytes) -> dict[str, Any]:
     """The opposite. Raises Damaged."""
     try:
         members: dict[str, Any] = json.loads(text)
         stated = members.pop(MEMBER)
-        if sealed_json(members) != text.decode():  # its own words alone: a changed space is damage too
+        if json_with_checksum(members) != text.decode():  # its own words alone: a changed space is damage too
             raise Damaged(f"its checksum is not the stated {stated}")
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise error if isinstance(error, Damaged) else Damaged("no JSON with a checksum") from error

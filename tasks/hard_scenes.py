@@ -76,7 +76,7 @@ def frame_digest(frame: str, planner: PdmSettings) -> str:
     return hashlib.sha256(repr((planner, frame == FOLLOW_UP_BEFORE)).encode()).hexdigest()[:16]
 
 
-def follow_up(
+def drive_follow_up(
     clip: Clip, stage_one: Rollout, traffic: TrafficSettings, planner: PdmSettings, timed: Timed = nullcontext
 ) -> Judged | Rejected:
     """PDM-Closed from T+H of a candidate's rollout, scored and never filtered.
@@ -94,7 +94,7 @@ def follow_up(
     return drive_and_judge(scene, Plan(pdm_plan.poses), traffic, planner, timed, pdm_plan)
 
 
-def half_a_second_before(judged: Judged, stage_one: Rollout, planner: PdmSettings) -> Judged:
+def seen_half_a_second_earlier(judged: Judged, stage_one: Rollout, planner: PdmSettings) -> Judged:
     """A follow-up's drive seen from its earlier frame: the last 0.5 s of the perturbation, then what came of it."""
     kept = HORIZON_STEPS - BEFORE_STEPS
     scene = perturbed_scene(judged.scene.clip, stage_one, kept)

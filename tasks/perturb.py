@@ -16,7 +16,7 @@ from itertools import islice
 import numpy as np
 
 from tasks.experts.pdm_closed import PdmSettings, plan_for
-from tasks.reward.epdms import Scores, among, prepare_scene, score
+from tasks.reward.epdms import Scores, prepare_scene, score, with_objects
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tasks.settings import PerturbSettings
@@ -49,11 +49,11 @@ class Perturbation:
 
     candidates: tuple[Candidate, ...]
     gate_counts: dict[str, int]
-    considered: "Considered"
+    considered: "ConsideredTrajectories"
 
 
 @dataclass(frozen=True)
-class Considered:
+class ConsideredTrajectories:
     """Every vocabulary trajectory that passed the raw gates, then the clip's own starts, and what became of them.
 
     For `explain` and pictures.
@@ -135,7 +135,7 @@ def perturb(
     a vocabulary's.
     """
     if settings.at_log:
-        return log_alone(clip, traffic, planner)
+        return log_as_candidate(clip, traffic, planner)
     scene = scene_of_clip(clip)
     start = scene.ego_state
     target = clip.ego_states[NOW + HORIZON_STEPS, : HEADING + 1]  # the logged pose at T+H
@@ -189,7 +189,7 @@ def perturb(
     def passes_reactive(member: int) -> bool:
         rollout = roll_out(traffic_scene, states[member].copy())
         pair = np.concatenate([pdm_states, rollout.ego_states[None]])
-        reactive = score(among(replay, rollout.agents, touched_from), pair, normalise="pairs")
+        reactive = score(with_objects(replay, rollout.agents, touched_from), pair, normalise="pairs")
         good = bool(reactive.pdm_score[1] >= settings.epdms_min)
         fate[member] = "kept" if good else "reactive"
         if good:
@@ -219,10 +219,10 @@ def perturb(
         counts |= {f"start_{what}": int((fate[n_gated:] == what).sum()) for what in START_FATES}
     if not candidates:
         return Rejected("perturb", "no_good_candidate", ", ".join(f"{k} {v}" for k, v in counts.items()), counts)
-    return Perturbation(tuple(candidates), counts, Considered(index, ends, tuple(fate), scores))
+    return Perturbation(tuple(candidates), counts, ConsideredTrajectories(index, ends, tuple(fate), scores))
 
 
-def log_alone(clip: Clip, traffic: TrafficSettings, planner: PdmSettings) -> Perturbation:
+def log_as_candidate(clip: Clip, traffic: TrafficSettings, planner: PdmSettings) -> Perturbation:
     """The log's own drive as the only candidate, among the traffic that answers to it; no score keeps it out."""
     scene, states = scene_of_clip(clip), clip.ego_states[NOW : NOW + HORIZON_STEPS + 1]
     pdm_states = plan_for(scene, planner).driven[None]
@@ -230,7 +230,7 @@ def log_alone(clip: Clip, traffic: TrafficSettings, planner: PdmSettings) -> Per
     rollout = roll_out(prepare_traffic(scene, traffic), states.copy())
     touched_from = scene.ego_state if traffic.leaves_out_touching else None
     pair = np.concatenate([pdm_states, states[None]])
-    reactive = score(among(replay, rollout.agents, touched_from), pair, normalise="pairs")
+    reactive = score(with_objects(replay, rollout.agents, touched_from), pair, normalise="pairs")
     logged = Candidate(
         vocabulary_index=OF_LOG,
         end_pose=np.zeros(3),
@@ -240,7 +240,7 @@ def log_alone(clip: Clip, traffic: TrafficSettings, planner: PdmSettings) -> Per
         reactive_scores=reactive,
         rollout=rollout,
     )
-    known = Considered(np.array([OF_LOG]), np.zeros((1, 3)), ("kept",), np.array([logged.score]))
+    known = ConsideredTrajectories(np.array([OF_LOG]), np.zeros((1, 3)), ("kept",), np.array([logged.score]))
     return Perturbation((logged,), {}, known)
 
 

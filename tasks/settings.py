@@ -10,7 +10,7 @@ T = TypeVar("T")
 FIXED = "fixed"  # in the metadata of a field
 
 
-def fixed(value: T) -> T:
+def constant(value: T) -> T:
     """The default of a field that no configuration sets: a constant with its reason behind it, recorded with the rest.
 
     Code that makes the settings itself, such as a test or a bench, may give another value.
@@ -19,7 +19,7 @@ def fixed(value: T) -> T:
     return constant
 
 
-def offered(shape: type[Any]) -> list[Field[Any]]:
+def configurable_fields(shape: type[Any]) -> list[Field[Any]]:
     """The fields of a dataclass of settings that configuration may set."""
     return [each for each in fields(shape) if FIXED not in each.metadata]
 
@@ -86,10 +86,10 @@ class TrafficSettings:
     headway_s: float = 1.5
     accel_max: float = 1.0  # m/s2
     decel_max: float = 2.0  # m/s2, comfortable
-    exponent: float = fixed(4.0)  # of the free-road term
-    emergency_decel: float = fixed(8.0)  # m/s2, what tyres can; the public traffic knows no limit
-    lookahead_m: float = fixed(60.0)
-    blend_length_m: float = fixed(20.0)  # over which a start beside the path fades onto it
+    exponent: float = constant(4.0)  # of the free-road term
+    emergency_decel: float = constant(8.0)  # m/s2, what tyres can; the public traffic knows no limit
+    lookahead_m: float = constant(60.0)
+    blend_length_m: float = constant(20.0)  # over which a start beside the path fades onto it
     yields: bool = True  # idm: drivers keep the intent of their log, and give way where paths cross or merge
     policy: str | None = None  # custom: a class, or function, that makes one: my_package.my_module:MyPolicy
 
@@ -121,12 +121,12 @@ class PdmSettings:
 
     speed_fractions: tuple[float, ...] = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the lane's speed limit
     lateral_offsets_m: tuple[float, ...] = (0.0, -1.0, 1.0)  # + is to the left
-    fallback_speed_mps: float = fixed(15.0)  # where the lane has no speed limit
-    min_gap_m: float = fixed(1.0)
+    fallback_speed_mps: float = constant(15.0)  # where the lane has no speed limit
+    min_gap_m: float = constant(1.0)
     headway_s: float = 1.5
-    accel_max_mps2: float = fixed(1.5)
-    decel_max_mps2: float = fixed(3.0)
-    exponent: int = fixed(10)  # of IDM's free-road term
+    accel_max_mps2: float = constant(1.5)
+    decel_max_mps2: float = constant(3.0)
+    exponent: int = constant(10)  # of IDM's free-road term
     shared_lead_memory: bool = True  # within one path, a speed inherits lead fields its own search did not write
     brakes_at_first_step: bool = True  # no lead is looked for before 0.2 s: until then one seems to stand at the bumper
     speed_below_zero: bool = True  # a stop before an oncoming car overshoots into creeping backwards
@@ -178,5 +178,5 @@ class RecoverySettings:
 
     smooth: bool = True  # False: the retrieved trajectory as it is, as published
     # Of the matching vector: vx, vy, heading now; x, y, heading at the end. The paper weighs none.
-    weights: tuple[float, float, float, float, float, float] = fixed((1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
-    feasible: FeasibleSettings = fixed(FEASIBLE_DEFAULTS)  # of the smoothing
+    weights: tuple[float, float, float, float, float, float] = constant((1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
+    feasible: FeasibleSettings = constant(FEASIBLE_DEFAULTS)  # of the smoothing

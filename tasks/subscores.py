@@ -60,11 +60,11 @@ TOTAL_WEIGHT = sum(WEIGHTS.values())
 PROGRESS_THRESHOLD_M = 5.0
 
 
-def multiplied(scores: Mapping[str, "NDArray[np.float64]"]) -> "NDArray[np.float64]":
+def multiplier_product(scores: Mapping[str, "NDArray[np.float64]"]) -> "NDArray[np.float64]":
     """What the weighted mean is multiplied by (K,), of sub-scores (K,) by name."""
     return reduce(mul, (scores[name] for name in MULTIPLIERS))
 
 
-def weighted(scores: Mapping[str, "NDArray[np.float64]"]) -> "NDArray[np.float64]":
+def weighted_sum(scores: Mapping[str, "NDArray[np.float64]"]) -> "NDArray[np.float64]":
     """The weighted sum (K,) of sub-scores (K,) of one plan by name; its mean is over TOTAL_WEIGHT."""
     return reduce(add, (weight * scores[name] for name, weight in WEIGHTS.items()))

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 
 from tasks.experts.pdm_closed import plan_for
-from tasks.reward.epdms import N_TIMES, Scores, prepare_scene, rows, score
+from tasks.reward.epdms import N_TIMES, Scores, prepare_scene, score, select_rows
 from tasks.rollout.lqr import track
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, Scene, scene_of_clip
@@ -35,7 +35,7 @@ def score_trajectories(clip: Clip, poses: Array, *, reference: Reference | Array
     if isinstance(reference, str) and reference == "batch":
         return score(prepared, states)
     pair = np.concatenate([_reference_states(scene, reference), states])
-    return rows(score(prepared, pair, normalise="pairs"), slice(1, None))
+    return select_rows(score(prepared, pair, normalise="pairs"), slice(1, None))
 
 
 def _reference_states(scene: Scene, reference: Reference | Array) -> Array:

@@ -28,7 +28,7 @@ from tasks.reward.epdms import score_with_ec
 from tasks.rollout.lqr import track
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
-from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene, scene_of_clip, stream
+from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene, random_stream, scene_of_clip
 from tasks.world.frames import AX, YAW_RATE
 
 COLUMNS = {
@@ -105,7 +105,7 @@ def states_before(work: FactoryWork, prepared: PreparedClip, candidate: int, nam
     else:
         rollout = payload.candidates[candidate].rollout
         before = perturbed_scene(payload.clip, rollout, HORIZON_STEPS - BEFORE_STEPS)
-    plan = expert.plan(before, stream(work.seed, prepared.clip_id, f"expert.{name}", candidate))
+    plan = expert.plan(before, random_stream(work.seed, prepared.clip_id, f"expert.{name}", candidate))
     return None if isinstance(plan, Rejected) else _driven(before, plan)
 
 

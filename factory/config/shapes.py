@@ -14,7 +14,7 @@ from enum import Enum
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from tasks.settings import offered
+from tasks.settings import configurable_fields
 
 SWITCH = ("false", "true")
 GIVE = "???"  # as Hydra has it: a value that must be given
@@ -31,7 +31,7 @@ def dataclass_in(hint: Any) -> type[Any] | None:
 def keys_of(shape: type[Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Every key with dots that may be set, groups before what is in them, and its type."""
     hints = get_type_hints(shape)
-    for field in offered(shape):
+    for field in configurable_fields(shape):
         yield f"{prefix}{field.name}", hints[field.name]
         inner = dataclass_in(hints[field.name])
         if inner is not None:
@@ -51,12 +51,14 @@ def choices_of(hint: Any) -> list[str]:
 
 def defaults_of(shape: type[Any]) -> dict[str, Any]:
     """Key -> default of every field that has one, as YAML would hold it."""
-    return {field.name: plain(_default(field)) for field in offered(shape) if _default(field) is not MISSING}
+    return {
+        field.name: plain(_default(field)) for field in configurable_fields(shape) if _default(field) is not MISSING
+    }
 
 
 def to_give(shape: type[Any]) -> dict[str, Any]:
     """Key -> ??? of every field that has no default."""
-    return {field.name: GIVE for field in offered(shape) if _default(field) is MISSING}
+    return {field.name: GIVE for field in configurable_fields(shape) if _default(field) is MISSING}
 
 
 def _default(field: Field[Any]) -> Any:
@@ -66,7 +68,7 @@ def _default(field: Field[Any]) -> Any:
 def plain(value: Any) -> Any:
     """Dataclasses as mappings of what they offer, tuples as lists, enums as text."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in offered(type(value))}
+        return {field.name: plain(getattr(value, field.name)) for field in configurable_fields(type(value))}
     if isinstance(value, Mapping):
         return {key: plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):

@@ -28,8 +28,8 @@ from factory.setup.vocabulary import (
 )
 from factory.stages.sensors import choose_cameras, masks_digest, refuse_unknown_masks
 from factory.store.schema import UNLISTED, RunIdentity, canonical_json
-from tasks.caches import check, user_cache
-from tasks.experts.protocol import Expert, tried_once
+from tasks.caches import user_cache, verify_checksum
+from tasks.experts.protocol import Expert, drives_once_per_clip
 from tasks.experts.recovery import Recovery, RecoverySettings, RecoveryTable
 from tasks.render.scene import engine
 from tasks.render.settings import RenderMode
@@ -216,7 +216,7 @@ def _asks_for_run(target: Callable[..., Any]) -> bool:
 
 def simulates(config: RunConfig) -> bool:
     """Whether the run drives from candidates: not where all its experts are tried once, on the log itself."""
-    return any(name in FRAMES or not tried_once(_target(config, name)) for name in config.experts)
+    return any(name in FRAMES or not drives_once_per_clip(_target(config, name)) for name in config.experts)
 
 
 def _must_have(plugged: object, members: Sequence[str], where: str, what: str) -> None:
@@ -308,7 +308,7 @@ def _table_of(run: RunContext, vocabularies: Sequence[str]) -> RecoveryTable:
     cached = user_cache() / "tables" / f"recovery-{key}.npz"
     if cached.is_file():
         try:
-            check(cached, cached.name)
+            verify_checksum(cached, cached.name)
             return load_recovery_table(cached)
         except ValueError as error:  # Damaged among them
             log.warning("%s: %s; it is made again", cached, str(error).removeprefix(f"{cached}: "))

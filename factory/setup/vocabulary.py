@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from factory.files import atomic_file
 from factory.readers.base import BadClip, ClipReader, read_clip
-from tasks.caches import seal
+from tasks.caches import append_checksum
 from tasks.experts.recovery import RecoveryTable
 from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, STEP_S
@@ -182,7 +182,7 @@ def save_recovery_table(path: str | Path, table: RecoveryTable, origin: dict[str
         with draft.open("wb") as file:
             np.savez(file, allow_pickle=False, trajectories=table.trajectories, digest=np.array(table.digest))
         if key:
-            seal(draft, key)
+            append_checksum(draft, key)
     _describe(Path(path), {"digest": table.digest, "trajectories": len(table)} | origin)
 
 

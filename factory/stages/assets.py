@@ -41,6 +41,7 @@ from factory.wording import time_text
 from tasks.caches import Damaged, check, seal, sealed_json, unsealed_json
 from tasks.render.fit.reconstruct import finish_scene, fit_backend, run_iterations
 from tasks.render.fit.start import prepare_fit
+from tasks.caches import Damaged, append_checksum, verify_checksum
 from tasks.render.fit.state import FitState
 from tasks.render.rig.correct import RigCorrection, correct_rig, detect_corners, estimate_ground_height, movable_mask
 from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom, photo_rises
@@ -51,7 +52,7 @@ from tasks.render.scene.sensed import median_own_bodies
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
 from tasks.render.settings import Adjust, Backend, FitSettings, RenderSettings, RigSettings, SceneDtype, SceneFrom
 from tasks.world.arrays import Array, Bools
-from tasks.world.clip import AgentTracks, Block, Camera, Clip, SensorFile, of_other_log, own_name
+from tasks.world.clip import AgentTracks, Block, Camera, Clip, SensorFile, is_of_other_log, own_name
 
 # A block's cameras and poses corrected by its photos before anything is made of them, and what that changed, on disk.
 #
@@ -286,7 +287,7 @@ def fit_scene(
         with atomic_file(begun, sum(array.nbytes for array in arrays.values())) as draft:
             with draft.open("wb") as file:
                 np.savez(file, **arrays)  # type: ignore[arg-type]
-            seal(draft, begun.name)
+            append_checksum(draft, begun.name)
         if state.iteration < settings.iterations and stopped():
             said.unlink(missing_ok=True)
             raise TaskStopped(f"{path.stem}: {state.iteration} of {settings.iterations} iterations are done")
@@ -312,7 +313,7 @@ def _resumed(begun: Path, start: FitState) -> FitState:
     if not begun.exists():
         return start
     try:
-        check(begun, begun.name)
+        verify_checksum(begun, begun.name)
         with np.load(begun, allow_pickle=False) as arrays:
             return FitState.from_arrays(dict(arrays))
     except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
@@ -417,12 +418,12 @@ def without_other_logs(asset: RenderAsset) -> RenderAsset:
     """A scene without what is of other logs' drives through it alone: their clips have a block of their own."""
     return replace(
         asset,
-        nodes={name: node for name, node in asset.nodes.items() if not of_other_log(name)},
-        exposures=tuple(exposure for exposure in asset.exposures if not of_other_log(exposure.camera)),
-        rig=tuple(camera for camera in asset.rig if not of_other_log(camera.name)),
-        taken=tuple(photo for photo in asset.taken if not of_other_log(photo.camera)),
-        bodies=tuple(body for body in asset.bodies if not of_other_log(body.camera)),
-        shifts=asset.shifts.select([name for name in asset.shifts.track_ids if not of_other_log(name)]),
+        nodes={name: node for name, node in asset.nodes.items() if not is_of_other_log(name)},
+        exposures=tuple(exposure for exposure in asset.exposures if not is_of_other_log(exposure.camera)),
+        rig=tuple(camera for camera in asset.rig if not is_of_other_log(camera.name)),
+        taken=tuple(photo for photo in asset.taken if not is_of_other_log(photo.camera)),
+        bodies=tuple(body for body in asset.bodies if not is_of_other_log(body.camera)),
+        shifts=asset.shifts.of([name for name in asset.shifts.track_ids if not is_of_other_log(name)]),
     )
 
 
@@ -503,6 +504,6 @@ def _check_file(path: Path) -> None:
     if path.name.endswith(SUFFIX):
         read_scene(path, path.stem)
     elif path.name.endswith(FIT_SUFFIX):
-        check(path, path.name)
+        verify_checksum(path, path.name)
     elif path.name.endswith(RIG_SUFFIX):
         read_rig_file(path)

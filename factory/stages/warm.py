@@ -19,7 +19,7 @@ from factory.exits import become_worker, terminal_signals_blocked
 from factory.files import locked
 from factory.graph.steps import NotReady
 from tasks.attempt import drive_and_judge
-from tasks.caches import Damaged, sealed, unsealed
+from tasks.caches import Damaged, with_checksum, without_checksum
 from tasks.experts.pdm_closed import forecast, proposals
 from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import USED, cache_dir, cache_write_error, make_cache_dir, processor_key, write_whole
@@ -137,7 +137,8 @@ def _is_compiled(name: str) -> bool:
     """The part was compiled, and nobody has taken a file of it away since."""
     try:
         files = [
-            cache_dir() / file for file in unsealed(marker(name).read_bytes(), marker(name).name).decode().splitlines()
+            cache_dir() / file
+            for file in without_checksum(marker(name).read_bytes(), marker(name).name).decode().splitlines()
         ]
     except OSError:  # not there, or in a folder that cannot be: whoever then writes into it says so
         return False
@@ -180,7 +181,7 @@ def _compile_and_mark(name: str) -> int:
     listed = "\n".join(sorted(path.relative_to(cache_dir()).as_posix() for path in USED))
     try:
         for part in (name, *INCLUDED.get(name, ())):
-            write_whole(marker(part), sealed(listed.encode(), marker(part).name))
+            write_whole(marker(part), with_checksum(listed.encode(), marker(part).name))
     except OSError as error:
         print(error, file=sys.stderr)
         return DISK_FULL

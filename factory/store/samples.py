@@ -31,7 +31,7 @@ from factory.store.schema import (
     why_other_schema,
 )
 from factory.store.table import Bytes, Codes, Ints, KeyedTable, distinct_rows, fixed_bytes, text_codes
-from tasks.caches import MEMBER, sealed_json, unsealed_json
+from tasks.caches import MEMBER, json_with_checksum, parse_json_with_checksum
 
 # What became of attempts: the tables `outcomes`, `candidates` and `plans`, and the history that a run goes on from.
 
@@ -382,7 +382,9 @@ def refuse_other_schema(out: Location) -> None:
     if data is None:
         return
     try:
-        version = (unsealed_json(data) if f'"{MEMBER}"'.encode() in data else json.loads(data))["schema_version"]
+        version = (parse_json_with_checksum(data) if f'"{MEMBER}"'.encode() in data else json.loads(data))[
+            "schema_version"
+        ]
     except (ValueError, KeyError, TypeError):  # damaged: who needs the records says so
         return
     if other := why_other_schema(out.uri, version):
@@ -482,7 +484,7 @@ class Store:
                 table.commit([], drop=list(table))
         if list(records) != self.runs():
             document = json.loads(canonical_json({"schema_version": SCHEMA_VERSION, "runs": list(records)}))
-            self.location.write(RUN_FILE, sealed_json(document).encode())
+            self.location.write(RUN_FILE, json_with_checksum(document).encode())
         twice = {key.decode() for key in np.intersect1d(self.outcomes.keys(), self.samples.keys(), True).tolist()}
         if twice:
             age = run_number_lookup(records)
@@ -515,7 +517,7 @@ class Store:
         if data is None:
             return []
         try:
-            return list(unsealed_json(data)["runs"])
+            return list(parse_json_with_checksum(data)["runs"])
         except (ValueError, KeyError, TypeError) as error:
             raise ChangedRun(f"{self.location.uri}/{RUN_FILE}: not readable: {error}") from error
 

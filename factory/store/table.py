@@ -44,7 +44,7 @@ from factory.store.location import (
 )
 from factory.store.schema import TableSpec
 from factory.wording import one_line
-from tasks.caches import Damaged, sealed, unsealed
+from tasks.caches import Damaged, with_checksum, without_checksum
 
 # Texts of millions of rows as integers: a number for each different text.
 
@@ -283,12 +283,12 @@ class CommitCopies:
     def _copy(self, name: str) -> bool:
         data = self._log.read(name)
         if data is not None:
-            self._copies.write(name, sealed(data, name))
+            self._copies.write(name, with_checksum(data, name))
         return data is not None
 
     def _copy_of(self, name: str) -> bytes:
         """Raises Damaged."""
-        return unsealed(self._copies.read(name) or b"", name)
+        return without_checksum(self._copies.read(name) or b"", name)
 
     def _unsealed(self) -> tuple[Mapping[str, bytes], list[DamagedPart]]:
         whole, problems = {}, []

@@ -11,7 +11,7 @@ import numpy as np
 from factory.store.reader import decode_stored_image, labels_of
 from factory.store.schema import NOW_INDEX
 from tasks.attempt import Judged
-from tasks.perturb import Candidate, Considered
+from tasks.perturb import Candidate, ConsideredTrajectories
 from tasks.world.arrays import Array, Bytes, Image, ShortInts
 from tasks.world.clip import NOW, AgentKind, Clip
 from tasks.world.frames import HEADING, PACIFICA, box_corners, points_to_local, to_local
@@ -211,7 +211,7 @@ def _ways(clip: Clip, candidate: Candidate | None, judged: Judged | None, expert
     return ways
 
 
-def candidates_picture(clip: Clip, considered: Considered, size_px: tuple[int, int] = (720, 720)) -> Image:
+def candidates_picture(clip: Clip, considered: ConsideredTrajectories, size_px: tuple[int, int] = (720, 720)) -> Image:
     """End poses of all gated trajectories around the logged pose at T+H, coloured by what became of them."""
     step = NOW + 40
     target = clip.ego_states[step, : HEADING + 1]

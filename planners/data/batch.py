@@ -7,7 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from tasks.settings import fixed
+from tasks.settings import constant
 from tasks.world.arrays import FloatArray
 
 COMMANDS = ("left", "straight", "right", "unknown")  # order of the one-hot driving command
@@ -24,8 +24,8 @@ class ImageLayout:
     cameras: tuple[str, ...] = ()  # left to right; empty: the front camera and its neighbours, by their yaw
     width: int = 2048  # pixels of the stitched picture
     height: int = 512
-    rows_cut: float = fixed(28 / 1080)  # share of the height, above and below
-    sides_cut: float = fixed(416 / 1920)  # share of the width, on both sides of every camera but the middle one
+    rows_cut: float = constant(28 / 1080)  # share of the height, above and below
+    sides_cut: float = constant(416 / 1920)  # share of the width, on both sides of every camera but the middle one
     decoding: Literal["reduced", "full"] = fixed("reduced")  # full: public planners', see planners.data.images
 
 

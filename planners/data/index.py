@@ -25,7 +25,7 @@ from planners.data.batch import ImageLayout, Needs, TrainingData
 from planners.data.files import SampleFile, files_of, group_bytes, leaves, read_all
 from planners.data.images import chosen_cameras
 from planners.data.mix import MixSettings, Samples, check_sides
-from tasks.settings import fixed
+from tasks.settings import constant
 from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
 
 HUMAN = "human"
@@ -56,7 +56,7 @@ class DataSettings:
     psnr_max: float | None = None  # [dB] and worse than this
     real_share: float = 1.0  # of the real clips; simulated samples of other clips are left out too
     limit_sim: int | None = None  # as many simulated samples, drawn from those that the rest leaves
-    seed: int = fixed(0)  # of the two draws; a smaller share or limit is a part of a larger one
+    seed: int = constant(0)  # of the two draws; a smaller share or limit is a part of a larger one
     storage_options: dict[str, str] = field(default_factory=dict)  # of object stores, as deltalake calls them
     pictures: str | None = None  # folder of this machine for decoded pictures, see planners.data.images
     pictures_gb: float = 100.0  # that it takes at most, 10^9 bytes; what is beyond is decoded in every pass

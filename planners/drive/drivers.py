@@ -15,7 +15,7 @@ from tasks.experts.pdm_closed import PdmClosed
 from tasks.experts.protocol import Plan
 from tasks.settings import PdmSettings
 from tasks.world.arrays import Array
-from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene, stream
+from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene, random_stream
 from tasks.world.frames import HEADING, VX, to_world
 
 
@@ -72,7 +72,7 @@ class PdmClosedDriver:
 
     def plan(self, scene: Scene, look: MakeSample) -> Array | DriveEnd:
         """NO_PLAN where the route ahead has no length."""
-        made = PdmClosed(self.settings).plan(scene, stream(0, scene.clip.clip_id, "drive"))
+        made = PdmClosed(self.settings).plan(scene, random_stream(0, scene.clip.clip_id, "drive"))
         return made.poses if isinstance(made, Plan) else DriveEnd.NO_PLAN
 
 

@@ -26,7 +26,7 @@ from planners.evaluation.planner_names import planner_of
 from tasks.perturb import Perturbation, perturb
 from tasks.rollout.simulate import traffic_record
 from tasks.stages import stage_versions
-from tasks.world.clip import HORIZON_STEPS, NOW, Clip, stream
+from tasks.world.clip import HORIZON_STEPS, NOW, Clip, random_stream
 from tasks.world.vocabulary import Vocabulary
 
 # The table `drives` under `out`: one row a drive, committed as they end, so that no drive is made twice.
@@ -210,7 +210,7 @@ class DriveWork:
         found = [logged_start(clip)] if LOGGED in wanted else []
         at_most = max(wanted) + 1
         if at_most > 0:
-            rng = stream(self.settings.seed, clip.clip_id, "perturb")
+            rng = random_stream(self.settings.seed, clip.clip_id, "perturb")
             s = self.settings
             listed = perturb(clip, self.vocabulary, s.perturb, s.traffic, s.pdm, rng)
             found += (

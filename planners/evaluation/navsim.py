@@ -26,7 +26,7 @@ from planners.evaluation.bootstrap import Interval
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow
 from tasks.reward.aggregate import COLUMNS, FrameScores, means_over
-from tasks.subscores import EC_WEIGHT, RECORDS, TOTAL_WEIGHT, multiplied, weighted
+from tasks.subscores import EC_WEIGHT, RECORDS, TOTAL_WEIGHT, multiplier_product, weighted_sum
 from tasks.world.arrays import Array
 
 FILTERS: tuple[HumanFilter, ...] = ("unfiltered", "filtered")
@@ -136,8 +136,8 @@ def score_of_columns(rows: Array) -> Array:
     """(N,) what sub-scores (N, C) of COLUMNS make, without extended comfort where there is none."""
     named = {name: rows[:, i] for i, name in enumerate(COLUMNS)}
     known = ~np.isnan(named["ec"])
-    terms = weighted(named) + np.where(known, EC_WEIGHT * np.nan_to_num(named["ec"]), 0.0)
-    made: Array = multiplied(named) * (terms / (TOTAL_WEIGHT + np.where(known, EC_WEIGHT, 0.0)))
+    terms = weighted_sum(named) + np.where(known, EC_WEIGHT * np.nan_to_num(named["ec"]), 0.0)
+    made: Array = multiplier_product(named) * (terms / (TOTAL_WEIGHT + np.where(known, EC_WEIGHT, 0.0)))
     return made
 
 

@@ -16,7 +16,7 @@ from planners.evaluation.score_rows import FrameRow, ScoreStage
 from tasks.experts.pdm_closed import PdmSettings, plan_for
 from tasks.reward.aggregate import COLUMNS, FrameScores, follow_up_weights, frame_scores
 from tasks.reward.comfort import extended_comfort
-from tasks.reward.epdms import N_TIMES, PreparedScene, Scores, among, prepare_scene, rows, score
+from tasks.reward.epdms import N_TIMES, PreparedScene, Scores, prepare_scene, score, select_rows, with_objects
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffic, roll_out
 from tasks.trajectories import at_ten_hz
@@ -92,7 +92,9 @@ def logged_poses(scene: Scene) -> Array:
 def drive(frame: PreparedFrame, poses: Array) -> ScoredDrive:
     """Drive and score a plan (40, 3) at 0.1 .. 4.0 s in the frame's ego frame. Raises ValueError if not finite."""
     states, world = _driven(frame, poses)
-    return ScoredDrive(states, rows(score(world, np.stack([frame.reference, states]), normalise="pairs"), slice(1, 2)))
+    return ScoredDrive(
+        states, select_rows(score(world, np.stack([frame.reference, states]), normalise="pairs"), slice(1, 2))
+    )
 
 
 def _driven(frame: PreparedFrame, poses: Array) -> tuple[Array, PreparedScene]:
@@ -100,7 +102,7 @@ def _driven(frame: PreparedFrame, poses: Array) -> tuple[Array, PreparedScene]:
     ego = frame.scene.ego_state
     states = track(ego, to_world(ego[: HEADING + 1], poses)[None])[0]
     touched_from = ego if frame.traffic.settings.leaves_out_touching else None
-    return states, among(frame.world, roll_out(frame.traffic, states).agents, touched_from)
+    return states, with_objects(frame.world, roll_out(frame.traffic, states).agents, touched_from)
 
 
 def _with_human(frame: PreparedFrame) -> PreparedFrame:

@@ -33,7 +33,7 @@ from planners.models.planner import (
     imitation_l1,
     visible_status,
 )
-from tasks.settings import fixed
+from tasks.settings import constant
 from tasks.world.arrays import FloatArray
 
 SMALL = FusionSettings(  # a step of 16 samples takes 0.1 s of a core
@@ -59,7 +59,7 @@ class LtfSettings(NetworkSettings):
     }
     plan_from: PlanFrom = "zero"  # what the regressed positions are added to
     status: Status = "all"  # what of the ego's own it sees; speed: no acceleration
-    trajectory_weight: float = fixed(10.0)  # the unit that the others are weighed against
+    trajectory_weight: float = constant(10.0)  # the unit that the others are weighed against
     agent_class_weight: float = 10.0
     agent_box_weight: float = 1.0
     bev_weight: float = 10.0

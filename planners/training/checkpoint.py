@@ -31,7 +31,7 @@ from factory.config.shapes import plain
 from factory.readers.pickles import load_tensors
 from factory.wording import one_line
 from planners.models.planner import Planner, PlannerChoice, build_planner, planner_class
-from tasks.caches import sealed_json, unsealed_json
+from tasks.caches import json_with_checksum, parse_json_with_checksum
 from tasks.world.arrays import FloatArray
 
 FOLDER = "checkpoints"
@@ -69,7 +69,7 @@ def save_checkpoint(
     np.savez(unfinished / ARRAYS, **planner.arrays)  # type: ignore[arg-type]
     torch.save(dict(training), unfinished / TRAINING)
     files = {FILES: {name: _sha256(unfinished / name) for name in (WEIGHTS, ARRAYS, TRAINING)}}
-    (unfinished / RECORD).write_text(sealed_json({**who, **record, **files}))
+    (unfinished / RECORD).write_text(json_with_checksum({**who, **record, **files}))
     shutil.rmtree(folder, ignore_errors=True)
     os.replace(unfinished, folder)
     stays = None if keep.best is None else best(out, keep.best)
@@ -109,7 +109,7 @@ def newest(path: Path) -> Path:
 def read_record(path: Path) -> dict[str, Any]:
     """What a checkpoint says of itself. Raises ConfigError."""
     try:
-        record = unsealed_json((newest(path) / RECORD).read_bytes())
+        record = parse_json_with_checksum((newest(path) / RECORD).read_bytes())
         record["planner"]["name"], record["planner"]["settings"], record["step"], record[FILES]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{path}: its {RECORD} cannot be read ({error}): restore the checkpoint") from error

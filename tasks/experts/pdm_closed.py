@@ -19,7 +19,7 @@ import shapely.ops
 from tasks.experts.protocol import Plan, RunContext
 from tasks.kernels.compiled import kernel
 from tasks.reward.epdms import Scores, prepare, score
-from tasks.rollout.corridor import extent
+from tasks.rollout.corridor import least_and_largest
 from tasks.rollout.lqr import track
 from tasks.settings import PDM_DEFAULTS, PdmSettings
 from tasks.stages import Rejected
@@ -162,7 +162,7 @@ GROUP_OF = {AgentKind.VEHICLE: 1, AgentKind.PEDESTRIAN: 2, AgentKind.BICYCLE: 3}
 NEAREST = np.array([50, 50, 25, 10])  # of each group
 
 
-class Things(NamedTuple):
+class LeadCandidates(NamedTuple):
     """M closed rings that may stand in the way, at S samples of time; the V vertices of all lie behind one another."""
 
     first: Ints  # (M + 1,) ring m: vertices first[m] .. first[m + 1] - 1, the first not repeated
@@ -191,7 +191,7 @@ class Forecast:
     red_lights: tuple[shapely.Polygon, ...] = ()  # on-route connectors that are red now, kept red
     red_light_holds_ego: tuple[bool, ...] = ()  # the ego's footprint lies within it already: it is no lead
 
-    def things(self, samples: int) -> Things:
+    def things(self, samples: int) -> LeadCandidates:
         """What can be a lead at 0, 0.2, 0.4 ... s: what does not touch the ego, then red lights that do not hold it."""
         keep = ~self.touches_ego
         lights = [light for light, holds in zip(self.red_lights, self.red_light_holds_ego) if not holds]
@@ -203,7 +203,7 @@ class Forecast:
         vertices = np.concatenate([self.corners[keep].reshape(-1, 2), *rings])
         centers = np.concatenate([self.boxes[keep, :2], middles])
         drift = np.concatenate([self.drift[keep], np.zeros((len(lights), 2))])
-        return Things(
+        return LeadCandidates(
             first,
             *_over_time(first, vertices, centers, drift, samples),
             speed=np.append(self.speed[keep] * self.is_agent[keep], still),
@@ -335,7 +335,9 @@ class Corridors(NamedTuple):
 
 def corridors(paths: DrivePaths, start_m: Array, reach_m: float, half_width_m: float) -> Corridors:
     """The corridor of each path from `start_m` (L,) [m] on over `reach_m`, with square ends."""
-    lines = np.array([ahead(paths, index, start, start + reach_m) for index, start in enumerate(start_m)], dtype=object)
+    lines = np.array(
+        [path_section(paths, index, start, start + reach_m) for index, start in enumerate(start_m)], dtype=object
+    )
     polygons = shapely.buffer(lines, half_width_m, cap_style="square")
     rings, of_polygon = shapely.get_rings(polygons, return_index=True)
     points, of_ring = shapely.get_coordinates(rings, return_index=True)
@@ -352,7 +354,7 @@ def corridors(paths: DrivePaths, start_m: Array, reach_m: float, half_width_m: f
     )
 
 
-def ahead(paths: DrivePaths, path: int, start_m: float, stop_m: float) -> shapely.LineString | shapely.Point:
+def path_section(paths: DrivePaths, path: int, start_m: float, stop_m: float) -> shapely.LineString | shapely.Point:
     """The part of a path between two arc lengths, made of its own points where at least two lie inside."""
     along, x, y = paths.progress[path], paths.x[path], paths.y[path]
     start_m, stop_m = max(start_m, 0.0), min(stop_m, along[-1])
@@ -363,7 +365,7 @@ def ahead(paths: DrivePaths, path: int, start_m: float, stop_m: float) -> shapel
 
 
 @kernel
-def lead_progress(paths: DrivePaths, swept: Corridors, things: Things) -> Array:
+def lead_progress(paths: DrivePaths, swept: Corridors, things: LeadCandidates) -> Array:
     """(L, S, M) arc length of each thing's centroid [m] at each sample; NaN where it is not in the path's corridor."""
     n_paths, (n_samples, n_things) = paths.x.shape[0], things.center_x.shape
     out = np.full((n_paths, n_samples, n_things), np.nan)
@@ -385,7 +387,7 @@ def lead_progress(paths: DrivePaths, swept: Corridors, things: Things) -> Array:
 
 @kernel
 def _in_corridor(
-    swept: Corridors, path: int, things: Things, m: int, sample: int, squares: Array
+    swept: Corridors, path: int, things: LeadCandidates, m: int, sample: int, squares: Array
 ) -> tuple[bool, float]:
     """Whether thing m has a point in common with a path's corridor, and its clearance to the corridor's edge [m].
 
@@ -398,7 +400,7 @@ def _in_corridor(
     if not outside < 0.0:  # also where the corridor is empty (NaN)
         return False, outside
     inside = _edges_around(swept, path, x, y, squares)
-    clearance = math.sqrt(extent(squares)[0]) - radius - ROUNDING_M
+    clearance = math.sqrt(least_and_largest(squares)[0]) - radius - ROUNDING_M
     if clearance >= 0.0:
         return inside, clearance
     ring_x = things.x[sample, things.first[m] : things.first[m + 1]]
@@ -522,7 +524,7 @@ def idm_step(progress: float, speed: float, lead: Array, target_mps: float, idm:
 @kernel
 def _drive(
     paths: DrivePaths,
-    things: Things,
+    things: LeadCandidates,
     lead_progress_m: Array,
     start_m: Array,
     speed0_mps: float,
@@ -551,7 +553,7 @@ def _drive(
                         written[:] = 0.0
                     set_footprint(poses[p, step - 1], footprint)
                     sample = step // SAMPLE_STEPS
-                    nearest = nearest_ahead(things, lead_progress_m[path, sample], sample, progress, footprint)
+                    nearest = nearest_lead(things, lead_progress_m[path, sample], sample, progress, footprint)
                     write_lead(paths, path, things, nearest, progress, poses[p, step - 1, 2], written)
                 for k in range(3):  # before the first search all zeros: no gap, so it brakes hard
                     leads[p, step, k] = written[k] if looks else leads[p, step - 1, k]
@@ -565,7 +567,7 @@ def _drive(
 def write_lead(
     paths: DrivePaths,
     path: int,
-    things: Things,
+    things: LeadCandidates,
     nearest: tuple[float, int],
     progress: float,
     heading: float,
@@ -585,7 +587,9 @@ def write_lead(
 
 
 @kernel
-def nearest_ahead(things: Things, ahead_m: Array, sample: int, progress: float, footprint: Array) -> tuple[float, int]:
+def nearest_lead(
+    things: LeadCandidates, ahead_m: Array, sample: int, progress: float, footprint: Array
+) -> tuple[float, int]:
     """Distance [m] from the footprint (2, 4) to the nearest thing farther along than `progress`, and which; -1: none.
 
     ahead_m: (M,) arc length of each thing in the corridor, NaN for those that are not in it.
@@ -685,7 +689,7 @@ def plan_for(scene: Scene, settings: PdmSettings = PDM_DEFAULTS) -> PdmPlan:
         agents=scene.agents.window(scene.step, scene.step + 1),
         polygons=polygons_near(clip.road_map, center, RADIUS_M),
         route_lane_ids=clip.route.lane_ids,
-        red_lane_ids=red_now(scene),
+        red_lane_ids=red_lane_ids(scene),
         speed_limit_mps=speed_limit_of(scene),
         settings=settings,
     )
@@ -701,7 +705,7 @@ def red_connectors(
     return tuple(polygon.token for polygon in red), tuple(shapely.Polygon(polygon.ring[:, :2]) for polygon in red)
 
 
-def red_now(scene: Scene) -> frozenset[str]:
+def red_lane_ids(scene: Scene) -> frozenset[str]:
     """Lanes whose light is red at the scene's step."""
     lights = scene.clip.lights
     states = lights.states[scene.step] if lights.lane_ids else ()

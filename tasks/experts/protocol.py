@@ -39,7 +39,7 @@ class Expert(Protocol):
         ...
 
 
-def tried_once(expert: object) -> bool:
+def drives_once_per_clip(expert: object) -> bool:
     """Whether an expert, or the class of one, says `once = True`.
 
     It then drives once a clip, from the log at T, always has a plan, and is kept whatever the reward says, as `human`.

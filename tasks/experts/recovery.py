@@ -50,7 +50,7 @@ N = HORIZON_STEPS
 SLOW_MPS = 0.5  # limits that divide by the speed stop growing below it
 
 
-def feasible(trajectory: Array, ego_state: Array, settings: FeasibleSettings = FEASIBLE_DEFAULTS) -> Array | str:
+def make_feasible(trajectory: Array, ego_state: Array, settings: FeasibleSettings = FEASIBLE_DEFAULTS) -> Array | str:
     """The nearest drivable trajectory (40, 3) to `trajectory` (40, 3), both in the frame of `ego_state` (11,).
 
     Returns the reason as text where a QP does not reach the tolerance within its iterations.
@@ -263,7 +263,7 @@ class Recovery:
         row = self.retrieve(scene)
         trajectory: Array | str = self.table.trajectories[row]
         if self.settings.smooth:
-            trajectory = feasible(self.table.trajectories[row], scene.ego_state, self.settings.feasible)
+            trajectory = make_feasible(self.table.trajectories[row], scene.ego_state, self.settings.feasible)
         if isinstance(trajectory, str):
             return Rejected("expert", "no_plan", f"table row {row}: {trajectory}")
         return Plan(to_world(scene.ego_state[: HEADING + 1], trajectory))

@@ -33,7 +33,7 @@ from numba.core.registry import cpu_target
 from numba.core.serialize import dumps
 from numpy.typing import NDArray
 
-from tasks.caches import Damaged, sealed, unsealed, user_cache
+from tasks.caches import Damaged, user_cache, with_checksum, without_checksum
 
 F = TypeVar("F", bound=Callable[..., Any])
 log = logging.getLogger(__name__)
@@ -150,7 +150,7 @@ class KernelCache:
         target.refresh()
         path = self._path(signature)
         try:
-            kept = unsealed(path.read_bytes(), _key(path))
+            kept = without_checksum(path.read_bytes(), _key(path))
         except OSError:  # not there, or nobody's to read: compiled again, and save_overload says what is wrong
             return None
         except Damaged as error:
@@ -166,7 +166,7 @@ class KernelCache:
         path = self._path(signature)
         try:
             make_cache_dir()
-            write_whole(path, sealed(dumps(compiled._reduce()), _key(path)))
+            write_whole(path, with_checksum(dumps(compiled._reduce()), _key(path)))
         except OSError as error:
             warnings.warn(cache_write_error(error), RuntimeWarning, stacklevel=1)
             return

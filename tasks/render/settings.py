@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from tasks.settings import fixed
+from tasks.settings import constant
 
 # How a scene is built, and what draws it.
 
@@ -73,8 +73,8 @@ class FitSettings:
     """
 
     iterations: int = 8000  # in all
-    seed: int = fixed(0)  # of every draw
-    hold_out_every: int = fixed(8)  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
+    seed: int = constant(0)  # of every draw
+    hold_out_every: int = constant(8)  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
     # Where it starts.
     start_every: int = 1  # every n-th instant's photos say where surfaces are: less work where photos hardly differ
     start_gaussians: int = 200_000  # of the background
@@ -83,11 +83,12 @@ class FitSettings:
     most_gaussians: int = 250_000  # of a scene
     start_opacity: float = 0.5  # of every Gaussian
     stereo_photos: int = 4  # neighbours compared where lidar does not reach
+    sh_degree: int = constant(0)  # 0 to 3
     # Loss.
     ssim_weight: float = 0.1  # loss = (1 - w) L1 + w (1 - SSIM)
-    opaque_weight: float = fixed(0.1)  # of the mean light that passes where a photo looks at the ground
+    opaque_weight: float = constant(0.1)  # of the mean light that passes where a photo looks at the ground
     # Step sizes of Adam; each falls exponentially to a share of itself.
-    rate_end: float = fixed(0.3)  # that share, but for mean_rate
+    rate_end: float = constant(0.3)  # that share, but for mean_rate
     mean_rate: float = 1.6e-3  # times the nearest viewing depth
     quat_rate: float = 4e-3  # of rotations
     scale_rate: float = 2e-2  # of sizes
@@ -95,21 +96,21 @@ class FitSettings:
     colour_rate: float = 1.2e-2  # of colours
     sky_rate: float = 4e-3  # of the sky map
     exposure_rate: float = 1e-3  # 0: the cameras agree, nothing is aligned
-    turn_rate: float = fixed(3e-4)  # [rad] of the pose corrections
-    shift_rate: float = fixed(1e-3)  # [m]
+    turn_rate: float = constant(3e-4)  # [rad] of the pose corrections
+    shift_rate: float = constant(1e-3)  # [m]
     pose_from: int = 100  # iteration at which poses and boxes start to move
-    box_shift_rate: float = fixed(2e-2)  # [m] of where boxes are; 0: where they were logged
-    box_turn_rate: float = fixed(2e-3)  # [rad]
-    mean_rate_end: float = fixed(0.15)  # that of mean_rate
+    box_shift_rate: float = constant(2e-2)  # [m] of where boxes are; 0: where they were logged
+    box_turn_rate: float = constant(2e-3)  # [rad]
+    mean_rate_end: float = constant(0.15)  # that of mean_rate
     # Shape: how often a Gaussian's longest side is its shortest, at most; 0: as often as it likes.
     stretch: float = 0.0  # of the background, but for the road
-    box_stretch: float = fixed(2.0)  # of what lies in boxes
+    box_stretch: float = constant(2.0)  # of what lies in boxes
     # Density: relocation and growth of 3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024).
-    refine_every: int = fixed(100)  # iterations
-    refine_from: int = fixed(300)  # iteration
-    growth: float = fixed(0.03)  # share of Gaussians added each time
+    refine_every: int = constant(100)  # iterations
+    refine_from: int = constant(300)  # iteration
+    growth: float = constant(0.03)  # share of Gaussians added each time
     # Road.
-    road: bool = fixed(True)  # Gaussians of the road lie flat on what lidar knows of it
+    road: bool = constant(True)  # Gaussians of the road lie flat on what lidar knows of it
 
     def __post_init__(self) -> None:
         for name in (
@@ -191,13 +192,13 @@ class GateSettings:
     """
 
     enabled: bool = True  # whether pictures are looked at
-    width: int = fixed(160)  # pixels of the pictures that are looked at, where those to be stored are no smaller
-    reach_m: float = fixed(30.0)  # of the scene that is looked at
-    contrast_min: float = fixed(0.02)  # standard deviation of the grey picture in [0, 1]: five grey levels
+    width: int = constant(160)  # pixels of the pictures that are looked at, where those to be stored are no smaller
+    reach_m: float = constant(30.0)  # of the scene that is looked at
+    contrast_min: float = constant(0.02)  # standard deviation of the grey picture in [0, 1]: five grey levels
     vehicle_min: float = 0.75  # likeness to its photos to be expected of a large vehicle; 0: no look at vehicles
     # Likeness that it must have beside a photo from near, place by place; 0: no such look.
-    beside_min: float = fixed(0.75)
-    vehicle_share: float = fixed(0.02)  # of a picture, from which on a vehicle is large
+    beside_min: float = constant(0.75)
+    vehicle_share: float = constant(0.02)  # of a picture, from which on a vehicle is large
 
     def __post_init__(self) -> None:
         shares = dict.fromkeys(("contrast_min", "vehicle_min", "beside_min", "vehicle_share"), (0.0, 1.0))
@@ -220,10 +221,10 @@ class RenderSettings:
     psnr_gate: PsnrGate = PsnrGate.REJECT  # what becomes of a block below psnr_min
     gate: GateSettings = field(default_factory=GateSettings)  # what every rendered picture of a drive must come up to
     scene: SceneFrom = SceneFrom.FIT  # discs: built in one go, seconds a block; fit: then fitted to its photos, minutes
-    scene_dtype: SceneDtype = fixed(SceneDtype.FLOAT16)  # of scenes' files; float16: all but the places of Gaussians
+    scene_dtype: SceneDtype = constant(SceneDtype.FLOAT16)  # of scenes' files; float16: all but the places of Gaussians
     own_body: str = ""  # folder of masks, <camera>.png, of what the rig sees of the ego itself
     rig: RigSettings = field(default_factory=RigSettings)  # whether cameras and poses are corrected first
-    asset: AssetSettings = fixed(DISCS)
+    asset: AssetSettings = constant(DISCS)
     fit: FitSettings = field(default_factory=FitSettings)
 
     def __post_init__(self) -> None:

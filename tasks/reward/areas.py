@@ -43,21 +43,21 @@ def outlines(polygons: Sequence[MapPolygon]) -> Outlines:
     for i, polygon in enumerate(polygons):
         for ring in (polygon.ring, *polygon.holes):
             if ring.ndim != 2 or ring.shape[1] != 2:
-                raise refused(polygon, f"a ring must be (M, 2), got {ring.shape}")
+                raise polygon_error(polygon, f"a ring must be (M, 2), got {ring.shape}")
             rings.append(ring)
             owner.append(i)
     points = np.concatenate([np.empty((0, 2)), *rings])
     edges, first = _edges(points, np.cumsum([0, *map(len, rings)]))
     if not all_within(points):
         bad = next(i for i, ring in zip(owner, rings) if not all_within(ring))
-        raise refused(polygons[bad], f"its ring is not finite or farther than {LARGEST:g} m")
+        raise polygon_error(polygons[bad], f"its ring is not finite or farther than {LARGEST:g} m")
     few = np.flatnonzero(np.diff(first) < 3)
     if few.size:
-        raise refused(polygons[owner[few[0]]], "its ring has fewer than three distinct points")
+        raise polygon_error(polygons[owner[few[0]]], "its ring has fewer than three distinct points")
     return Outlines(edges, first, np.array(owner, dtype=np.int64))
 
 
-def refused(polygon: MapPolygon, problem: str) -> ValueError:
+def polygon_error(polygon: MapPolygon, problem: str) -> ValueError:
     """The error that names a polygon, what is wrong with it and how to fix it."""
     return ValueError(
         f"polygons: {polygon.layer} {polygon.token!r}: {problem} (tasks.world.road_map.valid_ring repairs)"
@@ -83,7 +83,7 @@ def _edges(points: Array, ends: Ints) -> tuple[Array, Ints]:
 
 
 @kernel
-def first_flat(edges: Array, first: Ints) -> int:
+def first_ring_without_area(edges: Array, first: Ints) -> int:
     """The first ring without an area, -1: every ring has one."""
     for i in range(first.size - 1):
         x, y = edges[first[i], 0], edges[first[i], 1]
@@ -115,7 +115,7 @@ class Grid(NamedTuple):
     n_columns: int
 
 
-def grid_over(edges: Array) -> tuple[Grid, Ints]:
+def cover_with_grid(edges: Array) -> tuple[Grid, Ints]:
     """A grid over edges (E, 4), and the pairs cell << 32 | entry of its cells and the edges that touch them.
 
     An entry is 2 * edge, plus 1 where the cell's middle is on the left of the edge. No middle is on the line of an
@@ -147,23 +147,23 @@ def _grid(edges: Array, attempt: int) -> Grid:
 
 
 @kernel
-def middle(low: float, cell_m: float, index: int) -> float:
+def cell_middle(low: float, cell_m: float, index: int) -> float:
     """Where the middle of a row or column of cells is."""
     return low + (index + 0.5) * cell_m
 
 
 @kernel
-def beside(ax: float, ay: float, bx: float, by: float, x: float, y: float) -> float:
+def side_of_edge(ax: float, ay: float, bx: float, by: float, x: float, y: float) -> float:
     """Where a point is as seen from a to b: > 0 on the left, < 0 on the right; twice an area [m2]."""
     return (bx - ax) * (y - ay) - (by - ay) * (x - ax)
 
 
 @kernel
-def passes_between(
+def line_splits_edge(
     ax: float, ay: float, bx: float, by: float, from_x: float, from_y: float, x: float, y: float
 ) -> bool:
     """Whether the line through two points has the ends of an edge on either side; an end on it counts as right."""
-    return (beside(from_x, from_y, x, y, ax, ay) > 0.0) != (beside(from_x, from_y, x, y, bx, by) > 0.0)
+    return (side_of_edge(from_x, from_y, x, y, ax, ay) > 0.0) != (side_of_edge(from_x, from_y, x, y, bx, by) > 0.0)
 
 
 @kernel
@@ -174,13 +174,13 @@ def changes_along_rows(edges: Array, grid: Grid) -> Ints:
     for e in range(edges.shape[0]):
         ax, ay, bx, by = edges[e]
         row = int((min(ay, by) - grid.low_y) / grid.cell_m - 1.0)
-        y = middle(grid.low_y, grid.cell_m, row)
+        y = cell_middle(grid.low_y, grid.cell_m, row)
         while y < max(ay, by):
             if (ay > y) != (by > y):
                 found[n] = (row * grid.n_columns + _first_right_of(ax, ay, bx, by, y, grid)) << 32 | e
                 n += 1
             row += 1
-            y = middle(grid.low_y, grid.cell_m, row)
+            y = cell_middle(grid.low_y, grid.cell_m, row)
     return found[:n]
 
 
@@ -190,16 +190,16 @@ def _first_right_of(ax: float, ay: float, bx: float, by: float, y: float, grid: 
     rises = by > ay
     x = ax + (y - ay) / (by - ay) * (bx - ax)
     column = int((x - grid.low_x) / grid.cell_m)
-    while (beside(ax, ay, bx, by, middle(grid.low_x, grid.cell_m, column), y) < 0.0) != rises:
+    while (side_of_edge(ax, ay, bx, by, cell_middle(grid.low_x, grid.cell_m, column), y) < 0.0) != rises:
         column += 1
-    while (beside(ax, ay, bx, by, middle(grid.low_x, grid.cell_m, column - 1), y) < 0.0) == rises:
+    while (side_of_edge(ax, ay, bx, by, cell_middle(grid.low_x, grid.cell_m, column - 1), y) < 0.0) == rises:
         column -= 1
     return column
 
 
 @kernel
 def _touched_cells(edges: Array, grid: Grid) -> tuple[Ints, bool]:
-    """The pairs of `grid_over`, and whether no middle is on the line of an edge."""
+    """The pairs of `cover_with_grid`, and whether no middle is on the line of an edge."""
     found = np.empty(_most_cells(edges, grid.cell_m), np.int64)
     n = 0
     is_clear = True
@@ -209,10 +209,10 @@ def _touched_cells(edges: Array, grid: Grid) -> tuple[Ints, bool]:
         du, dv = (bx - ax) / grid.cell_m, (by - ay) / grid.cell_m
         near = CLEAR_CELLS * grid.cell_m * math.hypot(bx - ax, by - ay)
         for row in range(int(min(v, v + dv) - SLACK_CELLS), int(max(v, v + dv) + SLACK_CELLS) + 1):
-            y = middle(grid.low_y, grid.cell_m, row)
+            y = cell_middle(grid.low_y, grid.cell_m, row)
             start, stop = _columns(u, v, du, dv, row)
             for column in range(start, stop):
-                side = beside(ax, ay, bx, by, middle(grid.low_x, grid.cell_m, column), y)
+                side = side_of_edge(ax, ay, bx, by, cell_middle(grid.low_x, grid.cell_m, column), y)
                 is_clear &= abs(side) > near
                 found[n] = (row * grid.n_columns + column) << 32 | 2 * e + (side > 0.0)
                 n += 1
@@ -292,7 +292,7 @@ def index_map(polygons: Sequence[MapPolygon], route_lane_ids: frozenset[str]) ->
     n_words = max(1, -(-len(regions) // 64))
     lines = outlines(regions)
     edges, bounded = _merged(lines.edges.view(np.uint64), lines.first, lines.owner, n_words)
-    grid, touched = grid_over(edges)
+    grid, touched = cover_with_grid(edges)
     changes = np.sort(changes_along_rows(edges, grid))
     cells, crossed, entry, sets = _arranged(changes, touched, bounded, grid.n_rows * grid.n_columns)
     _check_rings(regions, lines, edges, bounded, crossed, entry)
@@ -333,10 +333,10 @@ def _check_rings(
     edge, region = _first_crossing(edges, bounded, crossed, entry)
     if edge >= 0:
         x, y = edges[edge, :2]
-        raise refused(regions[region], f"its outline crosses itself near ({x:.2f}, {y:.2f})")
-    flat = first_flat(lines.edges, lines.first)
+        raise polygon_error(regions[region], f"its outline crosses itself near ({x:.2f}, {y:.2f})")
+    flat = first_ring_without_area(lines.edges, lines.first)
     if flat >= 0:
-        raise refused(regions[lines.owner[flat]], "its ring bounds no area")
+        raise polygon_error(regions[lines.owner[flat]], "its ring bounds no area")
 
 
 @kernel
@@ -514,7 +514,7 @@ def _parts(edges: Array, line: int, edge: int) -> bool:
 # would cost more than the work: numba counts references to every one of them.
 
 
-class Held(NamedTuple):
+class RegionsAtPoints(NamedTuple):
     """The regions that hold each of P points."""
 
     number: ShortInts  # (P,) n >= 0: set n of the map index; else row -1 - n of `others`
@@ -523,7 +523,7 @@ class Held(NamedTuple):
 
 
 @kernel
-def areas_along(index: MapIndex, body: Body, half_length: float, half_width: float) -> None:
+def set_area_flags(index: MapIndex, body: Body, half_length: float, half_width: float) -> None:
     """Fill the flags of a placed body. A point on a region's boundary is outside of it, up to rounding."""
     x, y = _points(body, half_length, half_width)
     _set_flags(index, regions_at(index, x, y), body.flags)
@@ -536,9 +536,9 @@ def in_intersection(index: MapIndex, x: float, y: float) -> bool:
 
 
 @kernel
-def regions_at(index: MapIndex, x: Array, y: Array) -> Held:
+def regions_at(index: MapIndex, x: Array, y: Array) -> RegionsAtPoints:
     """Which regions hold the points x, y (P,) [m]."""
-    held = Held(
+    held = RegionsAtPoints(
         np.empty(x.size, np.int32), np.empty((x.size, index.sets.shape[1]), np.uint64), np.empty(x.size, np.uint8)
     )
     _look_up(index, x, y, held.number)
@@ -592,21 +592,21 @@ def _pass_edges(index: MapIndex, x: Array, y: Array, found: ShortInts) -> None:
     for p in range(x.size):
         q = -1 - found[p]
         if q >= 0 and crossed[q, FAR] >= 0:
-            from_x = middle(low_x, cell_m, int((x[p] - low_x) / cell_m))
-            from_y = middle(low_y, cell_m, int((y[p] - low_y) / cell_m))
+            from_x = cell_middle(low_x, cell_m, int((x[p] - low_x) / cell_m))
+            from_y = cell_middle(low_y, cell_m, int((y[p] - low_y) / cell_m))
             is_far = on_line = False
             for i in range(crossed[q, FIRST], crossed[q, LAST]):
                 ax, ay, bx, by = edges[entry[i] >> 1]
-                side = beside(ax, ay, bx, by, x[p], y[p])
+                side = side_of_edge(ax, ay, bx, by, x[p], y[p])
                 on_line |= side == 0.0
                 if (side > 0.0) != (entry[i] & 1 == 1):
-                    is_far ^= passes_between(ax, ay, bx, by, from_x, from_y, x[p], y[p])
+                    is_far ^= line_splits_edge(ax, ay, bx, by, from_x, from_y, x[p], y[p])
             if not on_line:
                 found[p] = crossed[q, FAR if is_far else NEAR]
 
 
 @kernel
-def _collect_others(index: MapIndex, x: Array, y: Array, held: Held) -> None:
+def _collect_others(index: MapIndex, x: Array, y: Array, held: RegionsAtPoints) -> None:
     """Fill in the other sets, and all parts."""
     low_x, low_y, cell_m = index.low_x, index.low_y, index.cell_m
     crossed, entry, edges = index.crossed, index.entry, index.edges
@@ -618,16 +618,16 @@ def _collect_others(index: MapIndex, x: Array, y: Array, held: Held) -> None:
             parts[p] = parts_of_set[found[p]]
             continue
         q = -1 - found[p]
-        from_x = middle(low_x, cell_m, int((x[p] - low_x) / cell_m))
-        from_y = middle(low_y, cell_m, int((y[p] - low_y) / cell_m))
+        from_x = cell_middle(low_x, cell_m, int((x[p] - low_x) / cell_m))
+        from_y = cell_middle(low_y, cell_m, int((y[p] - low_y) / cell_m))
         for w in range(others.shape[1]):
             others[n, w] = sets[crossed[q, NEAR], w]
         on_line = False
         for i in range(crossed[q, FIRST], crossed[q, LAST]):
             ax, ay, bx, by = edges[entry[i] >> 1]
-            side = beside(ax, ay, bx, by, x[p], y[p])
+            side = side_of_edge(ax, ay, bx, by, x[p], y[p])
             on_line |= side == 0.0
-            if (side > 0.0) != (entry[i] & 1 == 1) and passes_between(ax, ay, bx, by, from_x, from_y, x[p], y[p]):
+            if (side > 0.0) != (entry[i] & 1 == 1) and line_splits_edge(ax, ay, bx, by, from_x, from_y, x[p], y[p]):
                 for w in range(others.shape[1]):
                     others[n, w] ^= bounded[entry[i] >> 1, w]
         if on_line:
@@ -646,13 +646,17 @@ def _leave_edges(index: MapIndex, q: int, x: float, y: float, others: Bits, n: i
     for i in range(index.crossed[q, FIRST], index.crossed[q, LAST]):
         e = index.entry[i] >> 1
         ax, ay, bx, by = index.edges[e]
-        if beside(ax, ay, bx, by, x, y) == 0.0 and min(ax, bx) <= x <= max(ax, bx) and min(ay, by) <= y <= max(ay, by):
+        if (
+            side_of_edge(ax, ay, bx, by, x, y) == 0.0
+            and min(ax, bx) <= x <= max(ax, bx)
+            and min(ay, by) <= y <= max(ay, by)
+        ):
             for w in range(others.shape[1]):
                 others[n, w] &= ~index.bounded[e, w]
 
 
 @kernel
-def _set_flags(index: MapIndex, held: Held, flags: Bytes) -> None:
+def _set_flags(index: MapIndex, held: RegionsAtPoints, flags: Bytes) -> None:
     sets, lanes, n_words = index.sets, index.playing[LANE], index.n_lane_words
     number, others, parts = held
     n = flags.size

@@ -31,7 +31,7 @@ class Body(NamedTuple):
     flags: Bytes  # (41,) bits above
 
 
-def shaped(name: str, states: Array) -> Array:
+def as_states(name: str, states: Array) -> Array:
     """Contiguous float64 states (K >= 1, 41, 11) of any values. Raises ValueError where they are of another shape."""
     states = np.ascontiguousarray(states, dtype=np.float64)
     if states.ndim != 3 or states.shape[1:] != (HORIZON_STEPS + 1, EGO_STATE_SIZE) or len(states) == 0:
@@ -41,7 +41,7 @@ def shaped(name: str, states: Array) -> Array:
 
 @register_jitable
 def empty_body(n_times: int) -> Body:
-    """Scratch to be filled by `place`."""
+    """Scratch to be filled by `place_body`."""
     return Body(
         np.empty(n_times),
         np.empty(n_times),
@@ -53,7 +53,7 @@ def empty_body(n_times: int) -> Body:
 
 
 @kernel
-def place(states: Array, rear_axle_to_center: float, body: Body) -> None:
+def place_body(states: Array, rear_axle_to_center: float, body: Body) -> None:
     """Fill everything but the flags from the states (41, 11) of one trajectory; their pose is the rear axle."""
     x, y, cos, sin, speed = body.x, body.y, body.cos, body.sin, body.speed
     for t in range(states.shape[0]):
@@ -119,7 +119,7 @@ def nearest_on_segment(segments: Array, i: int, x: float, y: float) -> tuple[flo
 
 
 @kernel
-def locate_m(line: Centerline, x: float, y: float) -> float:
+def arc_length_at(line: Centerline, x: float, y: float) -> float:
     """Arc length [m] of the centreline's point nearest to (x, y), the first of several; beyond its ends: the end's."""
     circles, segments = line.circles, line.segments
     nearest_sq = math.inf
@@ -141,11 +141,11 @@ def locate_m(line: Centerline, x: float, y: float) -> float:
 @kernel
 def progress_m(line: Centerline, x0: float, y0: float, x1: float, y1: float) -> float:
     """EP raw [m]: arc length gained along the centreline from (x0, y0) to (x1, y1), at least 0."""
-    return max(0.0, locate_m(line, x1, y1) - locate_m(line, x0, y0))
+    return max(0.0, arc_length_at(line, x1, y1) - arc_length_at(line, x0, y0))
 
 
 @kernel
-def is_off(line: Centerline, x: float, y: float) -> bool:
+def is_off_centerline(line: Centerline, x: float, y: float) -> bool:
     """Whether (x, y) is more than DEVIATION_M from the centreline."""
     circles, segments = line.circles, line.segments
     for c in range(len(circles)):
@@ -182,7 +182,7 @@ def lane_keeping(line: Centerline, body: Body) -> float:
         seen, back = 0, t
         while seen < unseen:
             if not flags[back] & CENTER_IN_INTERSECTION:
-                if not is_off(line, x[back], y[back]):
+                if not is_off_centerline(line, x[back], y[back]):
                     break
                 seen += 1
             back -= 1

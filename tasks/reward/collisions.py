@@ -110,11 +110,13 @@ class Obstacles(NamedTuple):
 @kernel
 def obstacles_of(boxes: Array, is_stopped: Bools, collision_score: Array) -> Obstacles:
     """Obstacles from boxes (T, N, 5), is_stopped (N,) and collision_score (N,)."""
-    return Obstacles(boxes, is_stopped, collision_score, spans_of(boxes))
+    return Obstacles(boxes, is_stopped, collision_score, extents_over_time(boxes))
 
 
 @kernel
-def lay_out(boxes: Array, velocities: Array, valid: Bools, collision_score: Array, ego_box: Array) -> Obstacles:
+def obstacles_of_tracks(
+    boxes: Array, velocities: Array, valid: Bools, collision_score: Array, ego_box: Array
+) -> Obstacles:
     """The obstacles that tracks of N objects are over their first 41 steps.
 
     boxes (S >= 41, N, 5), velocities (S, N, 2) and valid (S, N) as in AgentTracks; collision_score: (N,). Left out for
@@ -151,7 +153,7 @@ def _box(box: Array) -> Box:
 
 
 @kernel
-def spans_of(boxes: Array) -> Array:
+def extents_over_time(boxes: Array) -> Array:
     """(N, 5) of boxes (T, N, 5): least x, y, most x, y of the centre at any time [m], largest diagonal squared [m^2].
 
     An object that is never there has a least above its most.

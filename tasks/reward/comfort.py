@@ -12,7 +12,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from tasks.kernels.compiled import kernel
-from tasks.reward.centerline import shaped
+from tasks.reward.centerline import as_states
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import HORIZON_STEPS, STEP_S
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, REAR_AXLE_TO_CENTER, STEERING, YAW_ACCEL, YAW_RATE
@@ -288,7 +288,7 @@ class ExtendedComfort:
 
 def extended_comfort(now_states: Array, previous_states: Array, interval_s: float = 0.5) -> ExtendedComfort:
     """Compare simulated states (K, 41, 11) with those (K or 1, 41, 11) of the plan made `interval_s` earlier."""
-    now, previous = shaped("now_states", now_states), shaped("previous_states", previous_states)
+    now, previous = as_states("now_states", now_states), as_states("previous_states", previous_states)
     rms = np.empty((len(now), len(EC_LIMITS)))
     _motion_rms(now, previous, round(interval_s / STEP_S), rms)
     return ExtendedComfort(ec=np.where((rms <= EC_LIMITS).all(axis=-1), 1.0, 0.0), rms=rms)

@@ -11,27 +11,27 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel, read_only
-from tasks.reward.areas import NEVER_RED, MapIndex, RedLanes, areas_along, first_red, index_map, index_red_lanes
+from tasks.reward.areas import NEVER_RED, MapIndex, RedLanes, first_red, index_map, index_red_lanes, set_area_flags
 from tasks.reward.centerline import (
     MULTIPLE_LANES,
     NON_DRIVABLE,
     ONCOMING,
     Body,
     Centerline,
+    as_states,
     driving_direction,
     empty_body,
     index_centerline,
     lane_keeping,
-    place,
+    place_body,
     progress_m,
-    shaped,
 )
 from tasks.reward.collisions import (
     N_TIMES,
     Obstacles,
     first_collision,
     first_time_to_collision,
-    lay_out,
+    obstacles_of_tracks,
     within_reach,
 )
 from tasks.reward.comfort import N_FLAGS, comfort_along, comfort_history, comfort_scratch
@@ -44,8 +44,8 @@ from tasks.subscores import (
     TOTAL_WEIGHT,
     WEIGHTS,
     WHOLES,
-    multiplied,
-    weighted,
+    multiplier_product,
+    weighted_sum,
 )
 from tasks.world.arrays import Array, Bools, Bytes
 from tasks.world.clip import MOVING_KINDS, AgentKind, AgentTracks, Clip, Scene
@@ -147,7 +147,7 @@ def prepare_scene(scene: Scene, agents: AgentTracks, drop_touching: bool = True)
     )
 
 
-def among(prepared: PreparedScene, objects: AgentTracks, ego_state0: Array | None) -> PreparedScene:
+def with_objects(prepared: PreparedScene, objects: AgentTracks, ego_state0: Array | None) -> PreparedScene:
     """The same scene among other objects: tracks of at least 41 steps, row 0 is now.
 
     Those that touch the ego at `ego_state0` (11,) are left out for good; None: nobody is.
@@ -172,7 +172,7 @@ def _red_connectors(clip: Clip, step: int) -> tuple[tuple[str, ...], Bools]:
 
 def _obstacles(objects: AgentTracks, ego_state0: Array | None) -> Obstacles:
     """The objects but those that touch an ego at `ego_state0`."""
-    return lay_out(
+    return obstacles_of_tracks(
         read_only(objects.boxes),
         read_only(objects.velocities),
         read_only(objects.valid, np.bool_),
@@ -231,7 +231,7 @@ class Scratch(NamedTuple):
     comfort: Array
 
 
-def context_of(prepared: PreparedScene, with_history: bool) -> RuleContext:
+def rule_context(prepared: PreparedScene, with_history: bool) -> RuleContext:
     """A prepared scene as the kernels take it."""
     history = prepared.history if with_history and prepared.history is not None else np.empty((0, EGO_STATE_SIZE))
     return RuleContext(
@@ -243,7 +243,7 @@ def context_of(prepared: PreparedScene, with_history: bool) -> RuleContext:
 
 
 @register_jitable
-def scratch_for(n_objects: int) -> Scratch:
+def empty_scratch(n_objects: int) -> Scratch:
     """Room for one trajectory among N objects."""
     return Scratch(empty_body(N_TIMES), np.empty(n_objects, np.bool_), comfort_scratch())
 
@@ -254,8 +254,8 @@ def judge_one(
 ) -> None:
     """All rules on one trajectory (41, 11), written to row k."""
     body = scratch.body
-    place(states, REAR_AXLE_TO_CENTER, body)
-    areas_along(context.map_index, body, HALF_LENGTH, HALF_WIDTH)
+    place_body(states, REAR_AXLE_TO_CENTER, body)
+    set_area_flags(context.map_index, body, HALF_LENGTH, HALF_WIDTH)
     _spread_flags(body.flags, out.ego_areas[k])
     items = within_reach(obstacles, body)
     out.scores[NC, k], out.fails[NC, k] = first_collision(obstacles, items, states, body, scratch.ignored)
@@ -340,10 +340,10 @@ def score(
     """
     if normalise not in _NORMALISE:
         raise ValueError(f"normalise must be one of {_NORMALISE}, got {normalise!r}")
-    states = shaped("states", states)
+    states = as_states("states", states)
     table = np.empty((N_ROWS, len(states)))
     areas, comfort = np.empty((len(states), N_TIMES, 3), np.bool_), np.empty((len(states), N_FLAGS), np.bool_)
-    context, in_pairs = context_of(prepared, with_history), normalise == "pairs"
+    context, in_pairs = rule_context(prepared, with_history), normalise == "pairs"
     if not _score_all(context, prepared.obstacles, states, in_pairs, table, areas, comfort):
         raise ValueError(f"states must be finite and at most {LARGEST:g}: leave out what is not a drive")
     return Scores(*[*table, areas, comfort])
@@ -351,7 +351,7 @@ def score(
 
 def score_with_ec(scores: Scores, ec: Array) -> Array:
     """The final per-frame score (K,): the multiplier times the weighted mean, with extended comfort (K,)."""
-    final: Array = scores.multiplier * (weighted(vars(scores)) + EC_WEIGHT * ec) / (TOTAL_WEIGHT + EC_WEIGHT)
+    final: Array = scores.multiplier * (weighted_sum(vars(scores)) + EC_WEIGHT * ec) / (TOTAL_WEIGHT + EC_WEIGHT)
     return final
 
 
@@ -367,12 +367,12 @@ def human_filtered(scores: Scores, human: Scores) -> Scores:
         name: np.ones(len(scores)) for name in (*MULTIPLIERS, *WEIGHTS) if getattr(human, name)[0] == 0.0
     }
     scores = replace(scores, **forgiven)
-    multiplier = multiplied(vars(scores))
-    pdm_score = multiplier * weighted(vars(scores)) / TOTAL_WEIGHT
+    multiplier = multiplier_product(vars(scores))
+    pdm_score = multiplier * weighted_sum(vars(scores)) / TOTAL_WEIGHT
     return replace(scores, multiplier=multiplier, pdm_score=pdm_score)
 
 
-def rows(scores: Scores, index: slice | NDArray[np.integer] | Bools) -> Scores:
+def select_rows(scores: Scores, index: slice | NDArray[np.integer] | Bools) -> Scores:
     """The chosen rows of the scores; progress stays relative to the batch it was scored in."""
     return Scores(**{field.name: getattr(scores, field.name)[index] for field in fields(Scores)})
 
@@ -398,7 +398,7 @@ def _score_all(
         return False
     table[:] = math.nan  # what no rule says
     out = Verdicts(table[:_N_SCORES], table[_N_SCORES:_EP_RAW_M], table[_EP_RAW_M], areas, comfort)
-    scratch = scratch_for(obstacles.boxes.shape[1])
+    scratch = empty_scratch(obstacles.boxes.shape[1])
     for k in range(states.shape[0]):
         judge_one(context, obstacles, states[k], scratch, k, out)
     _add_up(table, in_pairs)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tasks.subscores import HALVES, JUDGED, PROGRESS_THRESHOLD_M, TOTAL_WEIGHT, WHOLES, multiplied, weighted
+from tasks.subscores import HALVES, JUDGED, PROGRESS_THRESHOLD_M, TOTAL_WEIGHT, WHOLES, multiplier_product, weighted_sum
 from tasks.world.arrays import Array, Bools, Bytes
 
 Normalise = Literal["pairs", "batch", "masked"]
@@ -45,7 +45,7 @@ class VocabularyLabels(_Labels):
     @property
     def multiplier(self) -> Array:
         """(K,) what the weighted mean is multiplied by."""
-        return multiplied(vars(self))
+        return multiplier_product(vars(self))
 
     def ep(self, normalise: Normalise = "pairs") -> Array:
         """(K,) ego progress, 0 .. 1 (docs/reward.md 2k): in pairs with PDM-Closed, or in one batch of it and all K.
@@ -63,7 +63,7 @@ class VocabularyLabels(_Labels):
 
     def pdm_score(self, normalise: Normalise = "pairs") -> Array:
         """(K,) the multiplier times the weighted mean, without EC."""
-        return self.multiplier * weighted(vars(self) | {"ep": self.ep(normalise)}) / TOTAL_WEIGHT
+        return self.multiplier * weighted_sum(vars(self) | {"ep": self.ep(normalise)}) / TOTAL_WEIGHT
 
 
 def encode(labels: VocabularyLabels) -> tuple[bytes, bytes]:

@@ -5,21 +5,21 @@ import math
 import numpy as np
 
 from tasks.kernels.compiled import kernel
-from tasks.reward.areas import areas_along
-from tasks.reward.centerline import empty_body, place
+from tasks.reward.areas import set_area_flags
+from tasks.reward.centerline import empty_body, place_body
 from tasks.reward.collisions import STOPPED_SPEED_MPS, first_collision, obstacles_of, within_reach
 from tasks.reward.epdms import (
     PreparedScene,
     RuleContext,
     Scores,
     collision_scores,
-    context_of,
-    rows,
+    rule_context,
     score,
+    select_rows,
 )
 from tasks.reward.label_bytes import ARRAYS, VocabularyLabels
 from tasks.rollout.lqr import track
-from tasks.rollout.simulate import TrafficScene, roll_on
+from tasks.rollout.simulate import TrafficScene, roll_out_longer
 from tasks.settings import ExpertGate
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bools
@@ -59,7 +59,7 @@ def vocabulary_labels(
         driven = track(scene.ego_state, trajectories[start : start + TRAJECTORIES_AT_ONCE], local=True)
         scores = score(prepared, np.concatenate([reference[None], driven]), normalise="pairs")
         reference_m = float(scores.ep_raw_m[0] * scores.multiplier[0])
-        parts.append(rows(scores, slice(1, None)))
+        parts.append(select_rows(scores, slice(1, None)))
     kept = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
     return VocabularyLabels(vocabulary.digest, reference_m, **kept)
 
@@ -70,7 +70,7 @@ NEAR_M, NEAR_RAD = 0.5, math.radians(30.0)  # of a lane of the route
 ONWARD_M = 20.0  # as far as the driving command looks
 
 
-def way_on_m(road_map: RoadMap, route: Route, pose: Array) -> float | None:
+def route_ahead_m(road_map: RoadMap, route: Route, pose: Array) -> float | None:
     """Metres of the route's lanes ahead of a rear-axle pose (3,), along the longest way; inf: as far as is asked.
 
     Asked is for ONWARD_M, or to the route's end. None where the pose is on no lane of the route: farther than NEAR_M
@@ -95,20 +95,20 @@ def hit_after_s(traffic: TrafficScene, prepared: PreparedScene, states: Array, b
     """Seconds from a drive's end to the first collision at fault in the second after it; inf: there is none.
 
     traffic: as the drive with states (41, 11) met it; prepared: the scene that it was judged in. The ego goes on as
-    `onward` has it, the traffic answers to that. At fault is what NC takes for it (docs/reward.md 2b); who touches the
-    ego at the drive's end is left out, as who touches it at a scene's start is.
+    `extrapolate` has it, the traffic answers to that. At fault is what NC takes for it (docs/reward.md 2b); who touches
+    the ego at the drive's end is left out, as who touches it at a scene's start is.
     """
-    going_on = onward(states, braking_mps2)
-    tracks = roll_on(traffic, going_on).window(HORIZON_STEPS, len(going_on))
+    going_on = extrapolate(states, braking_mps2)
+    tracks = roll_out_longer(traffic, going_on).window(HORIZON_STEPS, len(going_on))
     after = going_on[HORIZON_STEPS:].copy()
     left = tracks.valid.any(axis=0) & ~touching(ego_boxes(after[0], PACIFICA), tracks.boxes[0])
     boxes = np.where(tracks.valid[:, left, None], tracks.boxes[:, left], np.nan)
     score = collision_scores(tracks.kinds)[left]
     is_stopped = (score > 0.0) | _stands_when_first_seen(tracks)[left]
-    return STEP_S * float(_first_hit(context_of(prepared, with_history=False), boxes, is_stopped, score, after))
+    return STEP_S * float(_first_hit(rule_context(prepared, with_history=False), boxes, is_stopped, score, after))
 
 
-def onward(states: Array, braking_mps2: float = 0.0) -> Array:
+def extrapolate(states: Array, braking_mps2: float = 0.0) -> Array:
     """States (51, 11): those of a drive (41, 11), and a second more at its last steering angle.
 
     At its last speed, or slowing down by `braking_mps2` until it stands. On an arc, since the kinematic bicycle's
@@ -144,8 +144,8 @@ def _stands_when_first_seen(tracks: AgentTracks) -> Bools:
 def _first_hit(context: RuleContext, boxes: Array, is_stopped: Bools, collision_score: Array, states: Array) -> float:
     """Index of the first collision at fault of states (T, 11) with boxes (T, N, 5), inf: none."""
     body = empty_body(states.shape[0])
-    place(states, REAR_AXLE_TO_CENTER, body)
-    areas_along(context.map_index, body, HALF_LENGTH, HALF_WIDTH)
+    place_body(states, REAR_AXLE_TO_CENTER, body)
+    set_area_flags(context.map_index, body, HALF_LENGTH, HALF_WIDTH)
     obstacles, ignored = obstacles_of(boxes, is_stopped, collision_score), np.empty(len(is_stopped), np.bool_)
     return first_collision(obstacles, within_reach(obstacles, body), states, body, ignored)[1]
 
@@ -153,11 +153,11 @@ def _first_hit(context: RuleContext, boxes: Array, is_stopped: Bools, collision_
 # What the gate asks of an end.
 
 
-def end_fault(traffic: TrafficScene, prepared: PreparedScene, states: Array, gate: ExpertGate) -> Rejected | None:
+def check_end(traffic: TrafficScene, prepared: PreparedScene, states: Array, gate: ExpertGate) -> Rejected | None:
     """None where a drive with states (41, 11) leads on; traffic: as it met it; prepared: the scene it was judged in."""
     clip = traffic.scene.clip
     if gate.off_route:
-        metres = way_on_m(clip.road_map, clip.route, states[-1, : HEADING + 1])
+        metres = route_ahead_m(clip.road_map, clip.route, states[-1, : HEADING + 1])
         if metres is None:
             return Rejected("reward", "off_route", "ends on no lane of the route")
         if metres < math.inf:

@@ -39,7 +39,7 @@ def interpolated(x: float, at: Array, values: Array) -> float:
 
 
 @inner_kernel
-def extent(values: Array) -> tuple[float, float]:
+def least_and_largest(values: Array) -> tuple[float, float]:
     """Least and largest of values (P,); a fraction of what numpy's own two take to compile."""
     low, high = np.inf, -np.inf
     for value in values:
@@ -100,7 +100,7 @@ def chord_headings(points: Array) -> Array:
 
 
 @kernel
-def frenet(xy: Array, length: Array, poses: Array) -> Array:
+def arc_length_and_offset(xy: Array, length: Array, poses: Array) -> Array:
     """(K, 2) path length and offset to the left of the polyline's points nearest to poses (K, >= 2)."""
     out = np.zeros((poses.shape[0], 2))
     for i in range(poses.shape[0]):
@@ -148,7 +148,7 @@ class CorridorAhead(NamedTuple):
 
 
 @kernel
-def stretches_of(xy: Array, heading: Array) -> Array:
+def stretch_rectangles(xy: Array, heading: Array) -> Array:
     """(M, S, 8) of paths xy (M, P, 2), heading (M, P): a rectangle around every CELLS cells.
 
     Columns: centre x, y [m]; unit vector along it; half its length and half its width [m]; radius around it [m];
@@ -160,12 +160,12 @@ def stretches_of(xy: Array, heading: Array) -> Array:
     for m in range(n_paths):
         for b in range(n):
             first, last = b * CELLS, min((b + 1) * CELLS, n_points - 1)
-            least, largest = extent(heading[m, first : last + 1])
+            least, largest = least_and_largest(heading[m, first : last + 1])
             middle = 0.5 * (least + largest)
             ux, uy = math.cos(middle), math.sin(middle)
             along = xy[m, first : last + 1, 0] * ux + xy[m, first : last + 1, 1] * uy
             across = xy[m, first : last + 1, 1] * ux - xy[m, first : last + 1, 0] * uy
-            (back, front), (right, left) = extent(along), extent(across)
+            (back, front), (right, left) = least_and_largest(along), least_and_largest(across)
             u, v = 0.5 * (back + front), 0.5 * (right + left)
             half_u, half_v = 0.5 * (front - back), 0.5 * (left - right)
             out[m, b, 0], out[m, b, 1] = u * ux - v * uy, u * uy + v * ux
@@ -177,7 +177,7 @@ def stretches_of(xy: Array, heading: Array) -> Array:
 
 
 @inner_kernel
-def view_along(
+def corridor_between(
     stretches: Array, length: float, m: int, begin: float, end: float, offset: float, turn: float, half_width: float
 ) -> CorridorAhead:
     """The corridor from path length `begin` to `end` of path m, which is `length` long.
@@ -209,7 +209,7 @@ def view_along(
 
 
 @inner_kernel
-def in_view(view: CorridorAhead, x: float, y: float, radius: float) -> bool:
+def near_corridor(view: CorridorAhead, x: float, y: float, radius: float) -> bool:
     """Can something within `radius` of (x, y) be in the corridor? False: surely not."""
     dx, dy = x - view.x, y - view.y
     return (
@@ -393,7 +393,7 @@ def _range_in_strip(box: Box, x: float, y: float, heading: float, half_width: fl
 
 
 @inner_kernel
-def look_ahead(paths: Paths, way: Way, blend_length: float, lookahead: float) -> CorridorAhead:
+def corridor_ahead(paths: Paths, way: Way, blend_length: float, lookahead: float) -> CorridorAhead:
     """Where the corridor ahead of a body is."""
     keep, _ = _fade(way.travelled + way.front, blend_length)
     offset, turn = abs(way.offset) * keep, abs(way.turn) * keep
@@ -401,7 +401,7 @@ def look_ahead(paths: Paths, way: Way, blend_length: float, lookahead: float) ->
         turn += abs(way.offset) * STEEPEST_FADE / blend_length
     length = (paths.heading.shape[1] - 1) * PATH_SPACING_M
     begin = way.s + way.front
-    return view_along(paths.stretches, length, way.path, begin, begin + lookahead, offset, turn, way.half_width)
+    return corridor_between(paths.stretches, length, way.path, begin, begin + lookahead, offset, turn, way.half_width)
 
 
 @inner_kernel

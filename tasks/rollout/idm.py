@@ -22,10 +22,10 @@ from tasks.rollout.corridor import (
     Paths,
     Way,
     boxes_overlap,
+    corridor_ahead,
     corridor_gap,
-    in_view,
-    look_ahead,
     may_meet,
+    near_corridor,
     pose_on_path,
     project_on_path,
 )
@@ -201,7 +201,7 @@ ENTER_CLEARANCE_M = 30.0  # of the ego's centre from where a vehicle enters
 
 
 @inner_kernel
-def cell_of(paths: Paths, s: float) -> int:
+def nearest_point_index(paths: Paths, s: float) -> int:
     """Index of the path's point nearest to path length s."""
     return min(max(round(s / PATH_SPACING_M), 0), paths.heading.shape[1] - 1)
 
@@ -218,7 +218,7 @@ def _forward_speed(rows: RolloutRows, t: int, i: int) -> float:
 
 
 @inner_kernel
-def start_on(
+def project_onto_path(
     paths: Paths, m: int, rows: RolloutRows, t: int, i: int, driver: IdmDriver
 ) -> tuple[float, float, float, float]:
     """(path length, offset to the left, turn, speed) of agent i if it starts to follow path m from row t."""
@@ -228,7 +228,7 @@ def start_on(
 
 
 @inner_kernel
-def due_path(roles: Roles, paths: Paths, rows: RolloutRows, t: int, i: int, clock: int) -> int:
+def path_to_join(roles: Roles, paths: Paths, rows: RolloutRows, t: int, i: int, clock: int) -> int:
     """The path on which agent i, replayed, switches to IDM by itself: its own, once it is due and on it; or -1."""
     m = roles.path[i]
     if m < 0 or clock < roles.join_step[i]:
@@ -238,7 +238,7 @@ def due_path(roles: Roles, paths: Paths, rows: RolloutRows, t: int, i: int, cloc
 
 
 @inner_kernel
-def way_of(rows: RolloutRows, t: int, i: int, m: int, s: float, travelled: float, offset: float, turn: float) -> Way:
+def way_along(rows: RolloutRows, t: int, i: int, m: int, s: float, travelled: float, offset: float, turn: float) -> Way:
     """Agent i, as big as in row t, on its way along path m."""
     front, half_width = 0.5 * rows.boxes[t, i, 3], 0.5 * rows.boxes[t, i, 4] + CORRIDOR_MARGIN_M
     return Way(m, s, travelled, offset, turn, front, half_width)
@@ -267,14 +267,14 @@ def must_brake(roles: Roles, paths: Paths, driver: IdmDriver, rows: RolloutRows,
     speed = _forward_speed(rows, t, i)
     if 0.5 * speed * speed <= driver.decel_max * SMALLEST_GAP_M:
         return False  # too slow to need it at any gap
-    s, left, turn, _ = start_on(paths, m, rows, t, i, driver)
-    way = way_of(rows, t, i, m, s, 0.0, left, turn)
-    view = look_ahead(paths, way, driver.blend_length_m, driver.lookahead_m)
+    s, left, turn, _ = project_onto_path(paths, m, rows, t, i, driver)
+    way = way_along(rows, t, i, m, s, 0.0, left, turn)
+    view = corridor_ahead(paths, way, driver.blend_length_m, driver.lookahead_m)
     for j in range(len(mode)):
         if (
             j == i
             or mode[j] != DRIVEN
-            or not in_view(view, rows.boxes[t, j, 0], rows.boxes[t, j, 1], rows.radius[t, j])
+            or not near_corridor(view, rows.boxes[t, j, 0], rows.boxes[t, j, 1], rows.radius[t, j])
         ):
             continue
         gap, h = gap_to(paths, driver, rows, t, i, way, view, j)
@@ -288,7 +288,7 @@ def must_brake(roles: Roles, paths: Paths, driver: IdmDriver, rows: RolloutRows,
 @inner_kernel
 def road_acceleration(paths: Paths, driver: IdmDriver, t: int, m: int, s: float, speed: float, length: float) -> float:
     """[m/s2] of one driven at path length s of path m, for the road alone: its target speed and its stop lines."""
-    free = free_acceleration(speed, paths.target_speed[m, cell_of(paths, s)], driver)
+    free = free_acceleration(speed, paths.target_speed[m, nearest_point_index(paths, s)], driver)
     accel = following_acceleration(free, speed, np.inf, 0.0, driver)
     line = stop_line_gap(paths, m, t, s + 0.5 * length, speed, driver.decel_max)
     if line < np.inf:
@@ -305,19 +305,19 @@ def hardest_acceleration(
 
     One that keeps its intent slows down for a leader from what it could do at most, not from what it means to do.
     """
-    view = look_ahead(paths, way, driver.blend_length_m, driver.lookahead_m)
+    view = corridor_ahead(paths, way, driver.blend_length_m, driver.lookahead_m)
     for j in range(rows.valid.shape[1]):
         if (
             j == i
             or not rows.valid[t, j]
-            or not in_view(view, rows.boxes[t, j, 0], rows.boxes[t, j, 1], rows.radius[t, j])
+            or not near_corridor(view, rows.boxes[t, j, 0], rows.boxes[t, j, 1], rows.radius[t, j])
         ):
             continue
         gap, h = gap_to(paths, driver, rows, t, i, way, view, j)
         if gap < np.inf:
             lead_speed = rows.velocities[t, j, 0] * math.cos(h) + rows.velocities[t, j, 1] * math.sin(h)
             if yielding is None:
-                free = free_acceleration(speed, paths.target_speed[way.path, cell_of(paths, way.s)], driver)
+                free = free_acceleration(speed, paths.target_speed[way.path, nearest_point_index(paths, way.s)], driver)
             else:
                 free = driver.accel_max
             behind = following_acceleration(free, speed, gap, lead_speed, driver)

@@ -19,13 +19,13 @@ from tasks.rollout.corridor import (
     OPEN,
     PATH_SPACING_M,
     Paths,
+    arc_length_and_offset,
     chord_headings,
-    extent,
-    frenet,
     interpolated,
+    least_and_largest,
     lengths_along,
     points_at,
-    stretches_of,
+    stretch_rectangles,
 )
 from tasks.world.arrays import Array, Bools, Bytes, Ints
 from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentTracks, Scene
@@ -106,7 +106,7 @@ def _discs_around(points: Array, first: Ints) -> Array:
     out = np.zeros((len(first) - 1, 3))
     for lane in range(len(out)):
         xy = points[first[lane] : first[lane + 1]]
-        (left, right), (low, high) = extent(xy[:, 0]), extent(xy[:, 1])
+        (left, right), (low, high) = least_and_largest(xy[:, 0]), least_and_largest(xy[:, 1])
         x, y, square = 0.5 * (left + right), 0.5 * (low + high), 0.0
         for k in range(len(xy)):
             square = max(square, (xy[k, 0] - x) ** 2 + (xy[k, 1] - y) ** 2)
@@ -367,7 +367,7 @@ def _lay_way(
     length = lengths_along(line)
 
     # A window around the vehicle, straight on where the lanes end.
-    here = frenet(line, length, np.array([[x, y]]))[0, 0]
+    here = arc_length_and_offset(line, length, np.array([[x, y]]))[0, 0]
     grid = here - BEHIND_M + PATH_SPACING_M * np.arange(float(n_points))
     center = points_at(line, length, grid)
     heading = chord_headings(center)
@@ -416,7 +416,7 @@ def _log_offset(center: Array, heading: Array, log_poses: Array) -> Array:
     """(P,) lateral offset of the log from the lane centre at every path point; 0 where the log is elsewhere."""
     n = len(center)
     grid = PATH_SPACING_M * np.arange(float(n))
-    beside = frenet(center, grid, log_poses)
+    beside = arc_length_and_offset(center, grid, log_poses)
     at, offset, m = np.empty(len(beside)), np.empty(len(beside)), 0
     for i in _order_along(beside):
         s, left = beside[i, 0], beside[i, 1]
@@ -503,7 +503,7 @@ def start_step(log: AgentTracks, i: int, step: int) -> int:
     return step + int(np.argmax(started)) if started.any() else NEVER
 
 
-def clocks(scene: Scene) -> Ints:
+def log_steps(scene: Scene) -> Ints:
     """(N,) the step of its log each agent is at: the scene's, or earlier for one that an earlier rollout made wait."""
     log, start = scene.clip.agents, scene.step
     here = scene.agents.boxes[start, :, :2]
@@ -535,7 +535,7 @@ STOP_STEPS = 5  # a logged stop lasts at least this long
 STOP_BEFORE_ENTRY_M, STOP_BEHIND_ENTRY_M = 12.0, 2.0  # where, around a junction's entry, a stop belongs to it
 
 
-def numbered(found: list[LanePath | None]) -> Ints:
+def path_numbers(found: list[LanePath | None]) -> Ints:
     """Index of each path among those there are, -1 where there is none."""
     has = np.array([path is not None for path in found], dtype=bool)
     return np.where(has, np.cumsum(has) - 1, -1)
@@ -549,7 +549,7 @@ def stack_paths(
     decel_max: float,
     logged_stops: bool = True,
 ) -> Paths:
-    """The agents' paths and logged ways (N,), as `numbered` counts them; a logged way's own speeds tell it to stop.
+    """The agents' paths and logged ways (N,), as `path_numbers` counts them; a logged way's own speeds tell it to stop.
 
     logged_stops: whether a stop of a log at a junction makes a stop line.
     """
@@ -566,7 +566,7 @@ def stack_paths(
         heading=heading,
         height=np.array([path.height for path in chosen]).reshape(-1, n_points),
         target_speed=_target_speeds(limit, heading, target_speed_mps, decel_max),
-        stretches=stretches_of(xy, heading),
+        stretches=stretch_rectangles(xy, heading),
         line_start=np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]),
         line_at=np.array([at for of_path in lines for at, _ in of_path], dtype=np.float64),
         line_state=np.array(states, dtype=np.uint8).reshape(-1, HORIZON_STEPS + 1).T.copy(),

@@ -153,7 +153,7 @@ def navsim_agents(scene: Scene, target_speed_mps: float) -> NavsimAgents:
     vehicles = [i for i in np.flatnonzero(now.valid[start]).tolist() if now.kinds[i] == AgentKind.VEHICLE]
     boxes = now.boxes[start]
     layers = _layers(scene.clip.road_map)
-    taken = [*bodies(ego_boxes(scene.ego_state, PACIFICA)[None])]
+    taken = [*box_polygons(ego_boxes(scene.ego_state, PACIFICA)[None])]
     driven: list[IdmAgent] = []
     staying: list[int] = []
     for i in vehicles:
@@ -167,7 +167,7 @@ def navsim_agents(scene: Scene, target_speed_mps: float) -> NavsimAgents:
         if np.hypot(pose[0] - boxes[i, 0], pose[1] - boxes[i, 1]) > SNAP_M:
             staying.append(i)
             continue
-        body = bodies(np.array([[*pose, *boxes[i, 3:]]]))[0]
+        body = box_polygons(np.array([[*pose, *boxes[i, 3:]]]))[0]
         if shapely.intersects(body, taken).any():
             continue
         path = baseline_path(found.centerline)
@@ -178,7 +178,7 @@ def navsim_agents(scene: Scene, target_speed_mps: float) -> NavsimAgents:
         length, width = map(float, boxes[i, 3:])
         taken.append(body)
         driven.append(IdmAgent(i, path, progress, speed, target_speed_mps, length, width, body))
-    return _together(driven, staying, bodies(boxes[staying]))
+    return _together(driven, staying, box_polygons(boxes[staying]))
 
 
 def _together(driven: list[IdmAgent], staying: list[int], stay: NDArray[np.object_]) -> NavsimAgents:
@@ -198,7 +198,7 @@ def _together(driven: list[IdmAgent], staying: list[int], stay: NDArray[np.objec
     )
 
 
-def bodies(boxes: Array) -> NDArray[np.object_]:
+def box_polygons(boxes: Array) -> NDArray[np.object_]:
     """(N,) polygons of boxes (N, 5), corners as nuPlan's `OrientedBox` has them."""
     x, y, heading, length, width = boxes.T
     quarter = np.pi / 2.0
@@ -283,7 +283,7 @@ class _Agent:
 
     @property
     def body(self) -> shapely.Polygon:
-        return bodies(np.array([[*self.pose, self.about.length, self.about.width]]))[0]
+        return box_polygons(np.array([[*self.pose, self.about.length, self.about.width]]))[0]
 
     def footprint(self, headway_s: float) -> shapely.Geometry:
         """Its body and the strip along its path that it covers in the next headway."""
@@ -319,7 +319,7 @@ class _Footprint:
         return self._stages[min(times, len(self._stages) - 1)]
 
 
-def answer(
+def roll_out_navsim(
     agents: NavsimAgents, settings: TrafficSettings, window: AgentTracks, ego_states: Array
 ) -> tuple[Array, Array, Bools]:
     """The traffic around one ego with states (T, 11), T = 41: boxes (T, N, 5), velocities (T, N, 2), valid (T, N).
@@ -363,7 +363,9 @@ class _Traffic:
 
     def steps(self) -> Iterator[dict[int, _Agent]]:
         """The agents that are left after each of the T - 1 steps, by their numbers."""
-        egos = bodies(np.column_stack([self.ego_states[:, [X, Y, HEADING]], np.tile(_BODY, (len(self.ego_states), 1))]))
+        egos = box_polygons(
+            np.column_stack([self.ego_states[:, [X, Y, HEADING]], np.tile(_BODY, (len(self.ego_states), 1))])
+        )
         for ego, body in zip(self.ego_states[:-1], egos):
             self.footprints[self.ego] = _Footprint(body, self.looks)
             for k, agent in list(self.moving.items()):

@@ -37,23 +37,23 @@ from tasks.rollout.idm import AgentStates, IdmDriver, Motion, Roles, RolloutRows
 from tasks.rollout.lane_following import (
     NEVER,
     LanePath,
-    clocks,
     find_path,
     first_later_step_on_lane,
     index_lanes,
     join_steps,
+    log_steps,
     logged_path,
     logged_track,
-    numbered,
+    path_numbers,
     stack_paths,
     stands_always,
     start_step,
     straight_path,
 )
 from tasks.rollout.lqr import track
-from tasks.rollout.navsim import NavsimAgents, answer, navsim_agents
-from tasks.rollout.traffic import begin_step, drive, finish_step, first_row
-from tasks.rollout.yielding import yielding_in
+from tasks.rollout.navsim import NavsimAgents, navsim_agents, roll_out_navsim
+from tasks.rollout.traffic import apply_policy_answer, drive, initial_rows, who_is_asked
+from tasks.rollout.yielding import prepare_yielding
 from tasks.settings import MOST, TrafficSettings
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import HORIZON_STEPS, MOVING_KINDS, PER_STEP, STEP_S, AgentKind, AgentTracks, Rollout, Scene
@@ -128,7 +128,7 @@ def traffic_record(settings: TrafficSettings) -> dict[str, object]:
     return record | ({} if settings.policy is None else {"policy": f"{name} {policy_named(settings.policy).digest()}"})
 
 
-def refuse_another_policy(settings: TrafficSettings, recorded: object) -> None:
+def check_same_policy(settings: TrafficSettings, recorded: object) -> None:
     """Raises OSError where the policy that drives here is not the one that `traffic_record` gave at the run's start."""
     if settings.policy is not None and traffic_record(settings)["policy"] != recorded:
         raise OSError(errno.ESTALE, "has another digest than when the run began; start it again", settings.policy)
@@ -144,14 +144,14 @@ def drive_by_policy(
     past: the agents over the SEEN_ROWS rows up to `start`; ego_past: the ego's boxes and velocities in them. Raises
     BadPolicy where the policy answers no states.
     """
-    rows, motion = first_row(now, roles, *ego)
+    rows, motion = initial_rows(now, roles, *ego)
     boxes, velocities = (
         np.concatenate([agents, of_ego[:, None]], axis=1)
         for agents, of_ego in ((past.boxes, ego_past[0]), (past.velocities, ego_past[1]))
     )
     valid = np.concatenate([past.valid, np.ones((SEEN_ROWS, 1), bool)], axis=1)
     for t in range(len(rows.boxes) - 1):
-        asked, mode = begin_step(start, roles, paths, driver, t, rows, motion)
+        asked, mode = who_is_asked(start, roles, paths, driver, t, rows, motion)
         answer = np.zeros((len(asked), 4))
         if asked.any():
             seen = SeenTraffic(
@@ -165,7 +165,7 @@ def drive_by_policy(
                 ways=paths._replace(line_state=paths.line_state[t : t + 1]),
             )
             answer = _checked(policy, policy.next_states(seen), asked)
-        finish_step(start, log, roles, paths, driver, t, asked, answer, rows, mode, motion)
+        apply_policy_answer(start, log, roles, paths, driver, t, asked, answer, rows, mode, motion)
     return rows, motion
 
 
@@ -218,7 +218,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     ahead_m = _path_length(scene, settings)
 
     join, hold = join_steps(index, scene), np.zeros(n, dtype=np.int64)
-    clock = clocks(scene)
+    clock = log_steps(scene)
     found: list[LanePath | None] = [None] * n
     logged_ways: list[LanePath | None] = [None] * n
     for i in np.flatnonzero(is_vehicle & ~standing).tolist():
@@ -239,7 +239,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
             join[i] = 0  # wherever its log is by now
         else:
             hold[i] = start_step(log, i, step)
-    numbers = numbered(found + logged_ways)
+    numbers = path_numbers(found + logged_ways)
     roles = Roles(
         path=numbers[:n],
         logged_path=numbers[n:],
@@ -256,7 +256,9 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     )
     if not yields:
         return TrafficScene(scene, settings, roles, paths)
-    return TrafficScene(scene, settings, roles, paths, yielding=yielding_in(scene, roles, paths, _agent_states(log)))
+    return TrafficScene(
+        scene, settings, roles, paths, yielding=prepare_yielding(scene, roles, paths, _agent_states(log))
+    )
 
 
 def simulate(scene: Scene, poses: Array, settings: TrafficSettings) -> Rollout:
@@ -273,7 +275,7 @@ def roll_out(traffic: TrafficScene, ego_states: Array, steps: int = HORIZON_STEP
     return Rollout(traffic.scene.step, ego_states, *_answer(traffic, ego_states, steps))
 
 
-def roll_on(traffic: TrafficScene, ego_states: Array) -> AgentTracks:
+def roll_out_longer(traffic: TrafficScene, ego_states: Array) -> AgentTracks:
     """The same for longer than H: T rows of the traffic around an ego with states (T, 11), 41 as `roll_out`'s.
 
     After the log's end, which is the clip's, who replays it goes straight on as fast as there, and lights stay as they
@@ -324,7 +326,7 @@ def _public_answer(
     agents: NavsimAgents, settings: TrafficSettings, window: AgentTracks, ego_states: Array
 ) -> tuple[AgentTracks, Bools]:
     """Boxes keep the height that they have now: the public traffic lives in the plane."""
-    boxes, velocities, valid = answer(agents, settings, window, ego_states)
+    boxes, velocities, valid = roll_out_navsim(agents, settings, window, ego_states)
     vehicle = np.array([kind == AgentKind.VEHICLE for kind in window.kinds], dtype=bool)
     center_z = np.where(vehicle, np.where(valid, window.center_z[0], np.nan), window.center_z)
     driven = np.zeros(len(window), dtype=bool)

@@ -25,20 +25,20 @@ from tasks.rollout.idm import (
     RolloutRows,
     Yielding,
     advance,
-    cell_of,
-    due_path,
     empty_motion,
     empty_rows,
     far_from_ego,
     hardest_acceleration,
     is_clear,
     must_brake,
+    nearest_point_index,
+    path_to_join,
+    project_onto_path,
     road_acceleration,
-    start_on,
     touches_driven,
-    way_of,
+    way_along,
 )
-from tasks.rollout.yielding import has_way, intended_acceleration, turned_at, yields_for
+from tasks.rollout.yielding import body_turn_at, intended_acceleration, may_enter, yielding_acceleration
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.geometry import wrapped
 
@@ -53,7 +53,7 @@ def drive(
     start: the clip's step of row 0; log: the clip's tracks over all its steps; now: the agents (1, N) at `start`;
     yielding: None where drivers have no intent but their target speed, and give way to nobody.
     """
-    rows, motion = first_row(now, roles, ego_boxes, ego_velocities)
+    rows, motion = initial_rows(now, roles, ego_boxes, ego_velocities)
     for t in range(ego_boxes.shape[0] - 1):
         mode = _switch_to_idm(roles, paths, driver, t, rows, motion, yielding)
         _drive_on(start, roles, paths, driver, t, rows, mode, motion, yielding)
@@ -63,7 +63,7 @@ def drive(
 
 
 @kernel
-def first_row(now: AgentStates, roles: Roles, ego_boxes: Array, ego_velocities: Array) -> tuple[RolloutRows, Motion]:
+def initial_rows(now: AgentStates, roles: Roles, ego_boxes: Array, ego_velocities: Array) -> tuple[RolloutRows, Motion]:
     """Row 0 around one ego, boxes (T, 5) and velocities (T, 2), who is in all rows."""
     n_rows, n = ego_boxes.shape[0], roles.path.shape[0]
     rows, motion = empty_rows(n_rows, n), empty_motion(n_rows, n)
@@ -83,7 +83,7 @@ def first_row(now: AgentStates, roles: Roles, ego_boxes: Array, ego_velocities: 
 
 
 @kernel
-def begin_step(
+def who_is_asked(
     start: int, roles: Roles, paths: Paths, driver: IdmDriver, t: int, rows: RolloutRows, motion: Motion
 ) -> tuple[Bools, Ints]:
     """(N,) whose next state a policy is asked for at row t, those driven and not held by their log; and the modes."""
@@ -96,7 +96,7 @@ def begin_step(
 
 
 @kernel
-def finish_step(
+def apply_policy_answer(
     start: int, log: AgentStates, roles: Roles, paths: Paths, driver: IdmDriver, t: int, asked: Bools, answer: Array,
     rows: RolloutRows, mode: Ints, motion: Motion,
 ) -> None:  # fmt: skip
@@ -110,7 +110,7 @@ def finish_step(
             m, s = motion.path[t, i], project_on_path(paths, motion.path[t, i], x, y)[0]
             rows.boxes[t + 1, i, 0], rows.boxes[t + 1, i, 1], rows.boxes[t + 1, i, 2] = x, y, h
             rows.velocities[t + 1, i, 0], rows.velocities[t + 1, i, 1] = speed * math.cos(h), speed * math.sin(h)
-            rows.center_z[t + 1, i] = motion.base_z[t, i] + paths.height[m, cell_of(paths, s)]
+            rows.center_z[t + 1, i] = motion.base_z[t, i] + paths.height[m, nearest_point_index(paths, s)]
             motion.was_driven[t + 1, i] = True
     _replay(log, roles, t, rows, mode, motion)
     _admit(start, log, roles, driver, t, rows, mode, motion, None)
@@ -151,19 +151,19 @@ def _switch_to_idm(
         mode[i] = motion.mode[t, i]
     for i in range(n):
         if mode[i] == REPLAYED and rows.valid[t, i]:
-            switch[i] = due_path(roles, paths, rows, t, i, motion.clock[t, i])
+            switch[i] = path_to_join(roles, paths, rows, t, i, motion.clock[t, i])
             if switch[i] < 0 and must_brake(roles, paths, driver, rows, t, i, mode):
                 switch[i] = roles.logged_path[i]
     for i in range(n):
         m = switch[i]
         if m >= 0:
             mode[i] = DRIVEN
-            s, offset, turn, speed = start_on(paths, m, rows, t, i, driver)
+            s, offset, turn, speed = project_onto_path(paths, m, rows, t, i, driver)
             if yielding is not None:
-                turn = wrapped(turn - turned_at(yielding, m, s))
+                turn = wrapped(turn - body_turn_at(yielding, m, s))
             motion.mode[t, i], motion.path[t, i], motion.travelled[t, i] = DRIVEN, m, 0.0
             motion.s[t, i], motion.offset[t, i], motion.turn[t, i], motion.speed[t, i] = s, offset, turn, speed
-            motion.base_z[t, i] = rows.center_z[t, i] - paths.height[m, cell_of(paths, s)]
+            motion.base_z[t, i] = rows.center_z[t, i] - paths.height[m, nearest_point_index(paths, s)]
         for values in (motion.mode, motion.path, motion.clock):
             values[t + 1, i] = values[t, i]
         for numbers in (motion.s, motion.travelled, motion.speed, motion.offset, motion.turn, motion.base_z):
@@ -190,10 +190,10 @@ def _drive_on(
         else:
             nose = s + 0.5 * rows.boxes[t, i, 3]
             accel = intended_acceleration(yielding, paths, driver, m, s, speed, start, t, nose)
-        way = way_of(rows, t, i, m, s, travelled, motion.offset[t, i], motion.turn[t, i])
+        way = way_along(rows, t, i, m, s, travelled, motion.offset[t, i], motion.turn[t, i])
         accel = hardest_acceleration(paths, driver, rows, t, i, way, speed, accel, yielding)
         if yielding is not None:
-            accel = yields_for(yielding, driver, start, t, i, m, s, speed, rows, mode, motion, accel)
+            accel = yielding_acceleration(yielding, driver, start, t, i, m, s, speed, rows, mode, motion, accel)
         motion.was_driven[t + 1, i] = True
         step_m, new_speed = advance(speed, accel)
         _advance(paths, driver, t, i, step_m, new_speed, rows, motion, yielding)
@@ -213,11 +213,11 @@ def _advance(
         x, y, h = pose_on_path(paths, m, s, travelled, offset, turn, driver.blend_length_m)
         rows.boxes[t + 1, i, 0], rows.boxes[t + 1, i, 1] = x, y
         if yielding is not None:
-            h += turned_at(yielding, m, s)
+            h += body_turn_at(yielding, m, s)
         rows.boxes[t + 1, i, 2] = wrapped(h)
     h = rows.boxes[t + 1, i, 2]
     rows.velocities[t + 1, i, 0], rows.velocities[t + 1, i, 1] = new_speed * math.cos(h), new_speed * math.sin(h)
-    rows.center_z[t + 1, i] = motion.base_z[t + 1, i] + paths.height[m, cell_of(paths, s)]
+    rows.center_z[t + 1, i] = motion.base_z[t + 1, i] + paths.height[m, nearest_point_index(paths, s)]
 
 
 @hidden_kernel
@@ -262,7 +262,7 @@ def _admit(
             roles, driver, log, k, i, rows, t + 1, mode, yielding
         )
         if yielding is not None and enters[i] and roles.path[i] >= 0:
-            enters[i] = has_way(yielding, driver, roles.path[i], k, t + 1, log, i, rows, mode, motion)
+            enters[i] = may_enter(yielding, driver, roles.path[i], k, t + 1, log, i, rows, mode, motion)
     for i in range(n):
         if enters[i]:
             motion.mode[t + 1, i], motion.clock[t + 1, i] = STANDING if roles.standing[i] else REPLAYED, k

@@ -122,7 +122,7 @@ def turns_as_logged(paths: Paths, boxes: Array, valid: Bools, owner: Ints, ancho
 
 
 @inner_kernel
-def turned_at(yielding: Yielding, m: int, s: float) -> float:
+def body_turn_at(yielding: Yielding, m: int, s: float) -> float:
     """[rad] of a body at path length s of path m against it."""
     last = yielding.turned.shape[1] - 1
     cell = min(max(s / PATH_SPACING_M, 0.0), last - 1e-9)
@@ -151,7 +151,7 @@ def _first_step_at(yielding: Yielding, m: int, s: float) -> float:
 
 
 @inner_kernel
-def moment_of(yielding: Yielding, m: int, s: float, step: int) -> float:
+def log_moment(yielding: Yielding, m: int, s: float, step: int) -> float:
     """The moment of its log [steps] that a driver at path length s of path m is in, at `step`."""
     n = yielding.at.shape[1]
     here = yielding.at[m, step] if step < n else np.inf
@@ -163,7 +163,7 @@ def moment_of(yielding: Yielding, m: int, s: float, step: int) -> float:
 
 
 @inner_kernel
-def speed_in(yielding: Yielding, m: int, moment: float) -> float:
+def log_speed_at(yielding: Yielding, m: int, moment: float) -> float:
     """[m/s] of the log of path m at a moment [steps]."""
     last = yielding.speed.shape[1] - 1
     k = min(int(moment), last)
@@ -176,9 +176,9 @@ def seconds_to(yielding: Yielding, m: int, s: float, speed: float, step: int, to
     """[s] that a driver at path length s of path m, if nobody holds it up, takes to path length `to`."""
     if to <= s:
         return 0.0
-    moment = moment_of(yielding, m, s, step)
+    moment = log_moment(yielding, m, s, step)
     planned = max(_first_step_at(yielding, m, to) - moment, 0.0) * STEP_S
-    if speed >= speed_in(yielding, m, moment) - STANDS_BELOW_MPS:
+    if speed >= log_speed_at(yielding, m, moment) - STANDS_BELOW_MPS:
         return planned
     alone = (math.sqrt(speed * speed + 2.0 * accel_max * (to - s)) - speed) / accel_max
     return max(planned, alone)
@@ -204,8 +204,8 @@ def intended_acceleration(
 
 @inner_kernel
 def _as_logged(yielding: Yielding, paths: Paths, driver: IdmDriver, m: int, s: float, speed: float, step: int) -> float:
-    moment = moment_of(yielding, m, s, step)
-    wanted, then = speed_in(yielding, m, moment), speed_in(yielding, m, moment + 1.0)
+    moment = log_moment(yielding, m, s, step)
+    wanted, then = log_speed_at(yielding, m, moment), log_speed_at(yielding, m, moment + 1.0)
     if then == 0.0 and speed < STANDS_BELOW_MPS:
         return -speed / STEP_S
     logged = (then - wanted) / STEP_S
@@ -230,7 +230,7 @@ MET_STEPS = 15  # of a log within a path: afterwards it is in the way, and a lea
 
 
 @kernel
-def zones_of(
+def find_zones(
     paths: Paths, owner: Ints, begin: Array, nose: Array, end: Array, half_width: Array,
     log: AgentStates, replays: Bools, clock: Ints, n_steps: int,
 ) -> tuple[Ints, Array]:  # fmt: skip
@@ -446,7 +446,7 @@ ASIDE = 0.3  # sine of the angle at which another way comes from the right or th
 STOP_BEFORE_M = 12.0  # of a zone, a stop of the log is one for it
 
 
-def yielding_in(scene: Scene, roles: Roles, paths: Paths, log: AgentStates) -> Yielding:
+def prepare_yielding(scene: Scene, roles: Roles, paths: Paths, log: AgentStates) -> Yielding:
     """What drivers on `paths` mean to do, and where they look out for others."""
     start, n_steps = scene.step, len(log.valid)
     owner, anchor_step, pose = _anchors(scene, roles, log, len(paths.heading))
@@ -458,7 +458,7 @@ def yielding_in(scene: Scene, roles: Roles, paths: Paths, log: AgentStates) -> Y
     moves = end - begin > MOVES_M
     replays = roles.moving_kind & ~roles.standing & ((roles.path < 0) | (roles.join_step > start))
     half_width = 0.5 * np.nan_to_num(np.nanmax(log.boxes[..., 4], axis=0, initial=0.0))
-    who, where = zones_of(
+    who, where = find_zones(
         paths, owner, begin - front, anchor_at + front, np.where(moves, end + front, -np.inf), half_width,
         log, replays, roles.clock, HORIZON_STEPS + 1,
     )  # fmt: skip
@@ -569,7 +569,7 @@ FASTER_MPS = 1.0  # than its schedule
 
 
 @inner_kernel
-def is_committed(speed: float, ahead: float, driver: IdmDriver) -> bool:
+def cannot_stop_before(speed: float, ahead: float, driver: IdmDriver) -> bool:
     """Could one only stop before a zone that begins `ahead` [m] of its nose by braking harder than half of what tyres
     can?"""
     if ahead < -INSIDE_M:
@@ -578,7 +578,7 @@ def is_committed(speed: float, ahead: float, driver: IdmDriver) -> bool:
 
 
 @inner_kernel
-def yields_for(
+def yielding_acceleration(
     yielding: Yielding, driver: IdmDriver, start: int, t: int, i: int,
     m: int, s: float, speed: float, rows: RolloutRows, mode: Ints, motion: Motion, accel: float,
 ) -> float:  # fmt: skip
@@ -589,7 +589,7 @@ def yields_for(
         if not rows.valid[t, j]:
             continue
         ahead = yielding.zone_in[z] - s - front
-        if is_committed(speed, ahead, driver):
+        if cannot_stop_before(speed, ahead, driver):
             continue
         o = yielding.zone_path[z]
         if o >= 0:
@@ -599,7 +599,7 @@ def yields_for(
             if other_s - other_front > yielding.other_out[z]:
                 continue
             other_ahead = yielding.other_in[z] - other_s - other_front
-            if not (yielding.gives_way[z] or is_committed(other_speed, other_ahead, driver)):
+            if not (yielding.gives_way[z] or cannot_stop_before(other_speed, other_ahead, driver)):
                 continue
             nose_s, rear_s = yielding.other_in[z] - other_front, yielding.other_out[z] + other_front
             comes = seconds_to(yielding, o, other_s, other_speed, start + t, nose_s, driver.accel_max)
@@ -624,7 +624,7 @@ def yields_for(
 
 
 @inner_kernel
-def has_way(
+def may_enter(
     yielding: Yielding, driver: IdmDriver, m: int, k: int, t: int, log: AgentStates, i: int,
     rows: RolloutRows, mode: Ints, motion: Motion,
 ) -> bool:  # fmt: skip
@@ -643,8 +643,8 @@ def has_way(
         other_front = 0.5 * rows.boxes[t, j, 3]
         if motion.path[t, j] != o or motion.s[t, j] - other_front > yielding.other_out[z]:
             continue
-        if is_committed(
+        if cannot_stop_before(
             motion.speed[t, j], yielding.other_in[z] - motion.s[t, j] - other_front, driver
-        ) and is_committed(speed, yielding.zone_in[z] - s - front, driver):
+        ) and cannot_stop_before(speed, yielding.zone_in[z] - s - front, driver):
             return False
     return True

@@ -194,7 +194,7 @@ class Block:
     other_cameras: tuple[Camera, ...] = ()  # of those drives
 
 
-def of_other_log(name: str) -> bool:
+def is_of_other_log(name: str) -> bool:
     """Whether a track, camera or lidar of a block is of another log than the block."""
     return OTHER_LOG in name
 
@@ -277,7 +277,7 @@ def scene_of_clip(clip: Clip) -> Scene:
 # Random streams: a function of the run's seed and of what is drawn for, never of settings, code, round or order.
 
 
-def stream(seed: int, clip_id: str, stage: str, candidate: int = -1) -> np.random.Generator:
+def random_stream(seed: int, clip_id: str, stage: str, candidate: int = -1) -> np.random.Generator:
     """The Philox stream of one stage of one clip (and candidate); equal arguments give equal numbers anywhere."""
     key = "\x1f".join((str(seed), clip_id, stage, str(candidate)))
     digest = hashlib.sha256(key.encode()).digest()

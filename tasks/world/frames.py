@@ -40,7 +40,7 @@ def points_to_local(origin: Array, points: Array) -> Array:
     return np.stack([c * dx + s * dy, -s * dx + c * dy], axis=-1)
 
 
-def upright(poses: Array) -> Array:
+def planar_matrices(poses: Array) -> Array:
     """Poses (N, 3) as matrices (N, 4, 4) on the plane z = 0, z up."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     out = np.tile(np.eye(4), (len(poses), 1, 1))

@@ -18,7 +18,7 @@ import pytest
 
 from factory.stages.warm import compile_kernels, marker
 from factory.store.reader import SampleTable
-from tasks.caches import unsealed
+from tasks.caches import without_checksum
 from tasks.kernels.compiled import cache_dir
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
@@ -138,7 +138,7 @@ def give_compiled_kernels(head: Head) -> Path:
     cache = head.folder / "cache" / "driving-data-factory" / cache_dir().name
     for part in PARTS:
         listing = marker(part)
-        for name in (listing.name, *unsealed(listing.read_bytes(), listing.name).decode().splitlines()):
+        for name in (listing.name, *without_checksum(listing.read_bytes(), listing.name).decode().splitlines()):
             (cache / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(cache_dir() / name, cache / name)
     return cache

@@ -18,7 +18,7 @@ from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.stages import Rejected
 from tasks.subscores import SUBSCORES
-from tasks.world.clip import HORIZON_STEPS, NOW, Clip, scene_of_clip, stream
+from tasks.world.clip import HORIZON_STEPS, NOW, Clip, random_stream, scene_of_clip
 from tasks.world.frames import to_local, to_world
 from tasks.world.vocabulary import Vocabulary
 
@@ -44,7 +44,7 @@ def experts(human: NDArray[np.float64]) -> tuple[Expert, ...]:
 
 
 def listed(clip: Clip, human: NDArray[np.float64]) -> Perturbation:
-    found = perturb(clip, Vocabulary(human[:K]), SETTINGS, TRAFFIC, PDM, stream(0, clip.clip_id, "perturb"))
+    found = perturb(clip, Vocabulary(human[:K]), SETTINGS, TRAFFIC, PDM, random_stream(0, clip.clip_id, "perturb"))
     assert isinstance(found, Perturbation)
     return found
 
@@ -77,7 +77,7 @@ def test_the_lazy_walk_equals_scoring_everything_first(
     scores[candidates] = score(replay, np.concatenate([pdm, states[candidates]]), normalise="pairs").pdm_score[1:]
 
     first: dict[tuple[int, int], int | None] = {}
-    for index in stream(0, clip.clip_id, "perturb").permutation(K).tolist():
+    for index in random_stream(0, clip.clip_id, "perturb").permutation(K).tolist():
         if inside[index]:
             cell = (int(cells[index, 0]), int(cells[index, 1]))
             if first.setdefault(cell, None) is None and scores[index] >= SETTINGS.epdms_min:
@@ -101,7 +101,7 @@ def outcomes(clip: Clip, found: Perturbation, expert: Expert, n: int) -> list[tu
     """Reason (empty: accepted), score and driven states of the first n attempts."""
     out = []
     for index, candidate in enumerate(found.candidates[:n]):
-        rng = stream(0, clip.clip_id, f"expert.{expert.name}", index)
+        rng = random_stream(0, clip.clip_id, f"expert.{expert.name}", index)
         result = attempt(perturbed_scene(clip, candidate.rollout), expert, GATE, TRAFFIC, PDM, rng)
         if isinstance(result, Rejected):
             out.append((result.reason, np.nan, b""))

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import ClipReader
-from tasks.attempt import ExpertGate, Judged, attempt, end_verdict, human_sample, perturbed_scene
+from tasks.attempt import ExpertGate, Judged, attempt, drive_as_human, end_verdict, perturbed_scene
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Human
 from tasks.experts.recovery import Recovery, RecoveryTable
 from tasks.perturb import Perturbation, PerturbSettings, perturb
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic
 from tasks.stages import Rejected
-from tasks.world.clip import Clip, scene_of_clip, stream
+from tasks.world.clip import Clip, random_stream, scene_of_clip
 from tasks.world.road_map import Rings
 from tasks.world.vocabulary import Vocabulary
 
@@ -37,7 +37,7 @@ def test_no_human_drive_is_one_that_would_be_refused(
     refs = logs.index().refs
     assert len(refs) in (14, 61)
     for ref in refs:
-        judged = human_sample(scene_of_clip(logs.read(ref)), Human(), PDM, RNG)
+        judged = drive_as_human(scene_of_clip(logs.read(ref)), Human(), PDM, RNG)
         replayed = prepare_traffic(judged.scene, TrafficSettings(mode="replay"))
         assert end_verdict(judged, replayed, ExpertGate()) is None, ref
 
@@ -52,7 +52,7 @@ def clip(shared_root: Path) -> Clip:
 def driven(clip: Clip, shared_root: Path) -> list[tuple[Judged, Rejected | None, Rejected | None]]:
     """Recovery's attempts: drive, the published gate's verdict, and that with the gates on ends."""
     human: NDArray[np.float64] = np.load(shared_root / "data" / "vocabulary" / "human_8192x40x3.npy")
-    rng, traffic = stream(0, clip.clip_id, "perturb"), TrafficSettings()
+    rng, traffic = random_stream(0, clip.clip_id, "perturb"), TrafficSettings()
     found = perturb(clip, Vocabulary(human), PerturbSettings(), traffic, PDM, rng)
     assert isinstance(found, Perturbation)
     expert, out = Recovery(RecoveryTable(human)), []

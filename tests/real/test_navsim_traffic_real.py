@@ -10,7 +10,7 @@ from reference_scenes import SCENES, loader, logged_tracks
 
 from factory.datasets.av2.reader import AV2Reader, log_folders, read_log
 from factory.readers.base import ClipRef
-from tasks.rollout.navsim import bodies
+from tasks.rollout.navsim import box_polygons
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tasks.world.clip import HISTORY_STEPS, NOW, AgentKind, AgentTracks, Clip, Scene, scene_of_clip
 from tasks.world.road_map import RoadMap, Route
@@ -91,7 +91,7 @@ def _meeting(agents: AgentTracks) -> set[tuple[int, int]]:
     pairs = []
     for boxes, valid in zip(agents.boxes, agents.valid):
         here = np.flatnonzero(valid)
-        shapes = bodies(boxes[here])
+        shapes = box_polygons(boxes[here])
         shared = shapely.area(shapely.intersection(shapes[:, None], shapes[None])) > SHARED_M2
         shared &= vehicle[here][:, None] | vehicle[here][None]
         pairs.append({(int(here[i]), int(here[j])) for i, j in np.argwhere(np.triu(shared, 1))})

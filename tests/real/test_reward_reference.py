@@ -11,7 +11,7 @@ from reference_scenes import RECORDED_K, SCENES, loader, prepared_scene, tracks,
 from factory.datasets.av2.reader import AV2Reader, log_folders
 from factory.readers.base import ClipRef
 from tasks.reward.comfort import extended_comfort
-from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_ec
+from tasks.reward.epdms import Scores, human_filtered, score, score_with_ec, select_rows
 from tasks.rollout.lqr import track
 from tasks.subscores import JUDGED, RECORDS
 from tasks.trajectories import score_trajectories
@@ -121,7 +121,7 @@ def test_official_rows_against_pdm_closed_with_the_human_filter(shared_root: Pat
             prepared = prepared_scene(inputs, objects)
         else:
             prepared = prepared_scene(inputs)
-        ours = rows(score(prepared, states), slice(1, 2))
+        ours = select_rows(score(prepared, states), slice(1, 2))
         human = score(prepared_scene(inputs), track(inputs["ego_state0"], human_poses), with_history=False)
         ours_filtered = human_filtered(ours, human)
         recorded = {key: np.array([value]) for key, value in row.items() if isinstance(value, float)}

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.perturb import Perturbation, PerturbSettings, perturb
 from tasks.rollout.simulate import TrafficSettings
-from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Clip, stream
+from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Clip, random_stream
 from tasks.world.frames import EGO_STATE_SIZE, VX, X, to_world
 from tasks.world.road_map import Lane, LightState, MapLayer, MapPolygon, RoadMap, Route, TrafficLights
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
@@ -143,7 +143,7 @@ def perturbed(clip: Clip, size: int = 150) -> Perturbation:
     """The clip's list of candidates, from so many trajectories."""
     listed = perturb(
         clip, Vocabulary(kinematic_trajectories(size, 0)), PerturbSettings(), TrafficSettings(), PdmSettings(),
-        stream(0, clip.clip_id, "perturb"),
+        random_stream(0, clip.clip_id, "perturb"),
     )  # fmt: skip
     assert isinstance(listed, Perturbation)
     return listed

@@ -9,7 +9,7 @@ import pytest
 from tasks.attempt import Judged, perturbed_scene
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Human
-from tasks.hard_scenes import BenchmarkClip, follow_up, frame_digest, half_a_second_before
+from tasks.hard_scenes import BenchmarkClip, drive_follow_up, frame_digest, seen_half_a_second_earlier
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import FRAMES, Rejected
 from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS, NOW, Clip, Rollout, Scene
@@ -36,7 +36,7 @@ def scenes(clip: Clip, stage_one: Rollout) -> BenchmarkClip:
 
 @pytest.fixture(scope="module")
 def judged(clip: Clip, stage_one: Rollout) -> Judged:
-    result = follow_up(clip, stage_one, TrafficSettings(), PdmSettings())
+    result = drive_follow_up(clip, stage_one, TrafficSettings(), PdmSettings())
     assert isinstance(result, Judged)
     return result
 
@@ -68,7 +68,7 @@ def test_the_four_kinds_of_scenes(scenes: BenchmarkClip, clip: Clip, stage_one: 
 def test_the_earlier_frame_drives_the_end_of_the_perturbation_and_then_the_same_drive(
     judged: Judged, stage_one: Rollout, scenes: BenchmarkClip
 ) -> None:
-    before = half_a_second_before(judged, stage_one, PdmSettings())
+    before = seen_half_a_second_earlier(judged, stage_one, PdmSettings())
     states = before.rollout.ego_states
     assert np.array_equal(states[:6], stage_one.ego_states[35:])
     assert np.array_equal(states[5:], judged.rollout.ego_states[:36])
@@ -82,7 +82,7 @@ def test_the_earlier_frame_drives_the_end_of_the_perturbation_and_then_the_same_
 
 def test_a_bad_drive_is_a_follow_up_too(clip: Clip, stage_one: Rollout) -> None:
     nowhere = replace(clip, road_map=replace(clip.road_map, drivable_areas=()))
-    judged = follow_up(nowhere, stage_one, TrafficSettings(), PdmSettings())
+    judged = drive_follow_up(nowhere, stage_one, TrafficSettings(), PdmSettings())
     assert isinstance(judged, Judged) and judged.scores.dac[1] == 0.0
 
 
@@ -95,7 +95,7 @@ def test_a_route_that_has_ended_at_either_frame_drops_both(
         return replace(scene, centerline=scene.centerline[[-1, -1]]) if scene.step == ended_at else scene
 
     monkeypatch.setattr("tasks.hard_scenes.perturbed_scene", perturbed)
-    lost = follow_up(clip, stage_one, TrafficSettings(), PdmSettings())
+    lost = drive_follow_up(clip, stage_one, TrafficSettings(), PdmSettings())
     assert isinstance(lost, Rejected)
     assert (lost.stage, lost.reason) == ("rollout", "route_ended")
 

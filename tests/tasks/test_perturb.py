@@ -22,7 +22,7 @@ from tasks.perturb import (
 from tasks.reward.epdms import prepare_scene, score
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.stages import STAGES, Rejected
-from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip, stream
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, random_stream, scene_of_clip
 from tasks.world.frames import to_local, to_world
 from tasks.world.vocabulary import OF_LOG, Vocabulary, kinematic_trajectories
 from tests.tasks.streets import moved, street_clip
@@ -38,7 +38,7 @@ def perturbed(
     seed: int = 0,
     traffic: TrafficSettings = TRAFFIC,
 ) -> Perturbation | Rejected:
-    rng = stream(seed, clip.clip_id, "perturb")
+    rng = random_stream(seed, clip.clip_id, "perturb")
     return perturb(clip, Vocabulary(trajectories), settings, traffic, PdmSettings(), rng)
 
 
@@ -192,7 +192,7 @@ def test_the_same_seed_gives_the_same_list_and_another_seed_another_order(
 def test_candidates_come_in_the_order_in_which_the_seeded_walk_met_their_cells(
     found: Perturbation, trajectories: NDArray[np.float64]
 ) -> None:
-    walk = stream(0, "street", "perturb").permutation(len(trajectories)).tolist()
+    walk = random_stream(0, "street", "perturb").permutation(len(trajectories)).tolist()
     considered = found.considered
     black = [i for i, fate in enumerate(considered.fate) if fate not in ("reached_gate", "white_cell")]
     cells = grid_cells(considered.end_pose, SETTINGS)

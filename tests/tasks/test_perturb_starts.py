@@ -10,7 +10,7 @@ from tasks.perturb import NO_STARTS, Candidate, Perturbation, PerturbSettings, p
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
-from tasks.world.clip import stream
+from tasks.world.clip import random_stream
 from tasks.world.vocabulary import FIRST_START, Vocabulary, kinematic_trajectories
 from tests.tasks.streets import street_clip
 
@@ -21,7 +21,7 @@ def perturbed(
     starts: Array = NO_STARTS, trajectories: Array = TRAJECTORIES, settings: PerturbSettings | None = None
 ) -> Perturbation | Rejected:
     clip = street_clip()
-    rng, chosen = stream(0, clip.clip_id, "perturb"), settings or PerturbSettings()
+    rng, chosen = random_stream(0, clip.clip_id, "perturb"), settings or PerturbSettings()
     return perturb(clip, Vocabulary(trajectories), chosen, TrafficSettings(), PdmSettings(), rng, starts)
 
 

@@ -4,7 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from tasks.caches import Damaged, check, seal, sealed, sealed_json, unsealed, unsealed_json
+from tasks.caches import (
+    Damaged,
+    append_checksum,
+    json_with_checksum,
+    parse_json_with_checksum,
+    verify_checksum,
+    with_checksum,
+    without_checksum,
+)
 
 CONTENT = bytes(range(90))
 
@@ -16,46 +24,46 @@ def damaged(whole: bytes) -> list[bytes]:
 
 def test_what_is_whole_comes_back_and_a_file_is_sealed_as_bytes_are(tmp_path: Path) -> None:
     for content in (CONTENT, b""):
-        assert unsealed(sealed(content)) == content
+        assert without_checksum(with_checksum(content)) == content
         (tmp_path / "x").write_bytes(content)
-        seal(tmp_path / "x")
-        assert (tmp_path / "x").read_bytes() == sealed(content)
-        check(tmp_path / "x")
+        append_checksum(tmp_path / "x")
+        assert (tmp_path / "x").read_bytes() == with_checksum(content)
+        verify_checksum(tmp_path / "x")
 
 
 def test_every_flip_and_every_cut_is_found(tmp_path: Path) -> None:
-    for data in damaged(sealed(CONTENT)):
+    for data in damaged(with_checksum(CONTENT)):
         (tmp_path / "x").write_bytes(data)
         with pytest.raises(Damaged):
-            unsealed(data)
+            without_checksum(data)
         with pytest.raises(Damaged):
-            check(tmp_path / "x")
+            verify_checksum(tmp_path / "x")
 
 
 def test_a_file_is_whole_under_its_own_key_alone(tmp_path: Path) -> None:
-    data = sealed(CONTENT, "a")
+    data = with_checksum(CONTENT, "a")
     (tmp_path / "x").write_bytes(data)
-    assert unsealed(data, "a") == CONTENT
-    check(tmp_path / "x", "a")
+    assert without_checksum(data, "a") == CONTENT
+    verify_checksum(tmp_path / "x", "a")
     (tmp_path / "y").write_bytes(CONTENT)
-    seal(tmp_path / "y", "a")
+    append_checksum(tmp_path / "y", "a")
     assert (tmp_path / "y").read_bytes() == data
     for key in ("b", "", "aa"):
         with pytest.raises(Damaged):
-            unsealed(data, key)
+            without_checksum(data, key)
         with pytest.raises(Damaged):
-            check(tmp_path / "x", key)
+            verify_checksum(tmp_path / "x", key)
     with pytest.raises(Damaged, match="under this name"):
-        unsealed(sealed(CONTENT), "a")
+        without_checksum(with_checksum(CONTENT), "a")
 
 
 def test_json_is_read_by_anyone_and_holds_its_own_checksum() -> None:
     members = {"cameras": [{"name": "ü", "shift_m": [0.1, float("nan")]}], "left_out": [], "ego_shift_m": 1e-9}
-    text = sealed_json(members)
-    assert str(unsealed_json(text.encode())) == str(members)
+    text = json_with_checksum(members)
+    assert str(parse_json_with_checksum(text.encode())) == str(members)
     for data in damaged(text.encode()):
         with pytest.raises(Damaged):
-            unsealed_json(data)
+            parse_json_with_checksum(data)
     for other in (b"[]", b"[" * 100_000, b'{"sha256": 1}', b"1", b'{"a": 1}'):
         with pytest.raises(Damaged):
-            unsealed_json(other)
+            parse_json_with_checksum(other)

@@ -20,7 +20,7 @@ from planners.models.layers import Sizes
 from tasks import subscores
 from tasks.attempt import ExpertGate, verdict
 from tasks.reward.aggregate import COLUMNS, columns_of
-from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_ec
+from tasks.reward.epdms import Scores, human_filtered, score, score_with_ec, select_rows
 from tasks.reward.label_bytes import ARRAYS, N_PLANES, VocabularyLabels
 from tasks.stages import STAGES
 from tests.factory.store.formats import formats_table
@@ -38,7 +38,7 @@ def scored() -> Scores:
     np.testing.assert_allclose(scores.pdm_score, [(5 * 0.5 + 5 + 2 + 2 + 3) / 17, (5 + 5 + 2 + 2) / 17], atol=1e-12)
     with_ec = score_with_ec(scores, np.ones(2))
     np.testing.assert_allclose(with_ec, [(5 * 0.5 + 5 + 2 + 2 + 3 + 2) / 19, (5 + 5 + 2 + 2 + 2) / 19], atol=1e-12)
-    filtered = human_filtered(scores, rows(scores, [1]))  # the human drives too fast as well
+    filtered = human_filtered(scores, select_rows(scores, [1]))  # the human drives too fast as well
     assert filtered.sl.tolist() == [1.0, 1.0] and filtered.pdm_score[1] == 1.0
     assert columns_of(scores, np.ones(2))[:, COLUMNS.index("sl")].tolist() == [1.0, 0.0]
     return scores

@@ -19,6 +19,7 @@ from factory.files import matching
 from factory.readers.base import BadClip
 from tasks.caches import Damaged, check, sealed, user_cache
 from tasks.kernels.compiled import write_whole
+from tasks.caches import append_checksum, user_cache, verify_checksum
 from tasks.world.arrays import Array, Ints
 from tasks.world.road_map import Lane, MapLayer, MapPolygon, RoadMap
 from tasks.world.roadblocks import Roadblocks

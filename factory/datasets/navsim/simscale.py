@@ -40,7 +40,7 @@ from factory.wording import shown
 from tasks.render.settings import ImageSource
 from tasks.reward.label_bytes import VocabularyLabels
 from tasks.stages import HUMAN
-from tasks.subscores import multiplied
+from tasks.subscores import multiplier_product
 from tasks.world.arrays import Array
 from tasks.world.road_map import RoadMap, Route
 from tasks.world.vocabulary import Vocabulary
@@ -72,7 +72,7 @@ def vocabulary_labels(rewards: Mapping[str, Array], vocabulary: str, k: int) -> 
         raise ValueError(f"rewards of {len(ep)} trajectories, the vocabulary has {k}")
     if not ((ep >= 0.0) & (ep <= 1.0)).all():
         raise ValueError(f"{PROGRESS}: must lie within 0 .. 1")
-    multiplier = multiplied(scores)
+    multiplier = multiplier_product(scores)
     stopped = multiplier == 0.0
     reference_m, raw_m = 0.0, np.zeros(k)
     if not (ep == 1.0).all():  # else nothing counts as progress, and nobody's is wanting

@@ -13,7 +13,7 @@ from factory.readers.pictures import frame_uri
 from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.clip import ROTATION_SLACK, STEP_S, Camera, Fisheye, SensorFile
-from tasks.world.frames import HEADING, X, Y, all_within, upright, wrap_angle
+from tasks.world.frames import HEADING, X, Y, all_within, planar_matrices, wrap_angle
 
 # Where the photos of ScenarioNet's logs are said to be: `cameras.json`, one of each log. Format: docs/photos.md.
 #
@@ -171,7 +171,7 @@ class _Drive:
             return None
         columns = (self._poses[:, 0], self._poses[:, 1], self._headings)
         x, y, heading = (np.interp(step, self._steps, column) for column in columns)
-        return upright(np.array([[x, y, wrap_angle(np.array(heading))]]))[0]
+        return planar_matrices(np.array([[x, y, wrap_angle(np.array(heading))]]))[0]
 
 
 def _uri(name: object, root: Path, sidecar: str, field: str) -> str:

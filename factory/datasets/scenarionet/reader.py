@@ -47,6 +47,7 @@ from factory.wording import shown
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import CLIP_STEPS, STEP_S, AgentKind, AgentTracks
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY, X, Y, upright, wrap_angle
+from tasks.world.frames import planar_matrices
 from tasks.world.road_map import TrafficLights
 
 # ScenarioNet's tracks as 10 Hz arrays: a smooth ego at its rear axle, agents with velocities derived again.
@@ -500,7 +501,7 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
         ego_states = log.motion.ego_states[start:stop]
         if not np.isfinite(ego_states).all():
             raise BadClip(log.file, "tracks[sdc]", f"the ego's drive is broken in the window at {start * STEP_MS} ms")
-        poses = upright(ego_states)  # the format's ego has no roll or pitch, its road is at z = 0
+        poses = planar_matrices(ego_states)  # the format's ego has no roll or pitch, its road is at z = 0
         found = log.photographs
         if not found.images:
             return Recorded(poses)

@@ -34,7 +34,7 @@ from tasks.render.splatting.gaussians import EMPTY, Gaussians
 from tasks.render.splatting.project import OF_DISCS
 from tasks.render.splatting.raster import backproject, project_and_sort, shade
 from tasks.world.arrays import F32, Array, Bools
-from tasks.world.clip import AgentKind, AgentTracks, Pinhole, of_other_log
+from tasks.world.clip import AgentKind, AgentTracks, Pinhole, is_of_other_log
 
 MIN_NODE_DISCS = 40  # a track seen less is drawn as a plain box
 RELAXATION = 0.6
@@ -90,7 +90,7 @@ def held_out_rows(photos: Sequence[Photo], every: int) -> frozenset[int]:
     for i, photo in enumerate(photos):
         at = count.get(photo.camera, 0)
         count[photo.camera] = at + 1
-        if at % every == every // 2 and not of_other_log(photo.camera):
+        if at % every == every // 2 and not is_of_other_log(photo.camera):
             out.add(i)
     return frozenset(out)
 

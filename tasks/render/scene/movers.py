@@ -9,7 +9,7 @@ import numpy as np
 from tasks.kernels.compiled import kernel
 from tasks.world.arrays import F32, Array, Bools, FloatArray
 from tasks.world.clip import STEP_S, AgentTracks
-from tasks.world.frames import upright, wrap_angle
+from tasks.world.frames import planar_matrices, wrap_angle
 
 MARGIN_M = 0.15  # boxes are drawn tightly; mirrors and noise stick out
 BEYOND_M = 0.12  # around a driving box nothing is trusted to be the street
@@ -114,7 +114,7 @@ def shift_boxes(boxes: Array, by: FloatArray) -> Array:
 
 def world_from_boxes(boxes: Array) -> Array:
     """Poses (N, 4, 4) of boxes (N, 7): origin at the centre, x along the heading, z up."""
-    poses = upright(boxes[:, [0, 1, 3]])
+    poses = planar_matrices(boxes[:, [0, 1, 3]])
     poses[:, 2, 3] = boxes[:, 2]
     return poses
 

@@ -23,7 +23,7 @@ from tasks.world.clip import (
     Block,
     Camera,
     SensorFile,
-    of_other_log,
+    is_of_other_log,
     own_name,
 )
 
@@ -134,9 +134,9 @@ def test_a_block_takes_in_the_log_that_shares_its_street(logs: Path) -> None:
     _, _, alone = clip_and_ref(logs, 0)
     reader, ref, clip = clip_and_ref(logs, 5)
     block = block_of(clip)
-    theirs = {f.sensor.partition("/")[0] for f in (*block.images, *block.sweeps) if of_other_log(f.sensor)}
+    theirs = {f.sensor.partition("/")[0] for f in (*block.images, *block.sweeps) if is_of_other_log(f.sensor)}
     assert theirs == {log_name(0, OTHER)}
-    own = tuple(f.uri for f in block.images if not of_other_log(f.sensor))
+    own = tuple(f.uri for f in block.images if not is_of_other_log(f.sensor))
     assert own == tuple(f.uri for f in block_of(alone).images)
     # What the clip itself is stays: only its block knows more, and so its digest says.
     assert clip.agents.track_ids == alone.agents.track_ids and clip.images[0].uri == alone.images[0].uri
@@ -171,7 +171,7 @@ def test_a_scene_of_two_drives_keeps_what_is_of_the_street_and_of_its_own_log(lo
     alone, both = (load_or_build_scene(clip_and_ref(logs, n)[2], settings, tmp_path / str(n)) for n in (0, 1))
     assert alone is not None and both is not None
     assert len(both.background) > len(alone.background)
-    assert not [name for name in both.nodes if of_other_log(name)]
+    assert not [name for name in both.nodes if is_of_other_log(name)]
     assert {view.camera for view in both.views} == {"ring_front_center"}
     assert [(v.camera, v.time_s) for v in both.views] == [(v.camera, v.time_s) for v in alone.views]
     assert both.block is not None and alone.block is not None
@@ -184,9 +184,9 @@ def test_photos_of_other_drives_are_never_held_out(logs: Path) -> None:
     block = block_of(clip)
     cameras = block_cameras(block, choose_cameras(clip.cameras, ()))
     photos = load_photos(block.images, cameras, 64, 36)
-    assert sum(of_other_log(photo.camera) for photo in photos) > 8
+    assert sum(is_of_other_log(photo.camera) for photo in photos) > 8
     held_out = held_out_rows(photos, 4)
-    assert held_out and not [i for i in held_out if of_other_log(photos[i].camera)]
+    assert held_out and not [i for i in held_out if is_of_other_log(photos[i].camera)]
 
 
 def test_cameras_that_are_not_chosen_are_not_taken_of_other_drives(logs: Path) -> None:

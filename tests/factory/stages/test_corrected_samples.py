@@ -13,8 +13,8 @@ from factory.stages.assets import RIG_SUFFIX, CorrectedRig, photo_poses, read_or
 from factory.stages.imaging import Imaging, height_columns
 from factory.stages.sensors import load_photos
 from factory.store.reader import decode_stored_image
-from tasks.attempt import Judged, human_sample
-from tasks.caches import unsealed_json
+from tasks.attempt import Judged, drive_as_human
+from tasks.caches import parse_json_with_checksum
 from tasks.experts.protocol import Human
 from tasks.perturb import Candidate
 from tasks.render.rig.adjust import motions_of_twists, twists_of
@@ -41,7 +41,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
 
 @pytest.fixture(scope="module")
 def judged(clip: Clip) -> Judged:
-    return human_sample(scene_of_clip(clip), Human(), PdmSettings(), np.random.default_rng(0))
+    return drive_as_human(scene_of_clip(clip), Human(), PdmSettings(), np.random.default_rng(0))
 
 
 def stored(camera: Camera, row: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
@@ -77,7 +77,7 @@ def test_photos_are_cut_by_the_camera_and_stand_at_the_poses_that_the_rig_s_file
 ) -> None:
     row = Imaging(SETTINGS, str(tmp_path)).pictures(clip, None, judged)
     (said,) = tmp_path.glob(f"block-*{RIG_SUFFIX}")
-    told = unsealed_json(said.read_bytes())
+    told = parse_json_with_checksum(said.read_bytes())
     used = {one["name"]: {key: np.array(value) for key, value in one.items() if key != "name"} for one in told["used"]}
     cameras = [replace(camera, **used[camera.name]) for camera in clip.cameras]  # type: ignore[arg-type]
     taken = {(camera, round(time_s, 3)): pose for camera, time_s, _, _, pose in told["taken"]}

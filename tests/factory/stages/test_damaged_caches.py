@@ -20,7 +20,14 @@ from factory.stages.assets import RIG_SUFFIX, _resumed, _write_rig_file, damaged
 from factory.stages.scene_file import BadScene, read_scene, write_scene
 from factory.stages.warm import _is_compiled, marker, tiny_clip
 from factory.store.location import BadCacheFile, Location, SceneFiles, encode_tree
-from tasks.caches import SEAL_BYTES, Damaged, seal, sealed, sealed_json, unsealed_json
+from tasks.caches import (
+    SEAL_BYTES,
+    Damaged,
+    append_checksum,
+    json_with_checksum,
+    parse_json_with_checksum,
+    with_checksum,
+)
 from tasks.experts.recovery import RecoveryTable
 from tasks.hard_scenes import OneStageClip
 from tasks.kernels.compiled import kernel
@@ -105,7 +112,7 @@ def test_a_fit_that_is_half_done(tmp_path: Path, lines: Lines) -> None:
     path, start = tmp_path / "block-1.fit.npz", SimpleNamespace()
     with path.open("wb") as file:
         np.savez(file, iteration=np.array(500), owner=np.arange(20))
-    seal(path, path.name)
+    append_checksum(path, path.name)
     for content in damaged(path.read_bytes()):
         path.write_bytes(content)
         assert _resumed(path, start) is start  # type: ignore[comparison-overlap, arg-type]
@@ -173,9 +180,9 @@ def test_the_list_of_a_part_s_kernels(tmp_path: Path, monkeypatch: pytest.Monkey
     path = marker("judge")
     path.parent.mkdir()
     (path.parent / "a.kernel").touch()
-    path.write_bytes(sealed(b"a.kernel", path.name))
+    path.write_bytes(with_checksum(b"a.kernel", path.name))
     assert _is_compiled("judge")
-    for content in damaged(sealed(b"a.kernel", path.name), every=1):
+    for content in damaged(with_checksum(b"a.kernel", path.name), every=1):
         path.write_bytes(content)
         assert not _is_compiled("judge")
         (line,) = lines()
@@ -247,10 +254,10 @@ def test_what_is_half_done_and_a_list_of_kernels_are_not_another_s(
     start, fit = SimpleNamespace(), tmp_path / "block-1.fit.npz"
     with fit.open("wb") as file:
         np.savez(file, iteration=np.array(500), owner=np.arange(20))
-    seal(fit, fit.name)
+    append_checksum(fit, fit.name)
     assert _resumed(fit.rename(tmp_path / "block-2.fit.npz"), start) is start  # type: ignore[comparison-overlap, arg-type]
     marker("judge").parent.mkdir()
-    marker("judge").write_bytes(sealed(b"", marker("judge").name))
+    marker("judge").write_bytes(with_checksum(b"", marker("judge").name))
     assert _is_compiled("judge")
     marker("judge").rename(marker("fit"))
     assert not _is_compiled("fit")
@@ -320,8 +327,8 @@ def test_a_town(tmp_path: Path, lines: Lines, several: bool) -> None:
     assert reader.index().refs and not lines()
     assert list(tmp_path.iterdir()) == [root]
     # Another town's folder under this one's name.
-    told = unsealed_json(whole[root / SUMS])
-    (root / SUMS).write_text(sealed_json(told | {"folder": "town-4"}))
+    told = parse_json_with_checksum(whole[root / SUMS])
+    (root / SUMS).write_text(json_with_checksum(told | {"folder": "town-4"}))
     (root / "another_log").mkdir()
     (root / "another_log/map.json").write_text("{}")
     assert reader.index().refs[0] == ref

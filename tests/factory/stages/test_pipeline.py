@@ -17,7 +17,7 @@ from factory.store.schema import COLUMNS, UNLISTED
 from tasks import stages
 from tasks.perturb import Perturbation, perturb
 from tasks.stages import HUMAN, HUMAN_BEFORE
-from tasks.world.clip import HORIZON_STEPS, NOW, stream
+from tasks.world.clip import HORIZON_STEPS, NOW, random_stream
 from tasks.world.frames import to_local
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
@@ -185,7 +185,7 @@ def test_a_clip_s_candidates_are_drawn_from_a_stream_of_the_run_s_seed_and_its_o
     assert isinstance(made, WholeClip)
 
     def drawn(seed: int, clip_id: str) -> list[int]:
-        rng = stream(seed, clip_id, "perturb")
+        rng = random_stream(seed, clip_id, "perturb")
         found = perturb(clip, work.vocabulary, work.perturb, work.traffic, work.pdm, rng)
         assert isinstance(found, Perturbation)
         return [candidate.vocabulary_index for candidate in found.candidates]

@@ -7,7 +7,7 @@ import pytest
 
 from factory.stages.rows import sample_row
 from factory.store.schema import BOOKKEEPING, COLUMNS, MAP_RADIUS_M, sample_row_to_table
-from tasks.attempt import Judged, human_sample, perturbed_scene
+from tasks.attempt import Judged, drive_as_human, perturbed_scene
 from tasks.attempt import drive_and_judge as judge
 from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.experts.protocol import Human
@@ -25,7 +25,7 @@ POSE_COLUMNS = {name for name, column in COLUMNS.items() if column.shape and col
 
 
 def human(clip: Clip) -> dict[str, object]:
-    return sample_row(clip, None, human_sample(scene_of_clip(clip), Human(), PdmSettings(), RNG))
+    return sample_row(clip, None, drive_as_human(scene_of_clip(clip), Human(), PdmSettings(), RNG))
 
 
 def simulated(clip: Clip) -> tuple[Candidate, Judged]:

@@ -28,10 +28,10 @@ from tasks.render.scene.engine import NOBODY, render
 from tasks.render.views import draw_map_views, pinhole, render_views
 from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.reward.label_bytes import VocabularyLabels
-from tasks.reward.labels import BRAKING_MPS2, hit_after_s, way_on_m
+from tasks.reward.labels import BRAKING_MPS2, hit_after_s, route_ahead_m
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.stages import STAGES, stage_versions
-from tasks.world.clip import HORIZON_STEPS, NOW, Camera, Clip, Pinhole, Rollout, Scene, scene_of_clip, stream
+from tasks.world.clip import HORIZON_STEPS, NOW, Camera, Clip, Pinhole, Rollout, Scene, random_stream, scene_of_clip
 from tasks.world.frames import EGO_STATE_SIZE, VX, Y, to_world
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.factory.datasets.av2.test_av2 import write_log
@@ -77,7 +77,7 @@ def read_clips(folder: Path) -> dict[str, object]:
 def perturbed_street() -> dict[str, object]:
     """The stage `perturb`."""
     clip = street_clip()
-    rng = stream(0, clip.clip_id, "perturb")
+    rng = random_stream(0, clip.clip_id, "perturb")
     vocabulary = Vocabulary(kinematic_trajectories(120, 0))
     found = perturb(clip, vocabulary, PerturbSettings(), TrafficSettings(), PdmSettings(), rng)
     assert isinstance(found, Perturbation)
@@ -152,7 +152,7 @@ def rewards() -> dict[str, object]:
     scores, clip = score(prepared, states), scene.clip
     traffic = prepare_traffic(scene, TrafficSettings(yields=False))
     onward = replace(clip.route, roadblock_ids=(*clip.route.roadblock_ids, "rb_elsewhere"))
-    ways = [way_on_m(clip.road_map, onward, one[-1, :3] + [240.0, 0.0, 0.0]) for one in states]
+    ways = [route_ahead_m(clip.road_map, onward, one[-1, :3] + [240.0, 0.0, 0.0]) for one in states]
     ends = {
         "way on": [-1.0 if metres is None else metres for metres in ways],
         "hit": [hit_after_s(traffic, prepared, one) for one in states],

@@ -10,7 +10,7 @@ import pytest
 
 from factory.config.run import load_config, photos_alone
 from factory.stages.warm import compile_kernels, marker, parts_of
-from tasks.caches import unsealed
+from tasks.caches import without_checksum
 from tasks.kernels.compiled import cache_dir
 from tasks.render.settings import Adjust, RenderMode, RenderSettings, RigSettings
 
@@ -42,7 +42,7 @@ def done_with_these(parts: list[str], tmp_path: Path, *command: str) -> tuple[se
     cache = tmp_path / "cache" / cache_dir().name
     for part in parts:
         listing = marker(part)
-        for name in (listing.name, *unsealed(listing.read_bytes(), listing.name).decode().splitlines()):
+        for name in (listing.name, *without_checksum(listing.read_bytes(), listing.name).decode().splitlines()):
             (cache / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(cache_dir() / name, cache / name)
     if (cache_dir() / "factory").is_dir():  # what paints the town

@@ -19,7 +19,7 @@ from factory.exits import BAD_CONFIG
 from factory.store.reader import SampleTable, image_of, labels_of, to_torch
 from factory.store.samples import Store
 from factory.store.schema import LABEL_COLUMNS
-from tasks.caches import sealed_json
+from tasks.caches import json_with_checksum
 from tasks.reward.label_bytes import VocabularyLabels
 from tests.factory.toy import ToyWork, executed, refs, row_of, stream
 
@@ -89,7 +89,7 @@ def test_tables_of_another_version_are_refused_in_one_line_and_left_as_they_are(
 ) -> None:
     executed(ToyWork(), refs(1), ["human"], 1, Store(tmp_path))
     record = {"schema_version": 3, "runs": json.loads((tmp_path / "run.json").read_text())["runs"]}
-    (tmp_path / "run.json").write_text(sealed_json(record) if is_sealed else json.dumps(record))
+    (tmp_path / "run.json").write_text(json_with_checksum(record) if is_sealed else json.dumps(record))
     shutil.rmtree(tmp_path / "samples" / "_commits")  # a repair would make them again
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     words = ["run executor=local", "plan executor=local", "verify", "verify repair=true"]

@@ -30,7 +30,7 @@ from planners.training.checkpoint import (
 from planners.training.fit import LOSSES, VALIDATION, Loop, fit, total_steps
 from planners.training.optim import TrainingSettings
 from planners.training.processes import TrainingProcess
-from tasks.caches import sealed_json
+from tasks.caches import json_with_checksum
 from tests.planners.toy import Toy, ToyBatches, ToySettings, toy_batch
 
 ALONE = TrainingProcess(0, 1, torch.device("cpu"))
@@ -289,7 +289,7 @@ def test_a_checkpoint_of_another_planner_is_refused_by_name(tmp_path: Path) -> N
     changed = json.loads(record.read_text())
     changed["planner"]["settings"]["hidden"] = 9
     del changed["sha256"]
-    record.write_text(sealed_json(changed))
+    record.write_text(json_with_checksum(changed))
     with pytest.raises(ConfigError, match=r"not a checkpoint of this .*net.0.weight is \(8, 8\), not \(9, 8\)"):
         load_planner(tmp_path)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from tasks.reward.areas import index_map
-from tasks.reward.epdms import Scores, human_filtered, relative_progress, rows, score, score_with_ec
+from tasks.reward.epdms import Scores, human_filtered, relative_progress, score, score_with_ec, select_rows
 from tasks.rollout.lqr import track
 from tasks.world.clip import AgentKind
 from tasks.world.frames import to_world
@@ -68,7 +68,7 @@ def test_the_score_is_a_product_times_a_weighted_mean():
 
 def test_the_human_filter_forgives_zeros_only():
     got = scored(np.zeros(3))
-    human = rows(got, slice(0, 1))
+    human = select_rows(got, slice(0, 1))
     human = replace(human, **{name: np.ones(1) for name in ("nc", "dac", "tlc", "ddc", "ep", "ttc", "lk", "hc")})
     assert np.array_equal(human_filtered(got, human).pdm_score, got.pdm_score)
     half = replace(human, nc=np.array([0.5]))

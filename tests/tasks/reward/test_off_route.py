@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 
-from tasks.reward.labels import NEAR_M, NEAR_RAD, way_on_m
+from tasks.reward.labels import NEAR_M, NEAR_RAD, route_ahead_m
 from tasks.world.clip import Clip
 from tests.tasks.streets import LANE_M, street_clip
 
 
 def way(clip: Clip, x: float, y: float, heading: float = 0.0) -> float | None:
-    return way_on_m(clip.road_map, clip.route, np.array([x, y, heading]))
+    return route_ahead_m(clip.road_map, clip.route, np.array([x, y, heading]))
 
 
 def test_half_a_metre_and_thirty_degrees_decide_what_is_on_the_route() -> None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.reward.epdms import Scores, among, prepare, score
+from tasks.reward.epdms import Scores, prepare, score, with_objects
 from tests.tasks.reward.random_worlds import random_drives, random_world
 from tests.tasks.reward.slow import epdms as slow
 from tests.tasks.reward.slow.prepare import prepare as slow_prepare
@@ -70,10 +70,10 @@ def test_a_scene_among_other_objects_is_the_scene_prepared_with_them(seed: int) 
     prepared = prepare(**world)
     score(prepared, states)  # which indexes the first objects
     assert_bits(
-        score(among(prepared, others["objects"], states[0, 0]), states), score(prepare(**world | others), states)
+        score(with_objects(prepared, others["objects"], states[0, 0]), states), score(prepare(**world | others), states)
     )
     every = score(prepare(**world | others, drop_touching=False), states)
-    assert_bits(score(among(prepared, others["objects"], None), states), every)
+    assert_bits(score(with_objects(prepared, others["objects"], None), states), every)
 
 
 def test_a_prepared_scene_from_a_store_of_read_only_memory_scores_the_same() -> None:

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tasks.reward.epdms import prepare_scene
-from tasks.reward.labels import BRAKING_MPS2, hit_after_s, onward
+from tasks.reward.labels import BRAKING_MPS2, extrapolate, hit_after_s
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentKind, Scene, scene_of_clip
 from tasks.world.frames import HEADING, PACIFICA, STEERING, VX, YAW_RATE, X, Y, to_world
@@ -32,28 +32,28 @@ def drive(speed_mps: float = 8.0, steering: float = 0.0, start_x: float = 0.0) -
 
 def test_straight_on_it_keeps_its_speed_or_brakes_to_a_stand() -> None:
     t = STEP_S * np.arange(1, 11)
-    np.testing.assert_allclose(onward(drive())[41:, X], END_X_M + 8.0 * t)
-    np.testing.assert_array_equal(onward(drive())[:41], drive())
-    braking = onward(drive(), 3.0)[41:]
+    np.testing.assert_allclose(extrapolate(drive())[41:, X], END_X_M + 8.0 * t)
+    np.testing.assert_array_equal(extrapolate(drive())[:41], drive())
+    braking = extrapolate(drive(), 3.0)[41:]
     np.testing.assert_allclose(braking[:, X], END_X_M + 8.0 * t - 1.5 * t**2)
     np.testing.assert_allclose(braking[:, VX], 8.0 - 3.0 * t)
-    short = onward(drive(1.5), 3.0)[41:]
+    short = extrapolate(drive(1.5), 3.0)[41:]
     np.testing.assert_allclose(short[5:, X], 6.0 + 1.5**2 / 6.0)  # stands after half a second: v^2 / 2 b
     np.testing.assert_allclose(short[5:, VX], 0.0, atol=1e-15)
-    back = onward(drive(-0.3), 3.0)[41:]
+    back = extrapolate(drive(-0.3), 3.0)[41:]
     np.testing.assert_allclose(back[:, X], -1.2 - 0.3**2 / 6.0)
-    np.testing.assert_array_equal(onward(drive(0.0), 3.0)[41:, X], 0.0)
+    np.testing.assert_array_equal(extrapolate(drive(0.0), 3.0)[41:, X], 0.0)
 
 
 @pytest.mark.parametrize("braking", [0.0, 3.0])
 @pytest.mark.parametrize("steering", [-0.5, 0.02, 0.6])
 def test_it_stays_on_the_circle_of_its_steering_angle(braking: float, steering: float) -> None:
     """Radius wheel base / tan(steering), and the arc is as long as the way straight on; against tiny Euler steps."""
-    states = onward(drive(6.0, steering), braking)
+    states = extrapolate(drive(6.0, steering), braking)
     radius = PACIFICA.wheel_base / math.tan(steering)
     after = states[41:]
     np.testing.assert_allclose(np.hypot(after[:, X] - 24.0, after[:, Y] - radius), abs(radius))
-    np.testing.assert_allclose(after[:, HEADING] * radius, onward(drive(6.0), braking)[41:, X] - 24.0)
+    np.testing.assert_allclose(after[:, HEADING] * radius, extrapolate(drive(6.0), braking)[41:, X] - 24.0)
     np.testing.assert_allclose(after[:, YAW_RATE] * radius, after[:, VX])
     x, y, heading, speed, dt = 24.0, 0.0, 0.0, 6.0, 1e-4
     for _ in range(round(1.0 / dt)):

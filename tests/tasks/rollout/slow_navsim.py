@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tasks.rollout.navsim import IdmAgent, NavsimAgents, bodies
+from tasks.rollout.navsim import IdmAgent, NavsimAgents, box_polygons
 from tasks.settings import TrafficSettings
 from tasks.world.frames import PACIFICA
 
@@ -35,7 +35,7 @@ class Driver:
 
     @property
     def body(self) -> shapely.Polygon:
-        return bodies(np.array([[*self.pose, self.about.length, self.about.width]]))[0]
+        return box_polygons(np.array([[*self.pose, self.about.length, self.about.width]]))[0]
 
     def strip(self, start: float, stop: float) -> shapely.Geometry:
         """Along the path between two clamped path lengths; where nothing lies between, at the end they are at."""
@@ -71,7 +71,7 @@ def drive(agents: NavsimAgents, settings: TrafficSettings, ego_states: Array) ->
     stay = np.zeros((len(ego_states), len(agents.staying)), dtype=bool)
     ego_number = len(agents.driven)
     for t, ego in enumerate(ego_states[:-1], start=1):
-        shapes[ego_number] = bodies(np.array([[*ego[:3], PACIFICA.length, PACIFICA.width]]))[0]
+        shapes[ego_number] = box_polygons(np.array([[*ego[:3], PACIFICA.length, PACIFICA.width]]))[0]
         for k, driver in list(drivers.items()):
             if np.hypot(*(driver.pose[:2] - ego[:2])) > 100.0:
                 del drivers[k], shapes[k]

@@ -5,7 +5,15 @@ import pytest
 import shapely
 import shapely.ops
 
-from tasks.rollout.corridor import Paths, Way, boxes_overlap, corridor_gap, pose_on_path, project_on_path, stretches_of
+from tasks.rollout.corridor import (
+    Paths,
+    Way,
+    boxes_overlap,
+    corridor_gap,
+    pose_on_path,
+    project_on_path,
+    stretch_rectangles,
+)
 from tasks.rollout.idm import (
     IdmDriver,
     advance,
@@ -28,7 +36,7 @@ def one_path(xy: np.ndarray, lines: tuple[tuple[float, int], ...] = ()) -> Paths
         heading=heading,
         height=np.zeros((1, len(xy))),
         target_speed=np.full((1, len(xy)), 10.0),
-        stretches=stretches_of(xy[None], heading),
+        stretches=stretch_rectangles(xy[None], heading),
         line_start=np.array([0, len(lines)]),
         line_at=np.array([at for at, _ in lines], dtype=float),
         line_state=np.array([[state for _, state in lines]] * 41, dtype=np.uint8).reshape(41, len(lines)),

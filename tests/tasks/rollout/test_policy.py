@@ -11,11 +11,11 @@ from tasks.rollout.simulate import (
     BadPolicy,
     SeenTraffic,
     TrafficSettings,
+    check_same_policy,
     next_scene,
     prepare_traffic,
-    refuse_another_policy,
-    roll_on,
     roll_out,
+    roll_out_longer,
     traffic_record,
 )
 from tasks.world.clip import CLIP_STEPS, NOW, PER_STEP, STEP_S, AgentKind, AgentTracks, Scene
@@ -97,7 +97,7 @@ def test_a_rollout_goes_on_and_leads_to_a_scene_that_does(seed: int) -> None:
     traffic, egos = prepare_traffic(scene, by(Nervous)), worlds.random_egos(scene, seed, 3)
     for ego in egos:
         alone = roll_out(traffic, ego)
-        on = roll_on(traffic, np.concatenate([ego, np.repeat(ego[-1:], 10, axis=0)]))
+        on = roll_out_longer(traffic, np.concatenate([ego, np.repeat(ego[-1:], 10, axis=0)]))
         for name in PER_STEP:
             np.testing.assert_array_equal(getattr(on, name)[:41], getattr(alone.agents, name))
         second = next_scene(scene, alone, scene.centerline)
@@ -172,10 +172,10 @@ def test_records_tell_policies_apart_and_hold_nothing_of_one_elsewhere(monkeypat
     assert "policy" not in traffic_record(TrafficSettings())
     one, other = (traffic_record(by(policy))["policy"] for policy in (StraightOn, Nervous))
     assert one == f"{__name__}:StraightOn straight on" != other
-    refuse_another_policy(by(StraightOn), one)
+    check_same_policy(by(StraightOn), one)
     monkeypatch.setattr(StraightOn, "digest", lambda self: "changed")
     with pytest.raises(OSError, match="another digest than when the run began"):
-        refuse_another_policy(by(StraightOn), one)
+        check_same_policy(by(StraightOn), one)
 
 
 @pytest.mark.parametrize("words", [{"mode": "custom"}, {"policy": "my:Policy"}, {"mode": "navsim", "policy": "my:P"}])

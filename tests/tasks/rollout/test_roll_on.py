@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_on, roll_out
+from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out, roll_out_longer
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, PER_STEP, STEP_S, AgentKind, Scene
 from tasks.world.frames import EGO_STATE_SIZE, VX, X
 from tasks.world.road_map import LightState, TrafficLights
@@ -41,7 +41,7 @@ def test_the_rows_of_a_rollout_do_not_change_by_a_bit_where_it_goes_on(seed: int
     second = prepare_traffic(next_scene(scene, rollout, scene.centerline), settings)
     (ego_after,) = worlds.random_egos(second.scene, seed + 100, 1)
     for traffic, states in ((first, ego), (second, ego_after)):
-        shorter, on = roll_out(traffic, states).agents, roll_on(traffic, longer(states))
+        shorter, on = roll_out(traffic, states).agents, roll_out_longer(traffic, longer(states))
         assert on.n_steps == LONG and on.track_ids == shorter.track_ids
         for name in PER_STEP:
             kept = getattr(on, name)[: HORIZON_STEPS + 1]
@@ -54,7 +54,7 @@ def test_the_public_traffic_goes_on_as_well() -> None:
     scene = at_the_end(worlds.scene(worlds.straight_road(), walker, Track(0.0, speed=5.0), ego=(60.0, -50.0, 0.0)))
     traffic = prepare_traffic(scene, TrafficSettings(mode="navsim"))
     ego = np.repeat(scene.ego_state[None], LONG, axis=0)
-    on, shorter = roll_on(traffic, ego), roll_out(traffic, ego[: HORIZON_STEPS + 1]).agents
+    on, shorter = roll_out_longer(traffic, ego), roll_out(traffic, ego[: HORIZON_STEPS + 1]).agents
     for name in PER_STEP:
         np.testing.assert_array_equal(getattr(on, name)[: HORIZON_STEPS + 1], getattr(shorter, name), strict=True)
     assert on.valid.all() and (np.diff(on.boxes[:, 1, 0])[1:] > 0.4).all()
@@ -72,7 +72,7 @@ def test_after_the_log_s_end_who_replays_it_goes_straight_on_and_who_is_driven_i
     gone = Track(60.0, -9.0, 0.0, 1.0, AgentKind.PEDESTRIAN, (0.6, 0.6), last=CLIP_STEPS - 3)
     scene = at_the_end(worlds.scene(worlds.straight_road(), walker, car, parked, gone))
     for yields in (False, True):
-        on = roll_on(prepare_traffic(scene, TrafficSettings(yields=yields)), parked_ego())
+        on = roll_out_longer(prepare_traffic(scene, TrafficSettings(yields=yields)), parked_ego())
         assert np.diff(on.boxes[:, 0, 1]) == pytest.approx(0.12) and on.boxes[:, 0, 0] == pytest.approx(20.0)
         speed = on.velocities[:, 1, 0]  # a free road: it accelerates through all 51 rows, or keeps its log's speed
         assert speed == pytest.approx(5.0) if yields else (np.diff(speed) > 0.0).all()
@@ -94,7 +94,7 @@ def test_a_light_is_after_the_log_s_end_what_it_was_at_it() -> None:
         here[AT_THE_END, 0, 0] = 56.0
         slow = np.where(np.arange(CLIP_STEPS)[:, None, None] == AT_THE_END, 0.01, agents.velocities)
         scene = replace(scene, agents=replace(agents, boxes=here, velocities=slow), ever_simulated=np.array([True]))
-        x = roll_on(prepare_traffic(scene, IDM), parked_ego()).boxes[:, 0, 0]
+        x = roll_out_longer(prepare_traffic(scene, IDM), parked_ego()).boxes[:, 0, 0]
         assert x[HORIZON_STEPS] + worlds.CAR[0] / 2.0 < 60.0
         assert (x[-1] - x[HORIZON_STEPS] < 0.3) == waits
 
@@ -102,7 +102,7 @@ def test_a_light_is_after_the_log_s_end_what_it_was_at_it() -> None:
 def test_the_log_s_own_second_is_replayed_where_there_is_one() -> None:
     way = np.where(np.arange(CLIP_STEPS) < NOW + HORIZON_STEPS, 0.0, 1.0).cumsum()
     scene = worlds.scene(worlds.straight_road(), Track(0.0, poses=np.column_stack([way, 0.0 * way, 0.0 * way])))
-    on = roll_on(prepare_traffic(scene, TrafficSettings(mode="replay")), parked_ego())
+    on = roll_out_longer(prepare_traffic(scene, TrafficSettings(mode="replay")), parked_ego())
     np.testing.assert_array_equal(on.boxes[:, 0, 0], way[NOW : NOW + LONG])
 
 
@@ -116,7 +116,8 @@ def test_the_traffic_of_the_second_after_answers_to_where_the_ego_is_then() -> N
     stops = longer(goes_on)
     stops[HORIZON_STEPS + 1 :, VX], stops[HORIZON_STEPS + 1 :, X] = 0.0, goes_on[-1, X]
     behind = {
-        name: roll_on(traffic, ego).velocities[-1, 0, 0] for name, ego in (("on", longer(goes_on)), ("no", stops))
+        name: roll_out_longer(traffic, ego).velocities[-1, 0, 0]
+        for name, ego in (("on", longer(goes_on)), ("no", stops))
     }
     assert behind["no"] < behind["on"] - 0.5
 
@@ -126,6 +127,6 @@ def test_states_that_are_none_are_refused() -> None:
     broken = parked_ego()
     broken[45, X] = np.nan
     with pytest.raises(ValueError, match="not finite"):
-        roll_on(traffic, broken)
+        roll_out_longer(traffic, broken)
     with pytest.raises(ValueError, match="ego_states must be"):
         roll_out(traffic, parked_ego())

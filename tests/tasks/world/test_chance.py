@@ -4,17 +4,17 @@ from itertools import combinations
 
 import numpy as np
 
-from tasks.world.clip import stream
+from tasks.world.clip import random_stream
 
 
 def draws(*words: object) -> np.ndarray:
-    return stream(*words).random(4)  # type: ignore[arg-type]
+    return random_stream(*words).random(4)  # type: ignore[arg-type]
 
 
 def test_equal_arguments_give_equal_numbers_on_every_machine() -> None:
     """Recorded once: Philox keyed by SHA-256 is the same for every numpy and processor."""
     expected = [63_895, 127_121, 976_219]
-    np.testing.assert_array_equal(stream(7, "clip", "perturb").integers(0, 1_000_000, 3), expected)
+    np.testing.assert_array_equal(random_stream(7, "clip", "perturb").integers(0, 1_000_000, 3), expected)
     np.testing.assert_array_equal(draws(7, "clip", "perturb"), draws(7, "clip", "perturb"))
 
 

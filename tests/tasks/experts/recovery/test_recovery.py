@@ -12,7 +12,7 @@ from tasks.experts.recovery import (
     Recovery,
     RecoverySettings,
     RecoveryTable,
-    feasible,
+    make_feasible,
     start_velocities,
 )
 from tasks.stages import Rejected
@@ -137,7 +137,7 @@ def test_a_clip_that_ends_before_the_goal_is_refused(road: Road) -> None:
 def test_a_drivable_trajectory_stays_as_it_is() -> None:
     for speed, accel in ((10.0, 0.0), (6.0, 1.2), (12.0, -2.0), (0.0, 0.0)):
         wanted = straight(speed, accel)
-        np.testing.assert_allclose(feasible(wanted, start_state(speed, accel)), wanted, atol=0.02)
+        np.testing.assert_allclose(make_feasible(wanted, start_state(speed, accel)), wanted, atol=0.02)
 
 
 @pytest.mark.parametrize(("speed", "accel", "steering"), [(8.0, 0.0, 0.0), (3.0, 1.0, 0.1), (13.0, -1.5, -0.03)])
@@ -145,7 +145,7 @@ def test_limits_hold_from_the_actual_start_state(speed: float, accel: float, ste
     limits = FeasibleSettings()
     state = start_state(speed, accel, steering)
     for wanted in kinematic_trajectories(40, 5):
-        result = feasible(wanted, state)
+        result = make_feasible(wanted, state)
         assert not isinstance(result, str), result
         found = motion(result, state)
         fast = found["speed"] > 1.0
@@ -160,7 +160,7 @@ def test_limits_hold_from_the_actual_start_state(speed: float, accel: float, ste
 
 
 def test_it_comes_back_to_the_reference_after_a_wrong_start() -> None:
-    result = feasible(straight(8.0), start_state(9.5, 0.0, 0.02))
+    result = make_feasible(straight(8.0), start_state(9.5, 0.0, 0.02))
     assert not isinstance(result, str)
     assert np.hypot(*(result[-1, :2] - straight(8.0)[-1, :2])) < 0.5
     assert abs(result[-1, 2]) < 0.02
@@ -168,14 +168,14 @@ def test_it_comes_back_to_the_reference_after_a_wrong_start() -> None:
 
 def test_a_start_that_breaks_a_limit_itself_still_has_a_plan() -> None:
     for state in (start_state(10.0, -6.0), start_state(0.3, -3.0), start_state(15.0, 3.5), start_state(4.0, 0.0, 0.9)):
-        assert not isinstance(feasible(straight(8.0), state), str)
+        assert not isinstance(make_feasible(straight(8.0), state), str)
 
 
 def test_the_same_problem_gives_the_same_bits() -> None:
     wanted = kinematic_trajectories(3, 9)
-    first = feasible(wanted[0], start_state(7.0))
-    feasible(wanted[1], start_state(2.0))
-    np.testing.assert_array_equal(feasible(wanted[0], start_state(7.0)), first)
+    first = make_feasible(wanted[0], start_state(7.0))
+    make_feasible(wanted[1], start_state(2.0))
+    np.testing.assert_array_equal(make_feasible(wanted[0], start_state(7.0)), first)
 
 
 def test_a_solver_that_does_not_converge_is_a_rejection_and_never_the_raw_trajectory(road: Road) -> None:

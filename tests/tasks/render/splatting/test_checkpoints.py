@@ -10,7 +10,7 @@ from tasks.render.splatting import sh
 from tasks.render.splatting.formats import LoggedVehicle, from_checkpoint, gauss_params, splatfacto, worldengine
 from tasks.render.splatting.gaussians import Gaussians, moved, rotations_of
 from tasks.render.splatting.project import ANTIALIASED
-from tasks.world.frames import upright
+from tasks.world.frames import planar_matrices
 from tests.tasks.render.splatting.test_ply import some
 from tests.tasks.render.splatting.test_spz import apart
 
@@ -96,7 +96,7 @@ def test_the_light_of_a_vehicle_is_that_of_its_place_in_the_middle_of_the_log() 
 def logged(token: str, node: Gaussians) -> LoggedVehicle:
     """Five instants at 10 Hz from 2 s of the log on; absent at the first and the last, turning left on the way."""
     turns = np.array([0.0, 0.2, 0.5, 0.9, 0.0])
-    poses = upright(np.column_stack([10.0 * np.arange(5.0), -np.arange(5.0), turns]))
+    poses = planar_matrices(np.column_stack([10.0 * np.arange(5.0), -np.arange(5.0), turns]))
     poses[:, 2, 3] = 0.8
     poses[[0, 4]] = np.nan
     return LoggedVehicle(token, node, 2.0 + 0.1 * np.arange(5), poses)

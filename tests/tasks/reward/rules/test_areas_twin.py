@@ -6,8 +6,15 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.reward.areas import areas_along, in_intersection, index_map
-from tasks.reward.centerline import CENTER_IN_INTERSECTION, MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, empty_body, place
+from tasks.reward.areas import in_intersection, index_map, set_area_flags
+from tasks.reward.centerline import (
+    CENTER_IN_INTERSECTION,
+    MULTIPLE_LANES,
+    NON_DRIVABLE,
+    ONCOMING,
+    empty_body,
+    place_body,
+)
 from tasks.world.frames import HEADING, PACIFICA, Vehicle, X, Y
 from tasks.world.geometry import ego_boxes
 from tasks.world.road_map import MapLayer, MapPolygon
@@ -24,8 +31,8 @@ def flags_along(polygons: list[MapPolygon], route: frozenset[str], states: np.nd
     flags = np.empty(states.shape[:2], np.uint8)
     for k, one in enumerate(states):
         body = empty_body(len(one))
-        place(one, vehicle.rear_axle_to_center, body)
-        areas_along(index, body, vehicle.half_length, vehicle.half_width)
+        place_body(one, vehicle.rear_axle_to_center, body)
+        set_area_flags(index, body, vehicle.half_length, vehicle.half_width)
         flags[k] = body.flags
     return flags
 

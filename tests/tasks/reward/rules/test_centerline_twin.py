@@ -13,11 +13,11 @@ from tasks.reward.centerline import (
     NON_DRIVABLE,
     ONCOMING,
     Body,
+    arc_length_at,
     driving_direction,
     index_centerline,
-    is_off,
+    is_off_centerline,
     lane_keeping,
-    locate_m,
     progress_m,
 )
 from tests.tasks.reward.slow import progress as slow
@@ -76,9 +76,9 @@ def places_around(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def test_place_and_deviation_are_those_of_geos(points: np.ndarray, seed: int) -> None:
     line, shape = index_centerline(points), shapely.LineString(points)
     places = places_around(points, np.random.default_rng(seed))
-    located = [locate_m(line, x, y) for x, y in places]
+    located = [arc_length_at(line, x, y) for x, y in places]
     np.testing.assert_allclose(located, shapely.line_locate_point(shape, shapely.points(places)), rtol=0, atol=1e-9)
-    off = [is_off(line, x, y) for x, y in places]
+    off = [is_off_centerline(line, x, y) for x, y in places]
     assert np.array_equal(off, shapely.distance(shape, shapely.points(places)) > 0.5)
 
 
@@ -119,15 +119,15 @@ def test_the_three_rules_equal_their_slow_twins(data: st.DataObject, points: np.
 
 def test_the_first_of_several_nearest_places_counts() -> None:
     hairpin, eight = index_centerline(HAIRPIN), index_centerline(EIGHT)
-    assert locate_m(hairpin, 5.0, 0.5) == 5.0  # half-way to y = 1, where it would be 36
-    assert locate_m(eight, 5.0, 5.0) == np.hypot(5.0, 5.0)  # at the crossing, not 10 root 2 + 10 + 5 root 2
-    assert locate_m(eight, 10.0, 5.0) == np.hypot(10.0, 10.0) + 5.0
+    assert arc_length_at(hairpin, 5.0, 0.5) == 5.0  # half-way to y = 1, where it would be 36
+    assert arc_length_at(eight, 5.0, 5.0) == np.hypot(5.0, 5.0)  # at the crossing, not 10 root 2 + 10 + 5 root 2
+    assert arc_length_at(eight, 10.0, 5.0) == np.hypot(10.0, 10.0) + 5.0
 
 
 def test_beyond_its_ends_a_line_goes_no_further() -> None:
     line = index_centerline(ALONG_X)
     for x, place in ((-5.0, 0.0), (-1e9, 0.0), (10.0, 10.0), (12.5, 12.5), (61.0, 60.0), (1e9, 60.0)):
-        assert locate_m(line, x, 3.0) == place
+        assert arc_length_at(line, x, 3.0) == place
     assert progress_m(line, -20.0, 0.0, 80.0, 0.0) == 60.0
     assert progress_m(line, 30.0, 0.0, 20.0, 0.0) == 0.0  # backwards is none
 
@@ -137,9 +137,11 @@ def test_exactly_half_a_metre_is_not_off(origin: tuple[float, float]) -> None:
     line = index_centerline(ALONG_X + origin)
     for x in (0.0, 5.0, 10.0, 17.0, 60.0):
         for y, off in ((0.5, False), (-0.5, False), (0.5000001, True), (-0.5000001, True), (0.0, False)):
-            assert is_off(line, x + origin[0], y + origin[1]) == off
-    assert not is_off(line, origin[0] - 0.5, origin[1]) and is_off(line, origin[0] - 0.5000001, origin[1])
-    assert not is_off(line, origin[0] + 60.5, origin[1])
+            assert is_off_centerline(line, x + origin[0], y + origin[1]) == off
+    assert not is_off_centerline(line, origin[0] - 0.5, origin[1]) and is_off_centerline(
+        line, origin[0] - 0.5000001, origin[1]
+    )
+    assert not is_off_centerline(line, origin[0] + 60.5, origin[1])
 
 
 @pytest.mark.parametrize(
@@ -163,11 +165,11 @@ def test_a_long_centreline_stays_exact() -> None:
     ):
         line, shape = index_centerline(points), shapely.LineString(points)
         places = places_around(points, rng)
-        assert [is_off(line, *place) for place in places] == (
+        assert [is_off_centerline(line, *place) for place in places] == (
             shapely.distance(shape, shapely.points(places)) > 0.5
         ).tolist()
         np.testing.assert_allclose(
-            [locate_m(line, *place) for place in places],
+            [arc_length_at(line, *place) for place in places],
             shapely.line_locate_point(shape, shapely.points(places)),
             rtol=0,
             atol=1e-9,
@@ -181,4 +183,4 @@ def test_a_centreline_without_length_is_refused() -> None:
 
 def test_further_columns_of_the_points_are_not_looked_at() -> None:
     with_heading = np.column_stack([ALONG_X, np.full(len(ALONG_X), np.nan)])
-    assert locate_m(index_centerline(with_heading), 12.0, 1.0) == 12.0
+    assert arc_length_at(index_centerline(with_heading), 12.0, 1.0) == 12.0

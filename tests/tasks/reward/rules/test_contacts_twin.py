@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tasks.reward.areas import index_map
-from tasks.reward.centerline import MULTIPLE_LANES, NON_DRIVABLE, empty_body, place
+from tasks.reward.centerline import MULTIPLE_LANES, NON_DRIVABLE, empty_body, place_body
 from tasks.reward.collisions import first_collision, first_time_to_collision, obstacles_of, within_reach
 from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y, box_corners, to_world
 from tasks.world.geometry import ego_boxes, touching
@@ -39,7 +39,7 @@ def contacts(world: World) -> np.ndarray:
     map_index = index_map([MapPolygon("crossing", MapLayer.INTERSECTION, world.crossing)], frozenset())
     for k, states in enumerate(world.states):
         body = empty_body(len(states))
-        place(states, PACIFICA.rear_axle_to_center, body)
+        place_body(states, PACIFICA.rear_axle_to_center, body)
         body.flags[:] = world.flags[k]
         items = within_reach(obstacles, body)
         found[k, :2] = first_collision(obstacles, items, states, body, ignored)
@@ -185,7 +185,7 @@ def test_objects_left_out_along_a_path_are_those_that_nothing_on_it_touches() ->
     states = np.zeros((41, 11))
     states[:, X] = np.arange(41.0) - PACIFICA.rear_axle_to_center
     body = empty_body(41)
-    place(states, PACIFICA.rear_axle_to_center, body)
+    place_body(states, PACIFICA.rear_axle_to_center, body)
     kept = within_reach(obstacles_of(boxes, np.zeros(7, dtype=bool), np.zeros(7)), body)
     assert kept.tolist() == [0, 1, 2, 6]
     ego = np.array([40.0, 0.0, 0.0, PACIFICA.length, PACIFICA.width])

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from test_areas_twin import EXACT, drives, lattice_states
 
 from tasks.reward.areas import first_red, index_red_lanes
-from tasks.reward.centerline import empty_body, place
+from tasks.reward.centerline import empty_body, place_body
 from tasks.world.frames import PACIFICA, Vehicle, X, Y
 from tasks.world.geometry import ego_boxes
 from tasks.world.road_map import MapLayer, MapPolygon
@@ -22,7 +22,7 @@ def first_reds(lanes: list[MapPolygon], is_red: np.ndarray, states: np.ndarray, 
     found = []
     for one in states:
         body = empty_body(len(one))
-        place(one, vehicle.rear_axle_to_center, body)
+        place_body(one, vehicle.rear_axle_to_center, body)
         found.append(first_red(red, body, vehicle.half_length, vehicle.half_width))
     return np.array(found)
 
