@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -321,11 +321,12 @@ class _Footprint:
 
 def roll_out_navsim(
     agents: NavsimAgents, settings: TrafficSettings, window: AgentTracks, ego_states: Array
-) -> tuple[Array, Array, Bools]:
-    """The traffic around one ego with states (T, 11), T = 41: boxes (T, N, 5), velocities (T, N, 2), valid (T, N).
+) -> tuple[AgentTracks, Bools]:
+    """The tracks of T rows around one ego with states (T, 11), and who is driven (N,).
 
-    window: the log's tracks over the same steps, row 0 as the scene has them. Raises ValueError where an agent's path
-    begins beyond its own body, at which the public code ends.
+    window: the log's tracks over the same steps, row 0 as the scene has them. Boxes keep the height that they have now:
+    the public traffic lives in the plane. Raises ValueError where an agent's path begins beyond its own body, at which
+    the public code ends.
     """
     vehicle = np.array([kind == AgentKind.VEHICLE for kind in window.kinds], dtype=bool)
     boxes, velocities, valid = window.boxes.copy(), window.velocities.copy(), window.valid.copy()
@@ -339,7 +340,10 @@ def roll_out_navsim(
             valid[t, i] = True
         stay = staying[_stay(agents, moving)]
         boxes[t, stay], velocities[t, stay], valid[t, stay] = window.boxes[0, stay], window.velocities[0, stay], True
-    return boxes, velocities, valid
+    center_z = np.where(vehicle, np.where(valid, window.center_z[0], np.nan), window.center_z)
+    driven = np.zeros(len(window), dtype=bool)
+    driven[[agent.row for agent in agents.driven]] = True
+    return replace(window, boxes=boxes, velocities=velocities, valid=valid, center_z=center_z), driven
 
 
 def _stay(agents: NavsimAgents, moving: dict[int, _Agent]) -> Bools:

@@ -134,57 +134,6 @@ def check_same_policy(settings: TrafficSettings, recorded: object) -> None:
         raise OSError(errno.ESTALE, "has another digest than when the run began; start it again", settings.policy)
 
 
-def drive_by_policy(
-    policy: TrafficPolicy, kinds: tuple[AgentKind, ...], road_map: RoadMap,
-    start: int, log: AgentStates, now: AgentStates, roles: Roles, paths: Paths, driver: IdmDriver,
-    past: AgentStates, ego_past: tuple[Array, Array], ego: tuple[Array, Array],
-) -> tuple[RolloutRows, Motion]:  # fmt: skip
-    """As `traffic.drive`: the traffic's answer to an ego of boxes (T, 5) about its centre and velocities (T, 2).
-
-    past: the agents over the SEEN_ROWS rows up to `start`; ego_past: the ego's boxes and velocities in them. Raises
-    BadPolicy where the policy answers no states.
-    """
-    rows, motion = initial_rows(now, roles, *ego)
-    boxes, velocities = (
-        np.concatenate([agents, of_ego[:, None]], axis=1)
-        for agents, of_ego in ((past.boxes, ego_past[0]), (past.velocities, ego_past[1]))
-    )
-    valid = np.concatenate([past.valid, np.ones((SEEN_ROWS, 1), bool)], axis=1)
-    for t in range(len(rows.boxes) - 1):
-        asked, mode = who_is_asked(start, roles, paths, driver, t, rows, motion)
-        answer = np.zeros((len(asked), 4))
-        if asked.any():
-            seen = SeenTraffic(
-                boxes=_up_to(t, boxes, rows.boxes),
-                velocities=_up_to(t, velocities, rows.velocities),
-                valid=_up_to(t, valid, rows.valid),
-                kinds=kinds,
-                asked=asked.copy(),
-                road_map=road_map,
-                way=motion.path[t + 1].copy(),
-                ways=paths._replace(line_state=paths.line_state[t : t + 1]),
-            )
-            answer = _checked(policy, policy.next_states(seen), asked)
-        apply_policy_answer(start, log, roles, paths, driver, t, asked, answer, rows, mode, motion)
-    return rows, motion
-
-
-def _up_to(t: int, past: NDArray[Any], rows: NDArray[Any]) -> NDArray[Any]:
-    """The SEEN_ROWS rows up to row t, copied; the past's last row is row 0."""
-    return np.concatenate([past[:-1], rows[: t + 1]])[-SEEN_ROWS:]
-
-
-def _checked(policy: TrafficPolicy, answer: Array, asked: Bools) -> Array:
-    """The answer as the kernels take it. Raises BadPolicy."""
-    name, expected = type(policy).__name__, (len(asked), 4)
-    answer = np.ascontiguousarray(answer, np.float64)
-    if answer.shape != expected:
-        raise BadPolicy(f"{name}.next_states gave {answer.shape}, not {expected}: x, y, heading, speed")
-    if not all_within(answer[asked]):
-        raise BadPolicy(f"{name}.next_states gave a state that is not finite, or too large to be one")
-    return answer
-
-
 SHORTEST_HEADWAY_S = 0.5  # of who keeps its intent: logged drivers follow as near as that
 LOG_STRIDE = 3  # every third logged pose tells a way
 _indexed_lanes = lru_cache(maxsize=4)(index_lanes)  # clips of one log share the map
@@ -254,11 +203,8 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     paths = stack_paths(
         scene, found, logged_ways, settings.target_speed_mps, settings.decel_max, logged_stops=not yields
     )
-    if not yields:
-        return TrafficScene(scene, settings, roles, paths)
-    return TrafficScene(
-        scene, settings, roles, paths, yielding=prepare_yielding(scene, roles, paths, _agent_states(log))
-    )
+    yielding = prepare_yielding(scene, roles, paths, _agent_states(log)) if yields else None
+    return TrafficScene(scene, settings, roles, paths, yielding=yielding)
 
 
 def simulate(scene: Scene, poses: Array, settings: TrafficSettings) -> Rollout:
@@ -271,7 +217,7 @@ def roll_out(traffic: TrafficScene, ego_states: Array, steps: int = HORIZON_STEP
 
     steps: of the rollout that are to happen: `simulated` names who is moved by IDM in those, not who would be later.
     """
-    _check_states(ego_states[None], HORIZON_STEPS + 1)
+    _check_states(ego_states, HORIZON_STEPS + 1)
     return Rollout(traffic.scene.step, ego_states, *_answer(traffic, ego_states, steps))
 
 
@@ -281,7 +227,7 @@ def roll_out_longer(traffic: TrafficScene, ego_states: Array) -> AgentTracks:
     After the log's end, which is the clip's, who replays it goes straight on as fast as there, and lights stay as they
     are. ValueError where the states are none.
     """
-    _check_states(ego_states[None], len(ego_states))
+    _check_states(ego_states, len(ego_states))
     return _answer(traffic, ego_states, HORIZON_STEPS)[0]
 
 
@@ -290,15 +236,64 @@ def _answer(traffic: TrafficScene, ego_states: Array, steps: int) -> tuple[Agent
     start, n_rows = traffic.scene.step, len(ego_states)
     window = _lasting(traffic.scene.agents, start + n_rows).window(start, start + n_rows)
     if traffic.navsim is not None:
-        return _public_answer(traffic.navsim, traffic.settings, window, ego_states)
+        return roll_out_navsim(traffic.navsim, traffic.settings, window, ego_states)
     if traffic.roles is None or traffic.paths is None or len(window) == 0:
         return window, np.zeros(len(window), dtype=bool)
     n, policy = len(window), traffic.settings.policy
     if policy is None:
-        rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states), _yielding(traffic))
+        yielding = None if traffic.yielding is None else Yielding(*_writable(traffic.yielding))
+        rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states), yielding)
     else:
-        rows, motion = _policy_answer(policy_named(policy), traffic, window, ego_states)
+        rows, motion = _drive_by_policy(policy_named(policy), traffic, window, ego_states)
     return replace(window, **{name: getattr(rows, name)[:, :n].copy() for name in PER_STEP}), motion.was_driven[steps]
+
+
+def _drive_by_policy(
+    policy: TrafficPolicy, traffic: TrafficScene, window: AgentTracks, ego_states: Array
+) -> tuple[RolloutRows, Motion]:
+    """As `traffic.drive`, by a policy. Raises BadPolicy where it answers no states."""
+    scene = traffic.scene
+    start, log, now, roles, paths, driver = _script(traffic, window)
+    rows, motion = initial_rows(now, roles, *_ego_boxes(ego_states))
+    past = _agent_states(scene.agents.window(start - SEEN_ROWS + 1, start + 1))
+    boxes, velocities = (
+        np.concatenate([agents, of_ego[:, None]], axis=1)
+        for agents, of_ego in zip((past.boxes, past.velocities), _ego_boxes(scene.ego_history[-SEEN_ROWS:]))
+    )
+    valid = np.concatenate([past.valid, np.ones((SEEN_ROWS, 1), bool)], axis=1)
+    for t in range(len(rows.boxes) - 1):
+        asked, mode = who_is_asked(start, roles, paths, driver, t, rows, motion)
+        answer = np.zeros((len(asked), 4))
+        if asked.any():
+            seen = SeenTraffic(
+                boxes=_up_to(t, boxes, rows.boxes),
+                velocities=_up_to(t, velocities, rows.velocities),
+                valid=_up_to(t, valid, rows.valid),
+                kinds=(*window.kinds, AgentKind.VEHICLE),
+                asked=asked.copy(),
+                road_map=scene.clip.road_map,
+                way=motion.path[t + 1].copy(),
+                ways=paths._replace(line_state=paths.line_state[t : t + 1]),
+            )
+            answer = _checked(policy, policy.next_states(seen), asked)
+        apply_policy_answer(start, log, roles, paths, driver, t, asked, answer, rows, mode, motion)
+    return rows, motion
+
+
+def _up_to(t: int, past: NDArray[Any], rows: NDArray[Any]) -> NDArray[Any]:
+    """The SEEN_ROWS rows up to row t, copied; the past's last row is row 0."""
+    return np.concatenate([past[:-1], rows[: t + 1]])[-SEEN_ROWS:]
+
+
+def _checked(policy: TrafficPolicy, answer: Array, asked: Bools) -> Array:
+    """The answer as the kernels take it. Raises BadPolicy."""
+    name, expected = type(policy).__name__, (len(asked), 4)
+    answer = np.ascontiguousarray(answer, np.float64)
+    if answer.shape != expected:
+        raise BadPolicy(f"{name}.next_states gave {answer.shape}, not {expected}: x, y, heading, speed")
+    if not all_within(answer[asked]):
+        raise BadPolicy(f"{name}.next_states gave a state that is not finite, or too large to be one")
+    return answer
 
 
 def _lasting(agents: AgentTracks, n_steps: int) -> AgentTracks:
@@ -312,35 +307,11 @@ def _lasting(agents: AgentTracks, n_steps: int) -> AgentTracks:
     return replace(agents, **out)
 
 
-def _policy_answer(
-    policy: TrafficPolicy, traffic: TrafficScene, window: AgentTracks, ego_states: Array
-) -> tuple[RolloutRows, Motion]:
-    scene = traffic.scene
-    kinds, first = (*window.kinds, AgentKind.VEHICLE), scene.step - SEEN_ROWS + 1
-    past = _agent_states(scene.agents.window(first, scene.step + 1))
-    egos = _ego_boxes(scene.ego_history[-SEEN_ROWS:]), _ego_boxes(ego_states)
-    return drive_by_policy(policy, kinds, scene.clip.road_map, *_script(traffic, window), past, *egos)
-
-
-def _public_answer(
-    agents: NavsimAgents, settings: TrafficSettings, window: AgentTracks, ego_states: Array
-) -> tuple[AgentTracks, Bools]:
-    """Boxes keep the height that they have now: the public traffic lives in the plane."""
-    boxes, velocities, valid = roll_out_navsim(agents, settings, window, ego_states)
-    vehicle = np.array([kind == AgentKind.VEHICLE for kind in window.kinds], dtype=bool)
-    center_z = np.where(vehicle, np.where(valid, window.center_z[0], np.nan), window.center_z)
-    driven = np.zeros(len(window), dtype=bool)
-    driven[[agent.row for agent in agents.driven]] = True
-    return replace(window, boxes=boxes, velocities=velocities, valid=valid, center_z=center_z), driven
-
-
 def _check_states(ego_states: Array, n_rows: int) -> None:
-    expected = (n_rows, EGO_STATE_SIZE)
-    if ego_states.ndim != 3 or ego_states.shape[1:] != expected:
-        raise ValueError(f"ego_states must be (B, {expected[0]}, {expected[1]}), not {ego_states.shape}")
+    if ego_states.shape != (n_rows, EGO_STATE_SIZE):
+        raise ValueError(f"ego_states must be ({n_rows}, {EGO_STATE_SIZE}), not {ego_states.shape}")
     if not all_within(ego_states):
-        first = next(b for b, states in enumerate(ego_states) if not all_within(states))
-        raise ValueError(f"ego_states of ego {first} are not finite or above {LARGEST:g}: leave it out")
+        raise ValueError(f"ego_states are not finite or above {LARGEST:g}: leave the ego out")
 
 
 def _script(
@@ -363,10 +334,6 @@ def _script(
         Paths(*_writable(paths)),
         driver,
     )
-
-
-def _yielding(traffic: TrafficScene) -> Yielding | None:
-    return None if traffic.yielding is None else Yielding(*_writable(traffic.yielding))
 
 
 def _ego_boxes(ego_states: Array) -> tuple[Array, Array]:
