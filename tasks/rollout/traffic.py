@@ -54,11 +54,12 @@ def drive(
     yielding: None where drivers have no intent but their target speed, and give way to nobody.
     """
     rows, motion = initial_rows(now, roles, ego_boxes, ego_velocities)
+    mode, scratch = np.empty(len(roles.path) + 1, np.int64), np.empty(len(roles.path), np.int64)
     for t in range(ego_boxes.shape[0] - 1):
-        mode = _switch_to_idm(roles, paths, driver, t, rows, motion, yielding)
+        _switch_to_idm(roles, paths, driver, t, rows, mode, scratch, motion, yielding)
         _drive_on(start, roles, paths, driver, t, rows, mode, motion, yielding)
         _replay(log, roles, t, rows, mode, motion)
-        _admit(start, log, roles, driver, t, rows, mode, motion, yielding)
+        _admit(start, log, roles, driver, t, rows, mode, scratch, motion, yielding)
     return rows, motion
 
 
@@ -87,8 +88,9 @@ def who_is_asked(
     start: int, roles: Roles, paths: Paths, driver: IdmDriver, t: int, rows: RolloutRows, motion: Motion
 ) -> tuple[Bools, Ints]:
     """(N,) whose next state a policy is asked for at row t, those driven and not held by their log; and the modes."""
-    mode = _switch_to_idm(roles, paths, driver, t, rows, motion, None)
-    asked = np.zeros(motion.mode.shape[1], np.bool_)
+    n = motion.mode.shape[1]
+    mode, asked = np.empty(n + 1, np.int64), np.zeros(n, np.bool_)
+    _switch_to_idm(roles, paths, driver, t, rows, mode, np.empty(n, np.int64), motion, None)
     for i in range(len(asked)):
         held = start + t < roles.hold_until[i] and motion.path[t, i] == roles.path[i] and not motion.was_driven[t, i]
         asked[i] = mode[i] == DRIVEN and not held
@@ -113,7 +115,7 @@ def apply_policy_answer(
             rows.center_z[t + 1, i] = motion.base_z[t, i] + paths.height[m, nearest_point_index(paths, s)]
             motion.was_driven[t + 1, i] = True
     _replay(log, roles, t, rows, mode, motion)
-    _admit(start, log, roles, driver, t, rows, mode, motion, None)
+    _admit(start, log, roles, driver, t, rows, mode, np.empty(len(asked), np.int64), motion, None)
 
 
 @hidden_kernel
@@ -138,17 +140,18 @@ def _stay(rows: RolloutRows, t: int, i: int) -> None:
 
 @hidden_kernel
 def _switch_to_idm(
-    roles: Roles, paths: Paths, driver: IdmDriver, t: int, rows: RolloutRows, motion: Motion, yielding: Yielding | None
-) -> Ints:
+    roles: Roles, paths: Paths, driver: IdmDriver, t: int,
+    rows: RolloutRows, mode: Ints, switch: Ints, motion: Motion, yielding: Yielding | None,
+) -> None:  # fmt: skip
     """Who is on its path and due switches to IDM, at its own pose and speed; so does who must brake on its log.
 
-    Returns what moves each agent, and the ego, from row t on (N + 1,); row t + 1 of the motion is row t's.
+    Fills what moves each agent, and the ego, from row t on (N + 1,); row t + 1 of the motion is row t's. switch: (N,)
+    scratch.
     """
     n = motion.mode.shape[1]
-    mode, switch = np.empty(n + 1, np.int64), np.full(n, -1)
     mode[n] = EGO
     for i in range(n):
-        mode[i] = motion.mode[t, i]
+        mode[i], switch[i] = motion.mode[t, i], -1
     for i in range(n):
         if mode[i] == REPLAYED and rows.valid[t, i]:
             switch[i] = path_to_join(roles, paths, rows, t, i, motion.clock[t, i])
@@ -164,12 +167,12 @@ def _switch_to_idm(
             motion.mode[t, i], motion.path[t, i], motion.travelled[t, i] = DRIVEN, m, 0.0
             motion.s[t, i], motion.offset[t, i], motion.turn[t, i], motion.speed[t, i] = s, offset, turn, speed
             motion.base_z[t, i] = rows.center_z[t, i] - paths.height[m, nearest_point_index(paths, s)]
-        for values in (motion.mode, motion.path, motion.clock):
-            values[t + 1, i] = values[t, i]
-        for numbers in (motion.s, motion.travelled, motion.speed, motion.offset, motion.turn, motion.base_z):
-            numbers[t + 1, i] = numbers[t, i]
+        motion.mode[t + 1, i], motion.path[t + 1, i] = motion.mode[t, i], motion.path[t, i]
+        motion.clock[t + 1, i], motion.s[t + 1, i] = motion.clock[t, i], motion.s[t, i]
+        motion.travelled[t + 1, i], motion.speed[t + 1, i] = motion.travelled[t, i], motion.speed[t, i]
+        motion.offset[t + 1, i], motion.turn[t + 1, i] = motion.offset[t, i], motion.turn[t, i]
+        motion.base_z[t + 1, i] = motion.base_z[t, i]
         motion.was_driven[t + 1, i] = motion.was_driven[t, i]
-    return mode
 
 
 @hidden_kernel
@@ -249,13 +252,13 @@ def _replay(log: AgentStates, roles: Roles, t: int, rows: RolloutRows, mode: Int
 @hidden_kernel
 def _admit(
     start: int, log: AgentStates, roles: Roles, driver: IdmDriver, t: int,
-    rows: RolloutRows, mode: Ints, motion: Motion, yielding: Yielding | None,
+    rows: RolloutRows, mode: Ints, enters: Ints, motion: Motion, yielding: Yielding | None,
 ) -> None:  # fmt: skip
-    """Newcomers, judged against everyone who was already there."""
+    """Newcomers, judged against everyone who was already there. enters: (N,) scratch."""
     n = motion.mode.shape[1]
     k = min(start + t + 1, log.valid.shape[0] - 1)
-    enters = np.zeros(n, np.bool_)
     for i in range(n):
+        enters[i] = False
         if mode[i] != ABSENT or not log.valid[k, i]:
             continue
         enters[i] = far_from_ego(roles, log.boxes, k, i, rows, t + 1) and is_clear(
