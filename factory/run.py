@@ -168,7 +168,7 @@ def _run(
                     config.workers,
                     claims=Claims(config.gpu_share if assembled.work.draws_on_gpu else 0.0, config.graph.memory_gb),
                     isolated=needs_own_process(config),
-                    limits=Limits({**label_time_limits(config), **config.graph.limit_s}, config.graph.limit_gb),
+                    limits=Limits(config.graph.limit_s, config.graph.limit_gb),
                     on_change=config.on_change,
                     retry=config.retry_failed,
                     shard_seconds=config.shard_seconds,

@@ -14,7 +14,7 @@ import numpy as np
 from factory.wording import one_line, shown
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import CLIP_STEPS, AgentKind, AgentTracks, Camera, Clip
-from tasks.world.frames import EGO_STATE_SIZE
+from tasks.world.frames import EGO_STATE_SIZE, LARGEST
 from tasks.world.road_map import Lane, LightState, MapLayer, RoadMap, Route, TrafficLights
 
 SPLITS = ("train", "val", "test")
@@ -266,8 +266,8 @@ def _agent_faults(clip: Clip) -> Iterator[Fault]:
     if len(set(agents.track_ids)) != n:
         yield "agents.track_ids", "a track id stands twice"
     for name in ("boxes", "velocities", "center_z"):
-        if not np.isfinite(getattr(agents, name)[agents.valid]).all():
-            yield f"agents.{name}", "not finite where valid"
+        if not (np.abs(getattr(agents, name)[agents.valid]) <= LARGEST).all():
+            yield f"agents.{name}", f"not finite where valid, or above {LARGEST:g}"
     if not (agents.boxes[agents.valid][:, 3:] > 0.0).all():
         yield "agents.boxes", "a length or width is not positive"
 
@@ -355,8 +355,8 @@ def _shape(field: str, array: Any, shape: tuple[int | None, ...]) -> Iterator[Fa
 
 def _array(field: str, array: Any, shape: tuple[int | None, ...]) -> Iterator[Fault]:
     yield from _shape(field, array, shape)
-    if not np.isfinite(array).all():
-        yield field, "not finite"
+    if not (np.abs(array) <= LARGEST).all():
+        yield field, f"not finite, or above {LARGEST:g}"
 
 
 def _ring(field: str, ring: Any) -> Iterator[Fault]:

@@ -6,7 +6,6 @@ Light, like every module of this name: no numpy is loaded for it.
 from dataclasses import dataclass
 from typing import Literal
 
-from tasks.settings import constant
 STEPS_PER_S = 10  # of clips
 Split = Literal["train", "val", "test"]
 

@@ -38,10 +38,9 @@ from factory.stages.sensors import (
 )
 from factory.store.location import Location
 from factory.wording import time_text
-from tasks.caches import Damaged, check, seal, sealed_json, unsealed_json
+from tasks.caches import Damaged, append_checksum, json_with_checksum, parse_json_with_checksum, verify_checksum
 from tasks.render.fit.reconstruct import finish_scene, fit_backend, run_iterations
 from tasks.render.fit.start import prepare_fit
-from tasks.caches import Damaged, append_checksum, verify_checksum
 from tasks.render.fit.state import FitState
 from tasks.render.rig.correct import RigCorrection, correct_rig, detect_corners, estimate_ground_height, movable_mask
 from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom, photo_rises
@@ -137,14 +136,14 @@ def correct_block_rig(
 
 
 def _write_rig_file(path: Path, found: dict[str, object]) -> None:
-    text = sealed_json({"block": path.stem, **found})
+    text = json_with_checksum({"block": path.stem, **found})
     with atomic_file(path.with_suffix(RIG_SUFFIX), len(text)) as draft:
         draft.write_text(text, encoding="utf-8")
 
 
 def read_rig_file(said: Path) -> dict[str, Any]:
     """What a file tells of its block. Raises Damaged, OSError."""
-    told = unsealed_json(said.read_bytes())
+    told = parse_json_with_checksum(said.read_bytes())
     if told.pop("block", None) != said.name.removesuffix(RIG_SUFFIX):
         raise Damaged("it was written of another block")
     return told
@@ -423,7 +422,7 @@ def without_other_logs(asset: RenderAsset) -> RenderAsset:
         rig=tuple(camera for camera in asset.rig if not is_of_other_log(camera.name)),
         taken=tuple(photo for photo in asset.taken if not is_of_other_log(photo.camera)),
         bodies=tuple(body for body in asset.bodies if not is_of_other_log(body.camera)),
-        shifts=asset.shifts.of([name for name in asset.shifts.track_ids if not is_of_other_log(name)]),
+        shifts=asset.shifts.select([name for name in asset.shifts.track_ids if not is_of_other_log(name)]),
     )
 
 

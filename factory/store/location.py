@@ -1,5 +1,5 @@
 """Where a store lives, a folder or an object-store URL, and its files: read and written whole; Parquet, under its
-content's name and with its checksums verified; prepared clips and scenes, sealed.
+content's name and with its checksums verified; prepared clips and scenes, with_checksum.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ from pyarrow import fs
 from factory.files import atomic_file, in_submitted_job, is_data
 from factory.store.schema import TableSpec
 from factory.wording import one_line
-from tasks.caches import Damaged, sealed, unsealed
+from tasks.caches import Damaged, with_checksum, without_checksum
 
 if TYPE_CHECKING:
     from tasks.hard_scenes import BenchmarkClip, GivenScenes, OneStageClip
@@ -326,7 +326,7 @@ class ClipCache:
 
     def store(self, key: str, value: object) -> None:
         """Whole or not at all."""
-        self.location.write(f"{key}.npz", sealed(encode_tree(value), key))
+        self.location.write(f"{key}.npz", with_checksum(encode_tree(value), key))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -337,7 +337,7 @@ class SceneFiles:
 
     def store(self, scenes: "BenchmarkClip | GivenScenes | OneStageClip") -> None:
         """Whole or not at all; in place of an older one."""
-        self.location.write(f"{scenes.clip.clip_id}.npz", sealed(encode_tree(scenes)))
+        self.location.write(f"{scenes.clip.clip_id}.npz", with_checksum(encode_tree(scenes)))
 
     def load(self, clip_id: str) -> "BenchmarkClip | GivenScenes | OneStageClip":
         """Raises FileNotFoundError where the clip has none, BadCacheFile, naming it, for a damaged or foreign file."""
@@ -364,14 +364,14 @@ class SceneFiles:
 def check_prepared_clip(data: bytes, key: str) -> None:
     """Hold the file of a prepared clip against its seal. Raises BadCacheFile."""
     try:
-        unsealed(data, key)
+        without_checksum(data, key)
     except Damaged as error:
         raise BadCacheFile(f"{error}; the next run makes it again") from error
 
 
 def _unsealed(data: bytes, key: str = "") -> bytes:
     try:
-        return unsealed(data, key)
+        return without_checksum(data, key)
     except Damaged as error:
         raise BadCacheFile(str(error)) from error
 

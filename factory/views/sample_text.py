@@ -75,7 +75,8 @@ def label_lines(row: dict[str, Any], drawn: bool) -> Iterable[str]:
         return
     labels = labels_of(row)
     scores = labels.pdm_score()
-    yield f"labels        {len(labels):,} trajectories of vocabulary {labels.vocabulary}, traffic {labels.traffic}"
+    which = f"vocabulary {labels.vocabulary}, traffic {row['label_traffic']}"
+    yield f"labels        {len(labels):,} trajectories of {which}"
     above = (scores > 0.0).mean()
     yield f"              EPDMS {scores.max():.3f} at best, {scores.mean():.3f} on average, {above:.0%} above 0"
     if not drawn:

@@ -26,7 +26,7 @@ class ImageLayout:
     height: int = 512
     rows_cut: float = constant(28 / 1080)  # share of the height, above and below
     sides_cut: float = constant(416 / 1920)  # share of the width, on both sides of every camera but the middle one
-    decoding: Literal["reduced", "full"] = fixed("reduced")  # full: public planners', see planners.data.images
+    decoding: Literal["reduced", "full"] = constant("reduced")  # full: public planners', see planners.data.images
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class BevLayout:
     side_m: float = 32.0  # to either side
     cell_m: float = 0.25
     times_s: tuple[float, ...] = (0.0,)  # one raster each, with the agents as they were then; now or before
-    public: bool = fixed(False)  # drawn as the public code's targets, see planners.data.bev
+    public: bool = constant(False)  # drawn as the public code's targets, see planners.data.bev
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -18,7 +18,6 @@ from pyarrow import fs
 
 from factory.store.location import raising_damaged_file
 from factory.store.reader import sample_table
-from tasks.caches import Damaged, with_checksum, without_checksum
 from tasks.world.arrays import Ints
 
 FOOTER_BYTES = 2**25  # as they are stored; parsed they take eight times that

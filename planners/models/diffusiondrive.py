@@ -46,7 +46,7 @@ from planners.models.layers import (
     initialise_as_public,
 )
 from planners.models.planner import Planner, TrainingData, evaluating, read_array
-from tasks.settings import fixed
+from tasks.settings import constant
 from tasks.world.arrays import FloatArray
 
 WAYPOINTS = 8  # 0.5 .. 4.0 s
@@ -301,12 +301,12 @@ class DiffusionDriveSettings(NetworkSettings):
     n_anchors: int = 20  # of them
     dropout: float = 0.1  # in the cascade
     offsets_from: Literal["noisy", "anchors"] = "noisy"  # what the first refinement's plans are added to
-    trajectory_weight: float = fixed(12.0)  # of all refinements together
+    trajectory_weight: float = constant(12.0)  # of all refinements together
     confidence_weight: float = 10.0  # within it
-    regression_weight: float = fixed(8.0)
-    agent_class_weight: float = fixed(10.0)
-    agent_box_weight: float = fixed(1.0)
-    bev_weight: float = fixed(14.0)
+    regression_weight: float = constant(8.0)
+    agent_class_weight: float = constant(10.0)
+    agent_box_weight: float = constant(1.0)
+    bev_weight: float = constant(14.0)
 
 
 class EncodedScene(NamedTuple):

@@ -33,7 +33,7 @@ from planners.models.layers import (
     initialise_as_public,
 )
 from planners.models.planner import Planner, TrainingData, evaluating, read_array
-from tasks.settings import fixed
+from tasks.settings import constant
 from tasks.subscores import HALVES, LABELLED
 from tasks.world.arrays import FloatArray
 from tasks.world.vocabulary import Vocabulary
@@ -146,8 +146,8 @@ class GtrsDenseSettings(NetworkSettings):
     weighting: WeightingName = "release"
     encoder: Literal["fused", "picture"] = "fused"  # as published with ResNet-34; with V2-99
     kept: float = 0.5  # share of the vocabulary in a training step
-    velocity_noise_mps: tuple[float, float] = fixed((1.0, 0.2))  # deviation along and across, in training
-    image_shift: float = fixed(1 / 256)  # largest, as a share of the width, in training: half a degree
+    velocity_noise_mps: tuple[float, float] = constant((1.0, 0.2))  # deviation along and across, in training
+    image_shift: float = constant(1 / 256)  # largest, as a share of the width, in training: half a degree
 
     def __post_init__(self) -> None:
         if self.inference_vocabulary is not None and self.inference_entries is not None:

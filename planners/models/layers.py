@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from planners.data.batch import Batch, BevLayout, ImageLayout
 from planners.data.bev import BevClass
 from planners.models.backbones import STRIDES, BackboneSettings, BasicBlock, build_backbone
-from tasks.settings import fixed
+from tasks.settings import constant
 
 
 class Attention(nn.Module):
@@ -143,7 +143,7 @@ class NetworkSettings:
     image: ImageLayout = field(default_factory=ImageLayout)
     variant: Variant = "paper"  # public: as the public code, whose checkpoints it takes; small: for two cores
     pretrained: str | None = None  # the picture's backbone: .safetensors, .pth or .pt, published names; null: random
-    sizes: Sizes | None = fixed(None)  # in the place of the variant's
+    sizes: Sizes | None = constant(None)  # in the place of the variant's
     SIZES: ClassVar[Mapping[str, Sizes]] = {"paper": Sizes(), "public": Sizes()}  # by variant
 
     @property

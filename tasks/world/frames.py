@@ -116,6 +116,7 @@ def pose_on_ground(logged: Array, ego_states: Array) -> Array:
     out[:, :3, 0], out[:, :3, 1], out[:, :3, 2] = forward, np.cross(up, forward), up
     return out
 
+
 # How large a number of a scene may be: no road has a length [m], heading [rad] or speed [m/s] like it; kernels number
 # cells and turns of a circle, which stops working far above it.
 LARGEST = 1e8

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from factory.files import matching
 from factory.readers.base import BadClip
-from tasks.caches import Damaged, check, sealed, user_cache
+from tasks.caches import Damaged, user_cache, verify_checksum, with_checksum
 from tasks.kernels.compiled import write_whole
-from tasks.caches import append_checksum, user_cache, verify_checksum
 from tasks.world.arrays import Array, Ints
 from tasks.world.road_map import Lane, MapLayer, MapPolygon, RoadMap
 from tasks.world.roadblocks import Roadblocks
@@ -249,7 +248,7 @@ def kept_tables(path: Path) -> dict[str, Table]:
     kept = cache_file(path)
     if kept.is_file():
         try:
-            check(kept, kept.name)
+            verify_checksum(kept, kept.name)
             with np.load(kept, allow_pickle=False) as stored:
                 return {layer: _kept_table(stored, layer) for layer in KEYS}
         except (Damaged, OSError) as error:
@@ -262,7 +261,7 @@ def kept_tables(path: Path) -> dict[str, Table]:
         arrays |= {f"{layer}.offsets{i}": offset for i, offset in enumerate(table.offsets)}
     data = io.BytesIO()
     np.savez(data, allow_pickle=False, **arrays)
-    write_whole(kept, sealed(data.getvalue(), kept.name))
+    write_whole(kept, with_checksum(data.getvalue(), kept.name))
     return tables
 
 

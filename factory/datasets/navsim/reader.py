@@ -60,7 +60,7 @@ from factory.readers.logs import (
 )
 from factory.readers.pickles import check_values, load_plain
 from factory.wording import shown, time_text
-from tasks.caches import sealed, unsealed, user_cache
+from tasks.caches import user_cache, with_checksum, without_checksum
 from tasks.kernels.compiled import write_whole
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import NOW, Block, Camera, Clip, SensorFile
@@ -314,7 +314,7 @@ def kept_table(path: Path, cache_dir: Path) -> FrameTable | None:
     """The table of the log at `path`, if one was kept of just this file. Raises BadClip where there is no such file."""
     try:
         kept = _kept(path, cache_dir)
-        data = unsealed(kept.read_bytes(), kept.name)
+        data = without_checksum(kept.read_bytes(), kept.name)
         rows = np.load(io.BytesIO(data), allow_pickle=False)
         return FrameTable(*(rows[column.name] for column in fields(FrameTable)))
     except FileNotFoundError:
@@ -347,7 +347,7 @@ def keep_table(table: FrameTable, path: Path, cache_dir: Path) -> None:
     np.save(data, rows, allow_pickle=False)
     cache_dir.mkdir(parents=True, exist_ok=True)
     kept = _kept(path, cache_dir)
-    write_whole(kept, sealed(data.getvalue(), kept.name))
+    write_whole(kept, with_checksum(data.getvalue(), kept.name))
 
 
 def _kept(path: Path, cache_dir: Path) -> Path:

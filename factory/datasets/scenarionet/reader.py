@@ -46,8 +46,7 @@ from factory.readers.pickles import id_text, load_plain
 from factory.wording import shown
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import CLIP_STEPS, STEP_S, AgentKind, AgentTracks
-from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY, X, Y, upright, wrap_angle
-from tasks.world.frames import planar_matrices
+from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY, X, Y, planar_matrices, wrap_angle
 from tasks.world.road_map import TrafficLights
 
 # ScenarioNet's tracks as 10 Hz arrays: a smooth ego at its rear axle, agents with velocities derived again.

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from factory.readers.settings import ReaderSettings, Split, check_traversals
-from tasks.settings import fixed
+from tasks.settings import constant
 
 LOG_STEPS = 116  # annotated frames of a log, 11.5 s
 STEPS_PER_SWEEP = 5  # 2 Hz
@@ -36,7 +36,7 @@ class TownSettings:
     cameras: tuple[str, ...] = ("ring_front_left", "ring_front_center", "ring_front_right")  # any of CAMERA_NAMES
     width: int = 320  # pixels
     height: int = 180  # pixels
-    jpeg_quality: int = fixed(92)  # 1 to 100
+    jpeg_quality: int = constant(92)  # 1 to 100
     steps_per_photo: int = 5  # of 0.1 s: 5 is 2 Hz, as fast as samples want them; 1 is 10 Hz, for scenes to learn from
     photo_steps: int = LOG_STEPS  # of a log, from its first, that are photographed; the three windows' histories are 36
     lidar_beams: int = 64  # 0: no lidar

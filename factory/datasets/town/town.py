@@ -43,7 +43,7 @@ from factory.datasets.town.streets import Streets, TownLane, build_streets
 from factory.exits import become_worker, terminal_signals_blocked
 from factory.files import matching_below
 from factory.wording import time_text
-from tasks.caches import Damaged, sealed_json, unsealed_json
+from tasks.caches import Damaged, json_with_checksum, parse_json_with_checksum
 from tasks.world.arrays import Array, Ints
 from tasks.world.clip import Camera
 
@@ -113,13 +113,13 @@ def _place(unfinished: Path, root: Path) -> None:
 def _fill(folder: Path, write: Write, named: str) -> None:
     write(folder)
     sums = {name: _digest(folder / name) for name in _files(folder)}
-    (folder / SUMS).write_text(sealed_json({"folder": named, "files": sums}))
+    (folder / SUMS).write_text(json_with_checksum({"folder": named, "files": sums}))
 
 
 def _find_damage(root: Path) -> str:
     """The first file that is not as it was written, and why; empty: all are."""
     try:
-        told = unsealed_json((root / SUMS).read_bytes())
+        told = parse_json_with_checksum((root / SUMS).read_bytes())
     except FileNotFoundError:
         return f"no {SUMS}"
     except Damaged as error:
