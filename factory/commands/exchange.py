@@ -164,7 +164,7 @@ def _label_trajectories(store: "Store", file: str | None) -> "Array | None":
 
 def _write_sample(format: str, store: "Store", row: Row, path: Path) -> None:
     """One sample as one file."""
-    logged = logged_drive(store, dict(row))
+    logged = logged_drive(store, row["clip_id"], row["settings_hash"])
     if format == "mcap":
         from factory.views.episode_messages import episode_of
 

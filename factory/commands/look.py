@@ -4,6 +4,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +14,7 @@ from factory.config.run import composed_run, run_config
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.views.sample_text import find, label_lines, labelled_trajectories, logged_drive, number_lines, open_samples
 from factory.views.sample_text import lineage as lineage_parts
-from factory.views.status import NothingThere, failed_lines, open_store, status_lines
+from factory.views.status import failed_lines, open_store, status_lines
 
 if TYPE_CHECKING:
     from factory.readers.base import ClipRef
@@ -116,7 +117,7 @@ def sample_lines(store: "Store", table: "SampleTable", which: str, request: Show
     drawn = labelled_trajectories(row, request.vocabulary)
     yield from number_lines(row)
     yield from label_lines(row, drawn is not None)
-    logged = logged_drive(store, row)
+    logged = logged_drive(store, row["clip_id"], row["settings_hash"])
     sheets = [sample_sheet(row, logged, vocabulary=drawn)]
     digest = digest_of(store, row)
     scene = None if digest is None else scene_of(store, digest)
@@ -297,7 +298,6 @@ class DashboardRequest:
     out: str
     port: int = 8266  # 0: any free one; Ray's own dashboard is at 8265
     host: str = "127.0.0.1"  # 0.0.0.0: for others too
-    wait: bool = False  # until there is a run
 
     def __post_init__(self) -> None:
         if self.port >= 2**16:
@@ -309,22 +309,13 @@ def dashboard(request: DashboardRequest) -> None:
 
         python -m factory dashboard out=runs/demo               then open the address that it prints
         python -m factory dashboard out=s3://bucket/samples port=9000
-        python -m factory dashboard out=runs/next wait=true     a run that is still to begin: the address once it has
         python -m factory dashboard out=runs/demo host=0.0.0.0  for others too: who reaches the port sees the data
 
     Works while a run goes on, and after it; it only reads. Ctrl-C ends it.
     """
-    try:
-        serve(request)
-    except KeyboardInterrupt:
-        print()
-
-
-def serve(request: DashboardRequest) -> None:
-    """Until Ctrl-C, which raises. Raises Refused where there is no run or the address cannot be had."""
-    store = awaited(request.out) if request.wait else open_store(request.out)
     from factory.views.board.server import LOOPBACK, Board, Server
 
+    store = open_store(request.out)
     board = Board(store)
     try:
         server = Server(board, request.host, request.port)
@@ -336,18 +327,6 @@ def serve(request: DashboardRequest) -> None:
     print(f"{store.location.uri} is shown at http://{host}:{server.server_address[1]}/ until Ctrl-C", flush=True)
     if request.host not in LOOPBACK:
         print("warning: everyone who reaches this port sees the run's data and pictures; there is no password")
-    with server:
+    with server, suppress(KeyboardInterrupt):
         server.serve_forever()
-
-
-def awaited(out: str, look_every_s: float = 2.0) -> "Store":
-    """The store of a run, once it has begun to write. Raises Refused where none can be."""
-    is_told = False
-    while True:
-        try:
-            return open_store(out)
-        except NothingThere as nothing:
-            if not is_told:
-                print(f"no store at {nothing.uri} yet: waiting for a run to begin, until Ctrl-C", flush=True)
-            is_told = True
-            time.sleep(look_every_s)
+    print()

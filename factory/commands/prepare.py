@@ -69,10 +69,14 @@ def vocabulary(request: VocabularyRequest) -> None:
     every_s=0.5 between the starts of windows. Each artefact has a .json with its digest and origin beside it.
     """
     from factory.config.compose import build, compose
+    from factory.setup.vocabulary import save_vocabulary
+    from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
     try:
         if request.kinematic:
-            print(write_kinematic(request))
+            made = Vocabulary(kinematic_trajectories(request.k, request.seed), source="kinematic")
+            save_vocabulary(str(request.out), made, {"source": "kinematic", "seed": request.seed})
+            print(f"{request.out}: {len(made)} kinematic trajectories, {made.digest}")
         else:
             print("\n".join(build_from_logs(request, build(compose("run", request.settings)["clips"], "clips"))))
     except (ValueError, OSError) as error:
@@ -116,16 +120,6 @@ def build_from_logs(request: VocabularyRequest, reader: "ClipReader") -> list[st
         )
     lines += [f"unreadable {name}: {reason}" for name, reason in sorted(windows.broken.items())]
     return lines
-
-
-def write_kinematic(request: VocabularyRequest) -> str:
-    """Writes the kinematic vocabulary of `k` and `seed`; a line of report."""
-    from factory.setup.vocabulary import save_vocabulary
-    from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
-
-    vocabulary = Vocabulary(kinematic_trajectories(request.k, request.seed), source="kinematic")
-    save_vocabulary(str(request.out), vocabulary, {"source": "kinematic", "seed": request.seed})
-    return f"{request.out}: {len(vocabulary)} kinematic trajectories, {vocabulary.digest}"
 
 
 @dataclass(frozen=True)

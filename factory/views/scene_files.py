@@ -199,9 +199,11 @@ def read_splats(path: Path, traversal: int | None = None, transforms: Path | Non
     try:
         if suffix in CHECKPOINTS:
             found = from_checkpoint(_loaded(path), traversal)
+        elif suffix == ".ply":
+            found = SplatCheckpoint(from_ply(path.read_bytes()))
         else:
-            data = path.read_bytes()
-            found = SplatCheckpoint(from_ply(data)) if suffix == ".ply" else _of_spz(data)
+            gaussians, antialiased = from_spz(path.read_bytes(), zstd)
+            found = SplatCheckpoint(gaussians, screen=ANTIALIASED if antialiased else None)
     except BadScene:
         raise
     except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:  # of another's content
@@ -228,12 +230,14 @@ def background_bytes(
     """
     if suffix in CHECKPOINTS:
         return _saved(worldengine(gaussians, origin, vehicles))
-    return _bytes(gaussians, suffix, screen)
+    return to_ply(gaussians) if suffix == ".ply" else to_spz(gaussians, screen.keeps_light)
 
 
 def node_bytes(gaussians: Gaussians, suffix: str, screen: ScreenFilter) -> bytes:
     """A vehicle's file; a checkpoint is splatfacto's. Raises ValueError."""
-    return _saved(splatfacto(gaussians)) if suffix in CHECKPOINTS else _bytes(gaussians, suffix, screen)
+    if suffix in CHECKPOINTS:
+        return _saved(splatfacto(gaussians))
+    return background_bytes(gaussians, suffix, np.zeros(3), screen)
 
 
 def transform_of(path: Path) -> tuple[Array, float]:
@@ -262,15 +266,6 @@ def taken_back(gaussians: Gaussians, transform: Array, scale: float) -> Gaussian
 def zstd(data: bytes, size: int) -> bytes:
     """What a stream of zstd holds, `size` bytes. Raises OSError."""
     return pa.decompress(data, size, codec="zstd", asbytes=True)
-
-
-def _bytes(gaussians: Gaussians, suffix: str, screen: ScreenFilter) -> bytes:
-    return to_ply(gaussians) if suffix == ".ply" else to_spz(gaussians, screen.keeps_light)
-
-
-def _of_spz(data: bytes) -> SplatCheckpoint:
-    found, antialiased = from_spz(data, zstd)
-    return SplatCheckpoint(found, screen=ANTIALIASED if antialiased else None)
 
 
 def _loaded(path: Path) -> object:
@@ -324,7 +319,8 @@ def info_text(path: Path, asset: RenderAsset) -> str:
         x, y = (f"{low:.1f} .. {high:.1f}" for low, high in zip(block.low, block.high))
         lines.append(f"block       {block.dataset} {block.log_id}, {block.start_s:.1f} to {block.end_s:.1f} s")
         lines.append(f"sensors at  x {x}, y {y} m")
-    lines.append(f"drawn       {_drawn(asset.screen)}")
+    how = "antialiased" if asset.screen.keeps_light else "classic"
+    lines.append(f"drawn       {how}, {asset.screen.dilation_px2:g} px2 wider")
     lines.append(f"background  {_counted(asset.background)}")
     lines += [f"node        {name}: {_counted(node)}" for name, node in asset.nodes.items()]
     held_out = f"{asset.psnr_db:.2f} dB over {asset.n_held_out} held-out photos"
@@ -402,10 +398,6 @@ def _place(text: str) -> np.ndarray:
     if place.shape != (3,) or not np.isfinite(place).all():
         raise ValueError(f"origin={text}: expected x,y,z in metres")
     return place
-
-
-def _drawn(screen: ScreenFilter) -> str:
-    return f"{'antialiased' if screen.keeps_light else 'classic'}, {screen.dilation_px2:g} px2 wider"
 
 
 def _counted(part: Gaussians) -> str:

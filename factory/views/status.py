@@ -43,16 +43,8 @@ def how_to_retry(error_kind: str, runs: Sequence[Mapping[str, Any]]) -> str:
     return f"fix or take out the named file, then {IMPORT_AGAIN.format(source)}"
 
 
-class NothingThere(Refused):
-    """No run has written here."""
-
-    def __init__(self, uri: str) -> None:
-        super().__init__(f"no store at {uri}: give the out= of a run of python -m factory.run")
-        self.uri = uri
-
-
 def open_store(out: str) -> "Store":
-    """Raises NothingThere where there is no run, Refused where there can be none."""
+    """Raises Refused where there is no run, or can be none."""
     location = out_of(out)
     from deltalake.exceptions import DeltaError
 
@@ -65,7 +57,7 @@ def open_store(out: str) -> "Store":
     except (OSError, DeltaError) as error:
         raise Refused(f"out={out}: {one_line(error)}") from error
     if store.samples.version is None and store.outcomes.version is None and store.candidates.version is None:
-        raise NothingThere(store.location.uri)
+        raise Refused(f"no store at {store.location.uri}: give the out= of a run of python -m factory.run")
     return store
 
 

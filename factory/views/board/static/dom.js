@@ -40,7 +40,7 @@ export function bytes(n) {
   return `${(n / size).toFixed(n / size < 10 ? 1 : 0)} ${unit}`;
 }
 
-// A report is this page with its answers and some pictures inside (factory/board/still.py); there is no server then.
+// A report is this page with its answers and some pictures inside (factory/views/board/report.py); there is no server then.
 const kept = JSON.parse(document.getElementById("kept")?.textContent ?? "null");
 export const still = kept !== null;
 export const extra = kept?.extra ?? null;

@@ -12,14 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
-from factory.commands.look import awaited
 from factory.commands.table import COMMANDS
-from factory.config.arguments import Refused
 from factory.config.run import load_config
 from factory.setup.settings import assemble
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
-from factory.views.board.gallery import Kept
 from factory.views.board.overview import QUIET_S, overview
 from factory.views.board.server import SERVED, STATIC, Board, Server
 from factory.views.board.watch import Watch
@@ -64,20 +61,6 @@ def test_the_numbers_are_those_of_the_tables(out: Path, board: Board) -> None:
     ]
     inside = sum(abs(end[0]) <= 20 and abs(end[1]) <= 2 for end in ends)
     assert np.sum(answer["coverage"]["accepted"]) == inside
-
-
-def test_a_run_that_is_still_to_begin_is_waited_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stores: list[Store] = []
-    waiting = threading.Thread(target=lambda: stores.append(awaited(str(tmp_path), look_every_s=0.01)))
-    waiting.start()
-    waiting.join(0.2)
-    assert waiting.is_alive()
-    run(tmp_path, 1)
-    waiting.join(60.0)
-    assert get(Board(stores[0], look_every_s=0.0), "/api/overview")["counts"]["samples"] > 0
-    assert capsys.readouterr().out.count("waiting for a run to begin") == 1
-    with pytest.raises(Refused, match="gopher"):
-        awaited("gopher://bucket/run")
 
 
 @pytest.mark.slow
@@ -220,7 +203,7 @@ def test_the_whole_logged_drive_is_in_the_picture_and_the_episode_where_the_prep
     executed(work, work.reader.index().refs[:1], ["pdm_closed"], 1, store)
     table = SampleTable(tmp_path / "out")
     row = table[table.attempt_ids[0]]
-    drive = logged_drive(store, row)
+    drive = logged_drive(store, row["clip_id"], row["settings_hash"])
     assert drive is not None and len(drive) == 81
     shown = {}
     for name, logged in (("whole", drive), ("joined", None)):
@@ -305,20 +288,6 @@ def test_another_host_name_is_refused_on_loopback(served: tuple[str, int]) -> No
     assert ask(served, "GET", "/api/overview", Host="localhost:80")[0] == 200
     status, _, body = ask(served, "GET", "/api/overview", Host="evil.example")
     assert status == 403 and b"evil.example" in body
-
-
-def test_what_is_kept_is_bounded_and_the_latest_used_stay() -> None:
-    kept, made = Kept(10, len), []
-
-    def make(name: str, size: int) -> bytes:
-        return kept.get((name,), lambda: made.append(name) or bytes(size))  # type: ignore[func-returns-value]
-
-    for name in ("a", "b", "a", "c", "a", "b"):
-        make(name, 4)
-    assert made == ["a", "b", "c", "b"]
-    make("large", 11)
-    make("large", 11)
-    assert made[-2:] == ["large", "large"]
 
 
 def test_a_taken_port_is_said(out: Path, served: tuple[str, int], capsys: pytest.CaptureFixture[str]) -> None:
