@@ -41,23 +41,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The samples of one log of the CSV reader, driven by the example's expert and the human."""
     home = tmp_path_factory.mktemp("examples")
     write_log(home / "logs" / "street")
-    code = run_main(
-        [
-            "clips=custom",
-            "clips._target_=examples.csv_logs.CsvReader",
-            f"+clips.root={home / 'logs'}",
-            "+expert.keep_lane._target_=examples.keep_lane.KeepLane",
-            "+expert.keep_lane.settle_m=12",
-            "experts=[keep_lane,human]",
-            "render=none",
-            "reward.labels=none",
-            "vocabulary.k=256",
-            "executor=local",
-            "limit=1",
-            f"out={home / 'out'}",
-        ]
-    )
-    assert code == 0
+    own = "clips=custom clips._target_=examples.csv_logs.CsvReader experts=[keep_lane,human] "
+    own += "+expert.keep_lane._target_=examples.keep_lane.KeepLane +expert.keep_lane.settle_m=12"
+    small = "render=none reward.labels=none vocabulary.k=256 executor=local limit=1"
+    assert run_main([*own.split(), *small.split(), f"+clips.root={home / 'logs'}", f"out={home / 'out'}"]) == 0
     return home
 
 
@@ -71,19 +58,10 @@ def test_the_reader_and_the_expert_make_samples_of_a_map_of_one_s_own(made: Path
 
 
 def test_the_planner_trains_on_them(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = [
-        "planner=custom",
-        "planner.name=examples.linear_planner:LinearPlanner",
-        "+planner.settings.history=true",
-        "planner.training.batch_size=2",
-        f"data.real=[{made / 'out'}]",
-        f"data.sim=[{made / 'out'}]",
-        "steps=3",
-        "workers=0",
-        "device=cpu",
-        f"out={made / 'linear'}",
-    ]
-    assert train_main(arguments) == 0, capsys.readouterr().err
+    own = "planner=custom planner.name=examples.linear_planner:LinearPlanner +planner.settings.history=true"
+    small = "planner.training.batch_size=2 steps=3 workers=0 device=cpu"
+    data = [f"data.real=[{made / 'out'}]", f"data.sim=[{made / 'out'}]", f"out={made / 'linear'}"]
+    assert train_main([*own.split(), *small.split(), *data]) == 0, capsys.readouterr().err
     assert type(load_planner(made / "linear")) is LinearPlanner  # as planners.evaluation.evaluate loads it
 
 
@@ -119,15 +97,6 @@ def test_a_traffic_policy_is_a_class_that_the_settings_name() -> None:
     assert free.velocities[:, 0, 0] == pytest.approx(8.0) and free.boxes[-1, 0, 0] == pytest.approx(32.0)
     assert behind.velocities[-1, 0, 0] < 1.0 and behind.boxes[-1, 0, 0] + 2.3 < 20.8
     assert traffic_record(settings)["policy"] == f"examples.keep_gap:KeepGap {KeepGap().digest()}"
-
-
-@pytest.mark.slow
-def test_a_run_among_its_traffic_writes_samples(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    few = ("clips.n_clips=1", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "vocabulary.k=256")
-    plain = ("render=none", "reward.labels=none", "executor=local", "experts=[pdm_closed]", f"out={out}")
-    assert run_main([*few, *plain, "traffic=custom", "traffic.policy=examples.keep_gap:KeepGap"]) == 0
-    assert len(SampleTable(out)) > 0
 
 
 @pytest.mark.slow

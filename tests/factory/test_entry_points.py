@@ -63,16 +63,8 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def run_arguments(home: Path) -> list[str]:
     write_log(home / "logs" / "street")
-    return [
-        "clips=mine",
-        f"clips.root={home / 'logs'}",
-        "experts=[mine,human]",
-        "render=none",
-        "reward.labels=none",
-        "vocabulary.k=256",
-        "limit=1",
-        f"out={home / 'out'}",
-    ]
+    small = "clips=mine experts=[mine,human] render=none reward.labels=none vocabulary.k=256 limit=1"
+    return [*small.split(), f"clips.root={home / 'logs'}", f"out={home / 'out'}"]
 
 
 @pytest.mark.slow
@@ -82,18 +74,9 @@ def test_a_reader_an_expert_and_a_planner_work_by_name(
     install(site, "somebody")
     assert run_main([*run_arguments(tmp_path), "executor=local"]) == 0, capsys.readouterr().err
     assert experts_of(tmp_path) == {"mine", "human"}
-    trained = [
-        "planner=mine",
-        "planner.settings.history=true",
-        "planner.training.batch_size=2",
-        f"data.real=[{tmp_path / 'out'}]",
-        f"data.sim=[{tmp_path / 'out'}]",
-        "steps=1",
-        "workers=0",
-        "device=cpu",
-        f"out={tmp_path / 'linear'}",
-    ]
-    assert train_main(trained) == 0, capsys.readouterr().err
+    small = "planner=mine planner.settings.history=true planner.training.batch_size=2 steps=1 workers=0 device=cpu"
+    data = [f"data.real=[{tmp_path / 'out'}]", f"data.sim=[{tmp_path / 'out'}]", f"out={tmp_path / 'linear'}"]
+    assert train_main([*small.split(), *data]) == 0, capsys.readouterr().err
     loaded = planner_of(str(tmp_path / "linear")).load
     assert loaded is not None and type(loaded()) is planner_class("mine")
     assert planner_of("mine").label == "mine"

@@ -107,25 +107,21 @@ def test_every_command_shows_its_settings_and_neither_writes_nor_starts_anything
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("command", "shown"),
-    [
-        ("planners.drive --cfg planner=human clips.n_clips=3", {"planner": "human", "seconds": 20.0}),
-        ("planners train planner=custom -c job steps=7", {"steps": 7, "seed": 0}),
-        ("factory.run clips=av2 --cfg rounds=5", {"rounds": 5, "executor": "ray"}),
-        ("factory explain --cfg tries=9 traffic=replay", {"clip": "0", "tries": 9, "rounds": 1}),
-        ("factory retry out=runs/a --cfg workers=3", {"out": "runs/a", "workers": 3}),
-        ("factory show --cfg 3 film=true", {"out": "???", "sample": "3", "film": True}),
-    ],
-)
-def test_settings_are_shown_as_they_are_given(command: str, shown: dict[str, object], tmp_path: Path) -> None:
-    door, *words = command.split()
-    env = os.environ | {"PYTHONPATH": str(REPOSITORY)}
-    script = [sys.executable, "-m", door, *words]
-    done = subprocess.run(script, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stderr) == (0, "")
-    found = yaml.safe_load(done.stdout)
-    assert {key: found.get(key) for key in shown} == shown
+def test_settings_are_shown_as_they_are_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for door, command, shown in (
+        (planners_main, "drive --cfg planner=human clips.n_clips=3", {"planner": "human", "seconds": 20.0}),
+        (planners_main, "train planner=custom -c job steps=7", {"steps": 7, "seed": 0}),
+        (main, "run clips=av2 --cfg rounds=5", {"rounds": 5, "executor": "ray"}),
+        (main, "explain --cfg tries=9 traffic=replay", {"clip": "0", "tries": 9, "rounds": 1}),
+        (main, "retry out=runs/a --cfg workers=3", {"out": "runs/a", "workers": 3}),
+        (main, "show --cfg 3 film=true", {"out": "???", "sample": "3", "film": True}),
+    ):
+        assert door(command.split()) == 0
+        found = yaml.safe_load(capsys.readouterr().out)
+        assert {key: found.get(key) for key in shown} == shown
     assert not list(tmp_path.iterdir())
 
 
@@ -227,30 +223,36 @@ def read_only(out: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[P
         place.chmod(mode)
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "said"),
-    [
-        ("report", 2, f"{{out}}/report.html: {DENIED}; {INSTEAD}, or give to=<another place>"),
-        ("clean", 2, f"{{out}}: {DENIED}; {INSTEAD}"),
-        ("compact", 2, f"{{out}}: {DENIED}; {INSTEAD}"),
-        ("verify repair=true", 2, f"{{out}}/candidates/{COPIES}/{0:020}.json: {DENIED}; {INSTEAD}"),
-        ("retry", 2, f"out={{out}}: {DENIED}"),
-        ("run executor=local", 2, f"out={{out}}: {DENIED}"),
-        ("import simscale root={out}", 2, f"out={{out}}: {DENIED}"),
-        ("export mcap sample=0 to=.", 0, ""),
-        ("status", 0, ""),
-    ],
-)
+ASK_ALL = """
+import contextlib, io, json, sys
+from factory.__main__ import main
+for argv in json.loads(sys.argv[1]):
+    with contextlib.redirect_stderr(io.StringIO()) as said, contextlib.redirect_stdout(io.StringIO()):
+        code = main(argv)
+    print(json.dumps([code, said.getvalue()]))
+"""
+
+
 def test_a_run_that_nobody_may_write_to_is_read_and_what_would_write_says_so_in_a_line(
-    words: str, code: int, said: str, read_only: Path, tmp_path: Path
+    read_only: Path, tmp_path: Path
 ) -> None:
-    name, *rest = words.format(out=read_only).split()
-    script = [*DROPPED, sys.executable, "-m", "factory", name, *rest, f"out={read_only}"]
+    wanted = {
+        "report": f"{read_only}/report.html: {DENIED}; {INSTEAD}, or give to=<another place>",
+        "clean": f"{read_only}: {DENIED}; {INSTEAD}",
+        "compact": f"{read_only}: {DENIED}; {INSTEAD}",
+        "verify repair=true": f"{read_only}/candidates/{COPIES}/{0:020}.json: {DENIED}; {INSTEAD}",
+        "retry": f"out={read_only}: {DENIED}",
+        "run executor=local": f"out={read_only}: {DENIED}",
+        f"import simscale root={read_only}": f"out={read_only}: {DENIED}",
+        "export mcap sample=0 to=.": "",
+        "status": "",
+    }
+    asked = json.dumps([[*words.split(), f"out={read_only}"] for words in wanted])
+    script = [*DROPPED, sys.executable, "-c", ASK_ALL, asked]
     env = os.environ | {"PYTHONPATH": str(REPOSITORY)}
     done = subprocess.run(script, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120)
-    assert done.returncode == code, done.stderr
-    if code == 2:
-        assert done.stderr == f"error: {said.format(out=read_only)}\n"
+    told = dict(zip(wanted, map(json.loads, done.stdout.splitlines())))
+    assert told == {words: [2, f"error: {said}\n"] if said else [0, ""] for words, said in wanted.items()}, done.stderr
 
 
 @pytest.fixture

@@ -2,10 +2,8 @@
 
 import dataclasses
 import math
-import os
 import pwd
 import re
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
+from factory.__main__ import main as door_main
 from factory.config.compose import ConfigError, build, conf_dir, fill
 from factory.config.plugins import choices
 from factory.config.run import PerturbSources, RewardSettings, RunConfig, composed_run, load_config, shapes_in
@@ -32,7 +31,6 @@ from tasks.rollout.simulate import TrafficSettings
 from tests.factory.data_folders import add_companions
 from tests.factory.text_keys import held, text_keys
 
-REPOSITORY = Path(__file__).resolve().parents[3]
 DENSE = PerturbSources(max_longitudinal_m=8.0, step_longitudinal_m=1.0, interleaved=False, order="spread", at_most=32)
 GROUPS = [
     ("perturb/paper", PerturbSources()),
@@ -119,20 +117,23 @@ def test_companions_of_files_of_configuration_are_no_choices(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_a_run_takes_its_files_from_the_home_folder(small_town: Path, tmp_path: Path) -> None:
+def test_a_run_takes_its_files_from_the_home_folder(
+    small_town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     clips = ["clips=av2", f"clips.root={small_town}", "clips.split=train"]
     at_home = ["vocabulary.file=~/v.npy", "reward.label_vocabulary=~/v.npy", "expert.recovery.table=~/t.npz"]
     settings = ["experts=[recovery]", "render=none", "perturb.epdms_min=0", "executor=local", "out=~/out"]
-    env = os.environ | {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(user_cache().parent)}
+    monkeypatch.setenv("XDG_CACHE_HOME", str(user_cache().parent))
+    monkeypatch.setenv("HOME", str(tmp_path))
     for words in (
         ["vocabulary", "out=~/v.npy", "kinematic=true", "k=64"],
         ["vocabulary", "table=~/t.npz", "vocabularies=[~/v.npy]", *clips],
         ["run", *clips, *at_home, *settings],
     ):
-        command = [sys.executable, "-m", "factory", *words]
-        done = subprocess.run(command, cwd=REPOSITORY, env=env, capture_output=True, text=True, timeout=280)
-        assert done.returncode == 0, done.stderr
-    assert f"64 trajectories ({tmp_path}/v.npy" in done.stdout and (tmp_path / "out" / "report.html").is_file()
+        assert door_main(words) == 0
+    assert (
+        f"64 trajectories ({tmp_path}/v.npy" in capsys.readouterr().out and (tmp_path / "out" / "report.html").is_file()
+    )
 
 
 def test_a_plug_in_s_key_is_led_home_too_and_a_stranger_s_home_is_told(
@@ -162,29 +163,6 @@ def test_render_settings_out_of_range_are_refused(name: str, values: tuple[float
             fill(RenderSettings, {name: value}, "render")
 
 
-def test_render_settings_at_their_bounds_are_taken() -> None:
-    for quality in (1, 100):
-        RenderSettings(width=16, height=16, jpeg_quality=quality, psnr_min=0.0)
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("limit=0", "limit=0"),
-        ("shard_seconds=0", "shard_seconds=0"),
-        ("experts=[]", "at least one"),
-        ("experts=[human,human]", "each expert once"),
-        ("perturb.step_lateral_m=0", "step_lateral_m must be positive"),
-        ("vocabulary.k=0", "k=0: must be positive"),
-        ("graph.memory_gb.rendr=3", "there is no such task; did you mean render"),
-        ("graph.memory_gb.render=-1", r"memory_gb\.render=-1"),
-    ],
-)
-def test_a_value_of_the_wrong_kind_is_an_error_that_names_it(override: str, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        load_config([override])
-
-
 PDM = "+expert.mine._target_=tasks.experts.pdm_closed.PdmClosed.of_run"
 RECOVERY = "+expert.mine._target_=factory.setup.settings.recovery"
 
@@ -203,11 +181,9 @@ def test_an_expert_is_added_by_its_target_with_all_its_arguments() -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["+expert.mine._target_=nowhere.Expert"], r"expert\.mine: .*nowhere"),
         (["+expert.mine._target_=tasks.experts.protocol.Nobody"], r"expert\.mine: .*Nobody"),
         (["+expert.mine._target_=tasks.experts.protocol.Human", "+expert.mine.speed=3"], r"(?s)expert\.mine: .*speed"),
         (["+expert.mine._target_=collections.Counter"], r"Counter is not an expert .* no name, digest, plan"),
-        (["+expert.mine.speed=3"], r"expert\.mine\._target_ is missing"),
         ([PDM, "+expert.mine.speed=3"], r"(?s)expert\.mine: .*speed"),
         ([RECOVERY, "+expert.mine.speed=3"], r"expert\.mine\.speed: there is no such setting"),
         ([RECOVERY, "+expert.mine.table=[1]"], r"expert\.mine\.table"),

@@ -75,13 +75,7 @@ def test_failed_names_file_field_and_how_to_retry(out: Path, capsys: pytest.Capt
     ("arguments", "message"),
     [
         ((), "out=<folder or URL of a run> is missing"),
-        (("outt=x",), "expected one of out="),
-        (("out",), "out=<folder or URL of a run> is missing"),
         (("out={out}",), "python -m factory status shows the run"),
-        (("out={out}", "0", "sample=0"), "sample is given twice"),
-        (("out=",), "expected one of out="),
-        (("out={out}", "out={out}"), "given twice"),
-        (("out={out}", "film=maybe"), "must be true or false"),
         (("out={out}", "sample=0", "list=true"), "choose one"),
         (("out={out}", "to=x.png", "list=true"), "give sample= too"),
         (("out={out}", "sample=zz"), "no sample zz"),
@@ -119,15 +113,11 @@ def test_a_run_that_died_is_told_from_one_that_ended(tmp_path: Path, capsys: pyt
 
 
 @pytest.mark.slow
-def test_show_imports_neither_ray_nor_torch_and_helps_without_heavy_imports(out: Path, tmp_path: Path) -> None:
+def test_show_and_status_import_neither_ray_nor_torch(out: Path, tmp_path: Path) -> None:
+    asked = [["show", f"out={out}", "sample=0", f"to={tmp_path}"], ["status", f"out={out}"]]
     script = (
-        "import sys; from factory.__main__ import main; code = main(sys.argv[2:]); "
-        "bad = set(sys.argv[1].split(',')) & set(sys.modules); sys.exit(f'{code} {bad}' if code or bad else 0)"
+        f"import sys; from factory.__main__ import main; codes = [main(argv) for argv in {asked}]; "
+        "sys.exit(str(codes) if any(codes) or {'ray', 'torch'} & set(sys.modules) else 0)"
     )
-    for heavy, arguments in (
-        ("ray,torch", ["show", f"out={out}", "sample=0", f"to={tmp_path}"]),
-        ("ray,torch", ["status", f"out={out}"]),
-        ("ray,torch,numpy,cv2,pyarrow,deltalake,rich,hydra", ["show", "--help"]),
-    ):
-        done = subprocess.run([sys.executable, "-c", script, heavy, *arguments], capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

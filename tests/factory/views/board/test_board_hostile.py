@@ -103,21 +103,6 @@ def test_random_bytes_bring_nothing_down(at: At, capfd: pytest.CaptureFixture[st
     assert "Traceback" not in capfd.readouterr().err and is_answered(at)
 
 
-@pytest.mark.slow
-def test_five_hundred_open_connections_keep_nobody_out(at: At) -> None:
-    """Half of them have sent half a request."""
-    before = threading.active_count()
-    held = []
-    for number in range(500):
-        held.append(socket.create_connection(at, timeout=20))
-        held[-1].sendall(b"GET / HT" if number % 2 else b"")
-    assert is_answered(at)
-    assert threading.active_count() <= before + CONNECTIONS
-    for connection in held:
-        connection.close()
-    assert is_answered(at)
-
-
 CLIENTS = 1000
 ASKED = b"GET /static/board.js HTTP/1.1\r\n" + HOST
 RESET = struct.pack("ii", 1, 0)  # SO_LINGER: what is closed is reset
