@@ -8,14 +8,15 @@ python -m factory --version
 
 from collections.abc import Sequence
 
-from factory.commands.table import COMMANDS, PLANNERS, dispatch, listed
+from factory.commands.table import COMMANDS, PLANNERS, command_list, dispatch
 from factory.exits import run_program
 
 
 def help_text() -> str:
     """Every command in one line."""
     return (
-        f"{__doc__}\ncommands\n{listed(COMMANDS)}\n\nplanners: python -m planners <command>\n{listed(PLANNERS)}\n\n"
+        f"{__doc__}\ncommands\n{command_list(COMMANDS)}\n\n"
+        f"planners: python -m planners <command>\n{command_list(PLANNERS)}\n\n"
         "Exit codes: docs/configuration.md. Arguments are key=value."
     )
 

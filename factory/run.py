@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING
 from factory.config.arguments import command
 from factory.config.compose import ConfigError
 from factory.config.datasets import data_set_of
-from factory.config.plugins import class_of, offered
+from factory.config.plugins import import_target, plugins_by_name
 from factory.config.run import RunConfig, built_in_classes, load_config, photos_alone, refuse_missing_root
-from factory.config.words import Asked, asked_of
+from factory.config.words import CommandLine, parse_command_line
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, run_program
 from factory.files import why_unusable
 from tasks.render.settings import RenderMode
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 @command("run", RunConfig, refused=(), resumes=True)
 def main(argv: Sequence[str]) -> int:
     """The command; returns the exit code."""
-    return run(asked_of(argv), only_plan=False)
+    return run(parse_command_line(argv), only_plan=False)
 
 
 def interleave_by_log(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
@@ -72,7 +72,7 @@ def needs_own_process(config: RunConfig) -> bool:
     used = [config.clips, *(spec for name, spec in config.expert.items() if name in config.experts)]
     foreign = any(not str(spec.get("_target_", "")).startswith(("factory.", "tasks.")) for spec in used)
     foreign |= config.traffic.policy is not None
-    foreign |= bool(getattr(class_of(config.clips, "clips", "my_package.MyReader"), "untrusted", False))
+    foreign |= bool(getattr(import_target(config.clips, "clips", "my_package.MyReader"), "untrusted", False))
     return config.graph.isolated == "always" or (config.graph.isolated == "auto" and foreign)
 
 
@@ -81,7 +81,7 @@ def minutes_left(minutes: float | None, began: float) -> float | None:
     return None if minutes is None else max(0.0, minutes - (time.monotonic() - began) / 60.0)
 
 
-def run(asked: Asked, only_plan: bool) -> int:
+def run(asked: CommandLine, only_plan: bool) -> int:
     """Plan, execute, commit, report; or plan alone. The command line is checked before anything heavy is imported.
 
     A run on Ray, unless this process has joined a cluster already, is a process of its own, which Ray may end.
@@ -95,7 +95,7 @@ def run(asked: Asked, only_plan: bool) -> int:
     return run_in_own_process(work, not os.environ.get("RAY_ADDRESS"), lambda line: print(line, flush=True))
 
 
-def _checked(asked: Asked) -> RunConfig:
+def _checked(asked: CommandLine) -> RunConfig:
     config = load_config(asked.words)
     if unusable := why_unusable(config.out):
         raise ConfigError(unusable)
@@ -113,7 +113,7 @@ def _run_in_child(words: Sequence[str], first_began: float, begun: int, tell: Ca
     began = first_began if begun else None
 
     def work(argv: Sequence[str]) -> int:
-        asked = asked_of(argv)
+        asked = parse_command_line(argv)
         return _run(_checked(asked), asked, False, began, begun, say)
 
     return replace(main, does=work)(words)
@@ -121,7 +121,7 @@ def _run_in_child(words: Sequence[str], first_began: float, begun: int, tell: Ca
 
 def _run(
     config: RunConfig,
-    asked: Asked,
+    asked: CommandLine,
     only_plan: bool,
     began: float | None = None,
     begun: int = 0,
@@ -219,14 +219,14 @@ def refuse_what_is_not_there(config: RunConfig) -> None:
 def refuse_missing_classes(config: RunConfig) -> None:
     """Raises ConfigError where the class of the reader, or of an expert that the user configured, is not there."""
     named = {"clips": (config.clips, "my_package.MyReader")}
-    others = {plugin.target for plugins in offered("expert").values() for plugin in plugins}
+    others = {plugin.target for plugins in plugins_by_name("expert").values() for plugin in plugins}
     for name, spec in config.expert.items():
         if name in config.experts or spec.get("_target_") not in others:  # an installed one may lie idle, and broken
             named[f"expert.{name}"] = (spec, "my_package.MyExpert")
     built_in = {*built_in_classes("clips").values(), *built_in_classes("expert").values()}
     for where, (spec, example) in named.items():
         if spec.get("_target_") not in built_in:
-            class_of(spec, where, example)
+            import_target(spec, where, example)
 
 
 def refuse_cameras_of_no_rig(config: RunConfig) -> None:

@@ -10,13 +10,13 @@ minutes, and the same command goes on. What is wrong is told in one line.
 
 from collections.abc import Sequence
 
-from factory.commands.table import PLANNERS, dispatch, listed
+from factory.commands.table import PLANNERS, command_list, dispatch
 from factory.exits import run_program
 
 
 def main(argv: Sequence[str]) -> int:
     """Hand the arguments to the command that is named first; its exit code, 2 where there is none."""
-    return dispatch(argv, PLANNERS, f"{__doc__}\ncommands\n{listed(PLANNERS)}\n\nMore: docs/training.md.")
+    return dispatch(argv, PLANNERS, f"{__doc__}\ncommands\n{command_list(PLANNERS)}\n\nMore: docs/training.md.")
 
 
 def program() -> None:

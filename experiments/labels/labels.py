@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 
 from experiments.sceptic.experiment import experiment
-from factory.config.arguments import NOT_FITTING, answered
+from factory.config.arguments import INPUT_ERRORS, run_command
 
 
 def labels(argv: Sequence[str]) -> None:
@@ -23,4 +23,4 @@ def labels(argv: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(answered(sys.argv[1:], labels, lambda: __doc__, NOT_FITTING))
+    sys.exit(run_command(sys.argv[1:], labels, lambda: __doc__, INPUT_ERRORS))

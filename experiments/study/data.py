@@ -14,7 +14,7 @@ from pathlib import Path
 from threading import Event
 
 from experiments.study.settings import settings_of
-from factory.config.arguments import NOT_FITTING, answered
+from factory.config.arguments import INPUT_ERRORS, run_command
 from factory.exits import INTERRUPTED, Failed, Stopped, calling_on_stop_signal
 from planners.training.many import Means, exit_code
 
@@ -67,4 +67,4 @@ def data(argv: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(answered(sys.argv[1:], data, lambda: __doc__, NOT_FITTING))
+    sys.exit(run_command(sys.argv[1:], data, lambda: __doc__, INPUT_ERRORS))

@@ -24,7 +24,7 @@ from typing import Any, Literal
 import numpy as np
 
 from experiments.study.settings import settings_of
-from factory.config.arguments import NOT_FITTING, answered
+from factory.config.arguments import INPUT_ERRORS, run_command
 from planners.evaluation.aggregation import name_of, scores_in_percent, shown, write_csv
 from planners.study.report import FRAMES, StudyFrames, read_study
 from planners.study.setups import Budget, Comparison, Imitation, Setup, words_of
@@ -244,4 +244,4 @@ def scale(words: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(answered(sys.argv[1:], scale, lambda: __doc__, NOT_FITTING))
+    sys.exit(run_command(sys.argv[1:], scale, lambda: __doc__, INPUT_ERRORS))

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from factory.config.compose import ConfigError, fill
-from factory.config.shapes import defaults_of, described, merged
-from factory.config.words import SettingsShown, asked_of
+from factory.config.shapes import deep_merge, defaults_of, yaml_lines
+from factory.config.words import SettingsShown, parse_command_line
 
 T = TypeVar("T")
 
@@ -16,14 +16,14 @@ def settings_of(shape: type[T], file: Path, argv: Sequence[str]) -> T:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    asked = asked_of(argv)
+    asked = parse_command_line(argv)
     try:
         found = OmegaConf.merge(OmegaConf.load(file), OmegaConf.from_dotlist(list(asked.overrides)))
         values = OmegaConf.to_container(found, resolve=True, throw_on_missing=not asked.shows)
     except OmegaConfBaseException as error:
         raise ConfigError(str(error).splitlines()[0]) from error
     assert isinstance(values, dict)
-    values = merged(defaults_of(shape), {str(key): value for key, value in values.items()})
+    values = deep_merge(defaults_of(shape), {str(key): value for key, value in values.items()})
     if asked.shows:
-        raise SettingsShown("\n".join(described(values, shape, {})))
+        raise SettingsShown("\n".join(yaml_lines(values, shape, {})))
     return fill(shape, values, "")

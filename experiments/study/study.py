@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.study.settings import settings_of
-from factory.config.arguments import NOT_FITTING, answered
+from factory.config.arguments import INPUT_ERRORS, run_command
 from factory.config.compose import ConfigError
 from planners.data.index import DataSettings, open_dataset
 from planners.study.setups import Budget, Comparison, Setup
@@ -226,4 +226,4 @@ def study(argv: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(answered(sys.argv[1:], study, lambda: __doc__, NOT_FITTING))
+    sys.exit(run_command(sys.argv[1:], study, lambda: __doc__, INPUT_ERRORS))

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from factory.config.arguments import NOT_FITTING, answered, parse
+from factory.config.arguments import INPUT_ERRORS, parse, run_command
 from planners.evaluation.aggregation import PAPER, HumanFilter
 from planners.evaluation.compare import CompareSettings, compare
 from planners.study.report import StudyFrames, read_study, write_tables
@@ -66,4 +66,4 @@ def tables(argv: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(answered(sys.argv[1:], tables, lambda: __doc__, NOT_FITTING))
+    sys.exit(run_command(sys.argv[1:], tables, lambda: __doc__, INPUT_ERRORS))

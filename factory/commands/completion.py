@@ -8,11 +8,19 @@ from typing import Literal
 
 from factory.commands.table import COMMANDS, DOORS
 from factory.config.arguments import POSITIONAL, RUN_SETTINGS, ComposedCommand, given_as, groups_of, keys_of, request_of
+from factory.config.arguments import (
+    POSITIONAL,
+    RUN_SETTINGS,
+    ComposedCommand,
+    config_groups,
+    fields_with,
+    request_class_of,
+    request_keys,
+)
 from factory.config.compose import conf_dir
-from factory.config.plugins import choices
-from factory.config.run import EXPERTS, built_in_classes, reader_of
-from factory.config.shapes import choices_of, dataclass_in
-from factory.config.shapes import keys_of as settings_in
+from factory.config.plugins import group_choices
+from factory.config.run import EXPERTS, built_in_classes, reader_settings_class
+from factory.config.shapes import allowed_values, dataclass_in, setting_keys
 from factory.run import main as run
 
 MODULES = ("factory", "factory.run", "planners", "planners.drive")  # what `python -m` starts
@@ -86,11 +94,11 @@ def complete(argv: Sequence[str]) -> int:
     door, *first = program.split(".")
     if first:  # python -m factory.run
         words = ["run" if door == "factory" else "drive", *words]
-    print("\n".join(sorted(found for found in candidates(words, last, door) if found.startswith(last))))
+    print("\n".join(sorted(found for found in completions(words, last, door) if found.startswith(last))))
     return 0
 
 
-def candidates(words: Sequence[str], last: str, door: str = "factory") -> Iterable[str]:
+def completions(words: Sequence[str], last: str, door: str = "factory") -> Iterable[str]:
     """Whole words that may follow `words`, the last of them begun as `last`."""
     commands = DOORS.get(door, COMMANDS)
     if not words:
@@ -100,12 +108,12 @@ def candidates(words: Sequence[str], last: str, door: str = "factory") -> Iterab
         return ()
     function = commands[name].function()
     if isinstance(function, ComposedCommand):
-        known = settings_of(given, function)
+        known = setting_choices(given, function)
     else:
-        shape = request_of(function)
-        known = settings_of(given) if given_as(shape, RUN_SETTINGS) else {}
-        known |= {key: choices_of(kind) for key, kind in keys_of(shape).items()}
-        if (words := given_as(shape, POSITIONAL)) and not given and known[words[0]]:
+        shape = request_class_of(function)
+        known = setting_choices(given) if fields_with(shape, RUN_SETTINGS) else {}
+        known |= {key: allowed_values(kind) for key, kind in request_keys(shape).items()}
+        if (words := fields_with(shape, POSITIONAL)) and not given and known[words[0]]:
             return known[words[0]]
     key, equals, _ = last.partition("=")
     if equals:
@@ -114,15 +122,15 @@ def candidates(words: Sequence[str], last: str, door: str = "factory") -> Iterab
     return [f"{key}=" for key in known if key not in taken]
 
 
-def settings_of(given: Sequence[str], command: ComposedCommand = run) -> dict[str, list[str]]:
+def setting_choices(given: Sequence[str], command: ComposedCommand = run) -> dict[str, list[str]]:
     """Setting -> its choices where they are few: groups, the command's keys, the chosen reader's, the experts'."""
-    folder, groups = conf_dir(), groups_of(command.conf)
+    folder, groups = conf_dir(), config_groups(command.conf)
     chosen = groups | {key: value for key, _, value in (word.partition("=") for word in given) if key in groups}
-    typed = dict(settings_in(command.shape))
+    typed = dict(setting_keys(command.shape))
     for name, target in built_in_classes("expert").items() if "expert" in typed else ():
-        typed |= dict(settings_in(EXPERTS[target], f"expert.{name}.")) if target in EXPERTS else {}
-    reader = reader_of(chosen.get("clips", ""))
-    typed |= {} if reader is None else dict(settings_in(reader, "clips."))
-    found = {key: choices_of(hint) for key, hint in typed.items() if key != "expert" and dataclass_in(hint) is None}
-    found |= {word: choices(word.partition("@")[0], [folder]) for word in groups}
-    return found | ({"experts": choices("expert", [folder])} if "experts" in typed else {})
+        typed |= dict(setting_keys(EXPERTS[target], f"expert.{name}.")) if target in EXPERTS else {}
+    reader = reader_settings_class(chosen.get("clips", ""))
+    typed |= {} if reader is None else dict(setting_keys(reader, "clips."))
+    found = {key: allowed_values(hint) for key, hint in typed.items() if key != "expert" and dataclass_in(hint) is None}
+    found |= {word: group_choices(word.partition("@")[0], [folder]) for word in groups}
+    return found | ({"experts": group_choices("expert", [folder])} if "experts" in typed else {})

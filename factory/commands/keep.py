@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from factory.commands.look import FolderRequest
 from factory.config.arguments import POSITIONAL, SOME_RUN_SETTINGS, Refused
+from factory.config.arguments import GIVEN_RUN_SETTINGS, POSITIONAL, Refused
 from factory.exits import COMPLETE, DAMAGED
 from factory.views.status import IMPORT_AGAIN, failed_lines, open_store, out_of
 
@@ -27,6 +28,7 @@ class RetryRequest:
 
     out: str
     settings: tuple[str, ...] = field(default=(), metadata=SOME_RUN_SETTINGS)
+    settings: tuple[str, ...] = field(default=(), metadata=GIVEN_RUN_SETTINGS)
 
 
 def retry(request: RetryRequest) -> int:

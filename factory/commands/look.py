@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from factory.config.arguments import POSITIONAL, RUN_SETTINGS, Refused
-from factory.config.run import composed_run, run_config
+from factory.config.run import compose_run, typed_run_config
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.views.sample_text import find, label_lines, labelled_trajectories, logged_drive, number_lines, open_samples
 from factory.views.sample_text import lineage as lineage_parts
@@ -201,7 +201,7 @@ def _explain(request: ExplainRequest) -> None:
     from tasks.subscores import OF_ONE_PLAN
 
     expert, to = request.expert, Path(request.to)
-    config = run_config(composed_run(request.settings) | {"experts": [expert]})
+    config = typed_run_config(compose_run(request.settings) | {"experts": [expert]})
     run = assemble(config)
     ref = clip_named((*run.index.refs, *run.index.broken), request.clip)
     work = run.work

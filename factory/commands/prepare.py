@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import factory.run
 from factory.config.arguments import POSITIONAL, SOME_RUN_SETTINGS, Refused, command, keys_of
 from factory.config.datasets import data_sets
+from factory.config.arguments import GIVEN_RUN_SETTINGS, POSITIONAL, Refused, command, request_keys
 from factory.config.run import RunConfig
-from factory.config.words import asked_of, nearest
+from factory.config.words import did_you_mean, parse_command_line
 
 if TYPE_CHECKING:
     from factory.readers.base import ClipReader
@@ -25,7 +26,7 @@ def plan(argv: Sequence[str]) -> int:
     already, also what the rates there come to. Takes the settings of `python -m factory run`.
     Exit codes: 0 told, 2 bad settings or no clip.
     """
-    return factory.run.run(asked_of(argv), only_plan=True)
+    return factory.run.run(parse_command_line(argv), only_plan=True)
 
 
 @dataclass(frozen=True)
@@ -40,15 +41,15 @@ class VocabularyRequest:
     every_s: float = 0.5  # a window starts this often
     kinematic: bool = False  # out: k seeded trajectories, as a run without vocabulary.file has; reads no clips
     settings: tuple[str, ...] = field(default=(), metadata=SOME_RUN_SETTINGS)
+    settings: tuple[str, ...] = field(default=(), metadata=GIVEN_RUN_SETTINGS)
 
     def __post_init__(self) -> None:
         for key, equals, _ in (word.lstrip("+").partition("=") for word in self.settings):
             if not equals:
                 raise ValueError(f"{key!r}: expected key=value; see --help")
             if key.partition(".")[0] != "clips":
-                raise ValueError(
-                    f"{key}: there is no such setting; see --help{nearest(key, list(keys_of(VocabularyRequest)))}"
-                )
+                meant = did_you_mean(key, list(request_keys(VocabularyRequest)))
+                raise ValueError(f"{key}: there is no such setting; see --help{meant}")
         if self.kinematic and (self.out is None or self.table is not None):
             raise ValueError("kinematic=true makes a vocabulary: give out=<file>.npy, and no table")
         if self.out is None and self.table is None:

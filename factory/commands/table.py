@@ -8,8 +8,8 @@ from importlib import import_module
 from typing import Any
 
 from factory import __version__
-from factory.config.arguments import ComposedCommand, answer
-from factory.config.words import nearest
+from factory.config.arguments import ComposedCommand, run_request_command
+from factory.config.words import did_you_mean
 from factory.exits import BAD_CONFIG
 
 
@@ -28,7 +28,7 @@ class Command:
     def load(self) -> Callable[[Sequence[str]], int]:
         """What answers: arguments -> exit code."""
         function = self.function()
-        return function if isinstance(function, ComposedCommand) else partial(answer, function)
+        return function if isinstance(function, ComposedCommand) else partial(run_request_command, function)
 
 
 LOOK, KEEP, EXCHANGE, PREPARE = (f"factory.commands.{name}" for name in ("look", "keep", "exchange", "prepare"))
@@ -68,7 +68,7 @@ PLANNERS: Mapping[str, Command] = {
 DOORS = {"factory": COMMANDS, "planners": PLANNERS}  # package -> what `python -m <package>` knows
 
 
-def listed(commands: Mapping[str, Command]) -> str:
+def command_list(commands: Mapping[str, Command]) -> str:
     """Every command in one line."""
     return "\n".join(f"  {name:<14}{command.about}" for name, command in commands.items())
 
@@ -85,6 +85,6 @@ def dispatch(argv: Sequence[str], commands: Mapping[str, Command], about: str) -
     if name in commands:
         return commands[name].load()(rest)
     door = next((door for door, known in DOORS.items() if name in known), None)
-    meant = f"; it is python -m {door} {name}" if door else nearest(name, list(commands))
+    meant = f"; it is python -m {door} {name}" if door else did_you_mean(name, list(commands))
     print(f"error: there is no command {name}; see --help{meant}", file=sys.stderr)
     return BAD_CONFIG

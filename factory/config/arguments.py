@@ -13,9 +13,9 @@ from dataclasses import MISSING, dataclass, fields
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from factory.config.compose import conf_dir
-from factory.config.plugins import choices
-from factory.config.shapes import choices_of, defaults_of, described, plain, to_give
-from factory.config.words import SEVERAL, SHOW, ConfigError, SettingsShown, at_home, nearest, without_show
+from factory.config.plugins import group_choices
+from factory.config.shapes import allowed_values, defaults_of, required_keys, to_plain, yaml_lines
+from factory.config.words import SEVERAL, SHOW, ConfigError, SettingsShown, did_you_mean, expand_home, split_off_cfg
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, Failed, Stopped
 
 if TYPE_CHECKING:
@@ -25,9 +25,15 @@ if TYPE_CHECKING:
 POSITIONAL = {"given_as": "positional"}
 RUN_SETTINGS = {"given_as": "run settings"}  # it takes every argument that is no field: settings of the run
 SOME_RUN_SETTINGS = {**RUN_SETTINGS, "of": "some"}  # what is given alone: the rest is recorded, or of no use here
-NOT_FITTING = (ValueError, OSError)  # what settings or files that do not fit raise, where no fault of a stage can
+POSITIONAL = {"given": "word"}
+RUN_SETTINGS = {"given": "run"}  # it takes every argument that is no field: settings of the run
+GIVEN_RUN_SETTINGS = {
+    **RUN_SETTINGS,
+    "of": "some",
+}  # of them what is given alone: the others are recorded, or of no use here
+INPUT_ERRORS = (ValueError, OSError)  # what settings or files that do not fit raise, where no fault of a stage can
 Request = TypeVar("Request", bound="DataclassInstance")
-Does = Callable[[Sequence[str]], int | None]  # arguments -> exit code, none for 0
+CommandFunction = Callable[[Sequence[str]], int | None]  # arguments -> exit code, none for 0
 
 
 class Refused(ValueError):
@@ -38,60 +44,62 @@ class Refused(ValueError):
 class ComposedCommand:
     """A command whose settings Hydra composes: arguments -> exit code."""
 
-    does: Does
+    does: CommandFunction
     conf: str  # the name of its file in conf/
     shape: type[Any]  # of its settings
-    refused: tuple[type[Exception], ...] = NOT_FITTING
+    refused: tuple[type[Exception], ...] = INPUT_ERRORS
     resumes: bool = False  # what the machine ends, the same command goes on with
 
     def __call__(self, argv: Sequence[str]) -> int:
-        """As `answered`."""
-        return answered(argv, self.does, self.help_text, refused=self.refused, resumes=self.resumes)
+        """As `run_command`."""
+        return run_command(argv, self.does, self.help_text, refused=self.refused, resumes=self.resumes)
 
     def help_text(self) -> str:
         """What its module says, the choices of its groups, plug-ins among them, its keys with their defaults."""
         text = (conf_dir() / f"{self.conf}.yaml").read_text(encoding="utf-8")
-        groups = [*groups_of(self.conf), *(["expert"] if "expert@" in text else [])]
-        listed = "\n".join(f"  {word}: {', '.join(choices(word.partition('@')[0], [conf_dir()]))}" for word in groups)
+        groups = [*config_groups(self.conf), *(["expert"] if "expert@" in text else [])]
+        listed = "\n".join(
+            f"  {word}: {', '.join(group_choices(word.partition('@')[0], [conf_dir()]))}" for word in groups
+        )
         told = f"\nchoices; the keys of each: --cfg\n{listed}\n" if groups else ""
         chosen = {word.rpartition("@")[2] for word in groups}
         values = {**_values(self.shape), **dict(re.findall(r"^(\w+): (\S+)", text, re.M))}
         keys = {key: value for key, value in values.items() if key not in chosen}
-        return help_of(f"{about_of(self.does)}{told}", keys, self.shape)
+        return help_text_of(f"{help_intro(self.does)}{told}", keys, self.shape)
 
 
 def command(
-    conf: str, shape: type[Any], refused: tuple[type[Exception], ...] = NOT_FITTING, resumes: bool = False
-) -> Callable[[Does], ComposedCommand]:
+    conf: str, shape: type[Any], refused: tuple[type[Exception], ...] = INPUT_ERRORS, resumes: bool = False
+) -> Callable[[CommandFunction], ComposedCommand]:
     """A function of a command line as a command; the arguments as of ComposedCommand."""
     return lambda does: ComposedCommand(does, conf, shape, refused, resumes)
 
 
-def answer(does: Callable[[Any], int | None], argv: Sequence[str]) -> int:
+def run_request_command(does: Callable[[Any], int | None], argv: Sequence[str]) -> int:
     """The exit code of a command that takes a request."""
-    shape = request_of(does)
-    keys = {name: value for name, value in _values(shape).items() if name in keys_of(shape)}
-    return answered(
+    shape = request_class_of(does)
+    keys = {name: value for name, value in _values(shape).items() if name in request_keys(shape)}
+    return run_command(
         argv,
         lambda words: does(parse(shape, words)),
-        lambda: help_of(about_of(does), keys, shape),
+        lambda: help_text_of(help_intro(does), keys, shape),
         elsewhere=", or give to=<another place>" if "to" in keys else "",
     )
 
 
-def request_of(does: Callable[[Any], int | None]) -> Any:
+def request_class_of(does: Callable[[Any], int | None]) -> Any:
     """The dataclass of a command's request."""
     return get_type_hints(does)["request"]
 
 
-def about_of(does: Callable[..., Any]) -> str:
+def help_intro(does: Callable[..., Any]) -> str:
     """What a command says of itself: its function, or the module where it is the module's only one, `main`."""
     return inspect.cleandoc((sys.modules[does.__module__] if does.__name__ == "main" else does).__doc__ or "") + "\n"
 
 
-def answered(
+def run_command(
     argv: Sequence[str],
-    does: Does,
+    does: CommandFunction,
     about: Callable[[], str],
     refused: tuple[type[Exception], ...] = (),
     resumes: bool = False,
@@ -116,14 +124,16 @@ def answered(
         print(settings)
         return COMPLETE
     except Exception as error:
-        code, line = _end_of(error, refused, resumes, elsewhere)
+        code, line = _exit_of_error(error, refused, resumes, elsewhere)
         if code == COMPLETE:
             raise
         print(line, file=sys.stderr)
         return code
 
 
-def _end_of(error: Exception, refused: tuple[type[Exception], ...], resumes: bool, elsewhere: str) -> tuple[int, str]:
+def _exit_of_error(
+    error: Exception, refused: tuple[type[Exception], ...], resumes: bool, elsewhere: str
+) -> tuple[int, str]:
     """The exit code and the line that an exception ends a command with; COMPLETE for a fault of the program."""
     from factory.files import DiskFull, machine_fault_of, why_not_written
     from factory.wording import one_line
@@ -143,14 +153,14 @@ def _end_of(error: Exception, refused: tuple[type[Exception], ...], resumes: boo
     return COMPLETE, ""
 
 
-def help_of(about: str, keys: Mapping[str, Any], shape: type[Any]) -> str:
+def help_text_of(about: str, keys: Mapping[str, Any], shape: type[Any]) -> str:
     """What a command does, its keys with their defaults and meanings, and its exit codes."""
     ends = "Exit codes: 0 done, 2 refused in one line that says why; all: docs/configuration.md."
     told = [] if "exit codes" in about.lower() else [f"\n{ends}"]
-    return "\n".join([about, "keys and defaults", *described(keys, shape, {}), *told])
+    return "\n".join([about, "keys and defaults", *yaml_lines(keys, shape, {}), *told])
 
 
-def groups_of(conf: str) -> dict[str, str]:
+def config_groups(conf: str) -> dict[str, str]:
     """Group of choices in conf/<conf>.yaml, as a command line names it -> what is chosen there."""
     text = (conf_dir() / f"{conf}.yaml").read_text(encoding="utf-8")
     return dict(re.findall(r"^  - (\w+(?:@\w+)?): (\w+)$", text, re.M))
@@ -158,7 +168,7 @@ def groups_of(conf: str) -> dict[str, str]:
 
 def _values(shape: type[Any]) -> dict[str, Any]:
     """Every key with its default, ??? where it has none, in their order."""
-    known = {**to_give(shape), **defaults_of(shape)}
+    known = {**required_keys(shape), **defaults_of(shape)}
     return {field.name: known[field.name] for field in fields(shape)}
 
 
@@ -168,31 +178,31 @@ def parse(shape: type[Request], argv: Sequence[str]) -> Request:
     Raises Refused for an unknown key, a value missing or of another kind, a key given twice, and a field without a
     default that is not given; with --cfg SettingsShown instead, whatever is not given yet.
     """
-    argv, shows = without_show(argv)
-    kinds, words, rest = keys_of(shape), given_as(shape, POSITIONAL), given_as(shape, RUN_SETTINGS)
+    argv, shows = split_off_cfg(argv)
+    kinds, words, rest = request_keys(shape), fields_with(shape, POSITIONAL), fields_with(shape, RUN_SETTINGS)
     given: dict[str, Any] = dict.fromkeys(rest, ())
     for argument in argv:
         key, equals, value = argument.partition("=")
         if key in kinds and value:
             if key in given:
                 raise Refused(f"{key} is given twice")
-            given[key] = at_home(_value(key, value, kinds[key]), key)
+            given[key] = expand_home(_value(key, value, kinds[key]), key)
         elif words and not equals and not argument.startswith("-"):
             name = words[0]
             if get_origin(kinds[name]) is tuple:
-                given[name] = (*given.get(name, ()), at_home(argument, name))
+                given[name] = (*given.get(name, ()), expand_home(argument, name))
                 continue
             if name in given:
                 raise Refused(f"{name} is given twice")
-            given[name] = at_home(_value("", argument, kinds[words.pop(0)]), name)
+            given[name] = expand_home(_value("", argument, kinds[words.pop(0)]), name)
         elif rest:
             given[rest[0]] += (argument,)
         else:
             known = [f"{name}=" for name in kinds]
-            near = "" if key in kinds else nearest(key, known)
+            near = "" if key in kinds else did_you_mean(key, known)
             raise Refused(f"{argument!r}: expected one of {'..., '.join(known)}...; see --help{near}")
     if shows:
-        raise SettingsShown("\n".join(_shown(shape, given)))
+        raise SettingsShown("\n".join(_settings_as_yaml(shape, given)))
     for field in fields(shape):
         if field.default is MISSING and field.name not in given:
             choices = "|".join(map(str, get_args(kinds[field.name])))
@@ -204,37 +214,39 @@ def parse(shape: type[Request], argv: Sequence[str]) -> Request:
         raise Refused(str(error)) from error
 
 
-def keys_of(shape: type["DataclassInstance"]) -> dict[str, Any]:
+def request_keys(shape: type["DataclassInstance"]) -> dict[str, Any]:
     """Key -> type of a request's fields, less the one that takes the settings of the run."""
     hints, rest = get_type_hints(shape), given_as(shape, RUN_SETTINGS)
+    hints, rest = get_type_hints(shape), fields_with(shape, RUN_SETTINGS)
     return {field.name: hints[field.name] for field in fields(shape) if field.name not in rest}
 
 
-def given_as(shape: type["DataclassInstance"], how: Mapping[str, str]) -> list[str]:
+def fields_with(shape: type["DataclassInstance"], how: Mapping[str, str]) -> list[str]:
     """The fields that are given as words, or that take the settings of the run."""
     return [field.name for field in fields(shape) if how.items() <= field.metadata.items()]
 
 
-def _shown(shape: type["DataclassInstance"], given: Mapping[str, Any]) -> Iterator[str]:
+def _settings_as_yaml(shape: type["DataclassInstance"], given: Mapping[str, Any]) -> Iterator[str]:
     """The keys of a request as YAML, and behind them the settings of the run that it takes."""
-    own = keys_of(shape)
-    values = {**_values(shape), **{name: plain(value) for name, value in given.items()}}
-    yield from described({name: values[name] for name in own}, shape, {})
-    for name in given_as(shape, RUN_SETTINGS):
+    own = request_keys(shape)
+    values = {**_values(shape), **{name: to_plain(value) for name, value in given.items()}}
+    yield from yaml_lines({name: values[name] for name in own}, shape, {})
+    for name in fields_with(shape, RUN_SETTINGS):
         groups = {re.split("[=.@]", word.lstrip("+"))[0] for word in given[name]}
         keeps = True
         for line in _settings_of_run(given[name]).splitlines():
             if name in given_as(shape, SOME_RUN_SETTINGS) and not line.startswith(" "):
+            if name in fields_with(shape, GIVEN_RUN_SETTINGS) and not line.startswith(" "):
                 keeps = line.partition(":")[0] in groups
             if keeps:
                 yield line
 
 
 def _settings_of_run(words: Sequence[str]) -> str:
-    from factory.config.run import composed_run
+    from factory.config.run import compose_run
 
     try:
-        composed_run([SHOW[0], *words])
+        compose_run([SHOW[0], *words])
     except SettingsShown as settings:
         return str(settings)
     raise AssertionError("what is only to be shown is shown")
@@ -242,10 +254,10 @@ def _settings_of_run(words: Sequence[str]) -> str:
 
 def _value(key: str, text: str, kind: Any) -> Any:
     allowed, said = {kind, *get_args(kind)}, f"{key}={text}" if key else repr(text)
-    choices = choices_of(kind)
+    choices = allowed_values(kind)
     if choices and (text.lower() if bool in allowed else text) not in choices:
         listed = "true or false" if bool in allowed else f"one of {', '.join(choices)}"
-        raise Refused(f"{said}: must be {listed}{nearest(text, choices)}")
+        raise Refused(f"{said}: must be {listed}{did_you_mean(text, choices)}")
     if bool in allowed:
         return text.lower() == "true"
     if int in allowed and not (text.isascii() and text.isdecimal()):

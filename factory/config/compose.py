@@ -7,9 +7,17 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
-from factory.config.plugins import offer_choices
-from factory.config.shapes import dataclass_in, defaults_of, described, keys_of, merged, to_give
-from factory.config.words import ConfigError, SettingsShown, asked_of, at_home, nearest, no_such_choice, readable
+from factory.config.plugins import register_plugin_choices
+from factory.config.shapes import dataclass_in, deep_merge, defaults_of, required_keys, setting_keys, yaml_lines
+from factory.config.words import (
+    ConfigError,
+    SettingsShown,
+    as_hydra_override,
+    did_you_mean,
+    expand_home,
+    parse_command_line,
+    unknown_choice_text,
+)
 from factory.files import default_runs_folder, folders_in
 
 T = TypeVar("T")
@@ -57,7 +65,7 @@ def compose(
     Raises SettingsShown for --cfg, where what must be given may be missing, and ConfigError for a misspelt key, an
     unknown choice, bad syntax or a value that must be given and is not.
     """
-    asked = asked_of(words)
+    asked = parse_command_line(words)
     need_run_extra("hydra", "omegaconf")
     import hydra
     from hydra.errors import HydraException, MissingConfigException
@@ -67,10 +75,10 @@ def compose(
     OmegaConf.register_new_resolver("runs", default_runs_folder, replace=True)
     groups = {path.name for root in (conf_dir(), *asked.folders) for path in folders_in(root)}
     overrides = []  # held against the dataclasses and not against conf/, which says few keys: Hydra takes any
-    for word in map(readable, asked.overrides):
+    for word in map(as_hydra_override, asked.overrides):
         plain = word.lstrip("+")
         overrides.append(word if re.split("[=@]", plain)[0] in groups else f"++{plain}")
-    offer_choices(overrides, conf_dir(), asked.folders)
+    register_plugin_choices(overrides, conf_dir(), asked.folders)
     if asked.folders:
         quoted = ",".join(f"'file://{folder!s}'" for folder in asked.folders)
         overrides.append(f"hydra.searchpath=[{quoted}]")
@@ -88,19 +96,19 @@ def compose(
         what = "<folder>" if key.endswith("root") else "<value>"
         raise ConfigError(f"{key} is missing: give {key}={what}") from error
     except MissingConfigException as error:
-        raise ConfigError(no_such_choice(error.missing_cfg_file or "", error.options)) from error
+        raise ConfigError(unknown_choice_text(error.missing_cfg_file or "", error.options)) from error
     except (HydraException, OmegaConfBaseException) as error:
         cause = f" ({error.__cause__})" if error.__cause__ is not None else ""
         raise ConfigError(f"{str(error).strip()}{cause}".splitlines()[0]) from error
     assert isinstance(resolved, dict)
-    values = {str(key): at_home(value, str(key)) for key, value in resolved.items()}
+    values = {str(key): expand_home(value, str(key)) for key, value in resolved.items()}
     if shape is not None:
         refuse_unknown(shape, values, "")
-        values = merged(defaults_of(shape), values)
-        values = {**to_give(shape), **values} if asked.shows else values
+        values = deep_merge(defaults_of(shape), values)
+        values = {**required_keys(shape), **values} if asked.shows else values
     values = completed(values)
     if asked.shows:
-        raise SettingsShown("\n".join(described(values, shape, shapes(values))))
+        raise SettingsShown("\n".join(yaml_lines(values, shape, shapes(values))))
     return values
 
 
@@ -162,7 +170,7 @@ def _message(error: Any) -> str:
     kind, value = str(error["type"]), error["input"]
     if kind in ("literal_error", "enum"):
         known = str(error["ctx"]["expected"]).replace("'", "")
-        return f"must be {known}{nearest(str(value), known.replace(' or ', ', ').split(', '))}"
+        return f"must be {known}{did_you_mean(str(value), known.replace(' or ', ', ').split(', '))}"
     known_kind = WORDS_OF.get(kind.partition("_")[0])
     return known_kind or str(error["msg"]).removeprefix("Value error, ")
 
@@ -175,10 +183,10 @@ def refuse_unknown(
     said: what else is known of such a key.
     """
     prefix = f"{where}." if where else ""
-    known = [key for key, _ in keys_of(cls, prefix)]
+    known = [key for key, _ in setting_keys(cls, prefix)]
     for key in _dotted(cls, values, prefix):
         if key not in known:
-            meant = nearest(key, known)
+            meant = did_you_mean(key, known)
             more = f"{meant.removesuffix('?')}=?" if meant else "; see --help"
             raise ConfigError(said(key) or f"{key}: there is no such setting{more}")
 

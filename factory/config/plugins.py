@@ -17,7 +17,7 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
 
-from factory.config.words import ConfigError, nearest
+from factory.config.words import ConfigError, did_you_mean
 from factory.files import matching
 from factory.wording import one_line
 from tasks.stages import FRAMES
@@ -50,7 +50,7 @@ class Plugin:
         return f"{self.module}:{self.attribute}"
 
 
-def offered(kind: str) -> dict[str, list[Plugin]]:
+def plugins_by_name(kind: str) -> dict[str, list[Plugin]]:
     """Name -> what installed packages offer under it; kind: a key of GROUPS."""
     found: dict[str, list[Plugin]] = {}
     for entry in _declared(_installed_since()).select(group=GROUPS[kind]):
@@ -71,12 +71,12 @@ def _declared(installed_since: tuple[tuple[str, int], ...]) -> Any:
     return entry_points()
 
 
-def installed(kind: str, name: str, built_in: Collection[str]) -> Plugin | None:
+def plugin_named(kind: str, name: str, built_in: Collection[str]) -> Plugin | None:
     """The one plug-in of that name, None where there is none.
 
     Raises ConfigError naming the packages where two offer it, or one offers what is built in.
     """
-    plugins = offered(kind).get(name, [])
+    plugins = plugins_by_name(kind).get(name, [])
     if not plugins:
         return None
     by = " and ".join(plugin.package for plugin in plugins)
@@ -87,21 +87,21 @@ def installed(kind: str, name: str, built_in: Collection[str]) -> Plugin | None:
     return plugins[0]
 
 
-def names(kind: str) -> list[str]:
+def plugin_names(kind: str) -> list[str]:
     """What is offered, sorted, for messages."""
-    return list(offered(kind))
+    return list(plugins_by_name(kind))
 
 
-def choices(group: str, folders: Sequence[Path]) -> list[str]:
+def group_choices(group: str, folders: Sequence[Path]) -> list[str]:
     """What a group of settings offers, sorted: files of its name in the folders, and what packages add to it."""
-    return sorted({*_files(group, folders), *(names(group) if group in GROUPS else ())})
+    return sorted({*_files(group, folders), *(plugin_names(group) if group in GROUPS else ())})
 
 
 def _files(group: str, folders: Sequence[Path]) -> set[str]:
     return {file.stem for folder in folders for file in matching(folder / group, "*.yaml")}
 
 
-def offer_choices(overrides: Sequence[str], conf: Path, folders: Sequence[Path] = ()) -> None:
+def register_plugin_choices(overrides: Sequence[str], conf: Path, folders: Sequence[Path] = ()) -> None:
     """Make `clips=<name>` and `planner=<name>` choices of Hydra's.
 
     conf, folders: where the files of the other choices lie. Raises ConfigError where the one that is chosen clashes.
@@ -113,8 +113,8 @@ def offer_choices(overrides: Sequence[str], conf: Path, folders: Sequence[Path] 
     for group in ("clips", "planner"):
         built_in = _files(group, (conf, *folders))
         if group in chosen:
-            installed(group, chosen[group], built_in)
-        for name, plugins in offered(group).items():
+            plugin_named(group, chosen[group], built_in)
+        for name, plugins in plugins_by_name(group).items():
             if name in built_in or len(plugins) > 1:
                 continue
             node = OmegaConf.load(conf / group / "custom.yaml")
@@ -124,7 +124,7 @@ def offer_choices(overrides: Sequence[str], conf: Path, folders: Sequence[Path] 
             ConfigStore.instance().store(name=name, node=node, group=group, provider=plugins[0].package)
 
 
-def with_experts(values: Mapping[str, Any], conf: Path) -> dict[str, Any]:
+def add_installed_experts(values: Mapping[str, Any], conf: Path) -> dict[str, Any]:
     """Composed settings with every installed expert as `expert.<name>`; what the command line says of one is kept.
 
     conf: where the files of the built-in ones lie. Raises ConfigError where one that `experts` names clashes.
@@ -132,11 +132,11 @@ def with_experts(values: Mapping[str, Any], conf: Path) -> dict[str, Any]:
     specs = {name: dict(spec) for name, spec in values["expert"].items()}
     built_in = {*_files("expert", (conf,)), *FRAMES}
     asked = [values["experts"]] if isinstance(values["experts"], str) else values["experts"]
-    for name, plugins in offered("expert").items():
+    for name, plugins in plugins_by_name("expert").items():
         if "_target_" in specs.get(name, {}) and name not in built_in:
             continue  # the command line names a class
         if name in asked:
-            installed("expert", name, built_in)
+            plugin_named("expert", name, built_in)
         if name not in built_in and len(plugins) == 1:
             specs[name] = {"_target_": plugins[0].target, **specs.get(name, {})}
     return {**values, "expert": specs}
@@ -149,23 +149,23 @@ def with_experts(values: Mapping[str, Any], conf: Path) -> dict[str, Any]:
 NEAR_MODULE = 0.75  # hundreds are installed: likenesses of short names mean nothing
 
 
-def class_of(spec: Mapping[str, Any], where: str, example: str) -> Any:
+def import_target(spec: Mapping[str, Any], where: str, example: str) -> Any:
     """What `spec["_target_"]` names, a class or a function. Raises ConfigError.
 
     where: the group of settings, for the message; example: a name of the user's own, for where none is given.
     """
     if "_target_" not in spec:
         raise ConfigError(f"{where}._target_ is missing: name the class to use, such as {example}")
-    return object_named(str(spec["_target_"]), where, example)
+    return import_object(str(spec["_target_"]), where, example)
 
 
-def object_named(name: str, where: str, example: str) -> Any:
+def import_object(name: str, where: str, example: str) -> Any:
     """The class or function of a name such as `package.module.Class` or `package.module:Class`. Raises ConfigError."""
     said, parts = f"{where}: {name}", name.replace(":", ".").split(".")
     if len(parts) < 2 or not all(parts):
         raise ConfigError(f"{said}: name a class with its module, such as {example}")
     if parts[0] != "__main__" and find_spec(parts[0]) is None:
-        meant = nearest(parts[0], [module.name for module in iter_modules()], NEAR_MODULE)
+        meant = did_you_mean(parts[0], [module.name for module in iter_modules()], NEAR_MODULE)
         raise ConfigError(f"{said}: there is no module {parts[0]}{meant or '; is it installed, or on PYTHONPATH?'}")
     depth = 1
     try:
@@ -179,6 +179,6 @@ def object_named(name: str, where: str, example: str) -> Any:
     for i in range(depth, len(parts)):
         if not hasattr(found, parts[i]):
             inside = [*vars(found), *(module.name for module in iter_modules(getattr(found, "__path__", [])))]
-            raise ConfigError(f"{said}: {'.'.join(parts[:i])} has no {parts[i]}{nearest(parts[i], inside)}")
+            raise ConfigError(f"{said}: {'.'.join(parts[:i])} has no {parts[i]}{did_you_mean(parts[i], inside)}")
         found = getattr(found, parts[i])
     return found

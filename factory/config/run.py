@@ -11,9 +11,9 @@ from typing import Any, Literal
 
 from factory.config.compose import compose, conf_dir, fill, need_run_extra, refuse_unknown
 from factory.config.datasets import reader_settings
-from factory.config.plugins import with_experts
-from factory.config.shapes import defaults_of, keys_of, merged
-from factory.config.words import ConfigError, nearest
+from factory.config.plugins import add_installed_experts
+from factory.config.shapes import deep_merge, defaults_of, setting_keys
+from factory.config.words import ConfigError, did_you_mean
 from factory.files import in_submitted_job, matching
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.settings import ExpertGate, PdmSettings, PerturbSettings, RecoverySettings, TrafficSettings
@@ -103,7 +103,9 @@ class GraphChoice:
         for key in ("memory_gb", "limit_s", "limit_gb"):
             for name, value in getattr(self, key).items():
                 if name not in known:
-                    raise ValueError(f"{key}.{name}: there is no such task{nearest(name, known)}; there are {known}")
+                    raise ValueError(
+                        f"{key}.{name}: there is no such task{did_you_mean(name, known)}; there are {known}"
+                    )
                 if not value >= 0.0:
                     raise ValueError(f"{key}.{name}={value}: must not be negative")
 
@@ -159,7 +161,7 @@ class RunConfig:
         unknown = [name for name in self.experts if name not in known]
         if unknown:
             raise ValueError(
-                f"experts: {unknown} is not among {known}{nearest(unknown[0], known)}; "
+                f"experts: {unknown} is not among {known}{did_you_mean(unknown[0], known)}; "
                 "add your own with expert.<name>._target_=<class>"
             )
 
@@ -169,24 +171,24 @@ class RunConfig:
         return {"none": 0, "all": 1}[self.episodes] if isinstance(self.episodes, str) else self.episodes
 
 
-def composed_run(words: Sequence[str]) -> dict[str, Any]:
+def compose_run(words: Sequence[str]) -> dict[str, Any]:
     """The settings of a command line with all defaults, not yet typed. Raises ConfigError, SettingsShown."""
-    return compose("run", words, RunConfig, _with_groups, shapes_in)
+    return compose("run", words, RunConfig, _with_defaults, settings_classes)
 
 
-def _with_groups(values: Mapping[str, Any]) -> dict[str, Any]:
+def _with_defaults(values: Mapping[str, Any]) -> dict[str, Any]:
     """With every installed expert, and the defaults of the chosen reader and of the experts."""
-    values = with_experts(values, conf_dir())
-    for key, shape in shapes_in(values).items():
+    values = add_installed_experts(values, conf_dir())
+    for key, shape in settings_classes(values).items():
         group, _, name = key.partition(".")
         given = values[group][name] if name else values[group]
-        refuse_unknown(shape, without_labels(given), key, said=_elsewhere)
-        full = {**given, **merged(defaults_of(shape), given)}
+        refuse_unknown(shape, own_settings(given), key, said=_choices_with_key)
+        full = {**given, **deep_merge(defaults_of(shape), given)}
         values = {**values, group: {**values[group], name: full} if name else full}
     return values
 
 
-def run_config(values: Mapping[str, Any]) -> RunConfig:
+def typed_run_config(values: Mapping[str, Any]) -> RunConfig:
     """The typed settings of composed ones, those of the reader and of the experts held against their types too.
 
     Raises ConfigError.
@@ -194,9 +196,9 @@ def run_config(values: Mapping[str, Any]) -> RunConfig:
     config = fill(RunConfig, values, "")
     rig: tuple[str, ...] = ()
     painted = config.render.mode is RenderMode.PAINTER
-    for key, shape in shapes_in(values).items():
+    for key, shape in settings_classes(values).items():
         group, _, name = key.partition(".")
-        filled = fill(shape, without_labels(values[group][name] if name else values[group]), key)
+        filled = fill(shape, own_settings(values[group][name] if name else values[group]), key)
         rig = filled.rig(painted) if key == "clips" else rig
     asked = config.render.cameras if rig and config.render.mode is not RenderMode.NONE else ()
     if missing := [name for name in asked if name not in rig]:
@@ -211,7 +213,7 @@ def run_config(values: Mapping[str, Any]) -> RunConfig:
 def photos_alone(config: RunConfig) -> bool:
     """Whether clips may have photos and no lidar, as far as the settings of their reader tell. Raises ConfigError."""
     shape = reader_settings(config.clips)
-    return shape is None or bool(fill(shape, without_labels(config.clips), "clips").photos_alone)
+    return shape is None or bool(fill(shape, own_settings(config.clips), "clips").photos_alone)
 
 
 def refuse_relative_root(clips: Mapping[str, Any]) -> None:
@@ -235,10 +237,10 @@ def refuse_missing_root(clips: Mapping[str, Any]) -> None:
 
 def load_config(words: Sequence[str]) -> RunConfig:
     """The typed settings of a command line. Raises ConfigError."""
-    return run_config(composed_run(words))
+    return typed_run_config(compose_run(words))
 
 
-def shapes_in(values: Mapping[str, Any]) -> dict[str, type[Any]]:
+def settings_classes(values: Mapping[str, Any]) -> dict[str, type[Any]]:
     """Key -> dataclass of the built-in reader and experts that a run's settings name."""
     reader = reader_settings(values["clips"])
     experts = {
@@ -249,10 +251,10 @@ def shapes_in(values: Mapping[str, Any]) -> dict[str, type[Any]]:
     return {**({} if reader is None else {"clips": reader}), **experts}
 
 
-def without_labels(spec: Mapping[str, Any]) -> dict[str, Any]:
+def own_settings(spec: Mapping[str, Any]) -> dict[str, Any]:
     """What is a setting of the reader or expert itself."""
     return {
-        key: without_labels(value) if isinstance(value, Mapping) else value
+        key: own_settings(value) if isinstance(value, Mapping) else value
         for key, value in spec.items()
         if key not in ("name", "_target_")
     }
@@ -267,15 +269,15 @@ def built_in_classes(group: str) -> dict[str, str]:
     return {name: target[1] for name, target in sorted(found.items()) if target}
 
 
-def reader_of(choice: str) -> type[Any] | None:
+def reader_settings_class(choice: str) -> type[Any] | None:
     """The settings of the built-in reader `clips=<choice>`; None where there is none of that name."""
     return reader_settings({"_target_": built_in_classes("clips").get(choice, "")})
 
 
-def _elsewhere(key: str) -> str:
+def _choices_with_key(key: str) -> str:
     """Which other choices have this key of `clips`."""
     group, _, inner = key.partition(".")
     names = [file.stem for file in matching(conf_dir() / "clips", "*.yaml")] if group == "clips" else []
-    shapes = {name: shape for name in names if (shape := reader_of(name)) is not None}
-    having = [f"clips={name}" for name, shape in shapes.items() if inner in dict(keys_of(shape))]
+    shapes = {name: shape for name in names if (shape := reader_settings_class(name)) is not None}
+    having = [f"clips={name}" for name, shape in shapes.items() if inner in dict(setting_keys(shape))]
     return f"{key} is a setting of {', '.join(having)}: choose one of them too" if having else ""

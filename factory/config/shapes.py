@@ -28,17 +28,17 @@ def dataclass_in(hint: Any) -> type[Any] | None:
     return next((option for option in options if isinstance(option, type) and is_dataclass(option)), None)
 
 
-def keys_of(shape: type[Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def setting_keys(shape: type[Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Every key with dots that may be set, groups before what is in them, and its type."""
     hints = get_type_hints(shape)
     for field in configurable_fields(shape):
         yield f"{prefix}{field.name}", hints[field.name]
         inner = dataclass_in(hints[field.name])
         if inner is not None:
-            yield from keys_of(inner, f"{prefix}{field.name}.")
+            yield from setting_keys(inner, f"{prefix}{field.name}.")
 
 
-def choices_of(hint: Any) -> list[str]:
+def allowed_values(hint: Any) -> list[str]:
     """The words that a key may have, where they are few."""
     if hint is bool:
         return list(SWITCH)
@@ -46,7 +46,7 @@ def choices_of(hint: Any) -> list[str]:
         return [str(member.value) for member in hint]
     if get_origin(hint) is Literal:
         return [str(value) for value in get_args(hint)]
-    return [choice for option in get_args(hint) if get_origin(option) is Literal for choice in choices_of(option)]
+    return [choice for option in get_args(hint) if get_origin(option) is Literal for choice in allowed_values(option)]
 
 
 def defaults_of(shape: type[Any]) -> dict[str, Any]:
@@ -54,9 +54,10 @@ def defaults_of(shape: type[Any]) -> dict[str, Any]:
     return {
         field.name: plain(_default(field)) for field in configurable_fields(shape) if _default(field) is not MISSING
     }
+    return {field.name: to_plain(_default(field)) for field in offered(shape) if _default(field) is not MISSING}
 
 
-def to_give(shape: type[Any]) -> dict[str, Any]:
+def required_keys(shape: type[Any]) -> dict[str, Any]:
     """Key -> ??? of every field that has no default."""
     return {field.name: GIVE for field in configurable_fields(shape) if _default(field) is MISSING}
 
@@ -65,27 +66,30 @@ def _default(field: Field[Any]) -> Any:
     return field.default if field.default_factory is MISSING else field.default_factory()
 
 
-def plain(value: Any) -> Any:
+def to_plain(value: Any) -> Any:
     """Dataclasses as mappings of what they offer, tuples as lists, enums as text."""
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: plain(getattr(value, field.name)) for field in configurable_fields(type(value))}
+        return {field.name: to_plain(getattr(value, field.name)) for field in offered(type(value))}
     if isinstance(value, Mapping):
-        return {key: plain(inner) for key, inner in value.items()}
+        return {key: to_plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
+        return [to_plain(inner) for inner in value]
     return value.value if isinstance(value, Enum) else value
 
 
-def merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+def deep_merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """`under` with what `over` says, group by group."""
     both = {
-        key: merged(under[key], value) if isinstance(value, Mapping) and isinstance(under.get(key), Mapping) else value
+        key: deep_merge(under[key], value)
+        if isinstance(value, Mapping) and isinstance(under.get(key), Mapping)
+        else value
         for key, value in over.items()
     }
     return {**under, **both}
 
 
-def meanings(shape: type[Any]) -> Mapping[str, str]:
+def field_comments(shape: type[Any]) -> Mapping[str, str]:
     """Field -> its comment; of a group without one, the first sentence of its docstring."""
     found: dict[str, str] = {}
     for cls in reversed(shape.__mro__):
@@ -114,7 +118,7 @@ def _comments(cls: type[Any]) -> dict[str, str]:
     return found
 
 
-def described(
+def yaml_lines(
     values: Mapping[str, Any], shape: type[Any] | None, others: Mapping[str, type[Any]], key: str = ""
 ) -> Iterator[str]:
     """The values as lines of YAML, each with its meaning behind it.
@@ -122,16 +126,16 @@ def described(
     others: key with dots -> the dataclass of a group that `shape` leaves open.
     """
     hints = {} if shape is None else get_type_hints(shape)
-    about = {} if shape is None else meanings(shape)
+    about = {} if shape is None else field_comments(shape)
     for name, value in values.items():
         path = f"{key}.{name}" if key else name
-        words = choices_of(hints.get(name))
+        words = allowed_values(hints.get(name))
         said = "; ".join(filter(None, (" | ".join(words) if words != list(SWITCH) else "", about.get(name))))
         comment = f"  # {said}" if said else ""
         pad = "  " * path.count(".")
         if isinstance(value, Mapping) and value:
             yield f"{pad}{name}:{comment}"
-            yield from described(value, others.get(path, dataclass_in(hints.get(name))), others, path)
+            yield from yaml_lines(value, others.get(path, dataclass_in(hints.get(name))), others, path)
         else:
             yield f"{pad}{name}: {_scalar(value)}{comment}"
 

@@ -31,7 +31,7 @@ class SettingsShown(Exception):
 
 
 @dataclass(frozen=True)
-class Asked:
+class CommandLine:
     """What a command line asks for."""
 
     overrides: tuple[str, ...]
@@ -45,7 +45,7 @@ class Asked:
         return [*show, *(f"--config-dir={folder}" for folder in self.folders), *self.overrides]
 
 
-def without_show(words: Sequence[str]) -> tuple[list[str], bool]:
+def split_off_cfg(words: Sequence[str]) -> tuple[list[str], bool]:
     """The words without --cfg, and whether it was among them. Raises ConfigError where it asks for other settings."""
     others: list[str] = []
     shows = False
@@ -63,18 +63,18 @@ def without_show(words: Sequence[str]) -> tuple[list[str], bool]:
     return others, shows
 
 
-def asked_of(words: Sequence[str]) -> Asked:
+def parse_command_line(words: Sequence[str]) -> CommandLine:
     """The words sorted into settings and options. Raises ConfigError for a word that is neither."""
     overrides: list[str] = []
     folders: list[Path] = []
-    rest, shows = without_show(words)
+    rest, shows = split_off_cfg(words)
     while rest:
         word = rest.pop(0)
         option, equals, value = word.partition("=")
         if option in FOLDER:
             if not equals:
                 value = rest.pop(0) if rest else ""
-            folder = Path(at_home(value, option))
+            folder = Path(expand_home(value, option))
             if not value or not folder.is_dir():
                 raise ConfigError(f"{option} {value}: there is no such folder".replace("  ", " "))
             folders.append(folder.resolve())
@@ -87,10 +87,10 @@ def asked_of(words: Sequence[str]) -> Asked:
             raise ConfigError(f"{word!r}: expected key=value; see --help")
         else:
             overrides.append(word)
-    return Asked(tuple(overrides), tuple(folders), shows)
+    return CommandLine(tuple(overrides), tuple(folders), shows)
 
 
-def readable(word: str) -> str:
+def as_hydra_override(word: str) -> str:
     """An override that Hydra reads. Raises ConfigError for a list without its end, and for several values."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
@@ -103,7 +103,7 @@ def readable(word: str) -> str:
             raise ConfigError(f"{word!r}: expected key=value; see --help") from error
         if value[:1] and value[0] in NEEDS_READING:
             if (quoted := HOME.sub(r"'\g<0>'", value)) != value:
-                return readable(f"{key}={quoted}")
+                return as_hydra_override(f"{key}={quoted}")
             raise ConfigError(
                 f"{word}: cannot be read; a list is {key}=[a,b], all of it in quotes for the shell"
             ) from (error)
@@ -114,16 +114,16 @@ def readable(word: str) -> str:
     return word
 
 
-def at_home(value: Any, key: str) -> Any:
+def expand_home(value: Any, key: str) -> Any:
     """A value whose texts that begin with `~` or `~user`, in lists and mappings too, are paths in those home folders.
 
     It goes by the text and not by the key, so that no key that names a file can be forgotten, a plug-in's among them.
     Raises ConfigError naming the key where there is no such home.
     """
     if isinstance(value, Mapping):
-        return {name: at_home(inner, f"{key}.{name}" if key else str(name)) for name, inner in value.items()}
+        return {name: expand_home(inner, f"{key}.{name}" if key else str(name)) for name, inner in value.items()}
     if isinstance(value, list | tuple):
-        return type(value)(at_home(inner, key) for inner in value)
+        return type(value)(expand_home(inner, key) for inner in value)
     if not isinstance(value, str) or not value.startswith("~"):
         return value
     path = os.path.expanduser(value)  # a Path would raise, and lose a slash at the end
@@ -133,15 +133,15 @@ def at_home(value: Any, key: str) -> Any:
     return path
 
 
-def no_such_choice(missing: str, choices: Sequence[str] | None) -> str:
+def unknown_choice_text(missing: str, choices: Sequence[str] | None) -> str:
     """`missing`: group/choice as Hydra names it."""
     group, _, choice = missing.rpartition("/")
     known = sorted(choices or ())
-    meant = nearest(choice, known).replace("mean ", f"mean {group}=")
+    meant = did_you_mean(choice, known).replace("mean ", f"mean {group}=")
     return f"{group}={choice}: there is {', '.join(known) or 'no choice'}{meant}"
 
 
-def nearest(word: str, known: Sequence[str], cutoff: float = 0.6) -> str:
+def did_you_mean(word: str, known: Sequence[str], cutoff: float = 0.6) -> str:
     """`; did you mean x?` where one is near, else nothing. cutoff: 0..1, the likeness that counts as near."""
     found = get_close_matches(word, known, n=1, cutoff=cutoff)
     return f"; did you mean {found[0]}?" if found else ""

@@ -131,13 +131,17 @@ def calibrate(run: Run, refs: Sequence[ClipRef], store: Store | None = None) -> 
         ),
         f"expected for {len(refs)} clips: {sums.attempts * factor:.0f} attempts, {sums.accepted * factor:.0f} samples, "
         f"{sums.row_bytes * factor / 1e9:.3f} GB before compression, {total}",
-        *(by_the_tables(store, run.config.experts, run.config.rounds, len(refs)) if store is not None else ()),
+        *(
+            extrapolated_from_tables(store, run.config.experts, run.config.rounds, len(refs))
+            if store is not None
+            else ()
+        ),
         *sums.notes,
     ]
     return "\n".join(lines)
 
 
-def by_the_tables(store: Store, experts: Sequence[str], rounds: int, n_clips: int) -> list[str]:
+def extrapolated_from_tables(store: Store, experts: Sequence[str], rounds: int, n_clips: int) -> list[str]:
     """For every expert with attempts in the tables: what so many clips come to at its rates there.
 
     Rounds that the tables do not hold go on at the rates of the last one they do.
@@ -165,11 +169,11 @@ def by_the_tables(store: Store, experts: Sequence[str], rounds: int, n_clips: in
 
 def setup_text(config: RunConfig, vocabulary: Vocabulary) -> str:
     """One line: settings that are not preset=paper's, with those in brackets, and what no preset makes the paper's."""
-    found = [*differences(config, vocabulary), *beyond_settings(config)]
+    found = [*differences_from_paper(config, vocabulary), *fixed_differences_from_paper(config)]
     return f"set-up: not the paper's (in brackets; preset=paper comes nearest): {', '.join(found)}"
 
 
-def beyond_settings(config: RunConfig) -> list[str]:
+def fixed_differences_from_paper(config: RunConfig) -> list[str]:
     """What of this set-up is not as the paper's text (3.2, supplement) or the public code has it, in any preset."""
     found = ["walks that go on to the next candidate until one is accepted (the rates fit one draw a round)"]
     if config.traffic.mode == "idm":
@@ -181,7 +185,7 @@ def beyond_settings(config: RunConfig) -> list[str]:
     return found
 
 
-def differences(config: RunConfig, vocabulary: Vocabulary) -> list[str]:
+def differences_from_paper(config: RunConfig, vocabulary: Vocabulary) -> list[str]:
     """`key=value (the paper's)` for each watched setting that is another.
 
     Nothing is said of pictures where none are rendered, nor of experts that do not drive.

@@ -12,16 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from factory.config.compose import ConfigError, build, fill
-from factory.config.plugins import class_of
+from factory.config.plugins import import_target
 from factory.config.run import RecoverySources, RunConfig, VocabularyChoice, photos_alone, refuse_relative_root
 from factory.files import machine_fault_of
 from factory.pipeline import BenchmarkWork, FactoryWork
 from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef, read_clip
 from factory.setup.vocabulary import (
-    Starts,
+    StartStates,
     build_recovery_table,
     load_recovery_table,
-    load_starts,
+    load_start_states,
     load_vocabulary,
     save_recovery_table,
     train_windows,
@@ -117,7 +117,7 @@ def assemble(config: RunConfig) -> Run:
         vocabulary = choose_vocabulary(config.vocabulary)
         labels_of = choose_labels_of(config, vocabulary)
         traffic_record(config.traffic)  # whether there is its policy
-        starts = None if config.perturb.starts is None else load_starts(config.perturb.starts)
+        starts = None if config.perturb.starts is None else load_start_states(config.perturb.starts)
         experts = {
             name: build_expert(RunContext(config, name, opened)) for name in config.experts if name not in FRAMES
         }
@@ -141,6 +141,7 @@ def assemble(config: RunConfig) -> Run:
         render=config.render,
         seed=config.seed,
         identity=identity_of(config, vocabulary, labels_of, starts),
+        identity=run_identity(config, vocabulary, labelling, starts),
         cache_dir=cache_folder(config.out),
         photos_alone=photos_alone(config),
         starts={} if starts is None else starts.of_clip,
@@ -203,7 +204,7 @@ def build_expert(run: RunContext) -> Expert:
 
 def _target(config: RunConfig, name: str) -> Callable[..., Any]:
     """What `expert.<name>._target_` names. Raises ConfigError."""
-    found: Callable[..., Any] = class_of(config.expert[name], f"expert.{name}", "my_package.MyExpert")
+    found: Callable[..., Any] = import_target(config.expert[name], f"expert.{name}", "my_package.MyExpert")
     return found
 
 
@@ -225,8 +226,8 @@ def _must_have(plugged: object, members: Sequence[str], where: str, what: str) -
         raise ConfigError(f"{where}: {type(plugged).__name__} is not {what}: it has no {', '.join(missing)}")
 
 
-def identity_of(
-    config: RunConfig, vocabulary: Vocabulary, labels_of: Vocabulary | None, starts: Starts | None = None
+def run_identity(
+    config: RunConfig, vocabulary: Vocabulary, labelling: Labelling | None, starts: StartStates | None = None
 ) -> RunIdentity:
     """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it.
 
@@ -284,7 +285,7 @@ def recovery(run: RunContext, **settings: Any) -> Recovery:
     sources = fill(RecoverySources, settings, where)
     chosen = RecoverySettings(sources.smooth, sources.weights, sources.feasible)
     if sources.table is None:
-        return Recovery(_table_of(run, sources.vocabularies), chosen)
+        return Recovery(_recovery_table(run, sources.vocabularies), chosen)
     if not Path(sources.table).is_file():
         raise ConfigError(f"{where}.table={sources.table}: there is no such file")
     if sources.vocabularies:
@@ -292,7 +293,7 @@ def recovery(run: RunContext, **settings: Any) -> Recovery:
     return Recovery(load_recovery_table(sources.table), chosen)
 
 
-def _table_of(run: RunContext, vocabularies: Sequence[str]) -> RecoveryTable:
+def _recovery_table(run: RunContext, vocabularies: Sequence[str]) -> RecoveryTable:
     """Of all TRAIN windows and the vocabulary files, kept in the user's cache."""
     reader, index = run.clips()
     named = run.config.vocabulary.file

@@ -7,7 +7,8 @@ from typing import Any, Literal
 from factory.config.compose import fill, refuse_unknown
 from factory.config.datasets import reader_settings
 from factory.config.run import VocabularyChoice, refuse_missing_root, without_labels
-from factory.config.shapes import defaults_of, merged
+from factory.config.run import READERS, VocabularyChoice, own_settings, refuse_missing_root
+from factory.config.shapes import deep_merge, defaults_of
 from planners.drive.loop import LoopSettings
 from planners.evaluation.planner_names import composed
 from tasks.render.settings import RenderSettings
@@ -84,7 +85,7 @@ def with_clips(values: dict[str, Any]) -> dict[str, Any]:
     shape = reader_settings(clips)
     if shape is None:
         return values
-    refuse_unknown(shape, without_labels(clips), "clips")
-    full = {**clips, **merged(defaults_of(shape), clips)}
-    fill(shape, without_labels(full), "clips")
+    refuse_unknown(shape, own_settings(clips), "clips")
+    full = {**clips, **deep_merge(defaults_of(shape), clips)}
+    fill(shape, own_settings(full), "clips")
     return values | {"clips": full}

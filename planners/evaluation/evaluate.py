@@ -37,7 +37,7 @@ from typing import Any
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, fill
 from factory.config.datasets import find_function, words_of
-from factory.config.shapes import plain
+from factory.config.shapes import to_plain
 from factory.graph.progress import Counter
 from planners.evaluation.aggregation import SummaryLine, lines_of, summarise, table_text, write_table
 from planners.evaluation.benchmark_folder import BenchmarkFolder
@@ -220,7 +220,7 @@ def settings_of(argv: Sequence[str]) -> EvaluateSettings:
 
     def completed(values: dict[str, Any]) -> dict[str, Any]:
         if values["benchmark"] in words_of("BENCHMARKS") and not any("two_stage_traffic" in word for word in argv):
-            return values | {"two_stage_traffic": plain(TrafficSettings(mode="navsim"))}
+            return values | {"two_stage_traffic": to_plain(TrafficSettings(mode="navsim"))}
         return values
 
     return fill(EvaluateSettings, composed("evaluate", argv, EvaluateSettings, completed), "evaluate")

@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any
 
 from factory.config.compose import ConfigError, compose
-from factory.config.plugins import installed, names, object_named
-from factory.config.words import at_home, nearest
+from factory.config.plugins import import_object, plugin_named, plugin_names
+from factory.config.words import did_you_mean, expand_home
 from planners.data.batch import Needs
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.scoring import Plans, PreparedFrame, human_plans, pdm_plans
@@ -54,13 +54,13 @@ class EvaluatedPlanner:
 
 def planner_of(spec: str, label: str | None = None, changed: Mapping[str, Any] | None = None) -> EvaluatedPlanner:
     """Who `spec` names; changed: settings of trained planners, see load_planner. Raises ConfigError for nobody."""
-    spec = "+".join(at_home(member, "planner") for member in spec.split("+"))
+    spec = "+".join(expand_home(member, "planner") for member in spec.split("+"))
     return replace(_named(spec, label, changed), spec=spec)
 
 
 def _named(spec: str, label: str | None, changed: Mapping[str, Any] | None) -> EvaluatedPlanner:
     name = label or spec.strip("/").replace("/", "_").replace(":", ".")
-    plugin = installed("planner", spec, [*PRIVILEGED, *BUILT_IN])
+    plugin = plugin_named("planner", spec, [*PRIVILEGED, *BUILT_IN])
     if plugin is not None:
         if Path(spec).is_dir():
             raise ConfigError(f"planner={spec} is a folder here and a planner of {plugin.package}: planner=./{spec}")
@@ -77,12 +77,12 @@ def _named(spec: str, label: str | None, changed: Mapping[str, Any] | None) -> E
         return EvaluatedPlanner(name, digest, partial(_trained, newest, changed))
     if ":" in spec:
         return _plugged(name, spec)
-    known = [*PRIVILEGED, *UNTRAINED, *names("planner")]
+    known = [*PRIVILEGED, *UNTRAINED, *plugin_names("planner")]
     listed = ", ".join(known)
     if spec in BUILT_IN:
         raise ConfigError(f"planner={spec} has to be trained first: name its training's folder; untrained: {listed}")
     raise ConfigError(
-        f"planner={spec}: neither a folder nor one of {listed}{nearest(spec, known)}; "
+        f"planner={spec}: neither a folder nor one of {listed}{did_you_mean(spec, known)}; "
         "or name a class, my.module:MyPlanner"
     )
 
@@ -159,7 +159,7 @@ def _built(name: str) -> Planner:
 
 def _imported(spec: str) -> Any:
     """The user's planner. Raises ConfigError."""
-    target = object_named(spec, "planner", OWN)
+    target = import_object(spec, "planner", OWN)
     if isinstance(target, type) and issubclass(target, Planner):
         return build_planner(PlannerChoice(spec), {}).eval()
     if not callable(target):

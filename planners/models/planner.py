@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from factory.config.compose import ConfigError, fill
-from factory.config.plugins import installed, names, object_named
-from factory.config.shapes import defaults_of, merged
-from factory.config.words import nearest
+from factory.config.plugins import import_object, plugin_named, plugin_names
+from factory.config.shapes import deep_merge, defaults_of
+from factory.config.words import did_you_mean
 from planners.data.batch import COMMANDS, Batch, Needs, TrainingData
 from tasks.world.arrays import FloatArray
 
@@ -176,13 +176,13 @@ class PlannerChoice:
 
 def planner_class(name: str) -> type[Planner]:
     """The class of a planner. Raises ConfigError where there is none of that name."""
-    plugin = installed("planner", name, BUILT_IN)
+    plugin = plugin_named("planner", name, BUILT_IN)
     target = BUILT_IN.get(name, name) if plugin is None else plugin.reference
     if ":" not in target:
-        known = [*BUILT_IN, *names("planner")]
-        meant = nearest(name, known)
+        known = [*BUILT_IN, *plugin_names("planner")]
+        meant = did_you_mean(name, known)
         raise ConfigError(f"planner.name={name}: none of {', '.join(known)}{meant}; or name a class, {OWN}")
-    cls: Any = object_named(target, "planner.name", OWN)
+    cls: Any = import_object(target, "planner.name", OWN)
     if not (isinstance(cls, type) and issubclass(cls, Planner)):
         raise ConfigError(f"planner.name={name} is not a planners.models.planner.Planner")
     return cls
@@ -191,7 +191,7 @@ def planner_class(name: str) -> type[Planner]:
 def settings_of(choice: PlannerChoice) -> Any:
     """The planner's own settings, its defaults for what is not named. Raises ConfigError for one it does not have."""
     shape = planner_class(choice.name).settings_type
-    return fill(shape, merged(defaults_of(shape), choice.settings), "planner.settings")
+    return fill(shape, deep_merge(defaults_of(shape), choice.settings), "planner.settings")
 
 
 def build_planner(choice: PlannerChoice, arrays: Mapping[str, FloatArray]) -> Planner:

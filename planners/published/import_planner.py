@@ -23,7 +23,7 @@ from torch import Tensor
 
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, compose, fill
-from factory.config.words import SHOW, without_show
+from factory.config.words import SHOW, split_off_cfg
 from factory.files import file_digest
 from factory.readers.pickles import load_tensors
 from planners.models.diffusiondrive import POINT_FEATURES, REFINEMENTS, WAYPOINTS, DiffusionDriveSettings
@@ -311,7 +311,7 @@ def main(argv: Sequence[str]) -> None:
 
 def config_of(argv: Sequence[str]) -> ImportConfig:
     """The settings of a command line. Raises ConfigError."""
-    argv, shows = without_show(argv)
+    argv, shows = split_off_cfg(argv)
     # Lightning's names hold equals signs
     files = [word for word in argv if Path(word).is_file() or not ("=" in word or word.startswith("-"))]
     if len(files) > 1:

@@ -27,7 +27,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from factory.config.compose import ConfigError
-from factory.config.shapes import plain
+from factory.config.shapes import to_plain
 from factory.readers.pickles import load_tensors
 from factory.wording import one_line
 from planners.models.planner import Planner, PlannerChoice, build_planner, planner_class
@@ -87,7 +87,7 @@ def best(out: Path, measure: str) -> Path | None:
 
 def as_record(settings: Any) -> dict[str, Any]:
     """A planner's settings as a checkpoint keeps them, those that configuration offers."""
-    record: dict[str, Any] = json.loads(json.dumps(plain(settings)))
+    record: dict[str, Any] = json.loads(json.dumps(to_plain(settings)))
     return record
 
 

@@ -24,7 +24,7 @@ import torch
 
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, compose, fill
-from factory.config.shapes import GIVE, merged, plain
+from factory.config.shapes import GIVE, deep_merge, to_plain
 from planners.data.index import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings, fitting_batch
@@ -150,7 +150,7 @@ def _with_planner_settings(values: dict[str, Any]) -> dict[str, Any]:
     if entry["name"] == GIVE:
         return values
     own = settings_of(PlannerChoice(entry["name"], entry.get("settings", {})))
-    return merged(values, {"planner": {"settings": plain(own)}})
+    return deep_merge(values, {"planner": {"settings": to_plain(own)}})
 
 
 def _shapes_of(values: Mapping[str, Any]) -> Mapping[str, type[Any]]:

@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from factory.config.arguments import answer
+from factory.config.arguments import run_request_command
 from factory.exits import COMPLETE
 from factory.graph.execute import Execution, execute
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
@@ -188,4 +188,4 @@ def _commits(out: Path) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(answer(sys.modules[__name__], sys.argv[1:]))
+    sys.exit(run_request_command(sys.modules[__name__], sys.argv[1:]))

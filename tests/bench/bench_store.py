@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from factory.config.arguments import answer
+from factory.config.arguments import run_request_command
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph.execute import Execution, execute
 from factory.graph.plan import make_plan, retry_policy
@@ -264,4 +264,4 @@ def _cpu_s() -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(answer(sys.modules[__name__], sys.argv[1:]))
+    sys.exit(run_request_command(sys.modules[__name__], sys.argv[1:]))

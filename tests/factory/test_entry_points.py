@@ -13,10 +13,10 @@ import pytest
 from hydra.core.config_store import ConfigStore
 
 from examples.csv_logs import write_log
-from factory.commands.completion import candidates
+from factory.commands.completion import completions
 from factory.config.compose import ConfigError, compose
-from factory.config.plugins import installed, offered
-from factory.config.run import composed_run, load_config
+from factory.config.plugins import plugin_named, plugins_by_name
+from factory.config.run import compose_run, load_config
 from factory.run import main as run_main
 from factory.store.reader import SampleTable
 from planners.evaluation.planner_names import planner_of
@@ -132,12 +132,12 @@ def test_help_and_completion_list_what_is_installed_and_import_none_of_it(
         return set(line.partition(": ")[2].split(", "))
 
     groups = ("clips", "expert", "planner")
-    without, experts = {group: listed(group) for group in groups}, set(candidates(["run"], "experts="))
+    without, experts = {group: listed(group) for group in groups}, set(completions(["run"], "experts="))
     assert "experts=recovery" in experts and "experts=mine" not in experts
     install(site, "somebody")
     assert {group: listed(group) for group in groups} == {group: without[group] | {"mine"} for group in groups}
-    assert set(candidates(["run"], "clips=")) == {f"clips={name}" for name in without["clips"] | {"mine"}}
-    assert set(candidates(["run"], "experts=")) == experts | {"experts=mine"}
+    assert set(completions(["run"], "clips=")) == {f"clips={name}" for name in without["clips"] | {"mine"}}
+    assert set(completions(["run"], "experts=")) == experts | {"experts=mine"}
     assert "somebody" not in sys.modules
 
 
@@ -162,8 +162,8 @@ def test_a_name_that_two_packages_offer_is_refused_with_both(site: Path, ask: ob
 @pytest.mark.parametrize(
     ("kind", "name", "words", "asked"),
     [
-        ("readers", "av2", ["clips=av2", "clips.root=/logs"], composed_run),
-        ("experts", "human", ["experts=[human]"], composed_run),
+        ("readers", "av2", ["clips=av2", "clips.root=/logs"], compose_run),
+        ("experts", "human", ["experts=[human]"], compose_run),
         ("planners", "ltf", ["planner=ltf"], partial(compose, "train")),
     ],
 )
@@ -186,8 +186,8 @@ def test_a_folder_of_the_same_name_is_told_apart(site: Path, tmp_path: Path, mon
 
 
 def test_without_plug_ins_nothing_is_offered_and_nothing_is_imported(site: Path) -> None:
-    assert offered("expert") == {} and installed("expert", "mine", ()) is None
+    assert plugins_by_name("expert") == {} and plugin_named("expert", "mine", ()) is None
     install(site, "somebody")
-    assert [plugin.target for plugin in offered("expert")["mine"]] == ["somebody.Expert"]
+    assert [plugin.target for plugin in plugins_by_name("expert")["mine"]] == ["somebody.Expert"]
     load_config([])
     assert "somebody" not in sys.modules

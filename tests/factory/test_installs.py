@@ -116,20 +116,18 @@ def test_the_small_install_has_neither_ray_nor_hydra() -> None:
     assert len(small) < 40 and not small & {"ray", "hydra-core", "omegaconf", "pydantic"}
 
 
-NEEDS = {  # a command line -> the extra that it takes
-    "factory run preset=demo": "run",
-    "factory run preset=demo --cfg": "run",
-    "factory explain preset=demo clip=0": "run",
-    "factory vocabulary clips=synthetic k=8 out=v.npy": "run",
-    "planners train planner=ego_mlp_small": "planners",
-}
-ASK_ALL = """
-import contextlib, io, json, sys
-from factory.commands.table import DOORS, dispatch
-for line in json.loads(sys.argv[1]):
-    door, *argv = line.split()
+NEED_RUN = (
+    "run preset=demo",
+    "run preset=demo --cfg",
+    "explain preset=demo clip=0",
+    "vocabulary clips=synthetic out=v.npy",
+)
+ASK_ALL = f"""
+import contextlib, io, json
+from factory.__main__ import main
+for words in {NEED_RUN}:
     with contextlib.redirect_stderr(io.StringIO()) as said:
-        code = dispatch(argv, DOORS[door], "")
+        code = main(words.split())
     print(json.dumps([code, said.getvalue()]))
 """
 
@@ -138,13 +136,17 @@ for line in json.loads(sys.argv[1]):
 def test_a_command_that_needs_an_extra_names_the_line_that_installs_it(tmp_path: Path) -> None:
     hidden = as_if_installed(SMALL, tmp_path / "small")
     env = os.environ | {"PYTHONPATH": f"{hidden}{os.pathsep}{REPOSITORY}"}
-    asked = [sys.executable, "-c", ASK_ALL, json.dumps(list(NEEDS))]
-    done = subprocess.run(asked, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=100)
+
+    def python(*words: str) -> "subprocess.CompletedProcess[str]":
+        command = [sys.executable, *words]
+        return subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=100)
+
+    done, trained = python("-c", ASK_ALL), python("-m", "planners.training.train", "planner=ego_mlp_small")
     told = [json.loads(line) for line in done.stdout.splitlines()]
-    assert len(told) == len(NEEDS), done.stderr
-    for (code, said), (line, extra) in zip(told, NEEDS.items()):
-        assert code == 2 and said.startswith("error: ") and said.count("\n") == 1, (line, said)
-        assert f'-e ".[{extra}]"' in said, (line, said)
+    assert len(told) == len(NEED_RUN), done.stderr
+    for code, said, extra in (*((*one, "run") for one in told), (trained.returncode, trained.stderr, "planners")):
+        assert code == 2 and said.startswith("error: ") and said.count("\n") == 1, said
+        assert f'-e ".[{extra}]"' in said, said
     assert list(tmp_path.iterdir()) == [hidden], "nothing is written"
 
 

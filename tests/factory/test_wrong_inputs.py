@@ -15,6 +15,7 @@ from pyarrow.feather import write_feather
 
 from factory.__main__ import main
 from factory.datasets.av2 import INTRINSICS, POSES
+from factory.commands.completion import setting_choices
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "numba", "scipy", "shapely", "pyarrow", "deltalake", "ray", "torch", "cv2")
@@ -242,10 +243,10 @@ def test_a_stranger_s_modules_in_the_working_folder_are_not_ours(folder: Path) -
 
 
 def test_one_expert_needs_no_brackets_and_odd_paths_no_quotes(folder: Path) -> None:
-    from factory.config.run import composed_run, run_config
+    from factory.config.run import compose_run, typed_run_config
 
-    values = composed_run(["experts=recovery", "render.cameras=front", "out=~/my (first) run=a", "render=none"])
-    config = run_config(values)
+    values = compose_run(["experts=recovery", "render.cameras=front", "out=~/my (first) run=a", "render=none"])
+    config = typed_run_config(values)
     assert config.experts == ("recovery",) and config.render.cameras == ("front",)
     assert config.out == str(Path.home() / "my (first) run=a")
 

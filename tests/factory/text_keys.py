@@ -2,12 +2,12 @@
 
 from typing import Any, get_args, get_origin
 
-from factory.config.shapes import keys_of
+from factory.config.shapes import setting_keys
 
 
 def text_keys(shape: type[Any]) -> list[str]:
     """With dots, into groups."""
-    return [key for key, hint in keys_of(shape) if _takes_text(hint)]
+    return [key for key, hint in setting_keys(shape) if _takes_text(hint)]
 
 
 def _takes_text(hint: Any) -> bool:

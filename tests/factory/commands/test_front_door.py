@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from factory.__main__ import main
-from factory.commands.completion import candidates, settings_of
+from factory.commands.completion import completions, setting_choices
 from factory.commands.table import COMMANDS, DOORS, PLANNERS
 from factory.config.arguments import ComposedCommand
 from factory.exits import EXIT_CODE_TEXT
@@ -309,29 +309,29 @@ def test_retry_of_a_run_without_failures_or_without_a_record_does_nothing(
 
 
 def test_completion_knows_commands_keys_groups_and_choices() -> None:
-    assert set(candidates([], "")) == set(COMMANDS)
-    assert {"clips=", "rounds=", "render.width=", "vocabulary.file="} <= set(candidates(["run"], ""))
-    assert "rounds=" not in candidates(["run", "rounds=5"], "")
-    assert set(candidates(["run"], "clips=")) >= {"clips=av2", "clips=synthetic"}
-    assert set(candidates(["run"], "executor=")) == {"executor=ray", "executor=local"}
-    assert set(candidates(["plan"], "on_change=")) == {"on_change=stop", "on_change=keep", "on_change=redo"}
-    assert "clips.root=" in candidates(["run", "clips=av2"], "") and "clips.root=" not in candidates(["run"], "")
-    assert set(candidates(["show"], "film=")) == {"film=true", "film=false"}
-    assert set(candidates(["export"], "m")) == {"mcap", "mp4", "navsim"}
-    assert {"out=", "workers="} <= set(candidates(["retry"], ""))
-    assert {"clip=", "clips=", "tries="} <= set(candidates(["explain"], ""))
-    assert set(candidates(["scene"], "")) == {"info", "export", "import"}
-    assert not list(candidates(["nothing"], ""))
+    assert set(completions([], "")) == set(COMMANDS)
+    assert {"clips=", "rounds=", "render.width=", "vocabulary.file="} <= set(completions(["run"], ""))
+    assert "rounds=" not in completions(["run", "rounds=5"], "")
+    assert set(completions(["run"], "clips=")) >= {"clips=av2", "clips=synthetic"}
+    assert set(completions(["run"], "executor=")) == {"executor=ray", "executor=local"}
+    assert set(completions(["plan"], "on_change=")) == {"on_change=stop", "on_change=keep", "on_change=redo"}
+    assert "clips.root=" in completions(["run", "clips=av2"], "") and "clips.root=" not in completions(["run"], "")
+    assert set(completions(["show"], "film=")) == {"film=true", "film=false"}
+    assert set(completions(["export"], "m")) == {"mcap", "mp4", "navsim"}
+    assert {"out=", "workers="} <= set(completions(["retry"], ""))
+    assert {"clip=", "clips=", "tries="} <= set(completions(["explain"], ""))
+    assert set(completions(["scene"], "")) == {"info", "export", "import"}
+    assert not list(completions(["nothing"], ""))
 
 
 def test_completion_knows_those_of_planners_too() -> None:
-    assert set(candidates([], "", "planners")) == set(PLANNERS)
-    assert set(candidates(["train"], "mix=", "planners")) == {"mix=half", "mix=natural", "mix=rewards_only"}
-    assert {"data.real=", "planner=", "resume="} <= set(candidates(["train"], "", "planners"))
-    assert "clips.root=" in candidates(["drive", "clips=av2"], "", "planners")
-    assert "traffic@two_stage_traffic=idm" in candidates(["evaluate"], "traffic@two_stage_traffic=", "planners")
-    assert "planner=ltf" not in candidates(["evaluate"], "planner=", "planners")
-    assert {"split=", "fine="} <= set(candidates(["submit"], "", "planners"))
+    assert set(completions([], "", "planners")) == set(PLANNERS)
+    assert set(completions(["train"], "mix=", "planners")) == {"mix=half", "mix=natural", "mix=rewards_only"}
+    assert {"data.real=", "planner=", "resume="} <= set(completions(["train"], "", "planners"))
+    assert "clips.root=" in completions(["drive", "clips=av2"], "", "planners")
+    assert "traffic@two_stage_traffic=idm" in completions(["evaluate"], "traffic@two_stage_traffic=", "planners")
+    assert "planner=ltf" not in completions(["evaluate"], "planner=", "planners")
+    assert {"split=", "fine="} <= set(completions(["submit"], "", "planners"))
 
 
 @pytest.mark.parametrize(
@@ -362,7 +362,7 @@ def test_no_command_does_several_runs_at_once(package: str, capsys: pytest.Captu
 
 
 def test_every_key_that_is_completed_is_one_the_run_takes() -> None:
-    from factory.config.run import composed_run
+    from factory.config.run import compose_run
 
     def has(tree: object, key: str) -> bool:
         for part in key.split("."):
@@ -371,8 +371,8 @@ def test_every_key_that_is_completed_is_one_the_run_takes() -> None:
             tree = tree[part]
         return True
 
-    groups, settings = {"preset"}, composed_run([])
-    unknown = [key for key in settings_of([]) if key not in groups and not has(settings, key)]
+    groups, settings = {"preset"}, compose_run([])
+    unknown = [key for key in setting_choices([]) if key not in groups and not has(settings, key)]
     assert unknown == []
 
 

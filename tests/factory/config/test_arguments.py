@@ -8,7 +8,8 @@ import pytest
 
 from factory.commands.table import COMMANDS, DOORS
 from factory.config.arguments import POSITIONAL, RUN_SETTINGS, Refused, keys_of, parse, request_of
-from factory.config.shapes import choices_of
+from factory.config.arguments import POSITIONAL, RUN_SETTINGS, Refused, parse, request_class_of, request_keys
+from factory.config.shapes import allowed_values
 from factory.config.words import ConfigError
 from tests.factory.text_keys import text_keys
 
@@ -45,9 +46,9 @@ def test_a_home_folder_is_one_in_every_key_that_takes_text(
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     package, name = command.split()
-    shape = request_of(DOORS[package][name].function())
-    texts = [key for key in text_keys(shape) if key in keys_of(shape)]
-    chosen = [f"{key}={choices_of(hint)[0]}" for key, hint in keys_of(shape).items() if choices_of(hint)]
+    shape = request_class_of(DOORS[package][name].function())
+    texts = [key for key in text_keys(shape) if key in request_keys(shape)]
+    chosen = [f"{key}={allowed_values(hint)[0]}" for key, hint in request_keys(shape).items() if allowed_values(hint)]
     monkeypatch.setattr(shape, "__post_init__", lambda self: None, raising=False)  # what goes with what
     found = parse(shape, [*chosen, *(f"{key}=~/x" for key in texts)])
     for key in texts:

@@ -13,8 +13,8 @@ import yaml
 
 from factory.__main__ import main as door_main
 from factory.config.compose import ConfigError, build, conf_dir, fill
-from factory.config.plugins import choices
-from factory.config.run import PerturbSources, RewardSettings, RunConfig, composed_run, load_config, shapes_in
+from factory.config.plugins import group_choices
+from factory.config.run import PerturbSources, RewardSettings, RunConfig, compose_run, load_config, settings_classes
 from factory.config.words import SettingsShown
 from factory.setup.settings import (
     RunContext,
@@ -54,10 +54,10 @@ def test_a_choice_is_its_dataclass_with_what_its_file_says(name: str, expected: 
 
 def test_every_setting_has_a_default_and_a_meaning_and_is_shown_with_both() -> None:
     with pytest.raises(SettingsShown) as settings:
-        composed_run(["--cfg"])
+        compose_run(["--cfg"])
     shown = str(settings.value).splitlines()
     assert "  width: 320  # pixels" in shown and "  mode: auto  # auto | map | painter | none; " in "\n".join(shown)
-    assert yaml.safe_load("\n".join(shown)) == composed_run([])
+    assert yaml.safe_load("\n".join(shown)) == compose_run([])
     silent = [line for line in shown if "  # " not in line and not re.search(r"_target_|name: |kind: |^  \w+:$", line)]
     assert [line for line in silent if not re.search(r"_(m|mps|s|mps2|deg)\b", line)] == []
 
@@ -73,13 +73,13 @@ def test_what_is_fixed_is_no_setting_and_stays_in_the_record() -> None:
 
 def test_a_plain_run_shows_at_most_120_keys() -> None:
     with pytest.raises(SettingsShown) as settings:
-        composed_run(["--cfg"])
+        compose_run(["--cfg"])
     lines = str(settings.value).splitlines()
     assert 100 < sum(bool(re.match(r" *[\w.]+: [^ #]", line)) for line in lines) <= 120
 
 
 def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
-    assert set(composed_run([])) == {field.name for field in dataclasses.fields(RunConfig)}
+    assert set(compose_run([])) == {field.name for field in dataclasses.fields(RunConfig)}
     config = load_config([])
     assert (config.rounds, config.executor, config.limit) == (1, "ray", None)
     assert config.perturb == PerturbSources()
@@ -99,12 +99,14 @@ def test_a_home_folder_is_one_in_every_key_that_takes_text(
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     words = f"clips={choice}".split()
-    found = composed_run(words)
-    keys = text_keys(RunConfig) + [f"{at}.{key}" for at, shape in shapes_in(found).items() for key in text_keys(shape)]
+    found = compose_run(words)
+    keys = text_keys(RunConfig) + [
+        f"{at}.{key}" for at, shape in settings_classes(found).items() for key in text_keys(shape)
+    ]
     assert {"out", "vocabulary.file", "reward.label_vocabulary", "expert.recovery.table"} < set(keys)
     assert len(keys) >= n_least
     for given, wanted in (("~/x", f"{tmp_path}/x"), ("[~/x,y]", [f"{tmp_path}/x", "y"])):
-        values = composed_run([*words, *(f"{key}={given}" for key in keys)])
+        values = compose_run([*words, *(f"{key}={given}" for key in keys)])
         assert {key: held(values, key) for key in keys} == dict.fromkeys(keys, wanted)
 
 
@@ -112,7 +114,7 @@ def test_companions_of_files_of_configuration_are_no_choices(tmp_path: Path) -> 
     (tmp_path / "render").mkdir()
     (tmp_path / "render" / "mine.yaml").write_text("mode: map\n")
     add_companions(tmp_path)
-    assert choices("render", [tmp_path]) == ["mine"]
+    assert group_choices("render", [tmp_path]) == ["mine"]
     assert load_config([f"--config-dir={tmp_path}", "render=mine"]).render.mode is RenderMode.MAP
 
 
@@ -141,11 +143,11 @@ def test_a_plug_in_s_key_is_led_home_too_and_a_stranger_s_home_is_told(
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     own = ["clips=custom", "clips._target_=my.Reader"]
-    assert composed_run([*own, "clips.logs={a: ~/a}"])["clips"]["logs"] == {"a": f"{tmp_path}/a"}
-    assert composed_run([*own, "clips.logs=~root/a"])["clips"]["logs"] == f"{pwd.getpwnam('root').pw_dir}/a"
-    assert composed_run([*own, "clips.logs=a~/b"])["clips"]["logs"] == "a~/b"
+    assert compose_run([*own, "clips.logs={a: ~/a}"])["clips"]["logs"] == {"a": f"{tmp_path}/a"}
+    assert compose_run([*own, "clips.logs=~root/a"])["clips"]["logs"] == f"{pwd.getpwnam('root').pw_dir}/a"
+    assert compose_run([*own, "clips.logs=a~/b"])["clips"]["logs"] == "a~/b"
     with pytest.raises(ConfigError, match=r"^clips\.logs\.a=~nobody\.here/a: there is no home folder ~nobody\.here;"):
-        composed_run([*own, "clips.logs={a: ~nobody.here/a}"])
+        compose_run([*own, "clips.logs={a: ~nobody.here/a}"])
 
 
 @pytest.mark.parametrize(

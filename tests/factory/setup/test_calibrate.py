@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.setup.calibrate import by_the_tables
+from factory.setup.calibrate import extrapolated_from_tables
 from factory.store.samples import Store
 from tests.factory.toy import ToyWork, executed, refs
 
@@ -19,7 +19,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
 def told(store: Store, rounds: int, n_clips: int) -> dict[str, tuple[int, int]]:
     """Expert -> attempts, samples."""
-    lines = by_the_tables(store, ["recovery", "human", "nobody"], rounds, n_clips)[1:]
+    lines = extrapolated_from_tables(store, ["recovery", "human", "nobody"], rounds, n_clips)[1:]
     found = [re.fullmatch(r"  (\w+): .*; (\d+) attempts, (\d+) samples", line) for line in lines]
     return {match[1]: (int(match[2]), int(match[3])) for match in found if match is not None}
 
@@ -38,4 +38,4 @@ def test_rounds_beyond_go_on_at_the_last_rate_and_the_log_has_one(store: Store) 
 
 
 def test_tables_without_attempts_say_nothing(tmp_path: Path) -> None:
-    assert by_the_tables(Store(tmp_path), ["recovery"], 2, 10) == []
+    assert extrapolated_from_tables(Store(tmp_path), ["recovery"], 2, 10) == []

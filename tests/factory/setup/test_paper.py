@@ -7,7 +7,7 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import RunConfig, load_config
-from factory.setup.calibrate import beyond_settings, differences, setup_text
+from factory.setup.calibrate import differences_from_paper, fixed_differences_from_paper, setup_text
 from factory.setup.settings import choose_vocabulary
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
@@ -23,7 +23,7 @@ def paper(*overrides: str) -> RunConfig:
 
 def test_the_preset_has_the_paper_s_settings(vocabulary: Vocabulary) -> None:
     config = paper()
-    assert differences(config, vocabulary) == []
+    assert differences_from_paper(config, vocabulary) == []
     assert (config.rounds, config.vocabulary.k, config.render.width, config.render.height) == (5, 16384, 1920, 1080)
     assert (config.render.psnr_min, config.render.camera_psnr_min) == (27.0, 0.0)
     assert (config.perturb.epdms_min, config.reward.progress_above) == (0.8, 0.5)
@@ -39,14 +39,14 @@ def test_what_no_preset_makes_the_paper_s_is_said_in_a_line(vocabulary: Vocabula
 
 
 def test_what_a_run_has_not_is_not_said_of_it() -> None:
-    (walks,) = beyond_settings(paper("render=none", "traffic=navsim"))
+    (walks,) = fixed_differences_from_paper(paper("render=none", "traffic=navsim"))
     assert walks.startswith("walks that go on")
-    assert "the project's own picture gate (unstable" in beyond_settings(load_config([]))[-1]
+    assert "the project's own picture gate (unstable" in fixed_differences_from_paper(load_config([]))[-1]
 
 
 def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:
     config = load_config([])
-    found = differences(config, choose_vocabulary(config.vocabulary))
+    found = differences_from_paper(config, choose_vocabulary(config.vocabulary))
     assert found == [
         "vocabulary of 1,024 kinematic trajectories (16,384 human ones)",
         "expert.recovery.smooth=True (False)",
@@ -71,12 +71,12 @@ def test_every_setting_of_the_paper_s_table_is_watched(vocabulary: Vocabulary) -
         "render.psnr_gate=mark": "render.psnr_gate=mark (reject)",
         "pdm=corrected": "pdm.speed_below_zero=False (True)",
     }
-    assert set(others.values()) <= set(differences(paper(*others), vocabulary))
+    assert set(others.values()) <= set(differences_from_paper(paper(*others), vocabulary))
 
 
 def test_of_pictures_and_experts_that_are_not_there_nothing_is_said(vocabulary: Vocabulary) -> None:
-    assert differences(paper("render=none", "render.width=320"), vocabulary) == ["render.mode=none (auto)"]
-    assert differences(paper("experts=[pdm_closed]", "expert.recovery.smooth=true"), vocabulary) == []
+    assert differences_from_paper(paper("render=none", "render.width=320"), vocabulary) == ["render.mode=none (auto)"]
+    assert differences_from_paper(paper("experts=[pdm_closed]", "expert.recovery.smooth=true"), vocabulary) == []
 
 
 def test_the_preset_asks_for_the_human_vocabulary(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from factory.exits import COMPLETE
 from factory.graph.steps import Columns, PreparedClip, RejectedAttempt, run_attempt
 from factory.pipeline import BenchmarkWork, FactoryWork
 from factory.readers.base import ClipRef
-from factory.setup.settings import assemble, identity_of
+from factory.setup.settings import assemble, run_identity
 from factory.stages.benchmark import describe_benchmark, write_benchmark
 from factory.store.location import BadCacheFile, Location, SceneFiles
 from factory.store.samples import Store
@@ -213,7 +213,7 @@ def test_a_pair_falls_together_at_the_pictures(tmp_path: Path) -> None:
 
 
 def test_a_run_of_pairs_of_frames_prepares_anew() -> None:
-    dense = identity_of(load_config(["perturb=dense"]), VOCABULARY, None).settings
+    dense = run_identity(load_config(["perturb=dense"]), VOCABULARY, None).settings
     assert dense["perturb.order"] == "spread" and dense["perturb.at_most"] == 32
-    benchmark = identity_of(load_config([f"experts=[{','.join(EXPERTS)}]"]), VOCABULARY, None)
-    assert benchmark.prepare_digest != identity_of(load_config([]), VOCABULARY, None).prepare_digest
+    benchmark = run_identity(load_config([f"experts=[{','.join(EXPERTS)}]"]), VOCABULARY, None)
+    assert benchmark.prepare_digest != run_identity(load_config([]), VOCABULARY, None).prepare_digest

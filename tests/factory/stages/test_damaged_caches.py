@@ -14,7 +14,7 @@ from factory.datasets.town.reader import SensedReader, SyntheticReader, Syntheti
 from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import SUMS
 from factory.graph.steps import PrepareReport, cache_key, prepare
-from factory.setup.settings import _table_of
+from factory.setup.settings import _recovery_table
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table, save_vocabulary
 from factory.stages.assets import RIG_SUFFIX, _resumed, _write_rig_file, damaged_blocks, read_rig_file
 from factory.stages.scene_file import BadScene, read_scene, write_scene
@@ -130,14 +130,14 @@ def test_a_recovery_table_is_made_again_in_the_cache(
         clips=lambda: (reader, reader.index()),
         config=SimpleNamespace(vocabulary=SimpleNamespace(file=None), clips={"root": "town"}),
     )
-    golden = _table_of(run, [str(tmp_path / "v.npy")]).digest  # type: ignore[arg-type]
+    golden = _recovery_table(run, [str(tmp_path / "v.npy")]).digest  # type: ignore[arg-type]
     (path,) = (tmp_path / "cache").rglob("recovery-*.npz")
     whole = path.read_bytes()
     save_recovery_table(tmp_path / "x.npz", RecoveryTable(np.zeros((3, 40, 3))), {}, "recovery-0.npz")
     another = (tmp_path / "x.npz").read_bytes()
     for content in (whole[:9000] + bytes([whole[9000] ^ 1]) + whole[9001:], whole[:100], b"", another):
         path.write_bytes(content)
-        assert _table_of(run, [str(tmp_path / "v.npy")]).digest == golden  # type: ignore[arg-type]
+        assert _recovery_table(run, [str(tmp_path / "v.npy")]).digest == golden  # type: ignore[arg-type]
         (line,) = lines()
         assert line.startswith(f"{path}: ") and line.endswith("it is made again")
         assert load_recovery_table(path).digest == golden

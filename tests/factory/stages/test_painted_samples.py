@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from factory.config.compose import ConfigError
-from factory.config.run import load_config, run_config
+from factory.config.run import load_config, typed_run_config
 from factory.graph.steps import Columns, PreparedClip, run_attempt
 from factory.pipeline import FactoryWork
 from factory.setup.settings import assemble
@@ -70,7 +70,7 @@ def test_clips_of_no_town_have_no_painter() -> None:
     config = load_config([*WORDS, "render.mode=painter", "out=nowhere"])
     values = {**vars(config), "clips": {"_target_": "my.Reader"}, "render": replace(config.render)}
     with pytest.raises(ConfigError, match="only the synthetic town has a painter"):
-        run_config(values)
+        typed_run_config(values)
 
 
 def test_a_camera_that_the_usual_rig_lacks_is_refused_at_once() -> None:

@@ -13,6 +13,7 @@ from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, Rejected
 from factory.pipeline import FactoryWork, WholeClip
 from factory.readers.base import BadClip
 from factory.setup.settings import assemble, identity_of
+from factory.setup.settings import assemble, refuse_missing_backend, run_identity
 from factory.store.schema import COLUMNS, UNLISTED
 from tasks import stages
 from tasks.perturb import Perturbation, perturb
@@ -210,28 +211,28 @@ def test_a_clip_s_candidates_are_drawn_from_a_stream_of_the_run_s_seed_and_its_o
     ],
 )
 def test_what_a_prepared_clip_depends_on(override: str, prepares_anew: bool) -> None:
-    before = identity_of(load_config([]), VOCABULARY, None).prepare_digest
-    after = identity_of(load_config([override]), VOCABULARY, None).prepare_digest
+    before = run_identity(load_config([]), VOCABULARY, None).prepare_digest
+    after = run_identity(load_config([override]), VOCABULARY, None).prepare_digest
     assert (before != after) == prepares_anew
 
 
 def test_gates_that_are_off_are_no_part_of_what_rows_are_made_under_and_gates_that_are_on_are() -> None:
     """So tables of before there was a choice go on without them, and are refused by name with them."""
-    off = identity_of(load_config(["reward.off_route=false", "reward.after=false"]), VOCABULARY, None)
-    on = identity_of(load_config([]), VOCABULARY, None)
+    off = run_identity(load_config(["reward.off_route=false", "reward.after=false"]), VOCABULARY, None)
+    on = run_identity(load_config([]), VOCABULARY, None)
     assert dict(on.settings) == dict(off.settings) | {"reward.off_route": True, "reward.after": True}
     assert on.settings_hash != off.settings_hash and on.prepare_digest == off.prepare_digest
 
 
 def test_without_a_gate_the_block_s_settings_are_no_part_of_what_is_prepared() -> None:
     for free in (["render.psnr_min=0"], ["render=none"]):
-        small, large = (identity_of(load_config([*free, f"render.width={w}"]), VOCABULARY, None) for w in (64, 128))
+        small, large = (run_identity(load_config([*free, f"render.width={w}"]), VOCABULARY, None) for w in (64, 128))
         assert small.prepare_digest == large.prepare_digest
 
 
 def test_a_gate_that_only_marks_prepares_nothing_anew() -> None:
     plain, marking = (
-        identity_of(load_config(overrides), VOCABULARY, None).prepare_digest
+        run_identity(load_config(overrides), VOCABULARY, None).prepare_digest
         for overrides in (["render.psnr_min=0"], ["render.psnr_gate=mark"])
     )
     assert plain == marking
@@ -239,10 +240,10 @@ def test_a_gate_that_only_marks_prepares_nothing_anew() -> None:
 
 @pytest.mark.parametrize("stage", ["clip", "perturb", "rollout", "expert", "reward"])
 def test_a_raised_stage_before_the_attempts_prepares_anew(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = identity_of(load_config([]), VOCABULARY, None).prepare_digest
+    before = run_identity(load_config([]), VOCABULARY, None).prepare_digest
     raised = [dataclasses.replace(s, version=s.version + (s.name == stage)) for s in stages.STAGES]
     monkeypatch.setattr(stages, "STAGES", tuple(raised))
-    assert identity_of(load_config([]), VOCABULARY, None).prepare_digest != before
+    assert run_identity(load_config([]), VOCABULARY, None).prepare_digest != before
 
 
 def test_the_log_s_own_drive_alone_needs_no_candidates_and_no_block(small_town: Path, tmp_path: Path) -> None:
