@@ -141,7 +141,7 @@ def _run(
     from factory.views.board.report import write_facts, write_report
     from factory.views.card import write_card
     from factory.views.sample_text import prepared_episode
-    from factory.views.status import failed_line
+    from factory.views.status import failure_summary
 
     try:
         store = Store(Location.parse(config.out))
@@ -200,7 +200,7 @@ def _run(
     print(f"card: {write_card(store)}")
     print(f"look at samples: python -m factory dashboard out={where}")
     if summary.exit_code == COMPLETE_WITH_FAILURES:
-        print(failed_line(store))
+        print(failure_summary(store))
     return summary.exit_code
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from factory.config.arguments import POSITIONAL, Refused
 from factory.config.datasets import find_function
 from factory.exits import COMPLETE, INTERRUPTED
-from factory.views.sample_text import find, logged_drive, open_samples
+from factory.views.sample_text import find_sample_id, logged_drive, open_samples
 from factory.views.status import open_store
 from factory.wording import one_line
 
@@ -70,7 +70,7 @@ class ExportRequest:
 EVERYWHERE = ("format", "out", "sample", "every", "to")
 
 
-def export(request: ExportRequest) -> int:
+def export_scene(request: ExportRequest) -> int:
     """`python -m factory export mcap|mp4|navsim out=<folder or URL> ...`: samples as files for other tools.
 
         python -m factory export mcap out=runs/demo sample=0             one sample for Foxglove, Lichtblick or Rerun
@@ -102,7 +102,7 @@ def _export_some(request: ExportRequest) -> Iterator[Path]:
     store, target = open_store(request.out), Path(request.to)
     table = open_samples(store)
     if request.sample is not None:
-        chosen = [find(table, store, request.sample)]
+        chosen = [find_sample_id(table, store, request.sample)]
     else:
         chosen = list(table.attempt_ids[:: request.every])
     suffix = f".{request.format}"
@@ -171,10 +171,10 @@ def _write_sample(format: str, store: "Store", row: Row, path: Path) -> None:
         path.write_bytes(episode_of(row, logged))
     else:
         from factory.views.pictures import write_mp4
-        from factory.views.seen_again import digest_of, film, scene_of
+        from factory.views.rendered_again import load_scene, sample_film, scene_digest_of
 
-        digest = digest_of(store, row)
-        write_mp4(path, film(row, None if digest is None else scene_of(store, digest), logged))
+        digest = scene_digest_of(store, row)
+        write_mp4(path, sample_film(row, None if digest is None else load_scene(store, digest), logged))
 
 
 CAMERAS = "nuscenes-cameras"
@@ -256,7 +256,7 @@ def import_(request: ImportRequest) -> int:
     from factory.store.location import Location
     from factory.store.samples import ChangedRun, Store
     from factory.store.table import AnotherWriter
-    from factory.views.status import failed_line
+    from factory.views.status import failure_summary
 
     if unusable := why_unusable(request.out):
         raise Refused(unusable)
@@ -268,6 +268,7 @@ def import_(request: ImportRequest) -> int:
     counts = summary.counts
     print(f"{counts['accepted']:,} samples imported, {summary.executed.found_done:,} were there: {store.location.uri}")
     for line in filter(None, (summary.message, said, failed_line(store) if counts["failed"] else "")):
+    for line in filter(None, (summary.message, told, failure_summary(store) if counts["failed"] else "")):
         print(line)
     return summary.exit_code
 
@@ -348,8 +349,7 @@ def scene(request: SceneRequest) -> None:
     edited one put back under the same name is what the next run draws.
     """
     from factory.stages.scene_file import read_scene, write_scene
-    from factory.views.scene_files import export as export_scene
-    from factory.views.scene_files import imported, info_text, logged_vehicles, read_splats
+    from factory.views.scene_files import export_scene, info_text, logged_vehicles, read_splats, scene_from_splats
     from factory.views.status import open_store
     from tasks.render.splatting.formats import LoggedVehicle
 
@@ -369,7 +369,9 @@ def scene(request: SceneRequest) -> None:
                 transforms = None if request.transforms is None else Path(request.transforms)
                 found = read_splats(file, request.traversal, transforms)
                 print(
-                    info_text(to, write_scene(to, imported(found, request.like, request.origin, request.antialiased)))
+                    info_text(
+                        to, write_scene(to, scene_from_splats(found, request.like, request.origin, request.antialiased))
+                    )
                 )
                 if found.left_out:
                     print(f"left out    {', '.join(found.left_out)}: bodies that bend need their network")

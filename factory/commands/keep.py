@@ -15,7 +15,7 @@ from factory.commands.look import FolderRequest
 from factory.config.arguments import POSITIONAL, SOME_RUN_SETTINGS, Refused
 from factory.config.arguments import GIVEN_RUN_SETTINGS, POSITIONAL, Refused
 from factory.exits import COMPLETE, DAMAGED
-from factory.views.status import IMPORT_AGAIN, failed_lines, open_store, out_of
+from factory.views.status import IMPORT_AGAIN, failed_lines, location_of_out, open_store
 
 if TYPE_CHECKING:
     from factory.store.samples import Store
@@ -106,7 +106,7 @@ def verify(request: VerifyRequest) -> int:
     from factory.store.table import AnotherWriter, DamagedLog
     from factory.store.verify import RunInProgress, claim_for_upkeep, damaged_logs, drop_damaged, restore_logs
 
-    out = out_of(request.out)
+    out = location_of_out(request.out)
     try:
         refuse_other_schema(out)
         if request.repair:

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING
 from factory.config.arguments import POSITIONAL, RUN_SETTINGS, Refused
 from factory.config.run import compose_run, typed_run_config
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
-from factory.views.sample_text import find, label_lines, labelled_trajectories, logged_drive, number_lines, open_samples
+from factory.views.sample_text import (
+    find_sample_id,
+    label_lines,
+    labelled_trajectories,
+    logged_drive,
+    number_lines,
+    open_samples,
+)
 from factory.views.sample_text import lineage as lineage_parts
 from factory.views.status import failed_lines, open_store, status_lines
 
@@ -108,10 +115,16 @@ def show(request: ShowRequest) -> None:
 
 def sample_lines(store: "Store", table: "SampleTable", which: str, request: ShowRequest) -> Iterator[str]:
     """One sample's numbers; writes its picture and says where it is."""
-    from factory.views.pictures import encoded, sample_sheet
-    from factory.views.seen_again import again_sheet, digest_of, film, scene_of, stacked
+    from factory.views.pictures import encode_image, sample_sheet
+    from factory.views.rendered_again import (
+        load_scene,
+        photos_and_renderings_sheet,
+        sample_film,
+        scene_digest_of,
+        stack_vertically,
+    )
 
-    attempt_id = find(table, store, which)
+    attempt_id = find_sample_id(table, store, which)
     row = table[attempt_id]
     path = _picture_path(attempt_id, request.to)
     drawn = labelled_trajectories(row, request.vocabulary)
@@ -119,20 +132,20 @@ def sample_lines(store: "Store", table: "SampleTable", which: str, request: Show
     yield from label_lines(row, drawn is not None)
     logged = logged_drive(store, row["clip_id"], row["settings_hash"])
     sheets = [sample_sheet(row, logged, vocabulary=drawn)]
-    digest = digest_of(store, row)
-    scene = None if digest is None else scene_of(store, digest)
+    digest = scene_digest_of(store, row)
+    scene = None if digest is None else load_scene(store, digest)
     if digest is not None and scene is None:
         yield f"              scene {digest} is not in the run's cache: nothing is rendered anew"
-    if scene is not None and (again := again_sheet(store, row, scene)) is not None:
+    if scene is not None and (again := photos_and_renderings_sheet(store, row, scene)) is not None:
         sheets.append(again)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(encoded(stacked(sheets), ".png"))
+        path.write_bytes(encode_image(stack_vertically(sheets), ".png"))
         yield f"picture       {path.resolve()}"
         if request.film:
             from factory.views.pictures import write_mp4
 
-            write_mp4(path.with_suffix(".mp4"), film(row, scene, logged))
+            write_mp4(path.with_suffix(".mp4"), sample_film(row, scene, logged))
             yield f"film          {path.with_suffix('.mp4').resolve()}"
     except OSError as error:
         raise Refused(f"to={request.to or '.'}: the picture cannot be written: {error}") from error
@@ -196,7 +209,7 @@ def _explain(request: ExplainRequest) -> None:
 
     from factory.graph.plan import candidate_order
     from factory.setup.settings import assemble
-    from factory.views.pictures import attempt_picture, candidates_picture, film, write_mp4
+    from factory.views.pictures import attempt_picture, candidates_picture, rollout_film, write_mp4
     from tasks.stages import Rejected
     from tasks.subscores import OF_ONE_PLAN
 
@@ -260,7 +273,7 @@ def _explain(request: ExplainRequest) -> None:
         picture = attempt_picture(clip, shown.candidate, shown.judged, title, (720, 720))
         cv2.imwrite(f"{stem}_rollouts.png", picture[..., ::-1])
         if shown.candidate is not None:
-            write_mp4(Path(f"{stem}.mp4"), film(clip, shown.candidate, shown.judged))
+            write_mp4(Path(f"{stem}.mp4"), rollout_film(clip, shown.candidate, shown.judged))
     written = ", ".join(str(path) for path in sorted(to.glob(f"{stem.name}*")))
     print(f"{time.perf_counter() - began:.1f} s; look at {written}")
 

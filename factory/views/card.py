@@ -17,7 +17,7 @@ from factory.store.funnel import Funnel, funnel_of_tables, funnel_tables
 from factory.store.samples import CURRENT_RUN, Kind, Store
 from factory.store.schema import SCHEMA_VERSION
 from factory.store.table import text_codes
-from factory.views.status import counted
+from factory.views.status import value_counts
 
 FILE = "README.md"
 MARK = "# written by python -m factory, and again by its next run"  # a README without it is the user's own
@@ -141,7 +141,7 @@ def _limits(store: Store, samples: pa.Table, outcomes: pa.Table, orphans: int) -
     """What a user must know; each line only where it is so."""
     yield "\n## Known limits\n"
     simulated = samples.filter(pc.greater_equal(samples["candidate_index"], 0)).select(["image_source", "psnr"])
-    sources = counted(simulated["image_source"])
+    sources = value_counts(simulated["image_source"])
     settings = _newest_run_record(store)["settings"]
     if simulated.num_rows:
         yield (
@@ -170,7 +170,7 @@ def _limits(store: Store, samples: pa.Table, outcomes: pa.Table, orphans: int) -
         yield "- `synthetic` is drawn test data: no real street, no real traffic."
     if (lines := len(_values(samples, "settings_hash"))) > 1:
         yield f"- Rows of {lines} different settings stand side by side (column `settings_hash`, file run.json)."
-    if failed := counted(outcomes["kind"]).get(Kind.FAILED, 0):
+    if failed := value_counts(outcomes["kind"]).get(Kind.FAILED, 0):
         yield f"- {failed:,} attempts failed and are not in it (`python -m factory failed out=...`)."
     if orphans:
         yield f"- {orphans:,} files under `samples` belong to no commit: read the table, not the folder."
@@ -227,7 +227,7 @@ def _counts(samples: pa.Table, by: Sequence[str], distinct: Sequence[str] = ()) 
 
 def _values(samples: pa.Table, column: str) -> list[str]:
     """The different texts of a column, sorted."""
-    return sorted(counted(samples[column]))
+    return sorted(value_counts(samples[column]))
 
 
 def _datasets(samples: pa.Table) -> str:

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from factory.store.episodes import Message, episode_bytes
 from factory.store.schema import FIELDS, NOW_INDEX, Column
-from factory.views.pictures import AGENT_COLOURS, EXPERT, LOGGED, OBJECT, PERTURBED, Colour, ego_way
+from factory.views.pictures import AGENT_COLOURS, EXPERT, LOGGED, OBJECT, PERTURBED, Colour, ego_poses
 from tasks.subscores import JUDGED, SUBSCORES
 from tasks.world.arrays import Array
 from tasks.world.frames import PACIFICA, to_local
@@ -127,7 +127,7 @@ def _transforms(row: Row) -> Iterator[Message]:
     """Of every frame, at every step."""
     rig = {camera["name"]: np.reshape(camera["ego_from_camera"], (4, 4)) for camera in row["cameras"] or ()}
     now = world_from_now(row)
-    poses = ego_way(row)
+    poses = ego_poses(row)
     for step, time_ns in _steps(row):
         here = np.eye(4)
         here[:3, :3] = Rotation.from_euler("z", poses[step, 2]).as_matrix()

@@ -126,14 +126,14 @@ def _polyline(image: Bytes, points: ShortInts, path: DrawnPath) -> None:
 
 def _captions(image: Bytes, title: str, paths: Sequence[DrawnPath]) -> None:
     height = image.shape[0]
-    write(image, title, (8, 18), 0.42)
+    write_text(image, title, (8, 18), 0.42)
     for row, path in enumerate(path for path in paths if path.label):
         y = height - 10 - 16 * row
         cv2.line(image, (8, y - 4), (26, y - 4), path.colour, 3, cv2.LINE_AA)
-        write(image, path.label, (32, y))
+        write_text(image, path.label, (32, y))
 
 
-def write(image: Bytes, text: str, at: tuple[int, int], size: float = 0.4, colour: Colour = (20, 20, 20)) -> None:
+def write_text(image: Bytes, text: str, at: tuple[int, int], size: float = 0.4, colour: Colour = (20, 20, 20)) -> None:
     """A line of text into the picture."""
     cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
 
@@ -198,11 +198,11 @@ def attempt_picture(
     else:
         step, ego, boxes, kinds = NOW, clip.ego_states[NOW], clip.agents.boxes[NOW], clip.agents.kinds
     pose = ego[: HEADING + 1]
-    ways = _ways(clip, candidate, judged, "expert (simulated)")
+    ways = _paths_of_attempt(clip, candidate, judged, "expert (simulated)")
     return draw_bev(pose, map_shapes(clip, step), Boxes(boxes, kinds), pose, ways, title, size_px)
 
 
-def _ways(clip: Clip, candidate: Candidate | None, judged: Judged | None, expert: str) -> list[DrawnPath]:
+def _paths_of_attempt(clip: Clip, candidate: Candidate | None, judged: Judged | None, expert: str) -> list[DrawnPath]:
     ways = [DrawnPath(clip.ego_states[NOW:, : HEADING + 1], LOGGED, "logged", dashed=True)]
     if candidate is not None:
         ways.append(DrawnPath(candidate.rollout.ego_states, PERTURBED, "perturbed"))
@@ -234,13 +234,15 @@ def candidates_picture(clip: Clip, considered: ConsideredTrajectories, size_px: 
     for row, (fate, colour) in enumerate(FATE_COLOURS.items()):
         count = sum(f == fate for f in considered.fate)
         cv2.circle(image, (14, height - 14 - 16 * row), 4, colour, -1, cv2.LINE_AA)
-        write(image, f"{fate} {count}", (24, height - 10 - 16 * row))
+        write_text(image, f"{fate} {count}", (24, height - 10 - 16 * row))
     return image
 
 
-def film(clip: Clip, candidate: Candidate, judged: Judged, size_px: tuple[int, int] = (480, 480)) -> Iterator[Image]:
+def rollout_film(
+    clip: Clip, candidate: Candidate, judged: Judged, size_px: tuple[int, int] = (480, 480)
+) -> Iterator[Image]:
     """Both rollouts at 10 Hz, T .. T+2H, one picture a step."""
-    ways = _ways(clip, candidate, judged, "expert")
+    ways = _paths_of_attempt(clip, candidate, judged, "expert")
     for stage, rollout in enumerate((candidate.rollout, judged.rollout)):
         for row in range(stage, len(rollout.ego_states)):
             step = rollout.start_step + row
@@ -302,21 +304,21 @@ def sample_bev(
         red=[lanes[i] for i in sorted(red) if i in lanes],
     )
     boxes = np.asarray(row["agent_boxes"], dtype=float).reshape(len(row["agent_kinds"]), -1, 5)
-    here = ego_way(row)[step]
-    paths = [*(_scored_paths(row, vocabulary) if vocabulary is not None else ()), *_paths(row, logged)]
+    here = ego_poses(row)[step]
+    paths = [*(_scored_paths(row, vocabulary) if vocabulary is not None else ()), *_paths_of_sample(row, logged)]
     if not legend:
         paths = [replace(path, label="") for path in paths]
     return draw_bev(here, shapes, Boxes(boxes[:, step], row["agent_kinds"]), here, paths, "", size_px)
 
 
-def nearer(image: Image) -> Image:
+def crop_to_60_m(image: Image) -> Image:
     """Of a square top-down picture the inner 60 m of 80 m, the ego staying at 6/10 of the height; the legend goes."""
     size = image.shape[0]
     top, side = round(0.6 * size / 4), size // 8
     return np.ascontiguousarray(image[top : top + 3 * size // 4, side : side + 3 * size // 4])
 
 
-def ego_way(row: Row) -> Array:
+def ego_poses(row: Row) -> Array:
     """(56, 3) poses at 10 Hz, -1.5 .. 4.0 s around now, in the ego frame at now: what led here, then the label."""
     return np.concatenate([row["ego_history_10hz"], row["label_10hz"]]).astype(np.float64)
 
@@ -337,7 +339,7 @@ def _score_colour(score: float) -> Colour:
     return round(red), round(green), round(blue)
 
 
-def _paths(row: Row, logged: Array | None) -> list[DrawnPath]:
+def _paths_of_sample(row: Row, logged: Array | None) -> list[DrawnPath]:
     pose = np.asarray(row["now_pose"], dtype=float)
     label = np.concatenate([np.zeros((1, 3)), row["label_10hz"]])
     if row["perturbed_states"] is None:
@@ -377,7 +379,7 @@ def front_camera(row: Row) -> str | None:
     )
 
 
-def fitted(image: Image, width: int, height: int) -> Image:
+def letterboxed(image: Image, width: int, height: int) -> Image:
     """The image scaled into width x height pixels, its aspect kept, padded with the background."""
     scale = min(width / image.shape[1], height / image.shape[0])
     size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
@@ -388,7 +390,7 @@ def fitted(image: Image, width: int, height: int) -> Image:
     return sheet
 
 
-def encoded(image: Image, suffix: str = ".jpg") -> bytes:
+def encode_image(image: Image, suffix: str = ".jpg") -> bytes:
     """RGB as the bytes of a JPEG (quality 85) or PNG file."""
     options = [cv2.IMWRITE_JPEG_QUALITY, 85] if suffix == ".jpg" else []
     done, data = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
@@ -398,55 +400,56 @@ def encoded(image: Image, suffix: str = ".jpg") -> bytes:
 
 def small_jpeg(image: Image, width: int) -> bytes:
     """RGB scaled to a width, as the bytes of a JPEG."""
-    return encoded(fitted(image, width, max(1, round(width * image.shape[0] / image.shape[1]))))
+    return encode_image(letterboxed(image, width, max(1, round(width * image.shape[0] / image.shape[1]))))
 
 
 def sample_sheet(row: Row, logged: Array | None = None, bev_px: int = 720, vocabulary: Array | None = None) -> Image:
     """Top-down view and all cameras at now, side by side; up to three cameras in one column, more in two."""
-    tiles = [_stored(image) for image in images_at_now(row)] or [
-        note(f"no images: image_source is {row['image_source']}")
+    tiles = [_stored_image_tile(image) for image in images_at_now(row)] or [
+        text_tile(f"no images: image_source is {row['image_source']}")
     ]
-    return beside(sample_bev(row, logged, (bev_px, bev_px), vocabulary), tiles)
+    return side_by_side(sample_bev(row, logged, (bev_px, bev_px), vocabulary), tiles)
 
 
-def beside(bev: Image, tiles: Sequence[Image]) -> Image:
+def side_by_side(bev: Image, tiles: Sequence[Image]) -> Image:
     """A top-down view and tiles to the right of it, in one column up to three, else in two."""
-    strip = in_rows(tiles, 1 if len(tiles) <= 3 else 2)
+    strip = tile_grid(tiles, 1 if len(tiles) <= 3 else 2)
     height = max(bev.shape[0], strip.shape[0])
-    return np.concatenate([padded(bev, height), padded(strip, height)], axis=1)
+    return np.concatenate([pad_below(bev, height), pad_below(strip, height)], axis=1)
 
 
-def in_rows(tiles: Sequence[Image], columns: int) -> Image:
+def tile_grid(tiles: Sequence[Image], columns: int) -> Image:
     """Tiles of one size, row by row, the last row filled up with background."""
     whole = [*tiles, *([np.full_like(tiles[0], BACKGROUND)] * (-len(tiles) % columns))]
     return np.concatenate([np.concatenate(whole[i : i + columns], axis=1) for i in range(0, len(whole), columns)])
 
 
-def _stored(image: Mapping[str, Any]) -> Image:
+def _stored_image_tile(image: Mapping[str, Any]) -> Image:
     try:
         return tile(decode_stored_image(image), f"{image['camera']}  {image['time_s']:+.1f} s")
+        return captioned_tile(decoded(image), f"{image['camera']}  {image['time_s']:+.1f} s")
     except ValueError as error:
-        return note(str(error))
+        return text_tile(str(error))
 
 
-def tile(pixels: Image, caption: str, size_px: tuple[int, int] = TILE_PX) -> Image:
+def captioned_tile(pixels: Image, caption: str, size_px: tuple[int, int] = TILE_PX) -> Image:
     """A picture over its caption, with a margin; `size_px` width, height."""
     framed = np.full((size_px[1], size_px[0], 3), BACKGROUND, np.uint8)
-    framed[4:-CAPTION_PX, 4:-4] = fitted(pixels, size_px[0] - 8, size_px[1] - CAPTION_PX - 4)
+    framed[4:-CAPTION_PX, 4:-4] = letterboxed(pixels, size_px[0] - 8, size_px[1] - CAPTION_PX - 4)
     return _written(framed, caption, size_px[1] - 7)
 
 
-def note(text: str) -> Image:
+def text_tile(text: str) -> Image:
     """A tile of words."""
     return _written(np.full((TILE_PX[1], TILE_PX[0], 3), BACKGROUND, np.uint8), text[:60], TILE_PX[1] // 2)
 
 
-def _written(tile: Image, text: str, baseline: int) -> Image:
-    write(tile, text, (8, baseline), 0.42, INK)
-    return tile
+def _written(picture: Image, text: str, baseline: int) -> Image:
+    write_text(picture, text, (8, baseline), 0.42, INK)
+    return picture
 
 
-def padded(image: Image, height: int) -> Image:
+def pad_below(image: Image, height: int) -> Image:
     """The image with background below."""
     below = np.full((height - image.shape[0], image.shape[1], 3), BACKGROUND, np.uint8)
     return np.concatenate([image, below], axis=0)

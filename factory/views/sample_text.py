@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from factory.config.arguments import Refused
-from factory.views.status import fate, rows_where, to_the_side, turned
+from factory.views.status import outcome_text, rows_where, side_text, turn_text
 
 if TYPE_CHECKING:
     from factory.graph.steps import PreparedClip
@@ -27,7 +27,7 @@ def open_samples(store: "Store") -> "SampleTable":
         raise Refused(str(error)) from error
 
 
-def find(table: "SampleTable", store: "Store", which: str) -> str:
+def find_sample_id(table: "SampleTable", store: "Store", which: str) -> str:
     """The attempt_id meant by an ordinal, an id or the beginning of one. Raises Refused."""
     from factory.store.table import keys_with_prefix
 
@@ -40,7 +40,7 @@ def find(table: "SampleTable", store: "Store", which: str) -> str:
         raise Refused(f"sample={which} is the beginning of {len(found)} ids: {', '.join(found[:8])}")
     dropped = keys_with_prefix(store.outcomes.keys(), which)
     if len(dropped) == 1:
-        raise Refused(fate(rows_where(store.outcomes, {"attempt_id": dropped[0]})[0]))
+        raise Refused(outcome_text(rows_where(store.outcomes, {"attempt_id": dropped[0]})[0]))
     raise Refused(f"no sample {which}: ids begin otherwise, ordinals go from 0 to {len(table) - 1}; see list=true")
 
 
@@ -108,7 +108,6 @@ def prepared_episode(row: Mapping[str, Any], prepared: "PreparedClip") -> bytes:
 
 def number_lines(row: dict[str, Any]) -> Iterable[str]:
     """A sample's numbers, without what is large."""
-    from factory.views.status import to_the_side, turned
     from tasks.subscores import SUBSCORES
 
     yield f"sample        {row['attempt_id']}"
@@ -119,9 +118,9 @@ def number_lines(row: dict[str, Any]) -> Iterable[str]:
     yield f"ego           {vx:.2f}, {vy:.2f} m/s; {ax:.2f}, {ay:.2f} m/s2; command {row['command']}"
     if row["candidate_end"] is not None:
         x, y, heading, speed = row["candidate_end"]
-        yield f"perturbed by  {x:+.2f} m along, {to_the_side(y)}, {turned(heading)}, at {speed:.2f} m/s"
+        yield f"perturbed by  {x:+.2f} m along, {side_text(y)}, {turn_text(heading)}, at {speed:.2f} m/s"
     x, y, heading = row["label_10hz"][-1]
-    yield f"label         ends {x:+.2f} m ahead, {to_the_side(y)}, turned {turned(heading)} after 4 s"
+    yield f"label         ends {x:+.2f} m ahead, {side_text(y)}, turned {turn_text(heading)} after 4 s"
     images, source = row["images"] or (), row["image_source"]
     cameras = ", ".join(dict.fromkeys(image["camera"] for image in images))
     tags = ", ".join(row["tags"]) or "-"
@@ -147,7 +146,7 @@ def lineage(store: "Store", which: str) -> list[Part]:
     """The chain, part by part. Raises Refused where no attempt, or more than one, is meant."""
     from factory.store.samples import run_number_lookup
 
-    attempt_id = _meant(store, which)
+    attempt_id = _find_attempt_id(store, which)
     is_sample = attempt_id in store.samples
     path, row = _row(store.samples if is_sample else store.outcomes, attempt_id)
     records = store.runs()
@@ -158,11 +157,13 @@ def lineage(store: "Store", which: str) -> list[Part]:
     if row["candidate_index"] >= 0:
         parts.append(("candidate", _candidate_facts(row, clip, record)))
     parts.append(("attempt", _attempt_facts(store, row)))
-    parts.append(("sample", _sample_facts(store, row, path)) if is_sample else ("no sample", _fate(store, row, path)))
+    parts.append(
+        ("sample", _sample_facts(store, row, path)) if is_sample else ("no sample", _outcome_facts(store, row, path))
+    )
     return parts
 
 
-def _meant(store: "Store", which: str) -> str:
+def _find_attempt_id(store: "Store", which: str) -> str:
     from factory.store.table import keys_with_prefix
 
     ids = store.samples.keys()
@@ -235,7 +236,7 @@ def _candidate_facts(row: Row, clip: Row, record: Row) -> list[tuple[str, object
     return [
         *facts,
         _moved_by(found["vocabulary_index"], clip, record),
-        ("ends", f"{x:+.2f} m along, {to_the_side(y)}, {turned(heading)}, at {speed:.2f} m/s"),
+        ("ends", f"{x:+.2f} m along, {side_text(y)}, {turn_text(heading)}, at {speed:.2f} m/s"),
         ("grid cell", ", ".join(map(str, found["cell"]))),
         ("EPDMS", f"{found['score']:.3f} against log replay, {found['reactive_score']:.3f} among reacting agents"),
     ]
@@ -285,7 +286,7 @@ def _sample_facts(store: "Store", row: Row, path: str) -> list[tuple[str, object
     ]
 
 
-def _fate(store: "Store", row: Row, path: str) -> list[tuple[str, object]]:
+def _outcome_facts(store: "Store", row: Row, path: str) -> list[tuple[str, object]]:
     return [
         ("became", row["kind"]),
         ("by", f"{row['stage']}.{row['reason']}".strip(".")),

@@ -61,7 +61,7 @@ def logged_vehicles(store: "Store", asset: RenderAsset) -> tuple[list[LoggedVehi
     found = False
     for clip in _clips_in(store, block):
         found = True
-        _add(seen, clip, asset, block)
+        _add_boxes(seen, clip, asset, block)
     if not found:
         stretch = f"{block.log_id}, {block.start_s:.1f} to {block.end_s:.1f} s"
         raise BadScene(f"{store.location.uri}: no prepared clip of log {stretch} in its cache")
@@ -70,7 +70,7 @@ def logged_vehicles(store: "Store", asset: RenderAsset) -> tuple[list[LoggedVehi
     tokens = _tokens(known)
     times_s = block.start_s + 1e-3 * np.array(times_ms)
     vehicles = [
-        LoggedVehicle(token, asset.nodes[name], times_s, _poses(seen[name], times_ms))
+        LoggedVehicle(token, asset.nodes[name], times_s, _poses_of_boxes(seen[name], times_ms))
         for name, token in zip(known, tokens)
     ]
     return vehicles, [name for name in seen if name not in known]
@@ -93,7 +93,7 @@ def _clips_in(store: "Store", block: BlockRange) -> Iterator[Clip]:
             yield clip
 
 
-def _add(seen: dict[str, dict[int, Array]], clip: Clip, asset: RenderAsset, block: BlockRange) -> None:
+def _add_boxes(seen: dict[str, dict[int, Array]], clip: Clip, asset: RenderAsset, block: BlockRange) -> None:
     """Of a clip's tracks those that are `seen` by now, their boxes (7,), within the block."""
     first_s, length_s = clip.start_s - block.start_s, block.end_s - block.start_s
     agents, origin = asset.settled(clip.agents, first_s), np.append(asset.origin, np.zeros(4))
@@ -106,7 +106,7 @@ def _add(seen: dict[str, dict[int, Array]], clip: Clip, asset: RenderAsset, bloc
                 seen[name][round(1e3 * time_s)] = box - origin
 
 
-def _poses(boxes: dict[int, Array], times_ms: Sequence[int]) -> Array:
+def _poses_of_boxes(boxes: dict[int, Array], times_ms: Sequence[int]) -> Array:
     """(F, 4, 4) of the boxes at these times; NaN where there is none."""
     poses = np.full((len(times_ms), 4, 4), np.nan)
     rows = [i for i, time_ms in enumerate(times_ms) if time_ms in boxes]
@@ -198,11 +198,11 @@ def read_splats(path: Path, traversal: int | None = None, transforms: Path | Non
         raise BadScene(f"{path}: traversal= is of a checkpoint of MTGS")
     try:
         if suffix in CHECKPOINTS:
-            found = from_checkpoint(_loaded(path), traversal)
+            found = from_checkpoint(_load_checkpoint(path), traversal)
         elif suffix == ".ply":
             found = SplatCheckpoint(from_ply(path.read_bytes()))
         else:
-            gaussians, antialiased = from_spz(path.read_bytes(), zstd)
+            gaussians, antialiased = from_spz(path.read_bytes(), decompress_zstd)
             found = SplatCheckpoint(gaussians, screen=ANTIALIASED if antialiased else None)
     except BadScene:
         raise
@@ -214,7 +214,7 @@ def read_splats(path: Path, traversal: int | None = None, transforms: Path | Non
         return found
     if found.nodes or found.origin is not None:
         raise BadScene(f"{path}: transforms= is of nerfstudio's own scenes, which have neither vehicles nor an origin")
-    return replace(found, background=taken_back(found.background, *transform_of(transforms)))
+    return replace(found, background=undo_transform(found.background, *read_nerfstudio_transform(transforms)))
 
 
 def background_bytes(
@@ -229,18 +229,18 @@ def background_bytes(
     Raises ValueError.
     """
     if suffix in CHECKPOINTS:
-        return _saved(worldengine(gaussians, origin, vehicles))
+        return _checkpoint_bytes(worldengine(gaussians, origin, vehicles))
     return to_ply(gaussians) if suffix == ".ply" else to_spz(gaussians, screen.keeps_light)
 
 
 def node_bytes(gaussians: Gaussians, suffix: str, screen: ScreenFilter) -> bytes:
     """A vehicle's file; a checkpoint is splatfacto's. Raises ValueError."""
     if suffix in CHECKPOINTS:
-        return _saved(splatfacto(gaussians))
+        return _checkpoint_bytes(splatfacto(gaussians))
     return background_bytes(gaussians, suffix, np.zeros(3), screen)
 
 
-def transform_of(path: Path) -> tuple[Array, float]:
+def read_nerfstudio_transform(path: Path) -> tuple[Array, float]:
     """Rigid (4, 4), and the scale after it, that led from the photos' frame to nerfstudio's. Raises BadScene."""
     try:
         told = json.loads(path.read_text(encoding="utf-8"))
@@ -253,7 +253,7 @@ def transform_of(path: Path) -> tuple[Array, float]:
     return np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]]), scale
 
 
-def taken_back(gaussians: Gaussians, transform: Array, scale: float) -> Gaussians:
+def undo_transform(gaussians: Gaussians, transform: Array, scale: float) -> Gaussians:
     """The Gaussians of a frame that x -> scale * (transform x) led to, in x's own."""
     grown = replace(
         gaussians,
@@ -263,12 +263,12 @@ def taken_back(gaussians: Gaussians, transform: Array, scale: float) -> Gaussian
     return moved(grown, np.asarray(np.linalg.inv(transform), np.float64))
 
 
-def zstd(data: bytes, size: int) -> bytes:
+def decompress_zstd(data: bytes, size: int) -> bytes:
     """What a stream of zstd holds, `size` bytes. Raises OSError."""
     return pa.decompress(data, size, codec="zstd", asbytes=True)
 
 
-def _loaded(path: Path) -> object:
+def _load_checkpoint(path: Path) -> object:
     """Of tensors, arrays and plain values alone; nothing of the file runs. Raises BadScene."""
     rebuilt: Any = np.zeros(0).__reduce__()[0]
     scalar: Any = np.float64(0.0).__reduce__()[0]
@@ -292,7 +292,7 @@ def _as_arrays(value: Any) -> Any:
     return (tensor.float() if tensor.is_floating_point() else tensor).numpy()
 
 
-def _saved(content: Mapping[str, Any]) -> bytes:
+def _checkpoint_bytes(content: Mapping[str, Any]) -> bytes:
     """The content as torch saves it, arrays as tensors. Raises ValueError without PyTorch."""
     import io
 
@@ -321,8 +321,8 @@ def info_text(path: Path, asset: RenderAsset) -> str:
         lines.append(f"sensors at  x {x}, y {y} m")
     how = "antialiased" if asset.screen.keeps_light else "classic"
     lines.append(f"drawn       {how}, {asset.screen.dilation_px2:g} px2 wider")
-    lines.append(f"background  {_counted(asset.background)}")
-    lines += [f"node        {name}: {_counted(node)}" for name, node in asset.nodes.items()]
+    lines.append(f"background  {_gaussians_text(asset.background)}")
+    lines += [f"node        {name}: {_gaussians_text(node)}" for name, node in asset.nodes.items()]
     held_out = f"{asset.psnr_db:.2f} dB over {asset.n_held_out} held-out photos"
     lines.append(f"psnr        {held_out if np.isfinite(asset.psnr_db) else 'not measured'}")
     lines += [f"camera      {row.camera}: {row.text}" for row in camera_rows(asset.views)]
@@ -334,7 +334,7 @@ def info_text(path: Path, asset: RenderAsset) -> str:
     return "\n".join([*lines, f"exposures   {len(asset.exposures)}"])
 
 
-def export(
+def export_scene(
     asset: RenderAsset, folder: Path, suffix: str = ".ply", vehicles: Sequence[LoggedVehicle] = ()
 ) -> list[Path]:
     """Writes the parts into a folder, Gaussians as `suffix` says; returns their paths.
@@ -361,7 +361,7 @@ def export(
     return [folder / name for name in (*files, "sky.png", "scene.json")]
 
 
-def imported(
+def scene_from_splats(
     found: SplatCheckpoint, like: str | None = None, origin: str | None = None, antialiased: bool | None = None
 ) -> RenderAsset:
     """What a file holds as a scene of unknown quality. Raises BadScene or ValueError.
@@ -373,7 +373,7 @@ def imported(
     screen = found.screen if antialiased is None else (ANTIALIASED if antialiased else CLASSIC)
     if found.origin is not None and origin is not None:
         raise ValueError("origin=: the file itself says where it lies in the world")
-    place = _place(origin or "0,0,0") if found.origin is None else found.origin
+    place = _parse_origin(origin or "0,0,0") if found.origin is None else found.origin
     if like is None:
         return RenderAsset(place, found.background, found.nodes, plain_sky(), float("nan"), screen=screen or CLASSIC)
     other = read_scene(Path(like))
@@ -390,7 +390,7 @@ def imported(
     )
 
 
-def _place(text: str) -> np.ndarray:
+def _parse_origin(text: str) -> np.ndarray:
     try:
         place = np.array([float(number) for number in text.split(",")])
     except ValueError as error:
@@ -400,5 +400,5 @@ def _place(text: str) -> np.ndarray:
     return place
 
 
-def _counted(part: Gaussians) -> str:
+def _gaussians_text(part: Gaussians) -> str:
     return f"{len(part)} Gaussians, SH degree {sh.COUNTS.index(part.sh_rest.shape[1])}"

@@ -45,7 +45,7 @@ def how_to_retry(error_kind: str, runs: Sequence[Mapping[str, Any]]) -> str:
 
 def open_store(out: str) -> "Store":
     """Raises Refused where there is no run, or can be none."""
-    location = out_of(out)
+    location = location_of_out(out)
     from deltalake.exceptions import DeltaError
 
     from factory.store.samples import OtherSchema, Store
@@ -61,7 +61,7 @@ def open_store(out: str) -> "Store":
     return store
 
 
-def out_of(out: str) -> "Location":
+def location_of_out(out: str) -> "Location":
     """Where a run is. Raises Refused where there can be none."""
     if not out.strip():
         raise Refused("out= is empty: name the folder or URL of a run (a shell variable that is not set?)")
@@ -79,13 +79,13 @@ def status_lines(store: "Store") -> Iterable[str]:
     from factory.store.funnel import funnel_of_tables, funnel_tables
 
     samples, fell, lists = funnel_tables(store, ("split", "image_source", "dataset"))
-    outcomes = counted(fell["kind"])
+    outcomes = value_counts(fell["kind"])
     yield f"store       {store.location.uri}"
     for table in (store.samples, store.candidates, store.outcomes, store.plans):
         version = "not there yet" if table.version is None else f"version {table.version}"
         yield f"{table.spec.name:<12}{len(table):,} rows, {len(table.live_files())} files, {version}"
     for title in ("dataset", "split", "image_source"):
-        counts = counted(samples[title])
+        counts = value_counts(samples[title])
         yield f"{title:<14}" + (", ".join(f"{name} {n}" for name, n in sorted(counts.items())) or "no samples")
     yield "not samples   " + (", ".join(f"{kind} {n}" for kind, n in sorted(outcomes.items())) or "none")
     yield ""
@@ -96,11 +96,11 @@ def status_lines(store: "Store") -> Iterable[str]:
         yield "planned = accepted + rejected + failed + pending"
         yield funnel.balance.text().rstrip()
         yield ""
-    yield from _in_work(store)
+    yield from _long_running_tasks(store)
     yield from _last_run(store)
 
 
-def _in_work(store: "Store") -> Iterable[str]:
+def _long_running_tasks(store: "Store") -> Iterable[str]:
     """Tasks that have been at work for long, as their guards said in the last half minute."""
     from factory.graph.guard import SHOWN_S, WORK, read_note
     from factory.graph.local import notes_folder
@@ -130,9 +130,9 @@ def _last_run(store: "Store") -> Iterable[str]:
         yield f"report        {store.location.uri}/report.html"
 
 
-def failed_line(store: "Store") -> str:
+def failure_summary(store: "Store") -> str:
     """What failed, how often, how the first error ends, and what shows all of it; for the end of a run."""
-    rows, kinds = _failed(store)
+    rows, kinds = _failed_rows(store)
     counts, first = ", ".join(f"{kind} {n}" for kind, n in kinds.items()), rows[0]
     where = f"{first['expert']} on clip {first['clip_id']}" if first["expert"] else f"clip {first['clip_id']}"
     said = (first["error"].strip().splitlines() or ["no message"])[-1]
@@ -142,7 +142,7 @@ def failed_line(store: "Store") -> str:
     )
 
 
-def counted(column: "pa.ChunkedArray") -> dict[str, int]:
+def value_counts(column: "pa.ChunkedArray") -> dict[str, int]:
     """Text -> rows, of a column of texts as numbers into a dictionary."""
     return {row["values"]: row["counts"] for row in column.unify_dictionaries().value_counts().to_pylist()}
 
@@ -161,13 +161,13 @@ def rows_where(
     return found
 
 
-def fate(row: Mapping[str, Any]) -> str:
+def outcome_text(row: Mapping[str, Any]) -> str:
     """What became of an attempt that is no sample, from its row of outcomes."""
     why = row["error"] or f"{row['stage']}.{row['reason']} {row['detail']}".strip(". ")
     return f"{row['attempt_id']} is no sample but a {row['kind']} attempt of {row['expert'] or 'a clip'}: {why}"
 
 
-def _failed(store: "Store") -> tuple[list[dict[str, Any]], dict[str, int]]:
+def _failed_rows(store: "Store") -> tuple[list[dict[str, Any]], dict[str, int]]:
     """By log, clip and walk; how many of each kind of error."""
     rows = rows_where(store.outcomes, {"kind": "failed"})
     rows.sort(key=lambda row: (row["log_id"], row["clip_id"], row["expert"], row["candidate_index"]))
@@ -176,7 +176,7 @@ def _failed(store: "Store") -> tuple[list[dict[str, Any]], dict[str, int]]:
 
 def failed_lines(store: "Store") -> Iterable[str]:
     """Every failed attempt with its message, and how to try it again."""
-    (rows, kinds), runs = _failed(store), store.runs()
+    (rows, kinds), runs = _failed_rows(store), store.runs()
     yield f"{len(rows)} failed" + (": " + ", ".join(f"{kind} {n}" for kind, n in kinds.items()) if rows else "")
     for row in rows:
         what = f"expert {row['expert']}, candidate {row['candidate_index']}" if row["expert"] else "the clip as a whole"
@@ -236,11 +236,11 @@ GATE_WORDS = {
 }
 
 
-def to_the_side(y_m: float) -> str:
+def side_text(y_m: float) -> str:
     """A distance across, by the word for its side: y of the ego frame points left."""
     return f"{abs(y_m):.2f} m to the {'left' if y_m >= 0.0 else 'right'}"
 
 
-def turned(heading_rad: float) -> str:
+def turn_text(heading_rad: float) -> str:
     """A turn by the word for its side: counter-clockwise is left."""
     return f"{abs(heading_rad) * 57.29578:.1f} deg to the {'left' if heading_rad >= 0.0 else 'right'}"

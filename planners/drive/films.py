@@ -18,11 +18,11 @@ from factory.views.pictures import (
     Boxes,
     DrawnPath,
     draw_bev,
-    fitted,
     front_camera,
+    letterboxed,
     map_shapes,
-    write,
     write_mp4,
+    write_text,
 )
 from planners.drive.loop import PLAN_STEPS, ClosedLoop, measure_drive
 from tasks.world.arrays import Image
@@ -74,8 +74,9 @@ def _sheet(made: ClosedLoop, rig: Rig, title: str, step: int) -> Image:
     if front is not None:
         seen = next(image for image in images if image["camera"] == front)
         sheet[: CAMERA_PX[1], BEV_PX[0] :] = fitted(decode_stored_image(seen), *CAMERA_PX)
+        sheet[: CAMERA_PX[1], BEV_PX[0] :] = letterboxed(decoded(seen), *CAMERA_PX)
     for row, line in enumerate(_lines(made, front, step, planned)):
-        write(sheet, line, (BEV_PX[0] + 12, CAMERA_PX[1] + 26 + 24 * row), 0.5)
+        write_text(sheet, line, (BEV_PX[0] + 12, CAMERA_PX[1] + 26 + 24 * row), 0.5)
     return sheet
 
 

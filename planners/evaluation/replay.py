@@ -23,8 +23,8 @@ from factory.views.pictures import (
     DrawnPath,
     draw_bev,
     earlier_images,
-    fitted,
     front_camera,
+    letterboxed,
     map_shapes,
     write_mp4,
 )
@@ -98,7 +98,7 @@ def _sheet(bev: Image, picture: Image | None, camera: str | None, scores: FrameS
     sheet[:, : BEV_PX[0]] = bev
     left = BEV_PX[0]
     if picture is not None:
-        sheet[: CAMERA_PX[1], left:] = fitted(picture, *CAMERA_PX)
+        sheet[: CAMERA_PX[1], left:] = letterboxed(picture, *CAMERA_PX)
     lines = [f"camera {camera}, up to now" if picture is not None else "no images"]
     lines += [f"{name.upper()} {_number(value)}" for name, value in zip(COLUMNS, scores.unfiltered)]
     for i, line in enumerate(lines):

@@ -15,19 +15,19 @@ from factory.store.reader import decode_stored_image, find_row_group
 from factory.store.samples import Kind, Store
 from factory.store.schema import AGENT_STEPS, SAMPLES, SCHEMA, table_to_rows
 from factory.store.table import KeyedTable, text_equals
-from factory.views.board.watch import Snapshot, plain
+from factory.views.board.watch import Snapshot, decode_dictionaries
 from factory.views.episode_messages import episode_of
 from factory.views.pictures import (
     BEV_COLUMNS,
-    encoded,
+    crop_to_60_m,
+    encode_image,
     front_camera,
     images_at_now,
-    nearer,
     sample_bev,
     small_jpeg,
 )
 from factory.views.sample_text import logged_drive
-from factory.views.status import REASON_WORDS, fate, how_to_retry, to_the_side, turned
+from factory.views.status import REASON_WORDS, how_to_retry, outcome_text, side_text, turn_text
 from tasks.subscores import SUBSCORES
 from tasks.world.arrays import Ints
 
@@ -57,11 +57,11 @@ class BadRequest(ValueError):
     """A question that cannot be answered as it is put; the message says why."""
 
 
-class NotThere(LookupError):
+class NotFound(LookupError):
     """What was asked for is not in the tables; the message says so."""
 
 
-def chosen(shot: Snapshot, wanted: Mapping[str, str], order: str = "newest") -> Ints:
+def filtered_order(shot: Snapshot, wanted: Mapping[str, str], order: str = "newest") -> Ints:
     """Places in `samples` of the rows that fit, in order. Raises BadRequest for an unknown filter or order."""
     if order not in ORDERS:
         raise BadRequest(f"order={order}: must be one of {', '.join(ORDERS)}")
@@ -84,7 +84,7 @@ def chosen(shot: Snapshot, wanted: Mapping[str, str], order: str = "newest") -> 
 
 def gallery(shot: Snapshot, wanted: Mapping[str, str], page: int = 1, size: int = 12, order: str = "newest") -> Json:
     """One page of cards, counted from 1; beyond the last it is empty. Raises BadRequest."""
-    places = chosen(shot, wanted, order)
+    places = filtered_order(shot, wanted, order)
     return {"version": shot.version, **_page(shot.samples, places, page, size, lambda row: card_of(shot, row))}
 
 
@@ -92,7 +92,7 @@ def failures(shot: Snapshot, page: int = 1, size: int = 50) -> Json:
     """A page of failed attempts with their errors, by log; of a failed clip `expert` is empty. Raises BadRequest."""
     rows = shot.outcomes.filter(pa.array(text_equals(shot.outcomes["kind"], Kind.FAILED.value)))
     by = [("log_id", "ascending"), ("clip_id", "ascending"), ("attempt_id", "ascending")]
-    order = np.asarray(pc.sort_indices(plain(rows.select([name for name, _ in by])), sort_keys=by))
+    order = np.asarray(pc.sort_indices(decode_dictionaries(rows.select([name for name, _ in by])), sort_keys=by))
 
     def failure(row: Row) -> Json:
         kind = row["error_kind"]
@@ -119,18 +119,18 @@ def card_of(shot: Snapshot, row: Row) -> Json:
     return {name: row[name] for name in CARD} | {"file": file, "written_ms": row["_written_ms"]}
 
 
-def place_of(shot: Snapshot, attempt_id: str) -> int:
+def newest_first_place(shot: Snapshot, attempt_id: str) -> int:
     """Its place in `newest_first`. Raises NotThere, which says what became of the attempt if anything did."""
     at = pc.index(shot.samples["attempt_id"], attempt_id).as_py()
     if at >= 0:
         return int(np.flatnonzero(shot.newest_first == at)[0])
     other = shot.outcomes.filter(pc.equal(shot.outcomes["attempt_id"], attempt_id)).to_pylist()
-    raise NotThere(fate(other[0]) if other else f"no sample {attempt_id}")
+    raise NotFound(outcome_text(other[0]) if other else f"no sample {attempt_id}")
 
 
-def whole(shot: Snapshot, attempt_id: str, row: Row, candidates: KeyedTable) -> Json:
+def sample_page(shot: Snapshot, attempt_id: str, row: Row, candidates: KeyedTable) -> Json:
     """One sample's page from its whole row; newer, older: its neighbours in the gallery. Raises NotThere."""
-    at = place_of(shot, attempt_id)
+    at = newest_first_place(shot, attempt_id)
     card = card_of(shot, shot.newest(at))
 
     def neighbour(place: int) -> str | None:
@@ -165,9 +165,9 @@ def _facts(row: Row) -> dict[str, str]:
     }
     if row["candidate_end"] is not None:
         x, y, heading, speed = (float(v) for v in row["candidate_end"])
-        facts["perturbed by"] = f"{x:+.2f} m along, {to_the_side(y)}, {turned(heading)}, at {speed:.1f} m/s"
+        facts["perturbed by"] = f"{x:+.2f} m along, {side_text(y)}, {turn_text(heading)}, at {speed:.1f} m/s"
     x, y, heading = (float(v) for v in row["label_10hz"][-1])
-    facts["label after 4 s"] = f"{x:.1f} m ahead, {to_the_side(y)}, turned {turned(heading)}"
+    facts["label after 4 s"] = f"{x:.1f} m ahead, {side_text(y)}, turned {turn_text(heading)}"
     facts["around it"] = f"{len(row['agent_ids'])} agents, {len(row['lane_ids'])} lanes"
     facts["images"] = f"{len(row['images'] or ())} from {row['image_source']}"
     if row["psnr"] is not None:
@@ -198,7 +198,7 @@ def _siblings(shot: Snapshot, card: Row, candidates: KeyedTable) -> list[Json]:
     for row in of_walk(shot.samples):
         accepted = {"attempt_id": row["attempt_id"], "kind": "accepted", "round": row["round"]}
         known[row["candidate_index"]] = accepted
-    ends = _ends(shot, card["clip_id"], candidates) if card["candidate_index"] >= 0 else {}
+    ends = _candidate_ends(shot, card["clip_id"], candidates) if card["candidate_index"] >= 0 else {}
     blank = {"attempt_id": "", "kind": "untried", "round": None, "reason": "", "words": "", "detail": ""}
     return [
         {"candidate_index": i, **blank, **known.get(i, {}), "end_x_m": x, "end_y_m": y}
@@ -207,7 +207,7 @@ def _siblings(shot: Snapshot, card: Row, candidates: KeyedTable) -> list[Json]:
     ]
 
 
-def _ends(shot: Snapshot, clip_id: str, table: KeyedTable) -> dict[int, tuple[float, float]]:
+def _candidate_ends(shot: Snapshot, clip_id: str, table: KeyedTable) -> dict[int, tuple[float, float]]:
     """Candidate -> where it ends, from the clip's own file."""
     at = shot.candidates.filter(pc.equal(shot.candidates["clip_id"], clip_id)).to_pylist()
     if not at:
@@ -277,7 +277,7 @@ class Pictures:
         try:
             return episode_of(row, self._logged(*(row[name] for name in MADE_FROM)))
         except ValueError as error:
-            raise NotThere(f"{attempt_id} makes no episode: {error}") from error
+            raise NotFound(f"{attempt_id} makes no episode: {error}") from error
 
     def _row(self, place: Place, columns: Sequence[str]) -> Sample:
         path, row, partition = place
@@ -295,25 +295,25 @@ class Pictures:
         name = front_camera(row)
         found = [image for image in images_at_now(row) if image["camera"] == name]
         if not found:
-            raise NotThere(f"{row['attempt_id']} has no image: image_source is {row['image_source']}")
+            raise NotFound(f"{row['attempt_id']} has no image: image_source is {row['image_source']}")
         return _jpeg(found[0], small=True)
 
     def _make_image(self, place: Place, index: int, small: bool) -> bytes:
         row = self._row(place, ("attempt_id", "images"))
         images = row["images"] or ()
         if index >= len(images):
-            raise NotThere(f"{row['attempt_id']} has {len(images)} images, none of number {index}")
+            raise NotFound(f"{row['attempt_id']} has {len(images)} images, none of number {index}")
         return _jpeg(images[index], small)
 
     def _make_bev(self, place: Place, size_px: int, step: int) -> bytes:
         size = (size_px * 4 // 3,) * 2  # `nearer` keeps three quarters
         row = self._row(place, (*BEV_COLUMNS, *MADE_FROM))
         logged = self._logged(*(row[name] for name in MADE_FROM)) if size_px == LARGE_PX else None
-        return encoded(nearer(sample_bev(row, logged, size, step=step, legend=False)))
+        return encode_image(crop_to_60_m(sample_bev(row, logged, size, step=step, legend=False)))
 
 
 def _place(shot: Snapshot, attempt_id: str) -> Place:
-    row = shot.newest(place_of(shot, attempt_id))
+    row = shot.newest(newest_first_place(shot, attempt_id))
     partition = tuple((name, row[name]) for name in SAMPLES.partition_by)
     return shot.sample_paths[row["_file"]], row["_row"], partition
 
@@ -325,7 +325,7 @@ def _jpeg(image: Mapping[str, Any], small: bool) -> bytes:
     try:
         pixels = decode_stored_image(image) if read_header(image["jpeg"])[1][0] > WIDE_PX else None
     except ValueError as error:
-        raise NotThere(str(error)) from error
+        raise NotFound(str(error)) from error
     if pixels is None:
         return bytes(image["jpeg"])
     return small_jpeg(pixels, WIDE_PX)

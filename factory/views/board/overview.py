@@ -19,7 +19,7 @@ from factory.store.samples import Kind
 from factory.store.schema import TableSpec
 from factory.store.table import KeyedTable, text_equals
 from factory.views.board.gallery import FILTERS
-from factory.views.board.watch import Snapshot, plain
+from factory.views.board.watch import Snapshot, decode_dictionaries
 from factory.views.status import GATE_WORDS, PAPER_CLIP_PERCENT, REASON_WORDS, STATUS
 from tasks.stages import STAGES
 
@@ -204,7 +204,7 @@ def _walks(shot: Snapshot, began_ms: int, elapsed_s: float) -> tuple[int, int, f
     """Walks that ended since the run began, these and those still pending, and the seconds left at this rate."""
     rounds, experts = shot.current["rounds"], shot.current["experts"]
     samples, outcomes = (
-        plain(rows.filter(pc.greater_equal(rows["_written_ms"], began_ms)).select(columns))
+        decode_dictionaries(rows.filter(pc.greater_equal(rows["_written_ms"], began_ms)).select(columns))
         for rows, columns in ((shot.samples, [*WALK, "round"]), (shot.outcomes, [*WALK, "kind"]))
     )
     once = pc.less(samples["candidate_index"], 0)

@@ -21,13 +21,13 @@ from factory.store.reader import decode_stored_image
 from factory.store.samples import Store
 from factory.store.schema import NOW_INDEX
 from factory.store.table import text_equals
-from factory.views.board.gallery import Pictures, card_of, failures, gallery, place_of, whole
+from factory.views.board.gallery import Pictures, card_of, failures, gallery, newest_first_place, sample_page
 from factory.views.board.overview import Drives, drives_as_json, overview
 from factory.views.board.server import STATIC
 from factory.views.board.watch import Snapshot, Watch
 from factory.views.pictures import front_camera, images_at_now, small_jpeg
 from factory.views.scene_files import scene_tables
-from factory.views.status import counted
+from factory.views.status import value_counts
 
 if TYPE_CHECKING:
     from factory.setup.settings import Run
@@ -49,11 +49,11 @@ POLICY = (
 def write_report(store: Store, to: str | None = None) -> str:
     """Write the file, into `out` where no other place is named; where it is now. Raises Refused where it cannot be."""
     extra: dict[str, Any] = json.loads(store.location.read(FACTS) or b"{}")
-    shot, pictures = Watch(store).now(), Pictures(store)
+    shot, pictures = Watch(store).snapshot(), Pictures(store)
     extra["scenes"] = scene_tables(Path(store.location.uri, "cache")) if store.location.is_local else {}
     settings = store.runs()[-1]["settings"] if store.runs() else {}
     extra["settings"] = {name: str(value) for name, value in settings.items()}
-    page = still_page(store, shot, pictures, extra)
+    page = report_page(store, shot, pictures, extra)
     if to is None:
         store.location.write(FILE, page)
         return f"{store.location.uri}/{FILE}"
@@ -85,7 +85,7 @@ def write_facts(store: Store, assembled: "Run") -> None:
     store.location.write(FACTS, json.dumps(facts).encode())
 
 
-def still_page(store: Store, shot: Snapshot, pictures: Pictures, extra: Mapping[str, Any]) -> bytes:
+def report_page(store: Store, shot: Snapshot, pictures: Pictures, extra: Mapping[str, Any]) -> bytes:
     """The file.
 
     extra: what the live page does not show: facts, settings, scenes, left_out (static/extra.js reads it).
@@ -102,7 +102,7 @@ def still_page(store: Store, shot: Snapshot, pictures: Pictures, extra: Mapping[
     }
     ids = [item["attempt_id"] for item in items]
     for i, attempt_id in enumerate(ids):
-        found = whole(shot, attempt_id, row := pictures.row(shot, attempt_id), store.candidates)
+        found = sample_page(shot, attempt_id, row := pictures.row(shot, attempt_id), store.candidates)
         newer, older = ids[i - 1] if i else None, ids[i + 1] if i + 1 < len(ids) else None
         images = _with_pictures(found, row, kept)
         answers[f"/api/samples/{attempt_id}"] = found | {"images": images, "newer": newer, "older": older}
@@ -113,7 +113,7 @@ def still_page(store: Store, shot: Snapshot, pictures: Pictures, extra: Mapping[
 def _shown(shot: Snapshot, always: Sequence[str]) -> list[Mapping[str, Any]]:
     """Rows of samples, newest first: some that must be there, and others as unlike each other as can be."""
     ids = list(dict.fromkeys([*always, *spread(shot.samples)]))[:N_SAMPLES]
-    return [shot.newest(place) for place in sorted(place_of(shot, attempt_id) for attempt_id in ids)]
+    return [shot.newest(place) for place in sorted(newest_first_place(shot, attempt_id) for attempt_id in ids)]
 
 
 def spread(samples: pa.Table) -> list[str]:
@@ -123,7 +123,7 @@ def spread(samples: pa.Table) -> list[str]:
     """
     rows = samples.select(["attempt_id", "expert", "clip_id", "round"])
     left: list[tuple[str, list[tuple[str, Any]]]] = []
-    for expert in counted(rows["expert"]):
+    for expert in value_counts(rows["expert"]):
         of_expert = rows.take(np.flatnonzero(text_equals(rows["expert"], expert)))
         few = pc.select_k_unstable(of_expert, PER_EXPERT, [("attempt_id", "ascending")])
         left += [(str(row.pop("attempt_id")), list(row.items())) for row in of_expert.take(few).to_pylist()]
@@ -164,7 +164,7 @@ def _text(data: bytes) -> str:
 def _document(kept: Mapping[str, Any]) -> bytes:
     """index.html with everything that it names inside; data is JSON in which no tag can begin."""
     scripts = {
-        path.stem: "data:text/javascript;base64," + _text(_bare(path.read_text(encoding="utf-8")).encode())
+        path.stem: "data:text/javascript;base64," + _text(_with_bare_imports(path.read_text(encoding="utf-8")).encode())
         for path in STATIC.glob("*.js")
     }
     data = json.dumps(kept, allow_nan=False).replace("<", "\\u003c")
@@ -181,6 +181,6 @@ def _document(kept: Mapping[str, Any]) -> bytes:
     return page.replace("</head>", inside).encode()
 
 
-def _bare(script: str) -> str:
+def _with_bare_imports(script: str) -> str:
     """Its imports by bare names, which the import map knows: a data: URL has no neighbours."""
     return re.sub(r'from "\./(\w+)\.js"', r'from "\1"', script)

@@ -5,7 +5,7 @@
 | `/` and `/static/...` | the page, its style and scripts |
 | `/api/overview` | factory.views.board.overview.overview |
 | `/api/samples?page=1&size=12&order=newest&expert=...` | factory.views.board.gallery.gallery; filters: FILTERS there |
-| `/api/samples/<attempt_id>` | factory.views.board.gallery.whole |
+| `/api/samples/<attempt_id>` | factory.views.board.gallery.sample_page |
 | `/api/failed?page=1` | factory.views.board.gallery.failures |
 | `/api/drives` | factory.views.board.overview.drives_as_json |
 | `/picture/<attempt_id>/<name>.jpg` | a JPEG, see factory.views.board.gallery |
@@ -34,7 +34,7 @@ import pyarrow as pa
 from deltalake.exceptions import DeltaError
 
 from factory.store.samples import ChangedRun, Store
-from factory.views.board.gallery import BadRequest, NotThere, Pictures, failures, gallery, whole
+from factory.views.board.gallery import BadRequest, NotFound, Pictures, failures, gallery, sample_page
 from factory.views.board.overview import Drives, drives_as_json, overview
 from factory.views.board.watch import LOOK_EVERY_S, Watch
 from factory.wording import one_line
@@ -52,7 +52,7 @@ class Connections:
         self._idle: dict[socket.socket, None] = {}  # of which no whole request has come, the longest first
         self._all: set[socket.socket] = set()
 
-    def come(self, connection: socket.socket) -> None:
+    def admit(self, connection: socket.socket) -> None:
         """Wait for a place. The connection that has been idle for longest is closed for it."""
         while not self._places.acquire(blocking=False):
             self._hang_up_idlest()
@@ -62,17 +62,17 @@ class Connections:
             self._all.add(connection)
             self._idle[connection] = None
 
-    def asks(self, connection: socket.socket) -> None:
+    def mark_busy(self, connection: socket.socket) -> None:
         """It is being answered, and stays until it is."""
         with self._lock:
             self._idle.pop(connection, None)
 
-    def answered(self, connection: socket.socket) -> None:
+    def mark_idle(self, connection: socket.socket) -> None:
         """It may ask again."""
         with self._lock:
             self._idle[connection] = None
 
-    def gone(self, connection: socket.socket) -> None:
+    def release(self, connection: socket.socket) -> None:
         """Its place is free."""
         with self._lock:
             self._idle.pop(connection, None)
@@ -132,7 +132,7 @@ class Board:
             return self._answer(target)
         except BadRequest as error:
             return _json({"error": str(error)}, 400)
-        except NotThere as error:
+        except NotFound as error:
             return _json({"error": str(error.args[0])}, 404)
         except (DeltaError, ChangedRun, OSError, pa.ArrowException) as error:
             return _json({"error": f"the tables cannot be read now: {error}"}, 503)
@@ -149,33 +149,35 @@ class Board:
             case ["static", name]:
                 return _static(name)
             case ["api", "overview"]:
-                return _json(overview(self.watch.now(), self._store.location.uri, time.time()))
+                return _json(overview(self.watch.snapshot(), self._store.location.uri, time.time()))
             case ["api", "samples"]:
                 page, size = _number(query, "page", 1), _number(query, "size", 12)
                 order = query.pop("order", "newest")
-                return _json(gallery(self.watch.now(), query, page, size, order))
+                return _json(gallery(self.watch.snapshot(), query, page, size, order))
             case ["api", "samples", attempt_id]:
-                shot = self.watch.now()
-                row = self._pictures.row(shot, _checked(attempt_id))
-                return _json(whole(shot, attempt_id, row, self._store.candidates))
+                shot = self.watch.snapshot()
+                row = self._pictures.row(shot, _valid_id(attempt_id))
+                return _json(sample_page(shot, attempt_id, row, self._store.candidates))
             case ["api", "failed"]:
-                return _json(failures(self.watch.now(), _number(query, "page", 1)))
+                return _json(failures(self.watch.snapshot(), _number(query, "page", 1)))
             case ["api", "drives"]:
                 return _json(drives_as_json(self._drives.rows()))
             case ["film", name]:
-                film = self._drives.film(_checked(name.removesuffix(".mp4")))
+                film = self._drives.film(_valid_id(name.removesuffix(".mp4")))
                 if film is None:
-                    raise NotThere(f"no film {name}")
+                    raise NotFound(f"no film {name}")
                 return Answer(200, "video/mp4", film, FOREVER)
             case ["picture", attempt_id, name]:
-                return self._picture(_checked(attempt_id), name, query)
+                return self._picture(_valid_id(attempt_id), name, query)
             case ["episode", name]:
-                attempt_id = _checked(name.removesuffix(".mcap"))
-                return Answer(200, "application/octet-stream", self._pictures.episode(self.watch.now(), attempt_id))
-        raise NotThere(f"nothing is at {parts.path}")
+                attempt_id = _valid_id(name.removesuffix(".mcap"))
+                return Answer(
+                    200, "application/octet-stream", self._pictures.episode(self.watch.snapshot(), attempt_id)
+                )
+        raise NotFound(f"nothing is at {parts.path}")
 
     def _picture(self, attempt_id: str, name: str, query: dict[str, str]) -> Answer:
-        shot = self.watch.now()
+        shot = self.watch.snapshot()
         if name == "front.jpg":
             data = self._pictures.front(shot, attempt_id)
         elif name == "bev.jpg":
@@ -184,13 +186,13 @@ class Board:
             small = query.get("small") == "1"
             data = self._pictures.image(shot, attempt_id, int(name.removesuffix(".jpg")), small)
         else:
-            raise NotThere(f"no picture {name}: there are front.jpg, bev.jpg and <n>.jpg")
+            raise NotFound(f"no picture {name}: there are front.jpg, bev.jpg and <n>.jpg")
         return Answer(200, "image/jpeg", data, FOREVER if "v" in query else "no-store")
 
 
-def _checked(attempt_id: str) -> str:
+def _valid_id(attempt_id: str) -> str:
     if not ATTEMPT_ID.fullmatch(attempt_id):
-        raise NotThere("no sample of that name: an id is letters, digits, _ and -")
+        raise NotFound("no sample of that name: an id is letters, digits, _ and -")
     return attempt_id
 
 
@@ -208,7 +210,7 @@ def _json(value: Any, status: int = 200) -> Answer:
 
 def _static(name: str) -> Answer:
     if name not in SERVED:
-        raise NotThere(f"no file {name}")
+        raise NotFound(f"no file {name}")
     return Answer(200, f"{KINDS[SERVED[name].suffix]}; charset=utf-8", SERVED[name].read_bytes(), "no-cache")
 
 
@@ -225,12 +227,12 @@ class Server(ThreadingHTTPServer):
         super().__init__((host, port), Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        self.connections.come(request)
+        self.connections.admit(request)
         super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:
         super().shutdown_request(request)
-        self.connections.gone(request)
+        self.connections.release(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """One line, and none where the other side has gone."""
@@ -250,7 +252,7 @@ class Handler(BaseHTTPRequestHandler):
     wbufsize = -1
 
     def do_GET(self) -> None:
-        self.server.connections.asks(self.connection)
+        self.server.connections.mark_busy(self.connection)
         if {"content-length", "transfer-encoding"} & {name.lower() for name in self.headers}:
             self.close_connection = True  # a body is not read, and is no next request
         try:
@@ -259,7 +261,7 @@ class Handler(BaseHTTPRequestHandler):
             print(f"{self.path[:200]!r}: {type(error).__name__}: {one_line(error)}", file=sys.stderr)
             answer = _json({"error": "a bug: the dashboard's own output says which"}, 500)
         self._send(answer)
-        self.server.connections.answered(self.connection)
+        self.server.connections.mark_idle(self.connection)
 
     def _answer(self) -> Answer:
         names = self.server.host_names

@@ -56,7 +56,7 @@ class WatchedFiles:
     end_points: Points = field(default_factory=lambda: np.zeros((0, 2), np.float32))
 
 
-class Watched:
+class WatchedTable:
     """One table and the parts of it that were read."""
 
     def __init__(self, table: KeyedTable, columns: Sequence[str]) -> None:
@@ -66,7 +66,7 @@ class Watched:
         self.paths: list[str] = []  # by the number in _file
         self._seen: int | None = None
 
-    def look(self) -> bool:
+    def refresh(self) -> bool:
         """Read what was committed since; whether anything was."""
         self.table.refresh()
         if self.table.version == self._seen:
@@ -74,7 +74,7 @@ class Watched:
         self.files, self._seen = self.table.file_facts(), self.table.version
         self.parts = {paths: part for paths, part in self.parts.items() if self.files.keys() >= set(paths)}
         if len(self.parts) > MOST_PARTS:  # of a run that is watched, a few files each
-            self.parts = {sum(self.parts, ()): _together(list(self.parts.values()))}
+            self.parts = {sum(self.parts, ()): _merge_files(list(self.parts.values()))}
         known = {path for paths in self.parts for path in paths}
         for pack in pack_small(sorted(self.files.keys() - known), lambda path: self.files[path].n_rows):
             self.parts[tuple(pack)] = self._read(pack)
@@ -85,7 +85,7 @@ class Watched:
         names = [name for name in self._columns if name not in UNPACKED]
         empty = self.table.schema_of(names, encoded=True).empty_table()
         return pa.concat_tables(
-            [_placed(empty, 0, LiveFile({}, 0, 0, 0)), *(part.rows for part in self.parts.values())]
+            [_with_file_and_row(empty, 0, LiveFile({}, 0, 0, 0)), *(part.rows for part in self.parts.values())]
         )
 
     def _read(self, paths: Sequence[str]) -> WatchedFiles:
@@ -97,7 +97,9 @@ class Watched:
         file = self.files[path]
         rows = self.table.read_file(path, file.partition, self._columns)
         self.paths.append(path)
-        kept = _placed(rows.drop_columns([n for n in UNPACKED if n in rows.column_names]), len(self.paths) - 1, file)
+        kept = _with_file_and_row(
+            rows.drop_columns([n for n in UNPACKED if n in rows.column_names]), len(self.paths) - 1, file
+        )
         if "seconds" in self._columns:
             return WatchedFiles(kept, seconds=seconds_of(rows["seconds"]))
         if "candidates" in self._columns:
@@ -109,7 +111,7 @@ class Watched:
         return WatchedFiles(kept)
 
 
-def _together(parts: Sequence[WatchedFiles]) -> WatchedFiles:
+def _merge_files(parts: Sequence[WatchedFiles]) -> WatchedFiles:
     rows = pa.concat_tables(part.rows for part in parts).unify_dictionaries().combine_chunks()
     return WatchedFiles(rows, _summed([part.seconds for part in parts]), _joined(parts))
 
@@ -118,13 +120,13 @@ def _joined(parts: Iterable[WatchedFiles]) -> Points:
     return np.concatenate([np.zeros((0, 2), np.float32), *(part.end_points for part in parts)])
 
 
-def plain(rows: pa.Table) -> pa.Table:
+def decode_dictionaries(rows: pa.Table) -> pa.Table:
     """Some rows with their texts as texts, which can be sorted and listed."""
     kinds = [f.with_type(f.type.value_type) if pa.types.is_dictionary(f.type) else f for f in rows.schema]
     return rows.cast(pa.schema(kinds))
 
 
-def _placed(rows: pa.Table, number: int, file: LiveFile) -> pa.Table:
+def _with_file_and_row(rows: pa.Table, number: int, file: LiveFile) -> pa.Table:
     n = rows.num_rows
     rows = rows.append_column("_file", pa.repeat(pa.scalar(number, pa.int32()), n))
     rows = rows.append_column("_row", pa.array(np.arange(n), pa.int32()))
@@ -202,32 +204,32 @@ class Watch:
     def __init__(self, store: Store, look_every_s: float = LOOK_EVERY_S) -> None:
         self.store = store
         self._every_s = look_every_s
-        self._outcomes = Watched(store.outcomes, OUTCOME_COLUMNS)
-        self._samples = Watched(store.samples, SAMPLE_COLUMNS)
-        self._candidates = Watched(store.candidates, CANDIDATE_COLUMNS)
+        self._outcomes = WatchedTable(store.outcomes, OUTCOME_COLUMNS)
+        self._samples = WatchedTable(store.samples, SAMPLE_COLUMNS)
+        self._candidates = WatchedTable(store.candidates, CANDIDATE_COLUMNS)
         self._plans = PLANS.schema.empty_table()
         self._lock = threading.Lock()
         self._snapshot: Snapshot | None = None
         self._due_s = 0.0
-        self._told: tuple[bytes | None, ...] = ()
+        self._run_files: tuple[bytes | None, ...] = ()
 
-    def now(self) -> Snapshot:
+    def snapshot(self) -> Snapshot:
         """The newest snapshot; the tables are looked at again where the last look is some seconds old."""
         with self._lock:
             if self._snapshot is None or time.monotonic() >= self._due_s:
                 began = time.monotonic()
-                self._snapshot = self._look(self._snapshot)
+                self._snapshot = self._new_snapshot(self._snapshot)
                 cost = time.monotonic() - began
                 self._due_s = time.monotonic() + max(self._every_s, 4.0 * cost if self._every_s else 0.0)
             return self._snapshot
 
-    def _look(self, known: Snapshot | None) -> Snapshot:
+    def _new_snapshot(self, known: Snapshot | None) -> Snapshot:
         tables = (self._outcomes, self._samples, self._candidates)
-        changed = [table.look() for table in tables]
-        told = tuple(self.store.location.read(name) for name in ("run.json", "last_run.json", CURRENT_RUN))
-        if known is not None and not any(changed) and told == self._told:
+        changed = [table.refresh() for table in tables]
+        run_files = tuple(self.store.location.read(name) for name in ("run.json", "last_run.json", CURRENT_RUN))
+        if known is not None and not any(changed) and run_files == self._run_files:
             return known
-        self._told = told
+        self._run_files = run_files
         self.store.plans.refresh()
         self._plans = self.store.plans.read()
         return Snapshot(
@@ -244,8 +246,8 @@ class Watch:
             end_points=[part.end_points for part in self._candidates.parts.values()],
             accepted_points=[part.end_points for part in self._samples.parts.values()],
             runs=self.store.runs(),
-            last=json.loads(told[1] or b"{}"),
-            current=json.loads(told[2] or b"{}"),
+            last=json.loads(run_files[1] or b"{}"),
+            current=json.loads(run_files[2] or b"{}"),
         )
 
 

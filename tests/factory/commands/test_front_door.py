@@ -25,7 +25,7 @@ from factory.graph.execute import Execution
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import COPIES
 from factory.views.sample_text import prepared_episode
-from factory.views.status import failed_line
+from factory.views.status import failure_summary
 from planners.__main__ import main as planners_main
 from tests.factory.filmed import FilmedWork
 from tests.factory.toy import ToyWork, executed, refs
@@ -139,7 +139,7 @@ def test_a_plan_is_the_run_s_own_and_makes_nothing(
 
 def test_a_run_with_failures_ends_with_what_failed_how_often_and_what_shows_all(out: Path) -> None:
     clip_id = next(row["clip_id"] for row in Store(out).outcomes.read().to_pylist() if row["kind"] == "failed")
-    assert failed_line(Store(out)).splitlines() == [
+    assert failure_summary(Store(out)).splitlines() == [
         f"1 failed (bug 1), the first, recovery on clip {clip_id}: ZeroDivisionError: a bug in a stage",
         f"all of them: python -m factory failed out={out}",
     ]

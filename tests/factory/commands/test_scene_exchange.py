@@ -12,7 +12,7 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.stages.scene_file import read_scene, write_scene
-from factory.views.scene_files import read_splats, taken_back, transform_of
+from factory.views.scene_files import read_nerfstudio_transform, read_splats, undo_transform
 from tasks.render.splatting.formats import gauss_params
 from tasks.render.splatting.gaussians import Gaussians, moved
 from tests.factory.stages.test_scene_file import scene
@@ -126,7 +126,7 @@ def test_nerfstudio_s_frame_is_taken_back(tmp_path: Path) -> None:
         there.means * np.float32(scale), there.quats, there.log_scales + np.float32(np.log(scale)),
         there.opacities, there.colours, there.sh_rest,
     )  # fmt: skip
-    found = apart(scene, taken_back(shrunk, *transform_of(tmp_path / "t.json")))
+    found = apart(scene, undo_transform(shrunk, *read_nerfstudio_transform(tmp_path / "t.json")))
     assert found["means"] < 1e-4 and max(found.values()) < 1e-4
 
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from factory.store.reader import SampleTable, decode_stored_image
 from factory.store.samples import Store
-from factory.views.pictures import encoded, fitted, sample_sheet
-from factory.views.seen_again import ASIDE_M, _looks_right
-from factory.views.status import to_the_side, turned
+from factory.views.pictures import encode_image, letterboxed, sample_sheet
+from factory.views.rendered_again import ASIDE_M, _yaw_to_the_right
+from factory.views.status import side_text, turn_text
 from tasks.world.frames import to_local
 from tests.factory.toy import ToyWork, executed, refs
 
@@ -16,8 +16,8 @@ from tests.factory.toy import ToyWork, executed, refs
 def test_what_lies_on_the_left_of_a_car_that_drives_north_lies_west_and_is_called_left() -> None:
     north = np.array([0.0, 0.0, np.pi / 2.0])
     west, east = to_local(north, np.array([[-1.5, 10.0, np.pi / 2.0 + 0.1], [1.5, 10.0, np.pi / 2.0 - 0.1]]))
-    assert (to_the_side(west[1]), turned(west[2])) == ("1.50 m to the left", "5.7 deg to the left")
-    assert (to_the_side(east[1]), turned(east[2])) == ("1.50 m to the right", "5.7 deg to the right")
+    assert (side_text(west[1]), turn_text(west[2])) == ("1.50 m to the left", "5.7 deg to the left")
+    assert (side_text(east[1]), turn_text(east[2])) == ("1.50 m to the right", "5.7 deg to the right")
 
 
 def test_views_stand_side_by_side_as_their_cameras_do() -> None:
@@ -28,16 +28,17 @@ def test_views_stand_side_by_side_as_their_cameras_do() -> None:
         return {"name": yaw_rad, "ego_from_camera": pose.ravel().tolist()}
 
     rig = [looking(yaw) for yaw in (0.0, 0.9, -0.9)]
-    assert [camera["name"] for camera in sorted(rig, key=_looks_right)] == [0.9, 0.0, -0.9]
+    assert [camera["name"] for camera in sorted(rig, key=_yaw_to_the_right)] == [0.9, 0.0, -0.9]
     assert list(ASIDE_M) == sorted(ASIDE_M, reverse=True), "y points left"
 
 
 def test_a_picture_keeps_its_aspect_and_survives_coding() -> None:
     wide = np.full((100, 400, 3), (200, 40, 90), np.uint8)
-    tile = fitted(wide, 200, 100)
+    tile = letterboxed(wide, 200, 100)
     assert tile.shape == (100, 200, 3)
     assert (tile[30:70] == wide[0, 0]).all() and not (tile[:20] == wide[0, 0]).all()
     back = decode_stored_image({"jpeg": encoded(wide), "camera": "front", "time_s": 0.0})
+    back = decoded({"jpeg": encode_image(wide), "camera": "front", "time_s": 0.0})
     assert np.abs(back.astype(int) - wide).max() <= 4
 
 

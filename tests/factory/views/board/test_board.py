@@ -20,7 +20,7 @@ from factory.store.samples import Store
 from factory.views.board.overview import QUIET_S, overview
 from factory.views.board.server import SERVED, STATIC, Board, Server
 from factory.views.board.watch import Watch
-from factory.views.pictures import encoded, nearer, sample_bev
+from factory.views.pictures import crop_to_60_m, encode_image, sample_bev
 from factory.views.sample_text import logged_drive
 from tests.factory.toy import executed
 from tests.factory.views.board.runs import EVIL, REFS, VIEW, counted, run, told
@@ -207,11 +207,11 @@ def test_the_whole_logged_drive_is_in_the_picture_and_the_episode_where_the_prep
     assert drive is not None and len(drive) == 81
     shown = {}
     for name, logged in (("whole", drive), ("joined", None)):
-        shown[name] = encoded(nearer(sample_bev(row, logged, (800, 800), legend=False)))
+        shown[name] = encode_image(crop_to_60_m(sample_bev(row, logged, (800, 800), legend=False)))
     target = f"/picture/{row['attempt_id']}/bev.jpg?size=600"
     assert shown["whole"] != shown["joined"]
     assert Board(store).answer(target).body == shown["whole"]
-    small = encoded(nearer(sample_bev(row, None, (400, 400), legend=False)))
+    small = encode_image(crop_to_60_m(sample_bev(row, None, (400, 400), legend=False)))
     assert Board(store).answer(target.removesuffix("?size=600")).body == small, "a gallery reads no prepared clips"
     path = tmp_path / "one.mcap"
     assert export_main(["mcap", f"out={tmp_path / 'out'}", "sample=0", f"to={path}"]) == 0

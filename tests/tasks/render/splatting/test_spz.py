@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factory.views.scene_files import zstd
+from factory.views.scene_files import decompress_zstd
 from tasks.render.splatting import sh
 from tasks.render.splatting.formats import from_spz, to_spz
 from tasks.render.splatting.gaussians import EMPTY, Gaussians, rotations_of
@@ -40,7 +40,7 @@ def apart(one: Gaussians, other: Gaussians) -> dict[str, float]:
 @pytest.mark.parametrize("version", PUBLIC)
 def test_a_file_of_the_public_library_is_the_scene_it_was_made_of(version: int) -> None:
     scene = some(3, 8, seed=5)
-    found = apart(scene, from_spz(b64decode(PUBLIC[version]), zstd)[0])
+    found = apart(scene, from_spz(b64decode(PUBLIC[version]), decompress_zstd)[0])
     assert found["means"] <= 0.5 / 4096  # half of the last bit
     assert found["log_scales"] <= 0.5 / 16 + 1e-6 and found["opacities"] <= 0.5 / 255 + 1e-6
     assert found["colours"] <= 0.5 / 255 / 0.15 * sh.C0 + 1e-6 and found["sh_rest"] <= 8.5 / 128
@@ -55,7 +55,7 @@ def test_what_is_written_is_what_the_public_library_writes() -> None:
 @pytest.mark.parametrize("count", sh.COUNTS)
 def test_every_degree_comes_back_within_its_bits(count: int) -> None:
     scene = some(300, count, seed=count)
-    found = apart(scene, from_spz(to_spz(scene, True), zstd)[0])
+    found = apart(scene, from_spz(to_spz(scene, True), decompress_zstd)[0])
     assert found["means"] <= 0.5 / 4096 and found["quats"] <= 0.005
     assert found["sh_rest"] <= (4.5 if count == 3 else 8.5) / 128
 
@@ -63,13 +63,13 @@ def test_every_degree_comes_back_within_its_bits(count: int) -> None:
 def test_writing_what_was_read_changes_nothing() -> None:
     for antialiased in (False, True):
         data = to_spz(some(200, 15), antialiased)
-        assert to_spz(*from_spz(data, zstd)) == data
+        assert to_spz(*from_spz(data, decompress_zstd)) == data
 
 
 def test_a_scene_far_from_its_origin_keeps_what_bits_it_can() -> None:
     scene = some(20, 0)
     far = replace(scene, means=scene.means + np.array([30_000.0, 0.0, -30_000.0], np.float32))
-    found = from_spz(to_spz(far, False), zstd)[0]
+    found = from_spz(to_spz(far, False), decompress_zstd)[0]
     assert 1e-3 < np.abs(found.means - far.means).max() <= 0.5 / 2**8 + 1e-3  # 2**15 m take 15 of 23 bits
     with pytest.raises(ValueError, match="spz: means: 9000000 m from the origin"):
         to_spz(replace(far, means=np.full_like(far.means, 9e6)), False)
@@ -101,5 +101,5 @@ def test_faults_are_named() -> None:
         (public[:150] + b"\x00" * (len(public) - 150), "zstd"),
     ):
         with pytest.raises(ValueError, match="spz: ") as caught:
-            from_spz(broken, zstd)
+            from_spz(broken, decompress_zstd)
         assert said in str(caught.value), (said, str(caught.value))

@@ -19,14 +19,14 @@ from factory.views.pictures import (
     BACKGROUND,
     BEV_COLUMNS,
     CAPTION_PX,
-    beside,
-    ego_way,
+    captioned_tile,
+    ego_poses,
     front_camera,
-    in_rows,
-    note,
-    padded,
+    pad_below,
     sample_bev,
-    tile,
+    side_by_side,
+    text_tile,
+    tile_grid,
 )
 from factory.views.status import rows_where
 from tasks.caches import user_cache
@@ -69,7 +69,7 @@ class CaptionedPicture:
     caption: str
 
 
-def digest_of(store: Store, row: Row) -> str | None:
+def scene_digest_of(store: Store, row: Row) -> str | None:
     """Of the scene that a row was rendered from, for a row of photos that of another row of its clip; None: none."""
     if row["asset_digest"] is not None:
         return str(row["asset_digest"])
@@ -79,7 +79,7 @@ def digest_of(store: Store, row: Row) -> str | None:
     return min({other["asset_digest"] for other in others} - {None}, default=None)
 
 
-def scene_of(store: Store, digest: str) -> RenderAsset | None:
+def load_scene(store: Store, digest: str) -> RenderAsset | None:
     """The block's scene of a digest; None where the cache has it no more, or has it damaged."""
     folder = Path(store.location.uri, "cache") if store.location.is_local else user_cache() / "assets"
     try:
@@ -88,32 +88,36 @@ def scene_of(store: Store, digest: str) -> RenderAsset | None:
         return None  # the next run builds it again and says so
 
 
-def photographed(store: Store, row: Row, asset: RenderAsset) -> dict[str, Any] | None:
+def nearest_photo_sample(store: Store, row: Row, asset: RenderAsset) -> dict[str, Any] | None:
     """Of the human samples with photos in the scene's stretch of the row's log, the one nearest in time; None: none."""
     first, last = (-np.inf, np.inf) if asset.block is None else (asset.block.start_s, asset.block.end_s)
     wanted = ("attempt_id", "log_id", "image_source", "clip_start_s", "now_s")
     of_log = rows_where(store.samples, {"log_id": row["log_id"], "image_source": ImageSource.PHOTO.value}, wanted)
-    found = [other for other in of_log if first <= _now(other) <= last]
+    found = [other for other in of_log if first <= _log_time_s(other) <= last]
     if not found:
         return None
-    nearest = min(found, key=lambda other: (abs(_now(other) - _now(row)), other["attempt_id"]))
+    nearest = min(found, key=lambda other: (abs(_log_time_s(other) - _log_time_s(row)), other["attempt_id"]))
     return SampleTable(store.location.uri, store.location.options).sample(nearest["attempt_id"], VIEW_COLUMNS)
 
 
-def real_and_rendered(asset: RenderAsset, photos: Row, at_s: float) -> list[tuple[CaptionedPicture, CaptionedPicture]]:
+def photo_rendering_pairs(
+    asset: RenderAsset, photos: Row, at_s: float
+) -> list[tuple[CaptionedPicture, CaptionedPicture]]:
     """For each camera, left ones first, the photo nearest to a time of the log, and the scene from the same pose.
 
     `photos`: VIEW_COLUMNS of a human sample, whose agents are the log's.
     """
-    agents, pairs, scene = agents_of(photos), [], _in_time_of(photos, asset)
-    for camera in sorted(photos["cameras"], key=_looks_right):
+    agents, pairs, scene = agents_in_world(photos), [], _scene_at_row_times(photos, asset)
+    for camera in sorted(photos["cameras"], key=_yaw_to_the_right):
         mine = [image for image in photos["images"] if image["camera"] == camera["name"]]
-        nearest = min(mine, key=lambda image: abs(_now(photos) + image["time_s"] - at_s), default=None)
+        nearest = min(mine, key=lambda image: abs(_log_time_s(photos) + image["time_s"] - at_s), default=None)
         if nearest is None:
             continue
         photo = decode_stored_image(nearest)
-        (again,) = drawn(scene, *_as_taken(asset, camera, nearest, _now(photos)), agents, nearest["time_s"])
-        gap = _now(photos) + nearest["time_s"] - at_s
+        (again,) = render_cameras(
+            scene, *_camera_and_pose_of_photo(asset, camera, nearest, _log_time_s(photos)), agents, nearest["time_s"]
+        )
+        gap = _log_time_s(photos) + nearest["time_s"] - at_s
         said = "at the sample's now" if abs(gap) < STEP_S / 2 else f"{gap:+.1f} s from the sample's now"
         pairs.append(
             (
@@ -124,67 +128,69 @@ def real_and_rendered(asset: RenderAsset, photos: Row, at_s: float) -> list[tupl
     return pairs
 
 
-def _looks_right(camera: Mapping[str, Any]) -> float:
+def _yaw_to_the_right(camera: Mapping[str, Any]) -> float:
     """How far to the right a camera looks, clockwise from behind [rad]."""
     ahead, left = np.reshape(camera["ego_from_camera"], (4, 4))[:2, 2]
     return float(-np.arctan2(left, ahead))
 
 
-def from_the_side(asset: RenderAsset, row: Row) -> list[CaptionedPicture]:
+def side_views(asset: RenderAsset, row: Row) -> list[CaptionedPicture]:
     """What the front camera sees at now from ASIDE_M beside the ego; nothing for a row without images."""
     front = front_camera(row)
     if front is None:
         return []
-    rig, agents = [camera for camera in row["cameras"] if camera["name"] == front], agents_of(row)
-    scene = _in_time_of(row, asset)
+    rig, agents = [camera for camera in row["cameras"] if camera["name"] == front], agents_in_world(row)
+    scene = _scene_at_row_times(row, asset)
     out = []
     for aside_m in ASIDE_M:
-        pose = pose_at(row, NOW_INDEX)
+        pose = ego_pose_at(row, NOW_INDEX)
         pose[:3, 3] += aside_m * pose[:3, 1]
         side = f"{abs(aside_m):g} m to the {'left' if aside_m > 0 else 'right'}"
         caption = side if aside_m else f"{front}, rendered at now"
-        out.append(CaptionedPicture(drawn(scene, rig, pose, agents, 0.0)[0], caption))
+        out.append(CaptionedPicture(render_cameras(scene, rig, pose, agents, 0.0)[0], caption))
     return out
 
 
-def again_sheet(store: Store, row: Row, scene: RenderAsset) -> Image | None:
+def photos_and_renderings_sheet(store: Store, row: Row, scene: RenderAsset) -> Image | None:
     """The log's photos nearest in time over their renderings, and below the row's now from the side; None: neither."""
-    photos, strip = photographed(store, row, scene), from_the_side(scene, row)
-    pairs = [] if photos is None else real_and_rendered(scene, photos, _now(row))
+    photos, strip = nearest_photo_sample(store, row, scene), side_views(scene, row)
+    pairs = [] if photos is None else photo_rendering_pairs(scene, photos, _log_time_s(row))
     shown = [*(photo for photo, _ in pairs), *(again for _, again in pairs)]
     parts = [
-        in_rows([tile(s.pixels, s.caption, STRIP_PX) for s in seen], columns)
+        tile_grid([captioned_tile(s.pixels, s.caption, STRIP_PX) for s in seen], columns)
         for seen, columns in ((shown, len(pairs)), (strip, len(strip)))
         if seen
     ]
-    return stacked(parts) if parts else None
+    return stack_vertically(parts) if parts else None
 
 
-def stacked(parts: Sequence[Image]) -> Image:
+def stack_vertically(parts: Sequence[Image]) -> Image:
     """One below the other, narrower ones with background to their right."""
     width = max(part.shape[1] for part in parts)
-    return np.concatenate([padded(p.swapaxes(0, 1), width).swapaxes(0, 1) for p in parts])
+    return np.concatenate([pad_below(p.swapaxes(0, 1), width).swapaxes(0, 1) for p in parts])
 
 
-def film(row: Row, asset: RenderAsset | None, logged: Array | None = None) -> Iterator[Image]:
+def sample_film(row: Row, asset: RenderAsset | None, logged: Array | None = None) -> Iterator[Image]:
     """A sample at 10 Hz, from 1.5 s before its now to the label's end: from above, and through its cameras.
 
     A rendered sample is drawn anew at every step where its scene is at hand; else stored images stand until the next.
     """
-    agents = agents_of(row)
-    scene = _in_time_of(row, asset) if asset is not None and row["image_source"] == ImageSource.RENDER else None
+    agents = agents_in_world(row)
+    scene = _scene_at_row_times(row, asset) if asset is not None and row["image_source"] == ImageSource.RENDER else None
     for step in range(AGENT_STEPS):
         time_s = (step - NOW_INDEX) * STEP_S
         if scene is not None:
-            views = drawn(scene, row["cameras"], pose_at(row, step), agents, time_s)
+            views = render_cameras(scene, row["cameras"], ego_pose_at(row, step), agents, time_s)
             named = zip(row["cameras"], views)
-            tiles = [tile(view, f"{camera['name']}  {time_s:+.1f} s") for camera, view in named]
+            tiles = [captioned_tile(view, f"{camera['name']}  {time_s:+.1f} s") for camera, view in named]
         else:
-            tiles = list(_standing(row, time_s)) or [note(f"no images: image_source is {row['image_source']}")]
-        yield _even(beside(sample_bev(row, logged, (720, 720), step=step), tiles))
+            tiles = list(_stored_image_tiles(row, time_s)) or [
+                text_tile(f"no images: image_source is {row['image_source']}")
+            ]
+        yield _pad_to_even(side_by_side(sample_bev(row, logged, (720, 720), step=step), tiles))
 
 
-def _standing(row: Row, time_s: float) -> Iterable[Image]:
+def _stored_image_tiles(row: Row, time_s: float) -> Iterable[Image]:
     """Tiles of the stored images that were taken last, each camera's for HOLD_S."""
     for camera in row["cameras"] or ():
         taken = [
@@ -195,21 +201,22 @@ def _standing(row: Row, time_s: float) -> Iterable[Image]:
         if taken:
             last = max(taken, key=lambda image: float(image["time_s"]))
             yield tile(decode_stored_image(last), f"{last['camera']}  {last['time_s']:+.1f} s")
+            yield captioned_tile(decoded(last), f"{last['camera']}  {last['time_s']:+.1f} s")
         else:
-            yield note(f"{camera['name']}: no image at {time_s:+.1f} s")
+            yield text_tile(f"{camera['name']}: no image at {time_s:+.1f} s")
 
 
-def _in_time_of(row: Row, asset: RenderAsset) -> RenderAsset:
+def _scene_at_row_times(row: Row, asset: RenderAsset) -> RenderAsset:
     """The scene, its times counted as those of the row's agents."""
     return asset.since(_first_of(row, asset))
 
 
 def _first_of(row: Row, asset: RenderAsset) -> float:
     """Seconds from the first step of the scene's block to that of the row's agents."""
-    return 0.0 if asset.block is None else _now(row) - NOW_INDEX * STEP_S - asset.block.start_s
+    return 0.0 if asset.block is None else _log_time_s(row) - NOW_INDEX * STEP_S - asset.block.start_s
 
 
-def _as_taken(
+def _camera_and_pose_of_photo(
     asset: RenderAsset, camera: Mapping[str, Any], image: Mapping[str, Any], now_s: float
 ) -> tuple[list[Mapping[str, Any]], Array]:
     """Camera and pose (4, 4) of a photo as the scene has them, where it corrected them, else as the row has them."""
@@ -223,7 +230,7 @@ def _as_taken(
     return [camera], np.reshape(image["ego_pose"], (4, 4))
 
 
-def drawn(
+def render_cameras(
     asset: RenderAsset, cameras: Sequence[Mapping[str, Any]], world_from_ego: Array, agents: AgentTracks, time_s: float
 ) -> list[Image]:
     """What cameras of a row see from a pose (4, 4), with the row's agents `time_s` after its now.
@@ -246,14 +253,14 @@ def drawn(
     return [np.rint(view.rgb * 255.0).astype(np.uint8) for view in views]
 
 
-def pose_at(row: Row, step: int) -> Array:
+def ego_pose_at(row: Row, step: int) -> Array:
     """(4, 4) 3-D pose of the ego at a 10 Hz step, on the ground that the row's own 3-D poses stand on."""
     known = [np.reshape(image["ego_pose"], (4, 4)) for image in row["images"]]
-    way = to_world(np.asarray(row["now_pose"], dtype=float), ego_way(row)[step : step + 1])
+    way = to_world(np.asarray(row["now_pose"], dtype=float), ego_poses(row)[step : step + 1])
     return pose_on_ground(np.stack(known), way)[0]
 
 
-def agents_of(row: Row) -> AgentTracks:
+def agents_in_world(row: Row) -> AgentTracks:
     """The row's agents in the world, step NOW_INDEX being now."""
     n = len(row["agent_ids"])
     boxes = np.asarray(row["agent_boxes"], dtype=float).reshape(n, AGENT_STEPS, 5).transpose(1, 0, 2).copy()
@@ -272,12 +279,12 @@ def agents_of(row: Row) -> AgentTracks:
     )
 
 
-def _now(row: Row) -> float:
+def _log_time_s(row: Row) -> float:
     """Seconds since the log's first instant."""
     return float(row["clip_start_s"] + row["now_s"])
 
 
-def _even(image: Image) -> Image:
+def _pad_to_even(image: Image) -> Image:
     """H.264 with 4:2:0 colours takes even sizes."""
     height, width = image.shape[:2]
     whole = np.full((height + height % 2, width + width % 2, 3), BACKGROUND, np.uint8)

@@ -14,17 +14,17 @@ from factory.setup.settings import assemble
 from factory.store.reader import SampleTable, decode_stored_image
 from factory.store.samples import Store
 from factory.views.pictures import sample_bev
-from factory.views.seen_again import (
+from factory.views.rendered_again import (
     ASIDE_M,
-    agents_of,
-    digest_of,
-    drawn,
-    film,
-    from_the_side,
-    photographed,
-    pose_at,
-    real_and_rendered,
-    scene_of,
+    agents_in_world,
+    ego_pose_at,
+    load_scene,
+    nearest_photo_sample,
+    photo_rendering_pairs,
+    render_cameras,
+    sample_film,
+    scene_digest_of,
+    side_views,
 )
 from factory.views.status import REASON_WORDS
 from tasks.render.scene.asset import RenderAsset, psnr
@@ -54,49 +54,49 @@ def rows(store: Store) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def scene(store: Store) -> RenderAsset:
-    found = scene_of(store, rows(store)[0]["asset_digest"])
+    found = load_scene(store, rows(store)[0]["asset_digest"])
     assert found is not None
     return found
 
 
 def test_a_row_holds_all_that_its_own_images_were_drawn_from(store: Store) -> None:
     rendered, _ = rows(store)
-    agents = agents_of(rendered)
+    agents = agents_in_world(rendered)
     for image in rendered["images"]:
         step = 15 + round(10 * image["time_s"])
-        pose = pose_at(rendered, step)
+        pose = ego_pose_at(rendered, step)
         np.testing.assert_allclose(pose, np.reshape(image["ego_pose"], (4, 4)), atol=1e-3)
-        (again,) = drawn(scene(store), rendered["cameras"], pose, agents, image["time_s"])
+        (again,) = render_cameras(scene(store), rendered["cameras"], pose, agents, image["time_s"])
         assert psnr(again, decode_stored_image(image)) > 30.0  # JPEG and float32 poses
 
 
 def test_a_photo_stands_beside_what_the_scene_shows_from_its_pose(store: Store) -> None:
     rendered, human = rows(store)
-    photos = photographed(store, rendered, scene(store))
+    photos = nearest_photo_sample(store, rendered, scene(store))
     assert photos is not None and photos["attempt_id"] == human["attempt_id"]
-    ((photo, again),) = real_and_rendered(scene(store), photos, rendered["clip_start_s"] + rendered["now_s"])
+    ((photo, again),) = photo_rendering_pairs(scene(store), photos, rendered["clip_start_s"] + rendered["now_s"])
     assert "photo, -4.0 s from the sample's now" in photo.caption and "dB" in again.caption
     np.testing.assert_array_equal(photo.pixels, decode_stored_image(human["images"][-1]))
     assert psnr(photo.pixels, again.pixels) > 15.0
-    other = real_and_rendered(scene(store), photos, human["clip_start_s"] + human["now_s"] - 1.5)[0]
+    other = photo_rendering_pairs(scene(store), photos, human["clip_start_s"] + human["now_s"] - 1.5)[0]
     np.testing.assert_array_equal(other[0].pixels, decode_stored_image(human["images"][0]))
 
 
 def test_the_view_from_the_side_moves_what_is_near_and_not_the_horizon(store: Store) -> None:
     rendered, human = rows(store)
-    strip = from_the_side(scene(store), rendered)
+    strip = side_views(scene(store), rendered)
     sides = ["2 m to the left", "1 m to the left", "", "1 m to the right", "2 m to the right"]
     assert [seen.caption if seen.caption in sides else "" for seen in strip] == sides, "left of the strip is left"
     assert strip[2].caption == "ring_front_center, rendered at now"
     assert len(ASIDE_M) == 5 and len({seen.pixels.tobytes() for seen in strip}) == 5
     now = next(image for image in rendered["images"] if abs(image["time_s"]) < 0.05)
     assert psnr(strip[2].pixels, decode_stored_image(now)) > 30.0
-    assert from_the_side(scene(store), {**human, "images": None}) == []
+    assert side_views(scene(store), {**human, "images": None}) == []
 
 
 def test_a_row_of_photos_is_compared_with_the_scene_of_its_clip(store: Store) -> None:
     rendered, human = rows(store)
-    assert human["asset_digest"] is None and digest_of(store, human) == rendered["asset_digest"]
+    assert human["asset_digest"] is None and scene_digest_of(store, human) == rendered["asset_digest"]
 
 
 @pytest.mark.slow
@@ -104,10 +104,10 @@ def test_a_film_shows_the_sample_from_its_history_to_the_label_s_end(store: Stor
     rendered, human = rows(store)
     for row, asset in ((rendered, scene(store)), (human, None), ({**rendered, "images": [], "cameras": None}, None)):
         if asset is None:
-            frames = list(film(row, None))
+            frames = list(sample_film(row, None))
             assert len(frames) == 56 and len({frame.shape for frame in frames}) == 1
         else:
-            frames = [next(film(row, asset))]
+            frames = [next(sample_film(row, asset))]
         assert all(side % 2 == 0 for side in frames[0].shape[:2])
     assert (sample_bev(rendered, step=0) != sample_bev(rendered, step=55)).any()
 
