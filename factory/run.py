@@ -153,7 +153,7 @@ def _run(
         refs = interleave_by_log(assembled.refs, config.workers or os.cpu_count() or 1)
         print(plan_text(assembled, refs), flush=True)
         if only_plan:
-            print(calibrate(assembled, refs, store))
+            print(calibrate(assembled, refs))
             return 0
         since = time.monotonic() if began is None else began
         summary = rerun_on_new_clusters(

@@ -70,7 +70,7 @@ class ExportRequest:
 EVERYWHERE = ("format", "out", "sample", "every", "to")
 
 
-def export_scene(request: ExportRequest) -> int:
+def export(request: ExportRequest) -> int:
     """`python -m factory export mcap|mp4|navsim out=<folder or URL> ...`: samples as files for other tools.
 
         python -m factory export mcap out=runs/demo sample=0             one sample for Foxglove, Lichtblick or Rerun

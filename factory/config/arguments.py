@@ -21,16 +21,9 @@ from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUP
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-# Metadata of a field. POSITIONAL: it may stand without its key; such fields in their order, a tuple for what is left.
-POSITIONAL = {"given_as": "positional"}
-RUN_SETTINGS = {"given_as": "run settings"}  # it takes every argument that is no field: settings of the run
-SOME_RUN_SETTINGS = {**RUN_SETTINGS, "of": "some"}  # what is given alone: the rest is recorded, or of no use here
-POSITIONAL = {"given": "word"}
-RUN_SETTINGS = {"given": "run"}  # it takes every argument that is no field: settings of the run
-GIVEN_RUN_SETTINGS = {
-    **RUN_SETTINGS,
-    "of": "some",
-}  # of them what is given alone: the others are recorded, or of no use here
+# Metadata of a field. POSITIONAL: it may stand without its key; the fields in their order, a tuple for all that is left.
+POSITIONAL = {"argument": "positional"}
+RUN_SETTINGS = {"argument": "settings of a run"}  # it takes every argument that is no field: settings of the run
 INPUT_ERRORS = (ValueError, OSError)  # what settings or files that do not fit raise, where no fault of a stage can
 Request = TypeVar("Request", bound="DataclassInstance")
 CommandFunction = Callable[[Sequence[str]], int | None]  # arguments -> exit code, none for 0
@@ -232,14 +225,8 @@ def _settings_as_yaml(shape: type["DataclassInstance"], given: Mapping[str, Any]
     values = {**_values(shape), **{name: to_plain(value) for name, value in given.items()}}
     yield from yaml_lines({name: values[name] for name in own}, shape, {})
     for name in fields_with(shape, RUN_SETTINGS):
-        groups = {re.split("[=.@]", word.lstrip("+"))[0] for word in given[name]}
-        keeps = True
-        for line in _settings_of_run(given[name]).splitlines():
+        yield _settings_of_run(given[name])
             if name in given_as(shape, SOME_RUN_SETTINGS) and not line.startswith(" "):
-            if name in fields_with(shape, GIVEN_RUN_SETTINGS) and not line.startswith(" "):
-                keeps = line.partition(":")[0] in groups
-            if keeps:
-                yield line
 
 
 def _settings_of_run(words: Sequence[str]) -> str:

@@ -14,8 +14,6 @@ from factory.graph.plan import candidate_order
 from factory.graph.steps import Columns, run_attempt
 from factory.readers.base import ClipRef
 from factory.setup.settings import Run
-from factory.store.funnel import funnel_of
-from factory.store.samples import Store
 from factory.store.schema import BOOKKEEPING, sample_row_to_table
 from tasks.render.settings import RenderMode
 from tasks.stages import TASKS, Rejected
@@ -108,8 +106,8 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
     return sums
 
 
-def calibrate(run: Run, refs: Sequence[ClipRef], store: Store | None = None) -> str:
-    """The expected size of the whole run as a text; with `store`, also by the acceptance its tables show."""
+def calibrate(run: Run, refs: Sequence[ClipRef]) -> str:
+    """The expected size of the whole run as a text."""
     sums = measure(run, refs)
     if sums.clips == 0:
         return "\n".join(["nothing could be measured:", *sums.notes])
@@ -131,40 +129,9 @@ def calibrate(run: Run, refs: Sequence[ClipRef], store: Store | None = None) -> 
         ),
         f"expected for {len(refs)} clips: {sums.attempts * factor:.0f} attempts, {sums.accepted * factor:.0f} samples, "
         f"{sums.row_bytes * factor / 1e9:.3f} GB before compression, {total}",
-        *(
-            extrapolated_from_tables(store, run.config.experts, run.config.rounds, len(refs))
-            if store is not None
-            else ()
-        ),
         *sums.notes,
     ]
     return "\n".join(lines)
-
-
-def extrapolated_from_tables(store: Store, experts: Sequence[str], rounds: int, n_clips: int) -> list[str]:
-    """For every expert with attempts in the tables: what so many clips come to at its rates there.
-
-    Rounds that the tables do not hold go on at the rates of the last one they do.
-    """
-    found: list[str] = []
-    for expert in experts:
-        rows = [row for row in funnel_of(store).rows if row.expert == expert and row.clips_before]
-        if not rows:
-            continue
-        wanted = rounds if rows[0].simulated else 1
-        left, attempts, samples = float(n_clips), 0.0, 0.0
-        for number in range(wanted):
-            row = rows[min(number, len(rows) - 1)]
-            attempts += left * row.tried / row.clips_before
-            left *= row.clip_rate
-            samples += left
-        tried = sum(row.tried for row in rows)
-        rate = 100.0 * sum(row.accepted for row in rows) / tried if tried else 0.0
-        found.append(
-            f"  {expert}: {rate:.1f} % of {tried} attempts on {rows[0].clips_total} clips were accepted; "
-            f"{attempts:.0f} attempts, {samples:.0f} samples"
-        )
-    return [f"by the acceptance measured in {store.location.uri}:", *found] if found else []
 
 
 def setup_text(config: RunConfig, vocabulary: Vocabulary) -> str:

@@ -17,7 +17,7 @@ from factory.store.funnel import Funnel, funnel_of_tables, funnel_tables
 from factory.store.samples import CURRENT_RUN, Kind, Store
 from factory.store.schema import SCHEMA_VERSION
 from factory.store.table import text_codes
-from factory.views.status import value_counts
+from factory.views.status import STATUS, value_counts
 
 FILE = "README.md"
 MARK = "# written by python -m factory, and again by its next run"  # a README without it is the user's own
@@ -28,11 +28,6 @@ LICENCES = {  # as a row's licence begins -> the identifier of the convention
     r"Apache-2\.0\b": "apache-2.0",
     r"CC BY-NC-SA 3\.0\b": "cc-by-nc-sa-3.0",
     r"CC BY-NC-SA 4\.0\b": "cc-by-nc-sa-4.0",
-}
-STATES = {
-    0: "complete",
-    3: "complete but for failed attempts",
-    4: "interrupted: some clips have fewer rounds than asked for, the same command goes on",
 }
 
 
@@ -202,7 +197,7 @@ def _state(store: Store) -> str:
     current = json.loads(store.location.read(CURRENT_RUN) or b"{}")
     if last.get("began_ms") != current.get("began_ms"):
         return "not finished: the same command goes on"
-    return STATES.get(last.get("exit_code", 4), "not finished")
+    return STATUS.get(last.get("exit_code", -1), ("not finished", ""))[0]
 
 
 def _orphans(store: Store) -> int:

@@ -106,28 +106,34 @@ def prepared_episode(row: Mapping[str, Any], prepared: "PreparedClip") -> bytes:
     return episode_of(row, logged_poses(prepared))
 
 
+def sample_facts(row: Mapping[str, Any]) -> dict[str, str]:
+    """What `show` and the sample's page say of it, without what is large."""
+    vx, vy, ax, ay = row["ego_status"]
+    facts = {"ego": f"{vx:.2f}, {vy:.2f} m/s; {ax:.2f}, {ay:.2f} m/s2; command {row['command']}"}
+    if row["candidate_end"] is not None:
+        x, y, heading, speed = row["candidate_end"]
+        facts["perturbed by"] = f"{x:+.2f} m along, {side_text(y)}, {turn_text(heading)}, at {speed:.2f} m/s"
+    x, y, heading = row["label_10hz"][-1]
+    facts["label"] = f"ends {x:+.2f} m ahead, {side_text(y)}, turned {turn_text(heading)} after 4 s"
+    tags = ", ".join(row["tags"]) or "-"
+    facts["world"] = f"{len(row['agent_ids'])} agents, {len(row['lane_ids'])} lanes; tags {tags}"
+    images = row["images"] or ()
+    cameras = ", ".join(dict.fromkeys(image["camera"] for image in images))
+    facts["images"] = f"{len(images)} from source {row['image_source']}" + (f": {cameras}" if cameras else "")
+    if row["psnr"] is not None:
+        facts["block"] = f"{row['psnr']:.2f} dB"
+    return facts
+
+
 def number_lines(row: dict[str, Any]) -> Iterable[str]:
-    """A sample's numbers, without what is large."""
+    """A sample's lineage, facts and scores."""
     from tasks.subscores import SUBSCORES
 
     yield f"sample        {row['attempt_id']}"
     yield f"clip          {row['clip_id']}, {row['dataset']} log {row['log_id']} at {row['clip_start_s']:.1f} s"
     yield f"              split {row['split']}, licence {row['licence'] or '-'}"
     yield f"expert        {row['expert']}, round {row['round']}, candidate {row['candidate_index']}"
-    vx, vy, ax, ay = row["ego_status"]
-    yield f"ego           {vx:.2f}, {vy:.2f} m/s; {ax:.2f}, {ay:.2f} m/s2; command {row['command']}"
-    if row["candidate_end"] is not None:
-        x, y, heading, speed = row["candidate_end"]
-        yield f"perturbed by  {x:+.2f} m along, {side_text(y)}, {turn_text(heading)}, at {speed:.2f} m/s"
-    x, y, heading = row["label_10hz"][-1]
-    yield f"label         ends {x:+.2f} m ahead, {side_text(y)}, turned {turn_text(heading)} after 4 s"
-    images, source = row["images"] or (), row["image_source"]
-    cameras = ", ".join(dict.fromkeys(image["camera"] for image in images))
-    tags = ", ".join(row["tags"]) or "-"
-    yield f"world         {len(row['agent_ids'])} agents, {len(row['lane_ids'])} lanes; tags {tags}"
-    yield f"images        {len(images)} from source {source}" + (f": {cameras}" if cameras else "")
-    if row["psnr"] is not None:
-        yield f"block         {row['psnr']:.2f} dB"
+    yield from (f"{name:<14}{value}" for name, value in sample_facts(row).items())
     yield f"scores        {'':11}" + "".join(f"{name:>7}" for name in (*SUBSCORES, "EPDMS"))
     for prefix, title in (("stage1", "perturbed"), ("stage2", "driven")):
         values = [row[f"{prefix}_{name}"] for name in (*SUBSCORES, "score")]

@@ -26,8 +26,8 @@ from factory.views.pictures import (
     sample_bev,
     small_jpeg,
 )
-from factory.views.sample_text import logged_drive
-from factory.views.status import REASON_WORDS, how_to_retry, outcome_text, side_text, turn_text
+from factory.views.sample_text import logged_drive, sample_facts
+from factory.views.status import REASON_WORDS, how_to_retry, outcome_text
 from tasks.subscores import SUBSCORES
 from tasks.world.arrays import Ints
 
@@ -138,7 +138,7 @@ def sample_page(shot: Snapshot, attempt_id: str, row: Row, candidates: KeyedTabl
 
     return {
         "item": card,
-        "facts": _facts(row),
+        "facts": sample_facts(row),
         "scores": [
             {"name": name}  # null: not defined, or it never failed
             | {stage: row[f"{stage}_{name}"] for stage in ("stage1", "stage2")}
@@ -155,25 +155,6 @@ def sample_page(shot: Snapshot, attempt_id: str, row: Row, candidates: KeyedTabl
         "newer": neighbour(at - 1),
         "older": neighbour(at + 1),
     }
-
-
-def _facts(row: Row) -> dict[str, str]:
-    vx, vy, ax, ay = (float(v) for v in row["ego_status"])
-    facts = {
-        "ego at now": f"{(vx**2 + vy**2) ** 0.5:.1f} m/s, {ax:+.1f} m/s² along, {ay:+.1f} m/s² to the left",
-        "command": row["command"],
-    }
-    if row["candidate_end"] is not None:
-        x, y, heading, speed = (float(v) for v in row["candidate_end"])
-        facts["perturbed by"] = f"{x:+.2f} m along, {side_text(y)}, {turn_text(heading)}, at {speed:.1f} m/s"
-    x, y, heading = (float(v) for v in row["label_10hz"][-1])
-    facts["label after 4 s"] = f"{x:.1f} m ahead, {side_text(y)}, turned {turn_text(heading)}"
-    facts["around it"] = f"{len(row['agent_ids'])} agents, {len(row['lane_ids'])} lanes"
-    facts["images"] = f"{len(row['images'] or ())} from {row['image_source']}"
-    if row["psnr"] is not None:
-        facts["block's PSNR"] = f"{row['psnr']:.2f} dB"
-    facts["tags"] = ", ".join(row["tags"]) or "-"
-    return facts
 
 
 def _siblings(shot: Snapshot, card: Row, candidates: KeyedTable) -> list[Json]:

@@ -322,7 +322,7 @@ def test_what_failed_is_tried_again_by_the_import_and_every_place_says_so(
     assert factory(["retry", f"out={out}"]) == 2
     told = capsys.readouterr()
     assert again in told.err and "retry_failed" not in told.err + told.out and "factory retry" not in told.out
-    (shown,) = failures(Watch(Store(out)).now())["items"]
+    (shown,) = failures(Watch(Store(out)).snapshot())["items"]
     assert again in shown["retry"] and shown["error"].startswith(str(path))
 
 

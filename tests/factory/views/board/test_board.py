@@ -97,11 +97,11 @@ def test_a_run_that_has_only_begun_is_shown(tmp_path: Path) -> None:
 
 def test_a_run_that_went_silent_is_said_to_be_quiet_and_to_have_no_end_in_sight(tmp_path: Path) -> None:
     run(tmp_path, 1, n=2)
-    shot = Watch(Store(tmp_path)).now()
+    shot = Watch(Store(tmp_path)).snapshot()
     began = shot.current["began_ms"]
     assert shot.last["began_ms"] == began and not shot.live
     (tmp_path / "last_run.json").unlink()
-    shot = Watch(Store(tmp_path)).now()
+    shot = Watch(Store(tmp_path)).snapshot()
     last_s = shot.last_commit_ms / 1000.0
     soon, late = (overview(shot, "", last_s + waited) for waited in (1.0, QUIET_S + 1.0))
     assert (soon["state"]["word"], late["state"]["word"]) == ("running", "quiet")
