@@ -31,18 +31,6 @@ def test_the_distance_of_boxes_is_shapely_s_and_below_zero_how_far_one_must_be_m
     assert inside == pytest.approx(-0.3)
 
 
-def test_the_nearest_one_is_as_far_as_boxes_with_round_corners_are() -> None:
-    """4 x 2 m, radius 0.7 m: side by side as far as rectangles, corner to corner farther."""
-    boxes = np.array([[[0.0, 0.0, 0.0, 4.0, 2.0], [5.0, 3.0, 0.0, 4.0, 2.0], [0.0, -2.5, 0.0, 4.0, 2.0]]])
-    there, first = np.ones((1, 3), bool), np.array([0])
-    assert nearest(boxes, there, first) == pytest.approx(np.array([[0.5]]))
-    assert nearest(boxes[:, :2], there[:, :2], first) == pytest.approx(np.array([[2.4 * np.sqrt(2.0) - 1.4]]))
-    boxes[0, 1, :2] = 300.0, 0.0  # however far
-    assert nearest(boxes[:, :2], there[:, :2], first) == pytest.approx(np.array([[296.0]]))
-    boxes[0, 1, :2] = 3.9, 1.9  # rectangles overlap by 0.1 m each way, round corners are apart
-    assert nearest(boxes[:, :2], there[:, :2], first) == pytest.approx(np.array([[1.3 * np.sqrt(2.0) - 1.4]]))
-
-
 def test_the_nearest_is_that_of_all_pairs() -> None:
     """What is left out beforehand is farther off: a lorry that reaches far among small ones, some of them away."""
     rng = np.random.default_rng(1)

@@ -126,24 +126,18 @@ def test_keep_lane_is_on_the_centreline_after_some_seconds_and_refuses_what_is_o
     assert refused == Rejected("expert", "off_route", "8.0 m beside the centreline")
 
 
-@pytest.mark.parametrize(
-    ("name", "old", "new", "told"),
-    [
-        ("ego.csv", "heading,speed", "heading,pace", r"ego\.csv: speed: expected a column of numbers"),
-        ("ego.csv", ",0,0,8.0", ",north,0,8.0", r"ego\.csv: y: expected a column of numbers: .*north"),
-        ("map.json", '"right": [[', '"rigth": [[', r"map\.json: map: KeyError\('right'\)"),
-    ],
-)
-def test_the_reader_names_file_and_field_of_what_is_wrong(
-    tmp_path: Path, name: str, old: str, new: str, told: str
-) -> None:
+def test_the_reader_names_file_and_field_of_what_is_wrong(tmp_path: Path) -> None:
     write_log(tmp_path / "street")
-    reader = CsvReader(tmp_path)
-    (ref, *_) = reader.index().refs
-    file = tmp_path / "street" / name
-    file.write_text(file.read_text().replace(old, new))
-    with pytest.raises(BadClip, match=told):
-        CsvReader(tmp_path).read(ref)
+    (ref, *_) = CsvReader(tmp_path).index().refs
+    for name, old, new, told in (
+        ("map.json", '"right": [[', '"rigth": [[', r"map\.json: map: KeyError\('right'\)"),
+        ("ego.csv", ",0,0,8.0", ",north,0,8.0", r"ego\.csv: y: expected a column of numbers: .*north"),
+    ):
+        file = tmp_path / "street" / name
+        file.write_text((whole := file.read_text()).replace(old, new))
+        with pytest.raises(BadClip, match=told):
+            CsvReader(tmp_path).read(ref)
+        file.write_text(whole)
 
 
 def test_every_example_says_how_it_is_run_and_is_short() -> None:

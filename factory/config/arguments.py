@@ -21,8 +21,8 @@ from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUP
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-# Metadata of a field. POSITIONAL: it may stand without its key; the fields in their order, a tuple for all that is left.
-POSITIONAL = {"argument": "positional"}
+# Metadata of a field.
+POSITIONAL = {"argument": "positional"}  # may stand without its key, in order; a tuple takes all that is left
 RUN_SETTINGS = {"argument": "settings of a run"}  # it takes every argument that is no field: settings of the run
 INPUT_ERRORS = (ValueError, OSError)  # what settings or files that do not fit raise, where no fault of a stage can
 Request = TypeVar("Request", bound="DataclassInstance")

@@ -118,15 +118,6 @@ def find_scene(folder: Path, digest: str) -> RenderAsset | None:
     return None
 
 
-def read_view_qualities(path: Path) -> tuple[ViewQuality, ...]:
-    """What was measured on a scene's photos, by its header alone. Raises BadScene where it has none."""
-    try:
-        with safe_open(path, framework="numpy") as file:
-            return tuple(_view_from_json(view) for view in json.loads((file.metadata() or {})[KEY])["views"])
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
-        raise BadScene(f"{path}: no scene: {type(error).__name__} {error}") from error
-
-
 def read_dtype(path: Path) -> SceneDtype:
     """What a scene's file holds its Gaussians in, by its header alone. Raises BadScene where it has none."""
     try:

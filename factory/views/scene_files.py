@@ -18,6 +18,7 @@ from factory.pipeline import logged_clip
 from factory.readers.pickles import load_tensors
 from factory.stages.scene_file import SUFFIX, BadScene, described_by, read_dtype, read_scene, read_view_qualities
 from factory.store.location import BadCacheFile
+from factory.stages.scene_file import BadScene, described_by, read_scene, stored_dtype
 from factory.wording import one_line
 from tasks.render.scene.asset import BlockRange, RenderAsset, ViewQuality
 from tasks.render.scene.movers import world_from_boxes
@@ -160,17 +161,6 @@ def camera_rows(views: Sequence[ViewQuality]) -> list[CameraRow]:
         of = {name: _mean(values) for name, values in classes.items()}
         rows.append(CameraRow(camera=camera, photos=len(mine), psnr_db_of=of, **means))
     return rows
-
-
-def scene_tables(folder: Path) -> dict[str, dict[str, str]]:
-    """Scene file -> camera -> its row in words, of the scenes in a cache folder; what is no scene is left out."""
-    found = {}
-    for path in sorted(folder.glob(f"block-*{SUFFIX}")):
-        try:
-            found[path.name] = {row.camera: row.text for row in camera_rows(read_view_qualities(path))}
-        except BadScene:
-            continue  # whoever needs that scene says so, and builds it again
-    return found
 
 
 def _mean(values: Sequence[float]) -> float:

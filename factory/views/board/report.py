@@ -26,7 +26,6 @@ from factory.views.board.overview import Drives, drives_as_json, overview
 from factory.views.board.server import STATIC
 from factory.views.board.watch import Snapshot, Watch
 from factory.views.pictures import front_camera, images_at_now, small_jpeg
-from factory.views.scene_files import scene_tables
 from factory.views.status import value_counts
 
 if TYPE_CHECKING:
@@ -50,7 +49,6 @@ def write_report(store: Store, to: str | None = None) -> str:
     """Write the file, into `out` where no other place is named; where it is now. Raises Refused where it cannot be."""
     extra: dict[str, Any] = json.loads(store.location.read(FACTS) or b"{}")
     shot, pictures = Watch(store).snapshot(), Pictures(store)
-    extra["scenes"] = scene_tables(Path(store.location.uri, "cache")) if store.location.is_local else {}
     settings = store.runs()[-1]["settings"] if store.runs() else {}
     extra["settings"] = {name: str(value) for name, value in settings.items()}
     page = report_page(store, shot, pictures, extra)
@@ -88,7 +86,7 @@ def write_facts(store: Store, assembled: "Run") -> None:
 def report_page(store: Store, shot: Snapshot, pictures: Pictures, extra: Mapping[str, Any]) -> bytes:
     """The file.
 
-    extra: what the live page does not show: facts, settings, scenes, left_out (static/extra.js reads it).
+    extra: what the live page does not show: facts, settings, left_out (static/extra.js reads it).
     """
     looks = gallery(shot, {"simulated": "1"}, 1, N_LOOKS)
     items = [card_of(shot, row) for row in _shown(shot, [item["attempt_id"] for item in looks["items"]])]

@@ -99,16 +99,10 @@ def test_a_row_of_photos_is_compared_with_the_scene_of_its_clip(store: Store) ->
     assert human["asset_digest"] is None and scene_digest_of(store, human) == rendered["asset_digest"]
 
 
-@pytest.mark.slow
-def test_a_film_shows_the_sample_from_its_history_to_the_label_s_end(store: Store) -> None:
+def test_a_film_s_frames_have_even_sides_with_the_scene_and_without(store: Store) -> None:
     rendered, human = rows(store)
     for row, asset in ((rendered, scene(store)), (human, None), ({**rendered, "images": [], "cameras": None}, None)):
-        if asset is None:
-            frames = list(sample_film(row, None))
-            assert len(frames) == 56 and len({frame.shape for frame in frames}) == 1
-        else:
-            frames = [next(sample_film(row, asset))]
-        assert all(side % 2 == 0 for side in frames[0].shape[:2])
+        assert all(side % 2 == 0 for side in next(sample_film(row, asset)).shape[:2])
     assert (sample_bev(rendered, step=0) != sample_bev(rendered, step=55)).any()
 
 

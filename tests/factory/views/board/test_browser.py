@@ -12,7 +12,6 @@ import pytest
 from factory.commands.table import COMMANDS
 from factory.store.samples import Store
 from factory.views.board.server import Board, Server
-from tests.factory.views.board.browser import Tab
 from tests.factory.views.board.runs import EVIL, counted, run
 
 report_main = COMMANDS["report"].load()
@@ -98,48 +97,6 @@ def test_the_gallery_and_a_sample_show_their_pictures_and_nothing_from_data_is_m
     assert page.count("data-loaded") == len(Store(out).samples.read(["images"])["images"][0])
     assert 'data-score="nc"' in page and 'data-kind="rejected"' in page
     assert EVIL not in dump("#/failed") and "a bug in a stage" in dump("#/failed")
-
-
-def test_an_open_page_follows_the_run_and_the_keys_work(tmp_path: Path) -> None:
-    run(tmp_path / "run", 1)
-    (tmp_path / "run" / "last_run.json").unlink()  # as if it went on
-    with Server(Board(Store(tmp_path / "run"), look_every_s=0.0), "127.0.0.1", 0) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        tab = Tab(str(CHROMIUM), tmp_path / "profile")
-        try:
-            follow(tab, f"http://127.0.0.1:{server.server_address[1]}/", tmp_path / "run")
-            assert not tab.console
-        finally:
-            tab.close()
-            server.shutdown()
-
-
-def follow(tab: Tab, address: str, out: Path) -> None:
-    samples = "document.querySelector('[data-count=samples] b')?.textContent"
-    ready = "document.getElementById('main').dataset.ready"
-    tab.ask("Page.navigate", url=address)
-    tab.wait(f"{samples} === '{counted(out)['samples']}'")
-    assert tab.value("document.getElementById('state').textContent !== 'complete'")
-    run(out, 2)
-    tab.wait(f"{samples} === '{counted(out)['samples']}'")  # without a reload
-    tab.wait("document.getElementById('state').textContent.startsWith('complete')")
-    tab.press("2")
-    tab.wait(f"{ready} === '#/gallery'")
-    tab.press("ArrowDown")
-    first = tab.value("document.activeElement.dataset.id")
-    tab.press("3")
-    tab.wait(f"{ready} === '#/failed'")
-    tab.press("Escape")
-    tab.wait(f"{ready} === '#/gallery'")
-    tab.value(f"location.hash = '#/sample/{first}'")
-    tab.wait(f"{ready} === '#/sample/{first}'")
-    tab.press("ArrowRight")
-    tab.wait(f"{ready}.startsWith('#/sample/') && {ready} !== '#/sample/{first}'")
-    before = tab.value("getComputedStyle(document.body).backgroundColor")
-    tab.press("t")
-    assert tab.value("getComputedStyle(document.body).backgroundColor") != before
-    tab.press("?")
-    assert tab.value("document.getElementById('keys').open")
 
 
 def test_a_report_is_the_same_page_in_one_file(out: Path, dump: Dump) -> None:

@@ -10,10 +10,8 @@ import pyarrow as pa
 import pytest
 
 from factory.commands.table import COMMANDS
-from factory.stages.scene_file import write_scene
 from factory.store.samples import Store
 from factory.views.board.report import FACTS, FILE, N_LOOKS, N_SAMPLES, PER_EXPERT, spread
-from tests.factory.stages.test_scene_file import scene
 from tests.factory.views.board.runs import EVIL, counted, run, told
 
 main = COMMANDS["report"].load()
@@ -26,8 +24,6 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run(folder, 2)
     remembered = {"facts": {EVIL: EVIL}, "left_out": {"Skipped logs": {EVIL: EVIL}}}
     (folder / FACTS).write_text(json.dumps(remembered))
-    write_scene(folder / "cache" / "block-0123.safetensors", scene())
-    (folder / "cache" / "block-4567.safetensors").write_bytes(b"no scene")
     assert main([f"out={folder}"]) == 0
     return folder
 
@@ -53,12 +49,6 @@ def kept(text: str) -> dict[str, Any]:
     found = re.search(r'<script type="application/json" id="kept">(.*?)</script>', text, re.S)
     assert found is not None
     return dict(json.loads(found[1]))
-
-
-def test_it_says_how_well_each_camera_of_a_scene_comes_out(text: str) -> None:
-    found = kept(text)["extra"]["scenes"]
-    assert list(found) == ["block-0123.safetensors"] and list(found["block-0123.safetensors"]) == ["front"]
-    assert found["block-0123.safetensors"]["front"].startswith("28.50 dB, SSIM 0.910 over 1 held-out")
 
 
 def test_its_numbers_are_the_tables(out: Path, text: str) -> None:
