@@ -221,22 +221,17 @@ def fields_with(shape: type["DataclassInstance"], how: Mapping[str, str]) -> lis
 
 def _settings_as_yaml(shape: type["DataclassInstance"], given: Mapping[str, Any]) -> Iterator[str]:
     """The keys of a request as YAML, and behind them the settings of the run that it takes."""
+    from factory.config.run import compose_run
+
     own = request_keys(shape)
     values = {**_values(shape), **{name: to_plain(value) for name, value in given.items()}}
     yield from yaml_lines({name: values[name] for name in own}, shape, {})
     for name in fields_with(shape, RUN_SETTINGS):
-        yield _settings_of_run(given[name])
+        try:
+            compose_run([SHOW[0], *given[name]])
+        except SettingsShown as settings:
+            yield str(settings)
             if name in given_as(shape, SOME_RUN_SETTINGS) and not line.startswith(" "):
-
-
-def _settings_of_run(words: Sequence[str]) -> str:
-    from factory.config.run import compose_run
-
-    try:
-        compose_run([SHOW[0], *words])
-    except SettingsShown as settings:
-        return str(settings)
-    raise AssertionError("what is only to be shown is shown")
 
 
 def _value(key: str, text: str, kind: Any) -> Any:

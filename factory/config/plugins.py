@@ -87,14 +87,9 @@ def plugin_named(kind: str, name: str, built_in: Collection[str]) -> Plugin | No
     return plugins[0]
 
 
-def plugin_names(kind: str) -> list[str]:
-    """What is offered, sorted, for messages."""
-    return list(plugins_by_name(kind))
-
-
 def group_choices(group: str, folders: Sequence[Path]) -> list[str]:
     """What a group of settings offers, sorted: files of its name in the folders, and what packages add to it."""
-    return sorted({*_files(group, folders), *(plugin_names(group) if group in GROUPS else ())})
+    return sorted({*_files(group, folders), *(plugins_by_name(group) if group in GROUPS else ())})
 
 
 def _files(group: str, folders: Sequence[Path]) -> set[str]:

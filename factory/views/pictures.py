@@ -415,7 +415,7 @@ def side_by_side(bev: Image, tiles: Sequence[Image]) -> Image:
     """A top-down view and tiles to the right of it, in one column up to three, else in two."""
     strip = tile_grid(tiles, 1 if len(tiles) <= 3 else 2)
     height = max(bev.shape[0], strip.shape[0])
-    return np.concatenate([pad_below(bev, height), pad_below(strip, height)], axis=1)
+    return np.concatenate([padded_to(part, height, part.shape[1]) for part in (bev, strip)], axis=1)
 
 
 def tile_grid(tiles: Sequence[Image], columns: int) -> Image:
@@ -449,7 +449,7 @@ def _written(picture: Image, text: str, baseline: int) -> Image:
     return picture
 
 
-def pad_below(image: Image, height: int) -> Image:
-    """The image with background below."""
-    below = np.full((height - image.shape[0], image.shape[1], 3), BACKGROUND, np.uint8)
-    return np.concatenate([image, below], axis=0)
+def padded_to(image: Image, height: int, width: int) -> Image:
+    """The image with background below and to the right of it."""
+    below, right = height - image.shape[0], width - image.shape[1]
+    return np.asarray(cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_CONSTANT, value=BACKGROUND))

@@ -16,13 +16,12 @@ from factory.store.reader import SampleTable, decode_stored_image
 from factory.store.samples import Store
 from factory.store.schema import AGENT_STEPS, NOW_INDEX, SCHEMA
 from factory.views.pictures import (
-    BACKGROUND,
     BEV_COLUMNS,
     CAPTION_PX,
     captioned_tile,
     ego_poses,
     front_camera,
-    pad_below,
+    padded_to,
     sample_bev,
     side_by_side,
     text_tile,
@@ -167,7 +166,7 @@ def photos_and_renderings_sheet(store: Store, row: Row, scene: RenderAsset) -> I
 def stack_vertically(parts: Sequence[Image]) -> Image:
     """One below the other, narrower ones with background to their right."""
     width = max(part.shape[1] for part in parts)
-    return np.concatenate([pad_below(p.swapaxes(0, 1), width).swapaxes(0, 1) for p in parts])
+    return np.concatenate([padded_to(part, part.shape[0], width) for part in parts])
 
 
 def sample_film(row: Row, asset: RenderAsset | None, logged: Array | None = None) -> Iterator[Image]:
@@ -187,7 +186,9 @@ def sample_film(row: Row, asset: RenderAsset | None, logged: Array | None = None
             tiles = list(_stored_image_tiles(row, time_s)) or [
                 text_tile(f"no images: image_source is {row['image_source']}")
             ]
-        yield _pad_to_even(side_by_side(sample_bev(row, logged, (720, 720), step=step), tiles))
+        whole = side_by_side(sample_bev(row, logged, (720, 720), step=step), tiles)
+        height, width = whole.shape[:2]
+        yield padded_to(whole, height + height % 2, width + width % 2)  # H.264 takes even sides
 
 
 def _stored_image_tiles(row: Row, time_s: float) -> Iterable[Image]:
@@ -208,12 +209,8 @@ def _stored_image_tiles(row: Row, time_s: float) -> Iterable[Image]:
 
 def _scene_at_row_times(row: Row, asset: RenderAsset) -> RenderAsset:
     """The scene, its times counted as those of the row's agents."""
-    return asset.since(_first_of(row, asset))
-
-
-def _first_of(row: Row, asset: RenderAsset) -> float:
-    """Seconds from the first step of the scene's block to that of the row's agents."""
-    return 0.0 if asset.block is None else _log_time_s(row) - NOW_INDEX * STEP_S - asset.block.start_s
+    first_s = 0.0 if asset.block is None else _log_time_s(row) - NOW_INDEX * STEP_S - asset.block.start_s
+    return asset.since(first_s)
 
 
 def _camera_and_pose_of_photo(
@@ -282,11 +279,3 @@ def agents_in_world(row: Row) -> AgentTracks:
 def _log_time_s(row: Row) -> float:
     """Seconds since the log's first instant."""
     return float(row["clip_start_s"] + row["now_s"])
-
-
-def _pad_to_even(image: Image) -> Image:
-    """H.264 with 4:2:0 colours takes even sizes."""
-    height, width = image.shape[:2]
-    whole = np.full((height + height % 2, width + width % 2, 3), BACKGROUND, np.uint8)
-    whole[:height, :width] = image
-    return whole

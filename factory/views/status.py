@@ -142,8 +142,8 @@ def failure_summary(store: "Store") -> str:
     )
 
 
-def value_counts(column: "pa.ChunkedArray") -> dict[str, int]:
-    """Text -> rows, of a column of texts as numbers into a dictionary."""
+def value_counts(column: "pa.ChunkedArray") -> dict[Any, int]:
+    """Value -> rows, also of texts as numbers into a dictionary."""
     return {row["values"]: row["counts"] for row in column.unify_dictionaries().value_counts().to_pylist()}
 
 

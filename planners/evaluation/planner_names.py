@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.config.compose import ConfigError, compose
-from factory.config.plugins import import_object, plugin_named, plugin_names
+from factory.config.plugins import import_object, plugin_named, plugins_by_name
 from factory.config.words import did_you_mean, expand_home
 from planners.data.batch import Needs
 from planners.evaluation.frames import FrameKey
@@ -77,7 +77,7 @@ def _named(spec: str, label: str | None, changed: Mapping[str, Any] | None) -> E
         return EvaluatedPlanner(name, digest, partial(_trained, newest, changed))
     if ":" in spec:
         return _plugged(name, spec)
-    known = [*PRIVILEGED, *UNTRAINED, *plugin_names("planner")]
+    known = [*PRIVILEGED, *UNTRAINED, *plugins_by_name("planner")]
     listed = ", ".join(known)
     if spec in BUILT_IN:
         raise ConfigError(f"planner={spec} has to be trained first: name its training's folder; untrained: {listed}")

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from factory.config.compose import ConfigError, fill
-from factory.config.plugins import import_object, plugin_named, plugin_names
+from factory.config.plugins import import_object, plugin_named, plugins_by_name
 from factory.config.shapes import deep_merge, defaults_of
 from factory.config.words import did_you_mean
 from planners.data.batch import COMMANDS, Batch, Needs, TrainingData
@@ -179,7 +179,7 @@ def planner_class(name: str) -> type[Planner]:
     plugin = plugin_named("planner", name, BUILT_IN)
     target = BUILT_IN.get(name, name) if plugin is None else plugin.reference
     if ":" not in target:
-        known = [*BUILT_IN, *plugin_names("planner")]
+        known = [*BUILT_IN, *plugins_by_name("planner")]
         meant = did_you_mean(name, known)
         raise ConfigError(f"planner.name={name}: none of {', '.join(known)}{meant}; or name a class, {OWN}")
     cls: Any = import_object(target, "planner.name", OWN)

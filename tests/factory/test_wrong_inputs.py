@@ -234,14 +234,6 @@ def test_a_bucket_without_credentials_is_refused_before_any_work(folder: Path) -
     assert "AWS_ACCESS_KEY_ID" in done.stderr
 
 
-def test_a_stranger_s_modules_in_the_working_folder_are_not_ours(folder: Path) -> None:
-    (folder / "tasks.py").write_text("raise RuntimeError('this is the wrong tasks')\n")
-    done = python(folder, "-m", "planners", "--help")
-    assert done.returncode == 0 and "wrong tasks" not in done.stderr, done.stderr
-    done = python(folder, "-m", "factory.run", "rounsd=5")
-    assert done.returncode == 2 and "did you mean rounds=?" in done.stderr
-
-
 def test_one_expert_needs_no_brackets_and_odd_paths_no_quotes(folder: Path) -> None:
     from factory.config.run import compose_run, typed_run_config
 

@@ -20,7 +20,7 @@ from factory.store.schema import TableSpec
 from factory.store.table import KeyedTable, text_equals
 from factory.views.board.gallery import FILTERS
 from factory.views.board.watch import Snapshot, decode_dictionaries
-from factory.views.status import GATE_WORDS, PAPER_CLIP_PERCENT, REASON_WORDS, STATUS
+from factory.views.status import GATE_WORDS, PAPER_CLIP_PERCENT, REASON_WORDS, STATUS, value_counts
 from tasks.stages import STAGES
 
 QUIET_S = 900.0  # a run that commits nothing for so long is said to be quiet
@@ -79,8 +79,8 @@ def overview(shot: Snapshot, where: str, now_s: float) -> Json:
         "stage_times": stage_times,  # worker seconds
         "stage_times_of": of,  # what they are measured on
         "coverage": _coverage(shot),
-        "failed_kinds": dict(Counter(_counts(failed["error_kind"])).most_common()),
-        "facets": {name: sorted(map(str, _counts(shot.samples[name]))) for name in FILTERS},
+        "failed_kinds": dict(Counter(value_counts(failed["error_kind"])).most_common()),
+        "facets": {name: sorted(map(str, value_counts(shot.samples[name]))) for name in FILTERS},
     }
 
 
@@ -102,21 +102,14 @@ def _quiet(shot: Snapshot, now_s: float) -> bool:
 def _facts(shot: Snapshot) -> dict[str, str]:
     """What the tables say about where the samples come from."""
     samples = shot.samples
-    sources = Counter(_counts(samples["image_source"]))
+    sources = Counter(value_counts(samples["image_source"]))
     return {
-        "data set": ", ".join(sorted(_counts(samples["dataset"]))) or "-",
-        "logs with samples": str(len(_counts(samples["log_id"]))),
+        "data set": ", ".join(sorted(value_counts(samples["dataset"]))) or "-",
+        "logs with samples": str(len(value_counts(samples["log_id"]))),
         "images": ", ".join(f"{name} {count:,}" for name, count in sources.most_common()) or "-",
-        "licences": ", ".join(sorted(filter(None, _counts(samples["licence"])))) or "-",
+        "licences": ", ".join(sorted(filter(None, value_counts(samples["licence"])))) or "-",
         "settings": str(shot.runs[-1]["settings_hash"]) if shot.runs else "-",
     }
-
-
-def _counts(column: pa.ChunkedArray) -> dict[Any, int]:
-    """Value -> rows."""
-    if pa.types.is_dictionary(column.type):
-        column = column.unify_dictionaries()
-    return {row["values"]: row["counts"] for row in pc.value_counts(column).to_pylist()}
 
 
 def _steps(funnel: Funnel) -> list[Json]:

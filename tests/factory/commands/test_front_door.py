@@ -2,13 +2,10 @@
 
 import json
 import os
-import pty
 import re
-import select
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -389,37 +386,6 @@ def test_bash_completes_the_end_of_the_line(tmp_path: Path) -> None:
     env = os.environ | {"PYTHONPATH": str(REPOSITORY)}
     done = subprocess.run(["bash", str(script)], env=env, capture_output=True, text=True)
     assert done.stdout.splitlines() == ["status", "local", "scenarionet", "", "demo", "evaluate"], done.stderr
-
-
-@pytest.mark.skipif(shutil.which("zsh") is None, reason="there is no zsh")
-def test_zsh_completes_what_is_typed_before_tab() -> None:
-    env = {"PATH": os.environ["PATH"], "HOME": "/nonexistent", "TERM": "dumb", "PYTHONPATH": str(REPOSITORY)}
-    ours, theirs = pty.openpty()
-    shell = subprocess.Popen(["zsh", "-f", "-i"], stdin=theirs, stdout=theirs, stderr=theirs, env=env)
-    os.close(theirs)
-
-    def heard(typed: str, answer: str) -> bool:
-        os.write(ours, typed.encode())
-        said, end = "", time.monotonic() + 60
-        while answer not in said and time.monotonic() < end:
-            if select.select([ours], [], [], 0.2)[0]:
-                said += os.read(ours, 65536).decode()
-        return answer in said
-
-    try:
-        begin = f"autoload -Uz compinit; compinit -u -D; source <({sys.executable} -m factory completion zsh)"
-        assert heard(f"{begin}; print REA''DY\n", "READY")
-        for typed, answer in (
-            ("python -m factory stat", "factory status "),
-            ("factory run preset=de", "factory run preset=demo "),
-            ("factory export mc", "export mcap "),
-            ("factory run executor=", "executor=local  executor=ray"),
-        ):
-            assert heard(f"\x15{typed}\t", answer), typed  # \x15 clears the line
-    finally:
-        shell.kill()
-        shell.wait()
-        os.close(ours)
 
 
 def test_completion_is_quick_and_another_shell_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
