@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import factory.run
 from factory.config.arguments import POSITIONAL, SOME_RUN_SETTINGS, Refused, command, keys_of
 from factory.config.datasets import data_sets
-from factory.config.arguments import POSITIONAL, RUN_SETTINGS, Refused, command, request_keys
+from factory.config.arguments import GIVEN_ALONE, POSITIONAL, RUN_SETTINGS, Refused, command, request_keys
 from factory.config.run import RunConfig
 from factory.config.words import did_you_mean, parse_command_line
 
@@ -41,7 +41,7 @@ class VocabularyRequest:
     every_s: float = 0.5  # a window starts this often
     kinematic: bool = False  # out: k seeded trajectories, as a run without vocabulary.file has; reads no clips
     settings: tuple[str, ...] = field(default=(), metadata=SOME_RUN_SETTINGS)
-    settings: tuple[str, ...] = field(default=(), metadata=RUN_SETTINGS)
+    settings: tuple[str, ...] = field(default=(), metadata=RUN_SETTINGS | GIVEN_ALONE)
 
     def __post_init__(self) -> None:
         for key, equals, _ in (word.lstrip("+").partition("=") for word in self.settings):

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 # Metadata of a field.
 POSITIONAL = {"argument": "positional"}  # may stand without its key, in order; a tuple takes all that is left
+GIVEN_ALONE = {"shown": "given alone"}  # of RUN_SETTINGS: the others are recorded, or of no use here
 RUN_SETTINGS = {"argument": "settings of a run"}  # it takes every argument that is no field: settings of the run
 INPUT_ERRORS = (ValueError, OSError)  # what settings or files that do not fit raise, where no fault of a stage can
 Request = TypeVar("Request", bound="DataclassInstance")
@@ -227,10 +228,16 @@ def _settings_as_yaml(shape: type["DataclassInstance"], given: Mapping[str, Any]
     values = {**_values(shape), **{name: to_plain(value) for name, value in given.items()}}
     yield from yaml_lines({name: values[name] for name in own}, shape, {})
     for name in fields_with(shape, RUN_SETTINGS):
+        groups = {re.split("[=.@]", word.lstrip("+"))[0] for word in given[name]}
+        keeps = True
         try:
             compose_run([SHOW[0], *given[name]])
         except SettingsShown as settings:
-            yield str(settings)
+            for line in str(settings).splitlines():
+                if name in fields_with(shape, GIVEN_ALONE) and not line.startswith(" "):
+                    keeps = line.partition(":")[0] in groups
+                if keeps:
+                    yield line
             if name in given_as(shape, SOME_RUN_SETTINGS) and not line.startswith(" "):
 
 
