@@ -19,7 +19,7 @@ from factory.commands.completion import setting_choices
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "numba", "scipy", "shapely", "pyarrow", "deltalake", "ray", "torch", "cv2")
-NO_HYDRA = ("Hydra", "hydra", "override", "Lexer", "EOF", "struct", "Traceback", "pydantic", "Input should")
+NO_HYDRA = ("Hydra", "hydra", "override", "Lexer", "EOF", "in struct", "Traceback", "pydantic", "Input should")
 
 
 @dataclass(frozen=True)
