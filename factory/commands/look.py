@@ -186,7 +186,7 @@ def explain(request: ExplainRequest) -> int:
     from factory.readers.base import BadClip
 
     try:
-        _explain(request)
+        _explain_clip(request)
     except BadClip as error:
         print(f"bad clip: {error}", file=sys.stderr)
         return COMPLETE_WITH_FAILURES
@@ -203,7 +203,7 @@ def clip_named(refs: Sequence["ClipRef"], wanted: str) -> "ClipRef":
     return found[0]
 
 
-def _explain(request: ExplainRequest) -> None:
+def _explain_clip(request: ExplainRequest) -> None:
     """Compose the settings, run the clip, print and draw."""
     import cv2
 

@@ -57,7 +57,7 @@ class ComposedCommand:
         )
         told = f"\nchoices; the keys of each: --cfg\n{listed}\n" if groups else ""
         chosen = {word.rpartition("@")[2] for word in groups}
-        values = {**_values(self.shape), **dict(re.findall(r"^(\w+): (\S+)", text, re.M))}
+        values = {**_default_values(self.shape), **dict(re.findall(r"^(\w+): (\S+)", text, re.M))}
         keys = {key: value for key, value in values.items() if key not in chosen}
         return help_text_of(f"{help_intro(self.does)}{told}", keys, self.shape)
 
@@ -72,7 +72,7 @@ def command(
 def run_request_command(does: Callable[[Any], int | None], argv: Sequence[str]) -> int:
     """The exit code of a command that takes a request."""
     shape = request_class_of(does)
-    keys = {name: value for name, value in _values(shape).items() if name in request_keys(shape)}
+    keys = {name: value for name, value in _default_values(shape).items() if name in request_keys(shape)}
     return run_command(
         argv,
         lambda words: does(parse(shape, words)),
@@ -160,7 +160,7 @@ def config_groups(conf: str) -> dict[str, str]:
     return dict(re.findall(r"^  - (\w+(?:@\w+)?): (\w+)$", text, re.M))
 
 
-def _values(shape: type[Any]) -> dict[str, Any]:
+def _default_values(shape: type[Any]) -> dict[str, Any]:
     """Every key with its default, ??? where it has none, in their order."""
     known = {**required_keys(shape), **defaults_of(shape)}
     return {field.name: known[field.name] for field in fields(shape)}
@@ -225,7 +225,7 @@ def _settings_as_yaml(shape: type["DataclassInstance"], given: Mapping[str, Any]
     from factory.config.run import compose_run
 
     own = request_keys(shape)
-    values = {**_values(shape), **{name: to_plain(value) for name, value in given.items()}}
+    values = {**_default_values(shape), **{name: to_plain(value) for name, value in given.items()}}
     yield from yaml_lines({name: values[name] for name in own}, shape, {})
     for name in fields_with(shape, RUN_SETTINGS):
         groups = {re.split("[=.@]", word.lstrip("+"))[0] for word in given[name]}

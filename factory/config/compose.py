@@ -184,21 +184,21 @@ def refuse_unknown(
     """
     prefix = f"{where}." if where else ""
     known = [key for key, _ in setting_keys(cls, prefix)]
-    for key in _dotted(cls, values, prefix):
+    for key in _dotted_keys(cls, values, prefix):
         if key not in known:
             meant = did_you_mean(key, known)
             more = f"{meant.removesuffix('?')}=?" if meant else "; see --help"
             raise ConfigError(said(key) or f"{key}: there is no such setting{more}")
 
 
-def _dotted(cls: type[Any], values: Mapping[str, Any], prefix: str) -> Iterator[str]:
+def _dotted_keys(cls: type[Any], values: Mapping[str, Any], prefix: str) -> Iterator[str]:
     """The keys of `values`, into groups that are dataclasses."""
     hints = get_type_hints(cls)
     for key, value in values.items():
         yield f"{prefix}{key}"
         inner = dataclass_in(hints.get(key))
         if inner is not None and isinstance(value, Mapping):
-            yield from _dotted(inner, value, f"{prefix}{key}.")
+            yield from _dotted_keys(inner, value, f"{prefix}{key}.")
 
 
 def build(spec: Mapping[str, Any], where: str, labels: Sequence[str] = ("name",)) -> Any:

@@ -158,7 +158,7 @@ def differences_from_paper(config: RunConfig, vocabulary: Vocabulary) -> list[st
     Nothing is said of pictures where none are rendered, nor of experts that do not drive.
     """
     paper = load_config(["preset=paper", "vocabulary.file=given"])
-    given, wanted = _dotted(asdict(config)), dict(_dotted(asdict(paper)))
+    given, wanted = _dotted_items(asdict(config)), dict(_dotted_items(asdict(paper)))
     found, size = [], paper.vocabulary.k
     if len(vocabulary) != size or config.vocabulary.file is None:
         kind = "kinematic" if config.vocabulary.file is None else "given"
@@ -177,10 +177,10 @@ def _within(key: str, groups: Sequence[str]) -> bool:
     return any(key == group or key.startswith(f"{group}.") for group in groups)
 
 
-def _dotted(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _dotted_items(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Keys with dots -> values."""
     for key, value in tree.items():
         if isinstance(value, Mapping):
-            yield from _dotted(value, f"{prefix}{key}.")
+            yield from _dotted_items(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value

@@ -47,11 +47,11 @@ def card(store: Store) -> str:
     orphans = _orphans(store)
     parts = (
         _front_matter(samples, orphans),
-        _what(store, samples),
-        _sources(samples),
-        _how(store),
-        _funnel(funnel_of_tables(samples, outcomes, lists, store.plans.read(), store.runs())),
-        _limits(store, samples, outcomes, orphans),
+        _overview_section(store, samples),
+        _sources_section(samples),
+        _settings_section(store),
+        _acceptance_section(funnel_of_tables(samples, outcomes, lists, store.plans.read(), store.runs())),
+        _limits_section(store, samples, outcomes, orphans),
     )
     return "\n".join(line for part in parts for line in part) + "\n"
 
@@ -76,7 +76,7 @@ def _front_matter(samples: pa.Table, orphans: int) -> Iterator[str]:
     yield "---"
 
 
-def _what(store: Store, samples: pa.Table) -> Iterator[str]:
+def _overview_section(store: Store, samples: pa.Table) -> Iterator[str]:
     clips = len(_values(samples, "clip_id"))
     yield f"\n# Driving samples of {_datasets(samples)}\n"
     yield (
@@ -85,7 +85,7 @@ def _what(store: Store, samples: pa.Table) -> Iterator[str]:
     )
     yield (
         "`expert=human` is the logged drive; the others begin where no human drove, and a pseudo-expert drove on from "
-        f"there in simulation. {_gate(store)}"
+        f"there in simulation. {_reward_gate_text(store)}"
     )
     yield f"\nThe run is {_state(store)}.\n"
     yield from _table(("expert", "round", "samples"), _counts(samples, ["expert", "round"]))
@@ -98,13 +98,13 @@ def _what(store: Store, samples: pa.Table) -> Iterator[str]:
     yield 'samples = DeltaTable("samples").to_pyarrow_dataset()  # the files that count\n```'
 
 
-def _sources(samples: pa.Table) -> Iterator[str]:
+def _sources_section(samples: pa.Table) -> Iterator[str]:
     yield "\n## Where it comes from\n"
     yield "Every row carries the licence of its source; it covers what is made of it.\n"
     yield from _table((*SOURCE, "logs", "clips", "samples"), _counts(samples, SOURCE, ["log_id", "clip_id"]))
 
 
-def _how(store: Store) -> Iterator[str]:
+def _settings_section(store: Store) -> Iterator[str]:
     record = _newest_run_record(store)
     told = json.loads(store.location.read("report.json") or b"{}").get("facts", {})
     command = json.loads(store.location.read(CURRENT_RUN) or b"{}").get("command")
@@ -120,7 +120,7 @@ def _how(store: Store) -> Iterator[str]:
     yield f"```json\n{json.dumps(record['settings'], indent=1, sort_keys=True)}\n```\n\n</details>"
 
 
-def _funnel(funnel: Funnel) -> Iterator[str]:
+def _acceptance_section(funnel: Funnel) -> Iterator[str]:
     yield "\n## Acceptance\n"
     yield f"{funnel.clips_prepared:,} clips prepared, {funnel.candidates:,} candidates.\n"
     head = ("expert", "round", "tried", "accepted", "of attempts", "clips", "why not")
@@ -132,7 +132,7 @@ def _funnel(funnel: Funnel) -> Iterator[str]:
     yield from _table(head, rows)
 
 
-def _limits(store: Store, samples: pa.Table, outcomes: pa.Table, orphans: int) -> Iterator[str]:
+def _limits_section(store: Store, samples: pa.Table, outcomes: pa.Table, orphans: int) -> Iterator[str]:
     """What a user must know; each line only where it is so."""
     yield "\n## Known limits\n"
     simulated = samples.filter(pc.greater_equal(samples["candidate_index"], 0)).select(["image_source", "psnr"])
@@ -173,7 +173,7 @@ def _limits(store: Store, samples: pa.Table, outcomes: pa.Table, orphans: int) -
         yield "- There is no sample in it yet."
 
 
-def _gate(store: Store) -> str:
+def _reward_gate_text(store: Store) -> str:
     """Which simulated drives became samples."""
     settings = _newest_run_record(store)["settings"]
     full, above = settings.get("reward.full", []), settings.get("reward.progress_above", -1.0)

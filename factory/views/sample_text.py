@@ -154,7 +154,7 @@ def lineage(store: "Store", which: str) -> list[Part]:
 
     attempt_id = _find_attempt_id(store, which)
     is_sample = attempt_id in store.samples
-    path, row = _row(store.samples if is_sample else store.outcomes, attempt_id)
+    path, row = _light_row(store.samples if is_sample else store.outcomes, attempt_id)
     records = store.runs()
     number = run_number_lookup(records)(row)
     record = records[number] if number >= 0 else {}
@@ -182,14 +182,14 @@ def _find_attempt_id(store: "Store", which: str) -> str:
     return found[0]
 
 
-def _row(table: "KeyedTable", attempt_id: str) -> tuple[str, Row]:
+def _light_row(table: "KeyedTable", attempt_id: str) -> tuple[str, Row]:
     """The file it stands in, and the row without what is large."""
     large = {"images", "cameras", "label_subscores", "label_progress"}
     small = [f.name for f in table.spec.schema if f.name not in large and not f.name.startswith(("agent_", "lane_"))]
-    return _found(table, attempt_id, small)
+    return _file_and_row(table, attempt_id, small)
 
 
-def _found(table: "KeyedTable", key: str, columns: Sequence[str]) -> tuple[str, Row]:
+def _file_and_row(table: "KeyedTable", key: str, columns: Sequence[str]) -> tuple[str, Row]:
     """A key's file, and these columns of its row."""
     import pyarrow.compute as pc
 
@@ -202,7 +202,7 @@ def _clip(store: "Store", row: Row) -> Row:
     """The clip's row of candidates with its file, empty where it has none."""
     if row["clip_id"] not in store.candidates:
         return {}
-    path, found = _found(store.candidates, row["clip_id"], store.candidates.spec.schema.names)
+    path, found = _file_and_row(store.candidates, row["clip_id"], store.candidates.spec.schema.names)
     return {**found, "file": path}
 
 
@@ -241,14 +241,14 @@ def _candidate_facts(row: Row, clip: Row, record: Row) -> list[tuple[str, object
     x, y, heading, speed = (found[name] for name in ("end_x", "end_y", "end_heading", "end_speed"))
     return [
         *facts,
-        _moved_by(found["vocabulary_index"], clip, record),
+        _perturbation_fact(found["vocabulary_index"], clip, record),
         ("ends", f"{x:+.2f} m along, {side_text(y)}, {turn_text(heading)}, at {speed:.2f} m/s"),
         ("grid cell", ", ".join(map(str, found["cell"]))),
         ("EPDMS", f"{found['score']:.3f} against log replay, {found['reactive_score']:.3f} among reacting agents"),
     ]
 
 
-def _moved_by(index: int, clip: Row, record: Row) -> tuple[str, object]:
+def _perturbation_fact(index: int, clip: Row, record: Row) -> tuple[str, object]:
     """What perturbs the ego: a row of the vocabulary, or a start of the clip's own; or nothing does."""
     from tasks.world.vocabulary import FIRST_START, OF_LOG
 

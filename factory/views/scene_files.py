@@ -60,7 +60,7 @@ def logged_vehicles(store: "Store", asset: RenderAsset) -> tuple[list[LoggedVehi
         raise BadScene("out=: the scene does not say which log it is of, so that no run has its vehicles' poses")
     seen: dict[str, dict[int, Array]] = {name: {} for name in asset.nodes}  # by time [ms] since the block's start
     found = False
-    for clip in _clips_in(store, block):
+    for clip in _prepared_clips_of_block(store, block):
         found = True
         _add_boxes(seen, clip, asset, block)
     if not found:
@@ -68,7 +68,7 @@ def logged_vehicles(store: "Store", asset: RenderAsset) -> tuple[list[LoggedVehi
         raise BadScene(f"{store.location.uri}: no prepared clip of log {stretch} in its cache")
     times_ms = sorted({time_ms for boxes in seen.values() for time_ms in boxes})
     known = [name for name, boxes in seen.items() if boxes]
-    tokens = _tokens(known)
+    tokens = _worldengine_tokens(known)
     times_s = block.start_s + 1e-3 * np.array(times_ms)
     vehicles = [
         LoggedVehicle(token, asset.nodes[name], times_s, _poses_of_boxes(seen[name], times_ms))
@@ -77,7 +77,7 @@ def logged_vehicles(store: "Store", asset: RenderAsset) -> tuple[list[LoggedVehi
     return vehicles, [name for name in seen if name not in known]
 
 
-def _clips_in(store: "Store", block: BlockRange) -> Iterator[Clip]:
+def _prepared_clips_of_block(store: "Store", block: BlockRange) -> Iterator[Clip]:
     """Prepared clips of the block's log that overlap its stretch, as far as the cache has them still."""
     rows = store.candidates.read(["clip_id", "dataset", "log_id", "prepare_digest"]).to_pylist()
     for row in sorted(rows, key=lambda row: str(row["clip_id"])):
@@ -115,7 +115,7 @@ def _poses_of_boxes(boxes: dict[int, Array], times_ms: Sequence[int]) -> Array:
     return poses
 
 
-def _tokens(names: Sequence[str]) -> list[str]:
+def _worldengine_tokens(names: Sequence[str]) -> list[str]:
     """Names as WorldEngine takes them: it cuts at underscores, and a point would nest."""
     tokens = [re.sub(r"[^A-Za-z0-9-]", "-", name) for name in names]
     if len(set(tokens)) < len(tokens):

@@ -85,7 +85,7 @@ def filtered_order(shot: Snapshot, wanted: Mapping[str, str], order: str = "newe
 def gallery(shot: Snapshot, wanted: Mapping[str, str], page: int = 1, size: int = 12, order: str = "newest") -> Json:
     """One page of cards, counted from 1; beyond the last it is empty. Raises BadRequest."""
     places = filtered_order(shot, wanted, order)
-    return {"version": shot.version, **_page(shot.samples, places, page, size, lambda row: card_of(shot, row))}
+    return {"version": shot.version, **_page(shot.samples, places, page, size, lambda row: gallery_card(shot, row))}
 
 
 def failures(shot: Snapshot, page: int = 1, size: int = 50) -> Json:
@@ -113,7 +113,7 @@ def _page(
     return {"total": len(order), "page": page, "pages": pages, "size": size, "items": items}
 
 
-def card_of(shot: Snapshot, row: Row) -> Json:
+def gallery_card(shot: Snapshot, row: Row) -> Json:
     """The card of a sample's row; file: in a picture's address, where it changes when the row does."""
     file = shot.sample_paths[row["_file"]].rpartition("part-")[2][:8]
     return {name: row[name] for name in CARD} | {"file": file, "written_ms": row["_written_ms"]}
@@ -131,7 +131,7 @@ def newest_first_place(shot: Snapshot, attempt_id: str) -> int:
 def sample_page(shot: Snapshot, attempt_id: str, row: Row, candidates: KeyedTable) -> Json:
     """One sample's page from its whole row; newer, older: its neighbours in the gallery. Raises NotThere."""
     at = newest_first_place(shot, attempt_id)
-    card = card_of(shot, shot.newest(at))
+    card = gallery_card(shot, shot.newest(at))
 
     def neighbour(place: int) -> str | None:
         return shot.newest(place)["attempt_id"] if 0 <= place < shot.samples.num_rows else None
@@ -151,13 +151,13 @@ def sample_page(shot: Snapshot, attempt_id: str, row: Row, candidates: KeyedTabl
         ],
         "lineage": {name: "-" if row[name] in (None, "") else str(row[name]) for name in LINEAGE}
         | {"clip begins": f"{row['clip_start_s']:.1f} s into the log", "now": f"{row['now_s']:.1f} s later"},
-        "siblings": _siblings(shot, card, candidates),
+        "siblings": _candidates_of_walk(shot, card, candidates),
         "newer": neighbour(at - 1),
         "older": neighbour(at + 1),
     }
 
 
-def _siblings(shot: Snapshot, card: Row, candidates: KeyedTable) -> list[Json]:
+def _candidates_of_walk(shot: Snapshot, card: Row, candidates: KeyedTable) -> list[Json]:
     """All candidates of the clip in the order of the walk, with what this expert made of them."""
 
     def of_walk(rows: pa.Table) -> list[Json]:

@@ -89,13 +89,13 @@ def _state(shot: Snapshot, now_s: float) -> Json:
     word, tone, detail = *STATUS.get(shot.last.get("exit_code", -1), ("run status unknown", "warn")), ""
     if shot.live:
         word, tone = "running", "live"
-        if _quiet(shot, now_s):
+        if _is_quiet(shot, now_s):
             word, tone = "quiet", "warn"
             detail = "nothing was committed for a while: a long reconstruction, or the run is gone; then run it again"
     return {"word": word, "tone": tone, "live": shot.live, "detail": detail, "last_commit_ms": shot.last_commit_ms}
 
 
-def _quiet(shot: Snapshot, now_s: float) -> bool:
+def _is_quiet(shot: Snapshot, now_s: float) -> bool:
     return now_s - max(shot.last_commit_ms, shot.current.get("began_ms", 0)) / 1000.0 > QUIET_S
 
 
@@ -179,7 +179,7 @@ def _throughput(shot: Snapshot, now_s: float) -> Json:
     edges[-1] += 1.0
     made = int((samples >= start).sum())
     hours = (end - start) / 3.6e6
-    done, walks, eta = _walks(shot, began, (end - start) / 1000.0) if shot.live else (None, None, None)
+    done, walks, eta = _walk_progress(shot, began, (end - start) / 1000.0) if shot.live else (None, None, None)
     return {
         "began_ms": start,
         "ended_ms": end,
@@ -189,11 +189,11 @@ def _throughput(shot: Snapshot, now_s: float) -> Json:
         "samples_per_hour": made / hours if hours > 0 else None,
         "walks_done": done,  # (clip, expert)
         "walks": walks,
-        "eta_s": None if _quiet(shot, now_s) else eta,
+        "eta_s": None if _is_quiet(shot, now_s) else eta,
     }
 
 
-def _walks(shot: Snapshot, began_ms: int, elapsed_s: float) -> tuple[int, int, float | None]:
+def _walk_progress(shot: Snapshot, began_ms: int, elapsed_s: float) -> tuple[int, int, float | None]:
     """Walks that ended since the run began, these and those still pending, and the seconds left at this rate."""
     rounds, experts = shot.current["rounds"], shot.current["experts"]
     samples, outcomes = (

@@ -21,7 +21,7 @@ from factory.store.reader import decode_stored_image
 from factory.store.samples import Store
 from factory.store.schema import NOW_INDEX
 from factory.store.table import text_equals
-from factory.views.board.gallery import Pictures, card_of, failures, gallery, newest_first_place, sample_page
+from factory.views.board.gallery import Pictures, failures, gallery, gallery_card, newest_first_place, sample_page
 from factory.views.board.overview import Drives, drives_as_json, overview
 from factory.views.board.server import STATIC
 from factory.views.board.watch import Snapshot, Watch
@@ -89,7 +89,7 @@ def report_page(store: Store, shot: Snapshot, pictures: Pictures, extra: Mapping
     extra: what the live page does not show: facts, settings, left_out (static/extra.js reads it).
     """
     looks = gallery(shot, {"simulated": "1"}, 1, N_LOOKS)
-    items = [card_of(shot, row) for row in _shown(shot, [item["attempt_id"] for item in looks["items"]])]
+    items = [gallery_card(shot, row) for row in _shown(shot, [item["attempt_id"] for item in looks["items"]])]
     kept: dict[str, str] = {}
     answers: dict[str, Any] = {
         "/api/overview": overview(shot, store.location.uri, time.time()),
@@ -110,11 +110,11 @@ def report_page(store: Store, shot: Snapshot, pictures: Pictures, extra: Mapping
 
 def _shown(shot: Snapshot, always: Sequence[str]) -> list[Mapping[str, Any]]:
     """Rows of samples, newest first: some that must be there, and others as unlike each other as can be."""
-    ids = list(dict.fromkeys([*always, *spread(shot.samples)]))[:N_SAMPLES]
+    ids = list(dict.fromkeys([*always, *varied_sample_ids(shot.samples)]))[:N_SAMPLES]
     return [shot.newest(place) for place in sorted(newest_first_place(shot, attempt_id) for attempt_id in ids)]
 
 
-def spread(samples: pa.Table) -> list[str]:
+def varied_sample_ids(samples: pa.Table) -> list[str]:
     """Ids of a few samples, each next one the least like those before it in expert, clip and round, then by its id.
 
     The same samples in any order give the same list.

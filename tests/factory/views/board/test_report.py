@@ -11,7 +11,7 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.store.samples import Store
-from factory.views.board.report import FACTS, FILE, N_LOOKS, N_SAMPLES, PER_EXPERT, spread
+from factory.views.board.report import FACTS, FILE, N_LOOKS, N_SAMPLES, PER_EXPERT, varied_sample_ids
 from tests.factory.views.board.runs import EVIL, counted, run, told
 
 main = COMMANDS["report"].load()
@@ -89,7 +89,7 @@ def test_its_samples_are_spread_and_do_not_depend_on_the_order_of_rows() -> None
 
     def chosen(rows: list[dict[str, Any]]) -> list[str]:
         table = pa.table({name: [row[name] for row in rows] for name in rows[0]})
-        return spread(table.set_column(1, "expert", table["expert"].dictionary_encode()))
+        return varied_sample_ids(table.set_column(1, "expert", table["expert"].dictionary_encode()))
 
     first = chosen(rows)
     assert chosen(rows[::-1]) == first == chosen(rows[: 2 * PER_EXPERT])
