@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from factory.commands.table import COMMANDS, DOORS
-from factory.config.arguments import POSITIONAL, RUN_SETTINGS, ComposedCommand, given_as, groups_of, keys_of, request_of
 from factory.config.arguments import (
     POSITIONAL,
     RUN_SETTINGS,

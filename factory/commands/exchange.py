@@ -267,8 +267,7 @@ def import_(request: ImportRequest) -> int:
         raise Refused(one_line(error)) from error
     counts = summary.counts
     print(f"{counts['accepted']:,} samples imported, {summary.executed.found_done:,} were there: {store.location.uri}")
-    for line in filter(None, (summary.message, said, failed_line(store) if counts["failed"] else "")):
-    for line in filter(None, (summary.message, told, failure_summary(store) if counts["failed"] else "")):
+    for line in filter(None, (summary.message, said, failure_summary(store) if counts["failed"] else "")):
         print(line)
     return summary.exit_code
 

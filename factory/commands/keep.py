@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from factory.commands.look import FolderRequest
-from factory.config.arguments import POSITIONAL, SOME_RUN_SETTINGS, Refused
 from factory.config.arguments import GIVEN_ALONE, POSITIONAL, RUN_SETTINGS, Refused
 from factory.exits import COMPLETE, DAMAGED
 from factory.views.status import IMPORT_AGAIN, failed_lines, location_of_out, open_store
@@ -27,7 +26,6 @@ class RetryRequest:
     """The command line."""
 
     out: str
-    settings: tuple[str, ...] = field(default=(), metadata=SOME_RUN_SETTINGS)
     settings: tuple[str, ...] = field(default=(), metadata=RUN_SETTINGS | GIVEN_ALONE)
 
 

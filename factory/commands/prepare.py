@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import factory.run
-from factory.config.arguments import POSITIONAL, SOME_RUN_SETTINGS, Refused, command, keys_of
-from factory.config.datasets import data_sets
 from factory.config.arguments import GIVEN_ALONE, POSITIONAL, RUN_SETTINGS, Refused, command, request_keys
+from factory.config.datasets import data_sets
 from factory.config.run import RunConfig
 from factory.config.words import did_you_mean, parse_command_line
 
@@ -40,7 +39,6 @@ class VocabularyRequest:
     vocabularies: tuple[str, ...] = ()  # files whose trajectories go into the table too
     every_s: float = 0.5  # a window starts this often
     kinematic: bool = False  # out: k seeded trajectories, as a run without vocabulary.file has; reads no clips
-    settings: tuple[str, ...] = field(default=(), metadata=SOME_RUN_SETTINGS)
     settings: tuple[str, ...] = field(default=(), metadata=RUN_SETTINGS | GIVEN_ALONE)
 
     def __post_init__(self) -> None:

@@ -210,7 +210,6 @@ def parse(shape: type[Request], argv: Sequence[str]) -> Request:
 
 def request_keys(shape: type["DataclassInstance"]) -> dict[str, Any]:
     """Key -> type of a request's fields, less the one that takes the settings of the run."""
-    hints, rest = get_type_hints(shape), given_as(shape, RUN_SETTINGS)
     hints, rest = get_type_hints(shape), fields_with(shape, RUN_SETTINGS)
     return {field.name: hints[field.name] for field in fields(shape) if field.name not in rest}
 
@@ -238,7 +237,6 @@ def _settings_as_yaml(shape: type["DataclassInstance"], given: Mapping[str, Any]
                     keeps = line.partition(":")[0] in groups
                 if keeps:
                     yield line
-            if name in given_as(shape, SOME_RUN_SETTINGS) and not line.startswith(" "):
 
 
 def _value(key: str, text: str, kind: Any) -> Any:

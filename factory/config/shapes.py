@@ -52,9 +52,8 @@ def allowed_values(hint: Any) -> list[str]:
 def defaults_of(shape: type[Any]) -> dict[str, Any]:
     """Key -> default of every field that has one, as YAML would hold it."""
     return {
-        field.name: plain(_default(field)) for field in configurable_fields(shape) if _default(field) is not MISSING
+        field.name: to_plain(_default(field)) for field in configurable_fields(shape) if _default(field) is not MISSING
     }
-    return {field.name: to_plain(_default(field)) for field in offered(shape) if _default(field) is not MISSING}
 
 
 def required_keys(shape: type[Any]) -> dict[str, Any]:
@@ -69,8 +68,7 @@ def _default(field: Field[Any]) -> Any:
 def to_plain(value: Any) -> Any:
     """Dataclasses as mappings of what they offer, tuples as lists, enums as text."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in configurable_fields(type(value))}
-        return {field.name: to_plain(getattr(value, field.name)) for field in offered(type(value))}
+        return {field.name: to_plain(getattr(value, field.name)) for field in configurable_fields(type(value))}
     if isinstance(value, Mapping):
         return {key: to_plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):

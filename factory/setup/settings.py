@@ -140,8 +140,7 @@ def assemble(config: RunConfig) -> Run:
         labels_of=labels_of,
         render=config.render,
         seed=config.seed,
-        identity=identity_of(config, vocabulary, labels_of, starts),
-        identity=run_identity(config, vocabulary, labelling, starts),
+        identity=run_identity(config, vocabulary, labels_of, starts),
         cache_dir=cache_folder(config.out),
         photos_alone=photos_alone(config),
         starts={} if starts is None else starts.of_clip,
@@ -227,7 +226,7 @@ def _must_have(plugged: object, members: Sequence[str], where: str, what: str) -
 
 
 def run_identity(
-    config: RunConfig, vocabulary: Vocabulary, labelling: Labelling | None, starts: StartStates | None = None
+    config: RunConfig, vocabulary: Vocabulary, labels_of: Vocabulary | None, starts: StartStates | None = None
 ) -> RunIdentity:
     """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it.
 

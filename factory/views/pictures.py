@@ -426,8 +426,7 @@ def tile_grid(tiles: Sequence[Image], columns: int) -> Image:
 
 def _stored_image_tile(image: Mapping[str, Any]) -> Image:
     try:
-        return tile(decode_stored_image(image), f"{image['camera']}  {image['time_s']:+.1f} s")
-        return captioned_tile(decoded(image), f"{image['camera']}  {image['time_s']:+.1f} s")
+        return captioned_tile(decode_stored_image(image), f"{image['camera']}  {image['time_s']:+.1f} s")
     except ValueError as error:
         return text_tile(str(error))
 

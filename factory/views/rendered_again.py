@@ -201,8 +201,7 @@ def _stored_image_tiles(row: Row, time_s: float) -> Iterable[Image]:
         ]
         if taken:
             last = max(taken, key=lambda image: float(image["time_s"]))
-            yield tile(decode_stored_image(last), f"{last['camera']}  {last['time_s']:+.1f} s")
-            yield captioned_tile(decoded(last), f"{last['camera']}  {last['time_s']:+.1f} s")
+            yield captioned_tile(decode_stored_image(last), f"{last['camera']}  {last['time_s']:+.1f} s")
         else:
             yield text_tile(f"{camera['name']}: no image at {time_s:+.1f} s")
 

@@ -16,9 +16,8 @@ import pyarrow as pa
 from factory.graph.steps import cache_key
 from factory.pipeline import logged_clip
 from factory.readers.pickles import load_tensors
-from factory.stages.scene_file import SUFFIX, BadScene, described_by, read_dtype, read_scene, read_view_qualities
+from factory.stages.scene_file import BadScene, described_by, read_dtype, read_scene
 from factory.store.location import BadCacheFile
-from factory.stages.scene_file import BadScene, described_by, read_scene, stored_dtype
 from factory.wording import one_line
 from tasks.render.scene.asset import BlockRange, RenderAsset, ViewQuality
 from tasks.render.scene.movers import world_from_boxes

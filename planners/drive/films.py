@@ -73,8 +73,7 @@ def _sheet(made: ClosedLoop, rig: Rig, title: str, step: int) -> Image:
     front = front_camera({"images": images, "cameras": rig})
     if front is not None:
         seen = next(image for image in images if image["camera"] == front)
-        sheet[: CAMERA_PX[1], BEV_PX[0] :] = fitted(decode_stored_image(seen), *CAMERA_PX)
-        sheet[: CAMERA_PX[1], BEV_PX[0] :] = letterboxed(decoded(seen), *CAMERA_PX)
+        sheet[: CAMERA_PX[1], BEV_PX[0] :] = letterboxed(decode_stored_image(seen), *CAMERA_PX)
     for row, line in enumerate(_lines(made, front, step, planned)):
         write_text(sheet, line, (BEV_PX[0] + 12, CAMERA_PX[1] + 26 + 24 * row), 0.5)
     return sheet

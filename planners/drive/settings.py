@@ -6,8 +6,7 @@ from typing import Any, Literal
 
 from factory.config.compose import fill, refuse_unknown
 from factory.config.datasets import reader_settings
-from factory.config.run import VocabularyChoice, refuse_missing_root, without_labels
-from factory.config.run import READERS, VocabularyChoice, own_settings, refuse_missing_root
+from factory.config.run import VocabularyChoice, own_settings, refuse_missing_root
 from factory.config.shapes import deep_merge, defaults_of
 from planners.drive.loop import LoopSettings
 from planners.evaluation.planner_names import composed

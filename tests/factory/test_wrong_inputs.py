@@ -15,7 +15,6 @@ from pyarrow.feather import write_feather
 
 from factory.__main__ import main
 from factory.datasets.av2 import INTRINSICS, POSES
-from factory.commands.completion import setting_choices
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "numba", "scipy", "shapely", "pyarrow", "deltalake", "ray", "torch", "cv2")

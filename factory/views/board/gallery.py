@@ -263,10 +263,10 @@ class Pictures:
     def _row(self, place: Place, columns: Sequence[str]) -> Sample:
         path, row, partition = place
         with self._lock:  # the pictures of a page ask at once; one of them reads for all
-            group, row = group_of(self._file(path), row)
+            group, row = find_row_group(self._file(path), row)
             stored = self._group(path, group, tuple(name for name, _ in partition))
         schema = pa.schema([SCHEMA.field(name) for name in columns])
-        return table_to_rows(with_partition(stored.slice(row, 1), schema, dict(partition)))[0]
+        return table_to_rows(with_partition_columns(stored.slice(row, 1), schema, dict(partition)))[0]
 
     def _read_group(self, path: str, group: int, in_path: Sequence[str]) -> pa.Table:
         return self._file(path).read_row_group(group, columns=[name for name in COLUMNS if name not in in_path])

@@ -7,8 +7,14 @@ from typing import Literal
 import pytest
 
 from factory.commands.table import COMMANDS, DOORS
-from factory.config.arguments import POSITIONAL, RUN_SETTINGS, Refused, keys_of, parse, request_of
-from factory.config.arguments import POSITIONAL, RUN_SETTINGS, Refused, parse, request_class_of, request_keys
+from factory.config.arguments import (
+    POSITIONAL,
+    RUN_SETTINGS,
+    Refused,
+    parse,
+    request_class_of,
+    request_keys,
+)
 from factory.config.shapes import allowed_values
 from factory.config.words import ConfigError
 from tests.factory.text_keys import text_keys

@@ -12,8 +12,7 @@ from factory.config.run import load_config
 from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, RejectedAttempt, run_attempt
 from factory.pipeline import FactoryWork, WholeClip
 from factory.readers.base import BadClip
-from factory.setup.settings import assemble, identity_of
-from factory.setup.settings import assemble, refuse_missing_backend, run_identity
+from factory.setup.settings import assemble, run_identity
 from factory.store.schema import COLUMNS, UNLISTED
 from tasks import stages
 from tasks.perturb import Perturbation, perturb

@@ -37,8 +37,7 @@ def test_a_picture_keeps_its_aspect_and_survives_coding() -> None:
     tile = letterboxed(wide, 200, 100)
     assert tile.shape == (100, 200, 3)
     assert (tile[30:70] == wide[0, 0]).all() and not (tile[:20] == wide[0, 0]).all()
-    back = decode_stored_image({"jpeg": encoded(wide), "camera": "front", "time_s": 0.0})
-    back = decoded({"jpeg": encode_image(wide), "camera": "front", "time_s": 0.0})
+    back = decode_stored_image({"jpeg": encode_image(wide), "camera": "front", "time_s": 0.0})
     assert np.abs(back.astype(int) - wide).max() <= 4
 
 
