@@ -82,7 +82,7 @@ def labels_of_stream(rng: np.random.Generator, k: int = 20) -> VocabularyLabels:
     """Any scores of k trajectories."""
     scores = {name: rng.integers(0, 3, k) / 2.0 for name in HALVES}
     scores |= {name: rng.integers(0, 2, k) * 1.0 for name in WHOLES}
-    return VocabularyLabels("vocabulary-1", "replay", 20.0, ep_raw_m=rng.random(k) * 60.0, **scores)
+    return VocabularyLabels("vocabulary-1", 20.0, ep_raw_m=rng.random(k) * 60.0, **scores)
 
 
 def row_of(rng: np.random.Generator) -> dict[str, object]:
