@@ -10,7 +10,7 @@ from tests.bench import bench_decoding, bench_planner_steps
 from tests.bench.bench_planner_steps import counted_alone, measured
 
 SMALL = "gtrs_dense_small"
-FIT_S_OWN = ("picture_of(", "backend import compose")  # what the fit draws with, no sample
+FIT_S_OWN = ("picture_of(", "backend import compose_scene")  # what the fit draws with, no sample
 
 
 @pytest.fixture

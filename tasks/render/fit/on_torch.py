@@ -46,13 +46,13 @@ from tasks.world.arrays import F32, Array, Ints, ShortInts
 
 
 class LearnedTensor:
-    """`adam.Learned`, on a device."""
+    """`state.AdamArray`, on a device."""
 
     def __init__(self, values: Tensor, first: Tensor, second: Tensor, steps: Tensor) -> None:
         self.values, self.first, self.second, self.steps = values, first, second, steps
 
     def step(self, rows: Tensor, gradient: Tensor, rate: float, scale: Tensor | None = None) -> None:
-        """`Learned.step`."""
+        """`AdamArray.step`."""
         self.steps[rows] += 1
         counts = self.steps[rows].double()[:, None]
         first = BETA1 * self.first[rows] + (1.0 - BETA1) * gradient
@@ -121,7 +121,7 @@ def composite_sky(
 ) -> tuple[Tensor, Tensor]:
     """A picture (H, W, 3) with the sky behind it, and which of the `cells` (ROWS * COLUMNS, 3) that it asks for.
 
-    As `backdrop.backdrop` has it, and `backdrop.backdrop_gradient`: what hides more than HIDDEN asks nothing.
+    As `sky.look_up_sky` has it, and `backend.backdrop_gradient`: what hides more than HIDDEN asks nothing.
     """
     height, width = alpha.shape
     v, u = torch.meshgrid(
@@ -154,7 +154,7 @@ def composite_sky(
 
 
 def lay_flat(means: Tensor, quats: Tensor, log_scales: Tensor, rows: Tensor, road: Road) -> None:
-    """`road.lay_flat`, in place."""
+    """`state.lay_flat`, in place."""
     field = torch.tensor(np.dstack([road.heights, road.slopes]), device=means.device)
     x, y, z = means[rows].double().unbind(1)
     u, v = (x - float(road.corner[0])) / CELL_M, (y - float(road.corner[1])) / CELL_M

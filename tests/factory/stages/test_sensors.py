@@ -256,7 +256,7 @@ def test_a_killed_fit_goes_on_to_the_same_bytes(
 
     monkeypatch.setattr(assets, "STRETCH", 8)
     monkeypatch.setattr(reconstruct, "REPORT_EVERY", 10)
-    advance, starts, said = assets.advance, [], []  # type: ignore[var-annotated]
+    advance, starts, said = assets.run_iterations, [], []  # type: ignore[var-annotated]
 
     def killed_at_16(problem, state, *rest):  # type: ignore[no-untyped-def]
         starts.append(state.iteration)
@@ -265,7 +265,7 @@ def test_a_killed_fit_goes_on_to_the_same_bytes(
             raise KeyboardInterrupt
         advance(problem, state, *rest)
 
-    monkeypatch.setattr(assets, "advance", killed_at_16)
+    monkeypatch.setattr(assets, "run_iterations", killed_at_16)
     with pytest.raises(KeyboardInterrupt):
         load_or_build_scene(clip, FITTED, tmp_path / "two")
     begun = tmp_path / "two" / f"block-{block_id(clip, FITTED)}.fit.npz"

@@ -78,7 +78,7 @@ from pathlib import Path
 sys.path.insert(0, {tests!r})
 from printed_street import CAMERAS, photographed
 
-from factory.stages.assets import asset_for
+from factory.stages.assets import load_or_build_scene
 from factory.stages.warm import tiny_clip
 from tasks.render.settings import FitSettings
 from tasks.render.settings import RenderSettings
@@ -86,7 +86,7 @@ from tasks.render.settings import RenderSettings
 folder = Path({folder!r})
 clip = replace(tiny_clip(), block=photographed(folder), cameras=CAMERAS)
 fit = FitSettings(iterations=4, start_gaussians=500, most_gaussians=600, refine_every=2, refine_from=2, pose_from=0)
-scene = asset_for(clip, RenderSettings(width=100, height=56, fit=fit), folder)
+scene = load_or_build_scene(clip, RenderSettings(width=100, height=56, fit=fit), folder)
 assert scene is not None and scene.rig, "the rig is corrected"
 """
 

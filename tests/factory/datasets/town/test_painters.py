@@ -64,12 +64,12 @@ def test_a_painter_that_dies_is_named(tmp_path: Path, capfd: pytest.CaptureFixtu
 INTERRUPTED = """
 import os, signal, sys
 from pathlib import Path
-from factory.datasets.town.town import TownFolder, write_all
+from factory.datasets.town.town import TownFolder, write_towns
 from factory.datasets.town.settings import TownSettings
 signal.signal(signal.SIGTERM, signal.default_int_handler)
 signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the processes it starts, too
 os.cpu_count = lambda: 2
-write_all([TownFolder(seed, (0, 1, 2, 3), Path(sys.argv[1]) / f"town-{seed}") for seed in (5, 6)], TownSettings())
+write_towns([TownFolder(seed, (0, 1, 2, 3), Path(sys.argv[1]) / f"town-{seed}") for seed in (5, 6)], TownSettings())
 """
 
 
