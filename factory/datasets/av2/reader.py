@@ -114,10 +114,6 @@ class LogMotion:
             raise BadClip(str(self.folder), "timestamps", f"a log of {last / 3600:.0f} h")
         return int(np.floor(last / STEP_S)) + 1
 
-    def seconds(self, stamps_ns: Ints) -> Array:
-        """Stamps as seconds since the first annotated frame."""
-        return seconds_since(self.start_ns, stamps_ns)
-
 
 def seconds_since(start_ns: int, stamps_ns: Ints) -> Array:
     """Seconds from start_ns to each stamp; the difference is taken in integers."""
@@ -584,7 +580,7 @@ def read_lights(folder: Path, road_map: RoadMap, motion: LogMotion, times_s: Arr
     unknown = set(names.tolist()) - LightState.__members__.keys()
     if unknown:
         raise BadClip(str(path), "state", f"unknown state {sorted(unknown)}")
-    changed_at = motion.seconds(stamps(path, table))
+    changed_at = seconds_since(motion.start_ns, stamps(path, table))
     lane_ids = tuple(sorted(set(lanes.tolist())))
     states = np.full((len(times_s), len(lane_ids)), LightState.UNKNOWN, np.int8)
     for column, lane_id in enumerate(lane_ids):
@@ -618,7 +614,7 @@ def _stamped(motion: LogMotion, sensor: str, folder: Path, suffix: str) -> list[
     for path in files:
         if not path.stem.isdecimal():
             raise BadClip(str(path), "name", f"expected <timestamp_ns>{suffix}")
-    times_s = motion.seconds(np.array([int(path.stem) for path in files], dtype=np.int64))
+    times_s = seconds_since(motion.start_ns, np.array([int(path.stem) for path in files], dtype=np.int64))
     order = np.argsort(times_s, kind="stable")
     poses = world_from_ego_at(motion, times_s[order]) if files else ()
     return [SensorFile(sensor, str(files[i]), float(times_s[i]), pose) for i, pose in zip(order, poses)]

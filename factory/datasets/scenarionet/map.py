@@ -385,7 +385,11 @@ def _drivable_areas(features: Mapping[str, Any], raw: Mapping[str, RawLane], fil
     kilometres beyond the lanes of the file: what is further than 50 m from their convex hull is left out.
     """
     shapes = [Polygon(lane.ring) for lane in raw.values() if lane.kind in CAR_LANE_KINDS]
-    outline = [points(f, "polyline", file, f"map_features[{k}]") for k, f in features.items() if _is_outline(k, f)]
+    outline = [
+        points(feature, "polyline", file, f"map_features[{key}]")
+        for key, feature in features.items()
+        if str(key).startswith("boundary_") and isinstance(feature, dict) and "polyline" in feature
+    ]
     if outline and all(len(ring) > 3 and np.allclose(ring[0], ring[-1]) for ring in outline):
         rings = [ring for ring in map(closed_ring, outline) if ring is not None]
         surface = reduce(shapely.symmetric_difference, [Polygon(ring) for ring in rings], Polygon())
@@ -423,10 +427,6 @@ def pieces(polygon: Polygon) -> list[Polygon]:
     high = shapely.box(x0 if x == x1 else x, y0 if y == y1 else y, x1, y1)
     found = [part for half in (low, high) for part in shapely.get_parts(shapely.intersection(polygon, half))]
     return [piece for part in found if part.geom_type == "Polygon" for piece in pieces(part)]
-
-
-def _is_outline(key: object, feature: object) -> bool:
-    return str(key).startswith("boundary_") and isinstance(feature, dict) and "polyline" in feature
 
 
 def _crossings(features: Mapping[str, Any], file: str) -> tuple[Array, ...]:

@@ -17,7 +17,6 @@ from tasks.world.frames import HEADING, X, Y, all_within, planar_matrices, wrap_
 
 # Where the photos of ScenarioNet's logs are said to be: `cameras.json`, one of each log. Format: docs/photos.md.
 #
-# Light: which cameras there are is told from the JSON alone; numpy is loaded where they are read (photos.py).
 
 NAME = "cameras.json"
 MAX_BYTES = 1 << 28  # an entry of 12 Hz takes some 500: half a million
@@ -82,16 +81,6 @@ def cameras_in(content: Mapping[str, Any], file: str) -> dict[str, Mapping[str, 
     if not isinstance(cameras, dict) or not cameras or not all(isinstance(one, dict) for one in cameras.values()):
         raise BadClip(file, "cameras", "missing, or not an object of one object for each camera")
     return cameras
-
-
-def rig_names(paths: Iterable[Path]) -> tuple[str, ...]:
-    """The rig of the first sidecar that can be read; none where none can: what is wrong is told when they are read."""
-    for path in paths:
-        try:
-            return tuple(cameras_in(load_sidecar(path)[0], str(path)))
-        except BadClip:
-            continue
-    return ()
 
 
 MAX_ENTRIES = 500_000

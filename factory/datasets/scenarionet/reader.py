@@ -326,16 +326,12 @@ def ego_segments(track: LoggedTrack, source: Source, at: Array) -> tuple[Array, 
     runs = pairwise([0, *(np.flatnonzero(broken) + 1).tolist(), len(xy)])
     long_enough = [(a, b) for a, b in runs if b - a >= FIT_STEPS and valid[a:b].all()]
     for number, (start, stop) in enumerate(long_enough):
-        states[start:stop] = _smooth_drive(xy[start:stop], heading[start:stop], source)
+        here = np.unwrap(heading[start:stop])
+        back = source.origin_to_rear_axle_m * np.stack([np.cos(here), np.sin(here)], axis=1)
+        axle = xy[start:stop] - back
+        states[start:stop] = smooth_drive(axle, here, _keyframe_weights(axle), source.smoothing)
         segment[start:stop] = number
     return states, segment
-
-
-def _smooth_drive(xy: Array, heading: Array, source: Source) -> Array:
-    """(S, 11) from logged positions (S, 2) and headings (S,) of one segment."""
-    heading = np.unwrap(heading)
-    xy = xy - source.origin_to_rear_axle_m * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    return smooth_drive(xy, heading, _keyframe_weights(xy), source.smoothing)
 
 
 def smooth_drive(xy: Array, heading: Array, weight: Array, smoothing: float) -> Array:
