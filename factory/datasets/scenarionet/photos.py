@@ -16,7 +16,6 @@ from tasks.world.clip import ROTATION_SLACK, STEP_S, Camera, Fisheye, SensorFile
 from tasks.world.frames import HEADING, X, Y, all_within, planar_matrices, wrap_angle
 
 # Where the photos of ScenarioNet's logs are said to be: `cameras.json`, one of each log. Format: docs/photos.md.
-#
 
 NAME = "cameras.json"
 MAX_BYTES = 1 << 28  # an entry of 12 Hz takes some 500: half a million
