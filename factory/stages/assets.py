@@ -104,10 +104,7 @@ def is_rig_corrected(block: Block, settings: RigSettings) -> bool:
 
 
 def correct_block_rig(
-    path: Path,
-    block: Block,
-    cameras: Sequence[Camera],
-    own_body: Mapping[str, Bools] = NO_MASKS,
+    path: Path, block: Block, cameras: Sequence[Camera], own_body: Mapping[str, Bools] = NO_MASKS
 ) -> tuple[Block, tuple[Camera, ...], RigCorrection | None]:
     """Block and cameras as the photos say they are, and what was found, which is written beside `path`.
 
@@ -174,20 +171,6 @@ def read_or_correct_rig(
         for name, time_s, rise_m, late_s, pose in told["taken"]
     )
     return CorrectedRig(tuple(replace(camera, **used[camera.name]) for camera in cameras), tuple(taken))
-
-
-def rewrite_damaged_rig_file(
-    path: Path, block: Block, cameras: Sequence[Camera], own_body: Mapping[str, Bools] = NO_MASKS
-) -> None:
-    """Writes what was found anew where the file beside `path` is damaged; the scene there stays. Raises BadClip."""
-    said = path.with_suffix(RIG_SUFFIX)
-    try:
-        read_rig_file(said)
-    except FileNotFoundError:  # somebody took it away
-        return
-    except Damaged as error:
-        log.warning("%s: %s; it is written again", said, error)
-        correct_block_rig(path, block, cameras, own_body)
 
 
 def known_points(data: SensorData, block: Block, found: RigCorrection) -> KnownPoints:
@@ -377,8 +360,8 @@ def load_or_build_scene(
             except BadScene as error:
                 log.warning("%s; it is built again", error)
             else:
-                if is_rig_corrected(block, settings.rig):
-                    rewrite_damaged_rig_file(path, block, cameras, masks)
+                if is_rig_corrected(block, settings.rig) and path.with_suffix(RIG_SUFFIX).exists():
+                    read_or_correct_rig(path, block, cameras, masks)  # written again where it is damaged
                 return kept
         agents, taken, found = block.agents, tuple[TakenFrom, ...](), None
         if is_rig_corrected(block, settings.rig):

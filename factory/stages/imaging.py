@@ -48,9 +48,7 @@ from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentTracks, Camera, Cl
 from tasks.world.frames import HEADING, pose_on_ground
 
 NO_IMAGES: dict[str, object] = {"cameras": None, "images": None, "image_source": str(ImageSource.NONE)}
-TAG_OF = {
-    Sensing.PHOTOS_ONLY: "photos_only",  # no lidar: depth is guessed from parallax, markings shear off the photos' path
-}
+PHOTOS_ONLY = "photos_only"  # tag: depth is guessed from parallax, markings shear off the photos' path
 LOW_PSNR = "low_psnr"  # tag: held-out photos of the block come out worse than psnr_min
 GATE_STRIDE = 5  # steps of 0.1 s between the pictures that are looked at: 2 Hz
 PHOTO_SLACK_S = 0.06  # a photo belongs to an instant of the 2 Hz grid when it was taken this close to it
@@ -121,7 +119,7 @@ class Imaging:
         if made_of is Sensing.NOTHING:
             return NO_IMAGES
         asset = scene_in_clip_time(clip, _scene_of_block(clip, self.settings, self.cache_dir))
-        tags = [TAG_OF[made_of]] if made_of in TAG_OF else []
+        tags = [PHOTOS_ONLY] if made_of is Sensing.PHOTOS_ONLY else []
         if block_fault(asset, self.settings) is not None:
             tags.append(LOW_PSNR)
         return self._drawn(clip, judged, asset, asset.as_corrected(cameras)) | {"tags": tags}

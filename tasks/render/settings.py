@@ -169,11 +169,7 @@ class Frames(StrEnum):
 
 
 # Steps of 0.1 s relative to the sample's now, at 2 Hz.
-STEPS_OF = {
-    Frames.ALL: tuple(range(-15, 41, 5)),
-    Frames.HISTORY: tuple(range(-15, 1, 5)),
-    Frames.NOW: (0,),
-}
+STEPS_OF = {Frames.ALL: tuple(range(-15, 41, 5)), Frames.HISTORY: tuple(range(-15, 1, 5)), Frames.NOW: (0,)}
 
 
 def _check(what: str, settings: object, bounds: Mapping[str, tuple[float, float]]) -> None:

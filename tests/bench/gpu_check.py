@@ -273,12 +273,7 @@ def views(place: Place, n: int, sizes: Sequence[tuple[int, int]], threads: int) 
 
 
 def _by_engine(
-    place: Place,
-    scene: Gaussians,
-    cameras: Sequence[Pinhole],
-    behind: NDArray[np.float32],
-    at_once: int,
-    packed: bool,
+    place: Place, scene: Gaussians, cameras: Sequence[Pinhole], behind: NDArray[np.float32], at_once: int, packed: bool
 ) -> list[View]:
     drawn: list[View] = []
     for i in range(0, len(cameras), at_once):

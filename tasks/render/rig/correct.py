@@ -217,32 +217,20 @@ LEAST_GAIN = 0.02  # share of what they are off
 WIDTHS_PX = (8.0, 4.0, 2.0, 1.0)
 
 
-@dataclass(frozen=True)
-class CameraDelays:
-    """What photos say of their cameras' stamps."""
-
-    late_s: Array  # (C,) that photos are taken later than said, were it so
-    gain: float  # share by which corners that were not fitted are less off then
-    sure: float  # the same in standard errors
-    believed: Bools  # (C,)
-
-
-def estimate_delays(
-    given: Rig, shots: RigPhotos, matched: CornerTracks, held: AdjustedRig, sigmas: Array
-) -> CameraDelays:
-    """Whose delay explains what nothing else does; `held` is what `sigmas` (n,), no delays, came to."""
-    every = np.ones(len(given.stamps), np.bool_)
+def cameras_with_delay(given: Rig, shots: RigPhotos, matched: CornerTracks, held: AdjustedRig, sigmas: Array) -> Bools:
+    """(C,) whose delay explains what nothing else does; `held` is what `sigmas` (n,), no delays, came to."""
+    none = np.zeros(len(given.stamps), np.bool_)
     fitted, measured = (select_corners(matched, matched.point_of % EVERY == k) for k in (0, 1))
-    late = bundle_adjust(given, shots, fitted, free_stamps(sigmas, every), held.rig, WIDTHS_PX).rig
+    late = bundle_adjust(given, shots, fitted, free_stamps(sigmas, ~none), held.rig, WIDTHS_PX).rig
     found = np.abs(late.stamps) >= LEAST_LATE_S
     if not found.any():
-        return CameraDelays(late.stamps, 0.0, 0.0, found)
+        return none
     on_time = bundle_adjust(given, shots, fitted, sigmas, held.rig, WIDTHS_PX).rig
     gained, off = _error_gain(on_time, late, shots, measured)
     if len(gained) < 2 or off == 0.0:
-        return CameraDelays(late.stamps, 0.0, 0.0, ~every)
+        return none
     gain, sure = gained.mean() / off, gained.mean() / (gained.std() / np.sqrt(len(gained)) + 1e-12)
-    return CameraDelays(late.stamps, float(gain), float(sure), found & bool(gain > LEAST_GAIN and sure > SURE))
+    return np.asarray(found & bool(gain > LEAST_GAIN and sure > SURE))
 
 
 def free_stamps(sigmas: Array, cameras: Bools) -> Array:
@@ -328,9 +316,9 @@ def correct_rig(
         if len(matched.starts) <= LEAST_POINTS:
             return None
         bundle = bundle_adjust(rig, shots, matched, sigmas)
-    believed = estimate_delays(rig, shots, matched, bundle, sigmas).believed
-    if believed.any():
-        bundle = bundle_adjust(rig, shots, matched, free_stamps(sigmas, believed))
+    late = cameras_with_delay(rig, shots, matched, bundle, sigmas)
+    if late.any():
+        bundle = bundle_adjust(rig, shots, matched, free_stamps(sigmas, late))
     points = bundle.points[np.bincount(matched.point_of, bundle.used, len(bundle.points)) > 0]
     if len(points) < LEAST_POINTS:
         return None

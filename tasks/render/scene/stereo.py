@@ -24,12 +24,7 @@ UNSEEN_COST = 0.25  # of a pixel whose hypothesis lies outside the other photo
 
 
 def plane_sweep_depth(
-    rgb: F32,
-    hints: F32,
-    others: Sequence[Compared],
-    intrinsics: Array,
-    world_from_camera: Array,
-    wanted: Bools,
+    rgb: F32, hints: F32, others: Sequence[Compared], intrinsics: Array, world_from_camera: Array, wanted: Bools
 ) -> tuple[F32, F32, F32]:
     """Best depth (H, W) [m], its cost, and the cost of the sky hypothesis (mean absolute rgb difference).
 
@@ -65,12 +60,7 @@ def smoothed_cost(
 
 
 def matching_cost(
-    rgb: F32,
-    others: Sequence[Compared],
-    intrinsics: Array,
-    world_from_camera: Array,
-    depth: F32,
-    wanted: Bools,
+    rgb: F32, others: Sequence[Compared], intrinsics: Array, world_from_camera: Array, depth: F32, wanted: Bools
 ) -> F32:
     """(H, W) what `_disagreement` says, pixel by pixel."""
     photos = np.stack([other_rgb for other_rgb, _, _ in others])
@@ -150,13 +140,7 @@ FINER = (-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75)  # of a level
 
 
 def wide_baseline_depth(
-    rgb: F32,
-    anchors: F32,
-    floor: F32,
-    others: Sequence[Compared],
-    intrinsics: Array,
-    pose: Array,
-    wanted: Bools,
+    rgb: F32, anchors: F32, floor: F32, others: Sequence[Compared], intrinsics: Array, pose: Array, wanted: Bools
 ) -> tuple[F32, F32, F32]:
     """As `plane_sweep_depth`: best depth (H, W) [m], its cost, and 0 where the sky is seen, infinity elsewhere.
 

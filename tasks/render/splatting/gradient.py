@@ -11,17 +11,7 @@ from typing import Any
 import numpy as np
 
 from tasks.kernels.compiled import inlined, kernel
-from tasks.kernels.simd import (
-    LANES,
-    fill,
-    fma,
-    larger,
-    load,
-    smaller,
-    store,
-    sums,
-    where_below,
-)
+from tasks.kernels.simd import LANES, fill, fma, larger, load, smaller, store, sums, where_below
 from tasks.kernels.threads import run_in_chunks
 from tasks.render.splatting.gaussians import Gaussians, quats_of, turned_quats
 from tasks.render.splatting.project import (
@@ -155,22 +145,13 @@ def blend_gradient(
             for j in range(batch, following):
                 i = np.uint64(tile_splats[j])
                 dx, steep, slope, level = exponent(projected, i, x0)
-                red, green, blue = (
-                    fill(projected[i, RED]),
-                    fill(projected[i, GREEN]),
-                    fill(projected[i, BLUE]),
-                )
+                red, green, blue = (fill(projected[i, RED]), fill(projected[i, GREEN]), fill(projected[i, BLUE]))
                 z = fill(projected[i, DEPTH])
                 first, last = max(0, int(projected[i, TOP]) - y0), min(TILE, int(projected[i, BOTTOM]) - y0)
                 dy = fill(np.float32(y0 + first) + np.float32(0.5) - projected[i, V])
                 at = np.uint64(first) * ROW
                 q, q_y, q_yy = fill(NOTHING), fill(NOTHING), fill(NOTHING)
-                w_depth, w_red, w_green, w_blue = (
-                    fill(NOTHING),
-                    fill(NOTHING),
-                    fill(NOTHING),
-                    fill(NOTHING),
-                )
+                w_depth, w_red, w_green, w_blue = (fill(NOTHING), fill(NOTHING), fill(NOTHING), fill(NOTHING))
                 for _ in range(first, last):
                     opaque = alpha_at(fma(fma(dy, steep, slope), dy, level))
                     light = load(buffer, at)
@@ -318,11 +299,7 @@ def _pulled_back(block: Any, rows: Any, centre: Any, fx: Any, fy: Any, limits: A
 @inlined
 def _both(a: Any, s: Any, b: Any, t: Any) -> Any:
     """s a + t b of triples a and b."""
-    return (
-        fma(a[0], s, b[0] * t),
-        fma(a[1], s, b[1] * t),
-        fma(a[2], s, b[2] * t),
-    )
+    return (fma(a[0], s, b[0] * t), fma(a[1], s, b[1] * t), fma(a[2], s, b[2] * t))
 
 
 @inlined

@@ -49,19 +49,7 @@ F0, F1, F2, F3, F4, F5 = (np.float32(1.0 / math.factorial(k)) for k in range(6))
 def exponential(x: Any) -> Any:
     """exp of Lanes; that of LEAST_LOG or MOST_LOG beyond them."""
     x = smaller(larger(x, fill(LEAST_LOG)), fill(MOST_LOG)) * fill(np.float32(1.0 / 64.0))
-    e = fma(
-        fma(
-            fma(
-                fma(fma(fill(F5), x, fill(F4)), x, fill(F3)),
-                x,
-                fill(F2),
-            ),
-            x,
-            fill(F1),
-        ),
-        x,
-        fill(F0),
-    )
+    e = fma(fma(fma(fma(fma(fill(F5), x, fill(F4)), x, fill(F3)), x, fill(F2)), x, fill(F1)), x, fill(F0))
     for _ in range(6):
         e = e * e
     return e

@@ -157,9 +157,7 @@ def exponent(projected: Any, i: Any, x0: Any) -> Any:
     steep = fill(np.float32(-0.5) * EIGHTH * projected[i, CONIC_YY])
     slope = fill(-EIGHTH * projected[i, CONIC_XY]) * dx
     level = fma(
-        fill(np.float32(-0.5) * EIGHTH * projected[i, CONIC_XX]) * dx,
-        dx,
-        fill(EIGHTH * projected[i, LOG_OPACITY]),
+        fill(np.float32(-0.5) * EIGHTH * projected[i, CONIC_XX]) * dx, dx, fill(EIGHTH * projected[i, LOG_OPACITY])
     )
     return dx, steep, slope, level
 
@@ -167,11 +165,7 @@ def exponent(projected: Any, i: Any, x0: Any) -> Any:
 @inlined
 def alpha_at(x: Any) -> Any:
     """Alpha where its logarithm is 8 x; 0 where that is below MIN_ALPHA."""
-    e = fma(
-        fma(fma(fma(fill(E4), x, fill(E3)), x, fill(E2)), x, fill(E1)),
-        x,
-        fill(E0),
-    )
+    e = fma(fma(fma(fma(fill(E4), x, fill(E3)), x, fill(E2)), x, fill(E1)), x, fill(E0))
     e = e * e
     e = e * e
     return where_at_least(x, fill(FAINTEST), smaller(e * e, fill(MAX_ALPHA)))
@@ -234,11 +228,7 @@ def blend(
             for j in range(batch, following):
                 i = np.uint64(tile_splats[j])
                 _, steep, slope, level = exponent(projected, i, x0)
-                red, green, blue = (
-                    fill(projected[i, RED]),
-                    fill(projected[i, GREEN]),
-                    fill(projected[i, BLUE]),
-                )
+                red, green, blue = (fill(projected[i, RED]), fill(projected[i, GREEN]), fill(projected[i, BLUE]))
                 z = fill(projected[i, DEPTH])
                 first, last = max(0, int(projected[i, TOP]) - y0), min(TILE, int(projected[i, BOTTOM]) - y0)
                 dy = fill(np.float32(y0 + first) + np.float32(0.5) - projected[i, V])
@@ -293,12 +283,7 @@ def backproject_tiles(projected: Any, tile_start: Any, tile_splats: Any, image: 
                 ignores_mask = fill(NOTHING if is_masked[i] else ALL)
                 first, last = max(0, int(projected[i, TOP]) - y0), min(TILE, int(projected[i, BOTTOM]) - y0)
                 dy = fill(np.float32(y0 + first) + np.float32(0.5) - projected[i, V])
-                red, green, blue, weight = (
-                    fill(NOTHING),
-                    fill(NOTHING),
-                    fill(NOTHING),
-                    fill(NOTHING),
-                )
+                red, green, blue, weight = (fill(NOTHING), fill(NOTHING), fill(NOTHING), fill(NOTHING))
                 at = np.uint64(first * 5 * TILE)
                 for _ in range(first, last):
                     light = load(buffer, at)

@@ -11,7 +11,7 @@ import pytest
 from printed_street import CAMERAS, ROAD_M, WIDTH, photographed
 
 from factory.readers.base import BadClip
-from factory.stages.assets import RIG_SUFFIX, correct_block_rig, is_rig_corrected, rewrite_damaged_rig_file
+from factory.stages.assets import RIG_SUFFIX, correct_block_rig, is_rig_corrected, read_or_correct_rig
 from tasks.render.rig.adjust import motions_of_twists, twists_of
 from tasks.render.rig.correct import estimate_ground_height
 from tasks.render.scene.asset import RenderAsset, TakenFrom
@@ -52,7 +52,7 @@ def test_a_turned_camera_is_put_right_told_and_drawn_with(
     path = tmp_path / f"block-1{RIG_SUFFIX}"
     whole = path.read_bytes()
     path.write_bytes(whole.replace(b"after_px", b"aftfr_px", 1))
-    rewrite_damaged_rig_file(tmp_path / "block-1.safetensors", block, said)
+    read_or_correct_rig(tmp_path / "block-1.safetensors", block, said)
     assert path.read_bytes() == whole and f"{path}: its checksum" in caplog.text and "written again" in caplog.text
     asset = RenderAsset(np.zeros(3), EMPTY, {}, SkyMap(np.zeros((2, 2, 3), np.float32)), 30.0, rig=found)
     assert asset.as_corrected([said[1]]) == (found[1],)

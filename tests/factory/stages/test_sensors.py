@@ -246,11 +246,7 @@ FIT = FitSettings(iterations=20, hold_out_every=3, start_gaussians=400, most_gau
 FITTED = RenderSettings(width=48, height=32, scene=SceneFrom.FIT, fit=FIT)
 
 
-def test_a_killed_fit_goes_on_to_the_same_bytes(
-    clip: Clip,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_killed_fit_goes_on_to_the_same_bytes(clip: Clip, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     undisturbed = load_or_build_scene(clip, FITTED, tmp_path / "one")
     assert undisturbed is not None and np.isfinite(undisturbed.psnr_db) and undisturbed.n_held_out > 0
 

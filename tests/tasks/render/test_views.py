@@ -7,17 +7,7 @@ import numpy as np
 import pytest
 import street
 
-from tasks.render.views import (
-    GROUND,
-    ROAD,
-    SKY,
-    WHITE,
-    clip_near,
-    draw_map_views,
-    ground_height,
-    pinhole,
-    undistorted,
-)
+from tasks.render.views import GROUND, ROAD, SKY, WHITE, clip_near, draw_map_views, ground_height, pinhole, undistorted
 from tasks.world.clip import Camera
 from tasks.world.frames import EGO_STATE_SIZE, HEADING, X, Y, pose_on_ground
 from tasks.world.road_map import Lane, MapLayer, MapPolygon, RoadMap

@@ -6,12 +6,7 @@ import slow_raster
 import torch
 from numpy.typing import NDArray
 
-from tasks.render.splatting.gaussians import (
-    Gaussians,
-    moved,
-    quats_of,
-    rotations_of,
-)
+from tasks.render.splatting.gaussians import Gaussians, moved, quats_of, rotations_of
 from tasks.render.splatting.project import CLASSIC, FITTED, MIN_ALPHA, ScreenFilter
 from tasks.render.splatting.raster import backproject, forward, project_and_sort
 
