@@ -166,10 +166,7 @@ def read_or_correct_rig(
     }
     if not used:
         return None
-    taken = (
-        TakenFrom(name, time_s, np.reshape(pose, (4, 4)), rise_m, late_s)
-        for name, time_s, rise_m, late_s, pose in told["taken"]
-    )
+    taken = (TakenFrom(name, time_s, np.reshape(pose, (4, 4)), rise_m) for name, time_s, rise_m, pose in told["taken"])
     return CorrectedRig(tuple(replace(camera, **used[camera.name]) for camera in cameras), tuple(taken))
 
 
@@ -189,9 +186,7 @@ def photo_poses(given: Sequence[SensorFile], used: Sequence[SensorFile]) -> tupl
     """Where the photos that are used of those given were taken."""
     logged = {(file.sensor, file.time_s): file.world_from_ego[2, 3] for file in given}
     return tuple(
-        TakenFrom(
-            f.sensor, f.time_s, f.world_from_ego, float(f.world_from_ego[2, 3] - logged[f.sensor, f.time_s]), f.late_s
-        )
+        TakenFrom(f.sensor, f.time_s, f.world_from_ego, float(f.world_from_ego[2, 3] - logged[f.sensor, f.time_s]))
         for f in used
     )
 
@@ -209,7 +204,7 @@ def rig_report(found: RigCorrection, given: Sequence[SensorFile]) -> dict[str, A
             for camera in found.cameras
         ],
         "taken": [
-            [photo.camera, photo.time_s, photo.rise_m, photo.late_s, photo.world_from_ego.ravel().tolist()]
+            [photo.camera, photo.time_s, photo.rise_m, photo.world_from_ego.ravel().tolist()]
             for photo in photo_poses(given, found.files)
         ],
     }
@@ -222,7 +217,7 @@ def rig_report_lines(found: RigCorrection) -> list[str]:
         shift, turn = 100.0 * np.linalg.norm(change.shift_m), np.linalg.norm(change.turn_deg)
         lines.append(
             f"{change.camera}: moved {shift:.1f} cm, turned {turn:.2f} deg, focal length {change.focal_px[0]:+.1f} px, "
-            f"centre {change.centre_px[0]:+.1f} {change.centre_px[1]:+.1f} px, stamp {1000.0 * change.late_s:+.0f} ms, "
+            f"centre {change.centre_px[0]:+.1f} {change.centre_px[1]:+.1f} px, "
             f"{change.corners} corners off by {change.before_px:.2f} px before, {change.after_px:.2f} after"
         )
     lines.append(f"ego: moved {100.0 * found.ego_shift_m:.1f} cm, turned {found.ego_turn_deg:.2f} deg (rms)")

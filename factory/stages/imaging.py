@@ -359,7 +359,7 @@ def open_vehicle_photos(clip: Clip, asset: RenderAsset, settings: RenderSettings
         return known[row][track_id]
 
     def taken(track_id: str, row: int) -> VehiclePhoto:
-        there = vehicles_at(agents, photo(row).taken_s)
+        there = vehicles_at(agents, photo(row).time_s)
         own = there.track_ids.index(track_id)
         return VehiclePhoto(photo(row), there.boxes[own], np.delete(there.boxes, own, axis=0))
 

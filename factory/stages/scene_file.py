@@ -150,7 +150,7 @@ def described_by(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> 
     """What of the scene is no array, as plain JSON values; NaN is null."""
     block = asset.block
     rig = [_camera_to_json(camera) for camera in asset.rig]
-    taken = [[photo.camera, photo.time_s, photo.rise_m, photo.late_s] for photo in asset.taken]
+    taken = [[photo.camera, photo.time_s, photo.rise_m] for photo in asset.taken]
     bodies, shifts = [body.camera for body in asset.bodies], list(asset.shifts.track_ids)
     more = {"rig": rig, "taken": taken, "bodies": bodies, "shifts": shifts}
     return {
@@ -192,8 +192,8 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
         block=block,
         rig=tuple(_camera_from_json(camera) for camera in described.get("rig", ())),
         taken=tuple(
-            TakenFrom(camera, time_s, tensors["taken"][i], rise_m, late_s)
-            for i, (camera, time_s, rise_m, late_s) in enumerate(described.get("taken", ()))
+            TakenFrom(camera, time_s, tensors["taken"][i], rise_m)
+            for i, (camera, time_s, rise_m) in enumerate(described.get("taken", ()))
         ),
         shifts=BoxShifts(tuple(described["shifts"]), tensors["shifts"]) if "shifts" in described else NO_SHIFTS,
         bodies=tuple(OwnBody(camera, tensors[f"bodies.{i}"]) for i, camera in enumerate(described.get("bodies", ()))),

@@ -220,7 +220,6 @@ def _photo(file: SensorFile, image: Bytes, camera: Camera, width: int, height: i
         rgb=np.asarray(small, np.uint8),
         intrinsics=pinhole.intrinsics,
         world_from_camera=file.world_from_ego @ pinhole.ego_from_camera,
-        late_s=file.late_s,
     )
 
 

@@ -94,7 +94,7 @@ def find_sightings(files: Sequence[SensorFile], cameras: Sequence[Camera], agent
             continue
         camera = rig[file.sensor]
         pose = file.world_from_ego @ camera.ego_from_camera
-        boxes, valid = boxes_at(agents, file.taken_s)
+        boxes, valid = boxes_at(agents, file.time_s)
         near = valid & (np.linalg.norm(boxes[:, :3] - pose[:3, 3], axis=1) < TELLING_M)
         rows = [j for j in np.flatnonzero(near) if agents.kinds[j] == AgentKind.VEHICLE]
         u, v, depth = _projected(boxes[rows], POINTS, camera.intrinsics, pose)
@@ -197,7 +197,7 @@ def likeness_to_photo(
     """
     height, width = photo.rgb.shape[:2]
     eye = Pinhole(photo.intrinsics, photo.world_from_camera, width, height)
-    there = vehicles_at(agents, photo.taken_s)
+    there = vehicles_at(agents, photo.time_s)
     seen = render(asset, [eye], there, backend, affines=[asset.affine_of(photo.camera, photo.time_s)])[0].rgb
     similar = ssim_map(seen, photo.rgb.astype(np.float32) / np.float32(255.0))
     out = {}

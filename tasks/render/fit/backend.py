@@ -103,8 +103,8 @@ def visible_parts(problem: FitProblem, owner: ShortInts, off: F32, photo: Photo)
     boxes are off by, (tracks * knots, SHIFT_SIZE), as of the state."""
     n = int(np.searchsorted(owner, 0))
     parts = [OwnedGaussians(0, np.arange(n), None)]
-    boxes, valid = problem.tracks.at(photo.taken_s)
-    shifts = interpolate_knots(off.reshape(len(boxes), problem.tracks.n_knots, SHIFT_SIZE), photo.taken_s)
+    boxes, valid = problem.tracks.at(photo.time_s)
+    shifts = interpolate_knots(off.reshape(len(boxes), problem.tracks.n_knots, SHIFT_SIZE), photo.time_s)
     boxes = shift_boxes(boxes, shifts)
     frames = world_from_boxes(boxes)
     for j in np.flatnonzero(valid & _in_view(boxes, photo)):

@@ -98,8 +98,8 @@ def draw_photo(
 
 def boxes_at_photo(asset: RenderAsset, problem: FitProblem, photo: Photo) -> tuple[Array, Bools]:
     """Boxes (N, 7) of the problem's tracks when a photo was taken, in its frame, and which of them are there (N,)."""
-    boxes, valid = problem.tracks.at(photo.taken_s)
-    return shift_boxes(boxes, asset.shifts.at(photo.taken_s, problem.tracks.ids)), valid
+    boxes, valid = problem.tracks.at(photo.time_s)
+    return shift_boxes(boxes, asset.shifts.at(photo.time_s, problem.tracks.ids)), valid
 
 
 def pixel_classes(photo: Photo, vehicles: Array, road: Road | None) -> dict[str, Bools]:
@@ -201,9 +201,9 @@ def _hiding_and_hidden_by_bodies(
     """Of `means` (M, 3) those that hide the body of a vehicle which drives in photo `i`, their depths in it [m], and
     those that such a body hides."""
     shot, tracks, nothing = problem.train[i], problem.tracks, np.zeros(0, np.int64)
-    boxes, valid = tracks.at(shot.photo.taken_s)
+    boxes, valid = tracks.at(shot.photo.time_s)
     off = state.learned["boxes"].values.reshape(len(boxes), tracks.n_knots, SHIFT_SIZE)
-    boxes = shift_boxes(boxes, interpolate_knots(off, shot.photo.taken_s))
+    boxes = shift_boxes(boxes, interpolate_knots(off, shot.photo.time_s))
     eye = corrected_pose(shot.photo.world_from_camera, state.learned["poses"].values[i])[:3, 3].copy()
     bodies, drives = bodies_near(boxes, valid, tracks, eye)
     if not drives.any():
@@ -347,7 +347,7 @@ def _step_boxes(problem: FitProblem, held: LearnedState, settings: FitSettings, 
     if settings.box_shift_rate == settings.box_turn_rate == 0.0 or not shown.any():
         return
     boxes, n_knots = held.learned["boxes"], problem.tracks.n_knots
-    before, share = knots_at(problem.train[row].photo.taken_s, n_knots)
+    before, share = knots_at(problem.train[row].photo.time_s, n_knots)
     rates = np.array([settings.box_shift_rate] * 3 + [settings.box_turn_rate], np.float32)
     fall = decay(settings.rate_end, held.iteration / settings.iterations)
     for knot, weight in ((before, 1.0 - share), (before + 1, share)):

@@ -125,7 +125,7 @@ def prepare_fit(
     eyes = np.stack([p.world_from_camera[:3, 3] for p in train])
     surface = fit_road(points.every, eyes) if settings.road else None
     cars = [nodes.get(i) for i in tracks.ids]
-    bodies = _unseen_bodies(cars, tracks, [p.taken_s for p in train])
+    bodies = _unseen_bodies(cars, tracks, [p.time_s for p in train])
     state = _first_state(
         background, cars, bodies, build_sky(alike, seen).rgb, exposures, surface, tracks.n_knots, settings
     )
@@ -172,7 +172,7 @@ def _unseen_bodies(
 
 def _hidden_pixels(photo: Photo, tracks: Tracks, unknown: Bools) -> Bools | None:
     """Pixels of what moves and has no Gaussians of its own, the own body too: it would be painted on the street."""
-    boxes, valid = tracks.at(photo.taken_s)
+    boxes, valid = tracks.at(photo.time_s)
     if not (valid & unknown).any():
         return photo.own_body
     height, width = photo.rgb.shape[:2]

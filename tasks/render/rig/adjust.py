@@ -36,13 +36,14 @@ class Rig:
 
     ego_from_camera: Array  # (C, 4, 4)
     lenses: Array  # (C, 9) fx, fy, cx, cy [px], k1, k2, p1, p2, k3
-    stamps: Array  # (C,) [s] that a camera's photos were taken later than said
     corrections: Array  # (T, 4, 4) of each instant: world_from_ego @ correction is where the ego was
 
-    def ego_poses(self, shots: RigPhotos, after_s: Array | float = 0.0) -> Array:
+    def ego_poses(self, shots: RigPhotos, after_s: Array | None = None) -> Array:
         """(V, 4, 4) corrected world_from_ego of the photos, `after_s` (V,) after their middle row was read."""
-        late = motions_of_twists((self.stamps[shots.camera_of] + after_s)[:, None] * shots.twists)
-        return np.asarray(shots.world_from_ego @ late @ self.corrections[shots.instant_of])
+        poses = shots.world_from_ego
+        if after_s is not None:
+            poses = poses @ motions_of_twists(after_s[:, None] * shots.twists)
+        return np.asarray(poses @ self.corrections[shots.instant_of])
 
     def moved(self, step: Array) -> "Rig":
         """After a step (n,) of its parameters, in the order of `normal_equations`."""
@@ -51,15 +52,13 @@ class Rig:
         return Rig(
             self.ego_from_camera @ motions_of_twists(of_camera[:, :6]),
             self.lenses + of_camera[:, 6:15],
-            self.stamps + of_camera[:, 15],
             self.corrections @ motions_of_twists(step[:n].reshape(-1, 6)),
         )
 
     def away_from(self, given: "Rig") -> Array:
         """(n,) how far each parameter is from that of another, in the same order."""
         mounts = twists_of(np.linalg.inv(given.ego_from_camera) @ self.ego_from_camera)
-        lenses, stamps = self.lenses - given.lenses, self.stamps - given.stamps
-        of_camera = np.column_stack([mounts, lenses, stamps])
+        of_camera = np.column_stack([mounts, self.lenses - given.lenses])
         of_instant = twists_of(np.linalg.inv(given.corrections) @ self.corrections)
         return np.concatenate([of_instant.ravel(), of_camera.ravel()])
 
@@ -74,7 +73,6 @@ def initial_rig(cameras: Sequence[Camera], files: Sequence[SensorFile]) -> tuple
     rig = Rig(
         np.stack([camera.ego_from_camera for camera in cameras]),
         np.column_stack([k[:, 0, 0], k[:, 1, 1], k[:, 0, 2], k[:, 1, 2], terms]),
-        np.zeros(len(cameras)),
         np.tile(np.eye(4), (instant_of.max() + 1, 1, 1)),
     )
     poses = np.stack([file.world_from_ego for file in files])
@@ -139,9 +137,9 @@ def _twists(poses: Array, times: Array) -> Array:
 # camera's stamp, D what it is corrected by at that instant, C the camera's mount. The lens is Brown's
 # (`tasks.render.views.undistorted`). Corrections turn and shift in the frame they are applied in.
 
-EGO, MOUNT, LENS, STAMP = 0, 6, 12, 21  # where they begin in the 22 parameters that one corner depends on
-N_CORNER = 22
-N_CAMERA = 16  # of a camera: shift, turn, fx, fy, cx, cy, k1, k2, p1, p2, k3, stamp
+EGO, MOUNT, LENS = 0, 6, 12  # where they begin in the 21 parameters that one corner depends on
+N_CORNER = 21
+N_CAMERA = 15  # of a camera: shift, turn, fx, fy, cx, cy, k1, k2, p1, p2, k3
 NEAR_M = 0.3
 
 
@@ -182,9 +180,9 @@ def reprojection_residuals(
 
 @kernel
 def _projection_jacobian(
-    seen: Any, camera_from_ego: Any, world_to_camera: Any, lens: Any, twist: Any, by_rig: Any, by_point: Any
+    seen: Any, camera_from_ego: Any, world_to_camera: Any, lens: Any, by_rig: Any, by_point: Any
 ) -> None:
-    """Derivatives of a pixel by the 22 parameters (2, 22) and by the point (2, 3), of what `_project_point` found."""
+    """Derivatives of a pixel by the 21 parameters (2, 21) and by the point (2, 3), of what `_project_point` found."""
     x, y, z = seen[5] / seen[7], seen[6] / seen[7], seen[7]
     fx, fy, k1, k2, p1, p2, k3 = lens[0], lens[1], lens[4], lens[5], lens[6], lens[7], lens[8]
     r2 = x * x + y * y
@@ -209,12 +207,7 @@ def _projection_jacobian(
         by_rig[k, 3], by_rig[k, 4], by_rig[k, 5] = gb * ez - gc * ey, gc * ex - ga * ez, ga * ey - gb * ex
         by_rig[k, 6], by_rig[k, 7], by_rig[k, 8] = -a, -b, -c
         by_rig[k, 9], by_rig[k, 10], by_rig[k, 11] = b * cz - c * cy, c * cx - a * cz, a * cy - b * cx
-        by_rig[k, STAMP] = -(
-            ga * (twist[0] + twist[4] * ez - twist[5] * ey)
-            + gb * (twist[1] + twist[5] * ex - twist[3] * ez)
-            + gc * (twist[2] + twist[3] * ey - twist[4] * ex)
-        )
-        for j in range(LENS, STAMP):
+        for j in range(LENS, N_CORNER):
             by_rig[k, j] = 0.0
     by_rig[0, 12], by_rig[0, 14] = x * s + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), 1.0
     by_rig[1, 13], by_rig[1, 15] = y * s + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y, 1.0
@@ -227,13 +220,13 @@ def _projection_jacobian(
 @kernel
 def normal_equations(
     points: Any, starts: Any, view_of: Any, at: Any, weights: Any, damping: float, camera_of: Any, places: Any,
-    ego_from_world: Any, camera_from_ego: Any, lenses: Any, twists: Any, n: int,
+    ego_from_world: Any, camera_from_ego: Any, lenses: Any, n: int,
 ) -> Any:  # fmt: skip
     """Matrix (n, n) and right side (n,) of the rig's parameters, and what gives the points' steps from theirs.
 
-    Corners of point p are rows starts[p] to starts[p + 1]; a weight of 0 leaves one out. `places` (N, 22): which of
+    Corners of point p are rows starts[p] to starts[p + 1]; a weight of 0 leaves one out. `places` (N, 21): which of
     the n parameters a corner depends on. The last three: inverse blocks (P, 3, 3) and right sides (P, 3) of the
-    points, mixed blocks (N, 22, 3) of the corners.
+    points, mixed blocks (N, 21, 3) of the corners.
     """
     matrix, right = np.zeros((n, n)), np.zeros(n)
     mixed = np.zeros((view_of.shape[0], N_CORNER, 3))
@@ -253,7 +246,7 @@ def normal_equations(
                     turn[r, k] = 0.0
                     for m in range(3):
                         turn[r, k] += camera_from_ego[c, r, m] * ego_from_world[v, m, k]
-            _projection_jacobian(seen, camera_from_ego[c], turn, lenses[c], twists[v], by_rig, by_point)
+            _projection_jacobian(seen, camera_from_ego[c], turn, lenses[c], by_rig, by_point)
             off_x, off_y = at[i, 0] - seen[0], at[i, 1] - seen[1]
             for k in range(N_CORNER):
                 gx, gy = w * by_rig[0, k], w * by_rig[1, k]
@@ -372,20 +365,10 @@ class AdjustedRig:
     used: Bools  # (N,)
 
 
-def bundle_adjust(
-    rig: Rig,
-    shots: RigPhotos,
-    matched: CornerTracks,
-    sigmas: Array,
-    start: Rig | None = None,
-    widths: Sequence[float] = WIDTHS_PX,
-) -> AdjustedRig:
-    """The rig that explains the corners best without leaving the given one by many `sigmas` (n,); 0 holds.
-
-    `start`: where to begin, by default at the given one.
-    """
-    now, points = start or rig, np.zeros((len(matched.starts) - 1, 3))
-    for width in widths:
+def bundle_adjust(rig: Rig, shots: RigPhotos, matched: CornerTracks, sigmas: Array) -> AdjustedRig:
+    """The rig that explains the corners best without leaving the given one by many `sigmas` (n,); 0 holds."""
+    now, points = rig, np.zeros((len(matched.starts) - 1, 3))
+    for width in WIDTHS_PX:
         points, there = triangulate_points(now, shots, matched)
         off = reprojection_errors(now, shots, matched, points)
         used = drop_lone_corners((off < OUT * width) & there[matched.point_of], matched)
@@ -397,11 +380,7 @@ def bundle_adjust(
 
 def without_views(matched: CornerTracks, views: Array) -> CornerTracks:
     """Without the corners of some photos, and without points that then have fewer than two."""
-    return select_corners(matched, ~np.isin(matched.view_of, views))
-
-
-def select_corners(matched: CornerTracks, keep: Bools) -> CornerTracks:
-    """The corners (N,) to keep, but for those whose point then has fewer than two."""
+    keep = ~np.isin(matched.view_of, views)
     count = np.bincount(matched.point_of, keep, len(matched.starts) - 1)
     keep = keep & (count >= 2)[matched.point_of]
     ends = np.cumsum(count[count >= 2]).astype(np.int64)
@@ -432,7 +411,7 @@ def reprojection_errors(rig: Rig, shots: RigPhotos, matched: CornerTracks, point
 
 def _residuals(rig: Rig, shots: RigPhotos, matched: CornerTracks, points: Array) -> Array:
     view_of, seen = _views_of_corners(shots, matched)
-    ego_from_world = np.linalg.inv(rig.ego_poses(seen, _delays_or_zero(matched)))
+    ego_from_world = np.linalg.inv(rig.ego_poses(seen, matched.after_s))
     of_photo = view_of, matched.at, seen.camera_of, ego_from_world, np.linalg.inv(rig.ego_from_camera), rig.lenses
     return np.asarray(reprojection_residuals(points, matched.point_of, *of_photo))
 
@@ -445,10 +424,6 @@ def _views_of_corners(shots: RigPhotos, matched: CornerTracks) -> tuple[Ints, Ri
     return np.arange(len(v)), RigPhotos(
         shots.camera_of[v], shots.instant_of[v], shots.world_from_ego[v], shots.twists[v]
     )
-
-
-def _delays_or_zero(matched: CornerTracks) -> Array | float:
-    return 0.0 if matched.after_s is None else matched.after_s
 
 
 def corner_rays(rig: Rig, shots: RigPhotos, matched: CornerTracks) -> tuple[Array, Array]:
@@ -466,7 +441,7 @@ def corner_rays(rig: Rig, shots: RigPhotos, matched: CornerTracks) -> tuple[Arra
             (seen[1] - p1 * (r2 + 2.0 * y * y) - 2.0 * p2 * x * y) / s,
         )
     view_of, seen_by = _views_of_corners(shots, matched)
-    pose = (rig.ego_poses(seen_by, _delays_or_zero(matched)) @ rig.ego_from_camera[seen_by.camera_of])[view_of]
+    pose = (rig.ego_poses(seen_by, matched.after_s) @ rig.ego_from_camera[seen_by.camera_of])[view_of]
     way = np.einsum("nij,nj->ni", pose[:, :3, :3], np.column_stack([x, y, np.ones(len(x))]))
     return pose[:, :3, 3], way / np.linalg.norm(way, axis=1, keepdims=True)
 
@@ -522,10 +497,10 @@ def _levenberg_marquardt(
 
     cost, weights = cost_of(rig, points)
     for _ in range(STEPS):
-        ego_from_world = np.linalg.inv(rig.ego_poses(seen, _delays_or_zero(matched)))
+        ego_from_world = np.linalg.inv(rig.ego_poses(seen, matched.after_s))
         matrix, right, inverses, sides, mixed = normal_equations(
             points, matched.starts, view_of, matched.at, weights, damping, seen.camera_of, places,
-            ego_from_world, np.linalg.inv(rig.ego_from_camera), rig.lenses, seen.twists, len(sigmas),
+            ego_from_world, np.linalg.inv(rig.ego_from_camera), rig.lenses, len(sigmas),
         )  # fmt: skip
         right = right - trust * rig.away_from(given)
         matrix[np.diag_indices(len(sigmas))] = np.diag(matrix) * (1.0 + damping) + trust
@@ -554,7 +529,7 @@ def _levenberg_marquardt(
 
 
 def _parameter_rows(rig: Rig, shots: RigPhotos, matched: CornerTracks) -> Ints:
-    """(N, 22) rows of the parameters that a corner depends on."""
+    """(N, 21) rows of the parameters that a corner depends on."""
     n = 6 * len(rig.corrections)
     of_instant = 6 * shots.instant_of[matched.view_of, None] + np.arange(MOUNT)
     of_camera = n + N_CAMERA * shots.camera_of[matched.view_of, None] + np.arange(N_CORNER - MOUNT)

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from tasks.render.rig.adjust import (
     N_CAMERA,
-    STAMP,
     AdjustedRig,
     CornerTracks,
     Rig,
@@ -24,7 +23,6 @@ from tasks.render.rig.adjust import (
     initial_rig,
     readout_delays_s,
     reprojection_errors,
-    select_corners,
     triangulate_points,
     twists_of,
     without_views,
@@ -202,56 +200,6 @@ def matched_corners(
     return CornerTracks(np.concatenate([[0], ends]).astype(np.int64), view[rows], at[rows], pixel[view[rows]])
 
 
-# Which cameras took their photos later than their stamps say, where photos can tell.
-#
-# A camera that is late is shifted along the road by the ego's speed: at a steady speed, straight on, a mount that is
-# wrong explains the same photos, and nothing is gained by a delay. So one is believed where corners that were not
-# fitted agree clearly better with it. They can where speeds change or the ego turns.
-
-STAMP_S = 0.05  # sigma of a camera's stamps against the ego's
-STAMP_OF_CAMERA = STAMP - 6  # of a camera's parameters
-EVERY = 4  # of so many points one is fitted and another measured: they decide as all do, in a fraction of the time
-LEAST_LATE_S = 0.01  # less is a decimetre at 10 m/s, which mounts have as well
-SURE = 5.0  # standard errors by which corners must agree better
-LEAST_GAIN = 0.02  # share of what they are off
-WIDTHS_PX = (8.0, 4.0, 2.0, 1.0)
-
-
-def cameras_with_delay(given: Rig, shots: RigPhotos, matched: CornerTracks, held: AdjustedRig, sigmas: Array) -> Bools:
-    """(C,) whose delay explains what nothing else does; `held` is what `sigmas` (n,), no delays, came to."""
-    none = np.zeros(len(given.stamps), np.bool_)
-    fitted, measured = (select_corners(matched, matched.point_of % EVERY == k) for k in (0, 1))
-    late = bundle_adjust(given, shots, fitted, free_stamps(sigmas, ~none), held.rig, WIDTHS_PX).rig
-    found = np.abs(late.stamps) >= LEAST_LATE_S
-    if not found.any():
-        return none
-    on_time = bundle_adjust(given, shots, fitted, sigmas, held.rig, WIDTHS_PX).rig
-    gained, off = _error_gain(on_time, late, shots, measured)
-    if len(gained) < 2 or off == 0.0:
-        return none
-    gain, sure = gained.mean() / off, gained.mean() / (gained.std() / np.sqrt(len(gained)) + 1e-12)
-    return np.asarray(found & bool(gain > LEAST_GAIN and sure > SURE))
-
-
-def free_stamps(sigmas: Array, cameras: Bools) -> Array:
-    """(n,) the same, the stamps of some cameras (C,) free."""
-    out = sigmas.copy()
-    of_camera = out[len(out) - N_CAMERA * len(cameras) :].reshape(-1, N_CAMERA)
-    of_camera[cameras, STAMP_OF_CAMERA] = STAMP_S
-    return out
-
-
-def _error_gain(one: Rig, other: Rig, shots: RigPhotos, matched: CornerTracks) -> tuple[Array, float]:
-    """(P',) by how much less each point is off with the other rig, and how much all are on average with the first."""
-    costs, there = [], np.ones(len(matched.starts) - 1, np.bool_)
-    for rig in (one, other):
-        points, seen = triangulate_points(rig, shots, matched)
-        off = np.where(seen[matched.point_of], reprojection_errors(rig, shots, matched, points), 0.0)
-        costs.append(np.add.reduceat(np.log1p(np.minimum(off, 1e3) ** 2), matched.starts[:-1]))
-        there &= seen
-    return (costs[0] - costs[1])[there], float(costs[0][there].mean()) if there.any() else 0.0
-
-
 # Sigmas: what calibration and poses are expected to be off by (docs/reconstruction.md, real rigs).
 TURN_DEG, SHIFT_M = 1.0, 0.1  # of a camera on the ego
 FOCAL, CENTRE = 0.01, 0.01  # of focal lengths and principal point, as shares of the focal length and of the width
@@ -273,7 +221,6 @@ class CameraChange:
     turn_deg: tuple[float, float, float]  # about the same axes
     focal_px: tuple[float, float]  # fx, fy, in pixels of the photo as taken
     centre_px: tuple[float, float]
-    late_s: float  # photos were taken so much later than their stamps say
     before_px: float  # median distance of a corner from its point, in pixels of the photo as taken
     after_px: float
 
@@ -316,9 +263,6 @@ def correct_rig(
         if len(matched.starts) <= LEAST_POINTS:
             return None
         bundle = bundle_adjust(rig, shots, matched, sigmas)
-    late = cameras_with_delay(rig, shots, matched, bundle, sigmas)
-    if late.any():
-        bundle = bundle_adjust(rig, shots, matched, free_stamps(sigmas, late))
     points = bundle.points[np.bincount(matched.point_of, bundle.used, len(bundle.points)) > 0]
     if len(points) < LEAST_POINTS:
         return None
@@ -348,17 +292,13 @@ def correct_rig(
                 _three(np.degrees(row[3:6])),
                 (float(row[6]), float(row[7])),
                 (float(row[8]), float(row[9])),
-                float(row[15]),
                 float(np.median(before[mine])) if mine.any() else float("nan"),
                 float(np.median(after[mine])) if mine.any() else float("nan"),
             )
         )
     return RigCorrection(
         tuple(adjusted_camera(camera, end, k) for k, camera in enumerate(cameras)),
-        tuple(
-            replace(file, world_from_ego=pose, late_s=float(late))
-            for file, pose, late in zip(files, poses, end.stamps[shots.camera_of])
-        ),
+        tuple(replace(file, world_from_ego=pose) for file, pose in zip(files, poses)),
         points + shift,
         tuple(changes),
         float(np.sqrt((of_pose[:, :3] ** 2).sum(axis=1).mean())),
@@ -375,7 +315,7 @@ def _drive_scale(places: Array, given: Array) -> float:
 
 
 def parameter_sigmas(cameras: Sequence[Camera], n_instants: int) -> Array:
-    """(n,) what each parameter of a rig may be off by, in the order of `Rig.away_from`; stamps: nothing."""
+    """(n,) what each parameter of a rig may be off by, in the order of `Rig.away_from`."""
     of_instant = np.repeat([POSE_SHIFT_M, np.radians(POSE_TURN_DEG)], 3)
     # Poses are off together, bit by bit along the drive: all of them weigh as much as one camera does.
     rows = [np.tile(of_instant * np.sqrt(n_instants), n_instants)]
@@ -383,7 +323,7 @@ def parameter_sigmas(cameras: Sequence[Camera], n_instants: int) -> Array:
         mount = [SHIFT_M] * 3 + [np.radians(TURN_DEG)] * 3
         pinhole = [FOCAL * camera.intrinsics[0, 0]] * 2 + [CENTRE * camera.width] * 2
         lens = LENS_TERM * np.array([1.0, 1.0, 0.1, 0.1, 1.0])
-        rows += [np.array(mount), np.array(pinhole), lens, np.zeros(1)]
+        rows += [np.array(mount), np.array(pinhole), lens]
     return np.concatenate(rows)
 
 

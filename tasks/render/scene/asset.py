@@ -88,7 +88,6 @@ class TakenFrom:
     time_s: float  # since the block's first step
     world_from_ego: Array  # (4, 4)
     rise_m: float = 0.0  # higher than the log has it
-    late_s: float = 0.0  # and later than `time_s`
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ class RenderAsset:
             return tuple(files)
         taken = {(photo.camera, photo.time_s): photo for photo in self.taken}
         pairs = [(file, taken.get((file.sensor, file.time_s))) for file in files]
-        return tuple(replace(f, world_from_ego=t.world_from_ego, late_s=t.late_s) for f, t in pairs if t is not None)
+        return tuple(replace(f, world_from_ego=t.world_from_ego) for f, t in pairs if t is not None)
 
     def on_road(self, logged: Array) -> Array:
         """Poses (S, 4, 4) of the ego that say how high the scene's road is and how it leans: the `logged` ones, or

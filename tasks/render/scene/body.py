@@ -42,7 +42,7 @@ def with_body_depths(photos: Sequence[Photo], seen: Sequence[PhotoDepth], tracks
 
 def _with_body_depth(photo: Photo, sight: PhotoDepth, tracks: Tracks) -> PhotoDepth:
     eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
-    bodies, driving = bodies_near(*tracks.at(photo.taken_s), tracks, eye)
+    bodies, driving = bodies_near(*tracks.at(photo.time_s), tracks, eye)
     if not driving.any():
         return sight
     height, width = sight.depth.shape

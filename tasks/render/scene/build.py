@@ -104,7 +104,7 @@ def build_surfaces(
     looks = []
     for photo, sight in zip(photos, seen):
         discs = discs_of_photo(photo.light, sight.depth, sight.label, photo.intrinsics, photo.world_from_camera)
-        boxes, valid = tracks.at(photo.taken_s)
+        boxes, valid = tracks.at(photo.time_s)
         poses = world_from_boxes(boxes)
         owner = box_of_points(discs.points, boxes, valid)
         at = (discs.pixels[:, 0], discs.pixels[:, 1])
@@ -164,7 +164,7 @@ def _present_tracks(asset: RenderAsset, tracks: Tracks, time_s: float) -> tuple[
 
 def _picture(asset: RenderAsset, photo: Photo, tracks: Tracks) -> F32:
     """The rendering of a photo (pose local) as the scene was at its time."""
-    rows, boxes = _present_tracks(asset, tracks, photo.taken_s)
+    rows, boxes = _present_tracks(asset, tracks, photo.time_s)
     present = Vehicles(tuple(tracks.ids[j] for j in rows), tuple(tracks.kinds[j] for j in rows), boxes[rows])
     height, width = photo.rgb.shape[:2]
     camera = Pinhole(photo.intrinsics, shift_pose(photo.world_from_camera, asset.origin), width, height)
@@ -192,7 +192,7 @@ def _refit_colours(
     for photo, sight in zip(photos, seen):
         height, width = photo.rgb.shape[:2]
         camera = photo.intrinsics, photo.world_from_camera, width, height
-        there, boxes = _present_tracks(asset, tracks, photo.taken_s)
+        there, boxes = _present_tracks(asset, tracks, photo.time_s)
         there = [j for j in there if tracks.ids[j] in place]
         ids = [tracks.ids[j] for j in there]
         splats = project_and_sort(

@@ -215,7 +215,7 @@ def estimate_photo_depth(
     """A photo's depth from the fused lidar (`fuse_sweeps`), completed from the `others` it is compared with."""
     height, width = photo.rgb.shape[:2]
     rgb = photo.rgb.astype(np.float32) / 255.0
-    boxes, valid = tracks.at(photo.taken_s)
+    boxes, valid = tracks.at(photo.time_s)
     poses = world_from_boxes(boxes)
     points, labels = [known.dense], [np.full(len(known.dense), -1, np.int32)]
     for j, mine in per_track.items():

@@ -153,7 +153,7 @@ def triangulate_matches(photos: Sequence[Photo], tracks: Tracks) -> Array:
         for j in _partners(photos, i):
             first, second = _matches(found[i][1], found[j][1])
             points = _intersect_rays(photo, photos[j], corners[i][first], corners[j][second])
-            for time_s in (photo.taken_s, photos[j].taken_s):
+            for time_s in (photo.time_s, photos[j].time_s):
                 boxes, valid = tracks.at(time_s)
                 points = points[box_of_points(points, boxes, valid) < 0]
             parts.append(points)

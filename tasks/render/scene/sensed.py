@@ -27,7 +27,6 @@ class Photo:
     intrinsics: Array  # (3, 3) pixels, the centre of pixel (0, 0) at (0.5, 0.5)
     world_from_camera: Array  # (4, 4)
     own_body: Bools | None = None  # (H, W) shows the car that carries the camera
-    late_s: float = 0.0  # so much later than `time_s` says was it taken
     to_common: F32 | None = None  # (3, 4) affine colour that takes it into an exposure common to several cameras
 
     @property
@@ -36,11 +35,6 @@ class Photo:
         shows what is brighter than white is there."""
         rgb = self.rgb.astype(np.float32) / np.float32(255.0)
         return rgb if self.to_common is None else np.maximum(apply_affine(rgb, self.to_common), np.float32(0.0))
-
-    @property
-    def taken_s(self) -> float:
-        """When everything was where it shows it."""
-        return self.time_s + self.late_s
 
 
 def resize_photo(photo: Photo, width: int) -> Photo:

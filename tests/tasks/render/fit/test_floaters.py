@@ -106,9 +106,9 @@ def slow_floaters(problem: FitProblem, state: FitState) -> list[int]:
     """Gaussian by Gaussian, photo by photo."""
     views, found = [], []
     for i, shot in enumerate(problem.train):
-        boxes, valid = problem.tracks.at(shot.photo.taken_s)
+        boxes, valid = problem.tracks.at(shot.photo.time_s)
         off = state.learned["boxes"].values.reshape(len(boxes), -1, SHIFT_SIZE)
-        boxes = shift_boxes(boxes, interpolate_knots(off, shot.photo.taken_s))
+        boxes = shift_boxes(boxes, interpolate_knots(off, shot.photo.time_s))
         camera = corrected_pose(shot.photo.world_from_camera, state.learned["poses"].values[i])
         near = [j for j in range(len(boxes)) if valid[j] and np.hypot(*(boxes[j, :2] - camera[:2, 3])) < REACH_M]
         views.append((shot, camera, [(part, problem.tracks.driving[j]) for j in near for part in body_boxes(boxes[j])]))

@@ -67,11 +67,10 @@ def street_points(rng: np.random.Generator) -> Array:
 def corners_seen(
     rig: list[Camera],
     taken: list[SensorFile],
-    late_s: Callable[[str], float] = lambda name: 0.0,
     seed: int = 0,
     drive: Callable[[float], Array] = ego_pose,
 ) -> list[PhotoCorners]:
-    """Of each file what its camera saw, `late_s` after its stamp: points on both sides of the street, with noise.
+    """Of each file what its camera saw: points on both sides of the street, with noise.
 
     A camera that reads row by row sees each point from where it was as it read the point's row.
     """
@@ -80,13 +79,13 @@ def corners_seen(
     looks = rng.normal(size=(POINTS, 128)) ** 2
     looks = np.rint(UNIT * np.sqrt(looks / looks.sum(axis=1, keepdims=True))).astype(np.float32)
     row = {camera.name: k for k, camera in enumerate(rig)}
-    late = [replace(file, world_from_ego=drive(file.time_s + late_s(file.sensor))) for file in taken]
+    late = [replace(file, world_from_ego=drive(file.time_s)) for file in taken]
     known, shots = initial_rig(rig, late)
     out = []
     for i, file in enumerate(taken):
         at = _off(known, points, row[file.sensor], shots.world_from_ego[i])
         if readout_s := rig[row[file.sensor]].readout_s:
-            look = partial(_seen_at, known, points, row[file.sensor], drive, file.time_s + late_s(file.sensor))
+            look = partial(_seen_at, known, points, row[file.sensor], drive, file.time_s)
             at = by_rows(look, readout_s)
         pose = shots.world_from_ego[i] @ rig[row[file.sensor]].ego_from_camera
         ahead = (points - pose[:3, 3]) @ pose[:3, 2]

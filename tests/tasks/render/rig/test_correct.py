@@ -37,9 +37,9 @@ def turned(camera: Camera, turn_deg: tuple[float, ...], shift_m: tuple[float, ..
     return replace(camera, ego_from_camera=camera.ego_from_camera @ motion)
 
 
-def correct(said: list[Camera], **late: float) -> RigCorrection:
+def correct(said: list[Camera]) -> RigCorrection:
     true, taken = cameras(), files(NAMES)
-    found = correct_rig(said, taken, corners_seen(true, taken, lambda name: late.get(name, 0.0)))
+    found = correct_rig(said, taken, corners_seen(true, taken))
     assert found is not None
     return found
 
@@ -78,23 +78,6 @@ def test_a_focal_length_wrong_by_a_pixel_is_found() -> None:
     first, *rest = (np.mean(change.focal_px) for change in found.changes)
     assert first - np.mean(rest) == pytest.approx(-1.0, abs=0.6)  # -1.2: noise leaves half a pixel in 700
     assert found.changes[0].after_px < 0.33
-
-
-def test_a_camera_stamped_100_ms_early_is_found_where_the_ego_turns_and_accelerates() -> None:
-    found = correct(cameras(), right=0.1)
-    late = {change.camera: change.late_s for change in found.changes}
-    assert late["right"] == pytest.approx(0.1, abs=0.02), late
-    assert all(abs(late[name]) < 0.02 for name in NAMES if name != "right"), late
-    assert found.changes[3].after_px < 0.5 < found.changes[3].before_px
-
-
-def test_no_delay_is_made_up_where_there_is_none_or_a_shifted_mount_says_the_same(as_said: RigCorrection) -> None:
-    assert [change.late_s for change in as_said.changes] == [0.0] * 4
-    true, steady = cameras(), files(NAMES, straight_on)
-    said = [turned(c, (0.0, 0.0, 0.0), (-0.08, 0.0, 0.0)) if c.name == "right" else c for c in true]
-    found = correct_rig(said, steady, corners_seen(true, steady, drive=straight_on))
-    assert found is not None and [change.late_s for change in found.changes] == [0.0] * 4
-    assert apart(true[3].ego_from_camera, found.cameras[3].ego_from_camera)[0] < 0.05
 
 
 def test_rows_that_are_read_one_after_the_other_are_put_where_the_ego_was() -> None:
