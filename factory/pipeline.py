@@ -305,7 +305,7 @@ class FactoryWork:
 
     def warm(self, draws: bool = True) -> None:
         """This run's kernels, and no others, into the on-disk cache. Raises NotReady."""
-        from factory.stages.warm import compile_kernels, parts_of
+        from factory.stages.warm import compile_kernels, kernel_parts
 
         if draws and self.render.mode is RenderMode.AUTO:
             try:

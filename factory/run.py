@@ -62,7 +62,7 @@ def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:
 def kernel_parts(config: RunConfig) -> list[str]:
     """The parts of factory.stages.warm that the run will ask for."""
     from factory.setup.settings import simulates
-    from factory.stages.warm import parts_of
+    from factory.stages.warm import kernel_parts
 
     return parts_of(simulates(config), config.traffic.mode, config.render, photos_alone(config))
 

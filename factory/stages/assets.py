@@ -43,7 +43,7 @@ from tasks.render.fit.reconstruct import finish_scene, fit_backend, run_iteratio
 from tasks.render.fit.start import prepare_fit
 from tasks.render.fit.state import FitState
 from tasks.render.rig.correct import RigCorrection, correct_rig, detect_corners, estimate_ground_height, movable_mask
-from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom, photo_rises
+from tasks.render.scene.asset import BlockRange, PhotoPose, RenderAsset, photo_rises
 from tasks.render.scene.build import build_asset
 from tasks.render.scene.features import KnownPoints, driven_roads
 from tasks.render.scene.movers import lift_tracks
@@ -69,7 +69,7 @@ class CorrectedRig:
     """A block's cameras, and where its photos were taken, as these say; times count from the block's first step."""
 
     cameras: tuple[Camera, ...]
-    taken: tuple[TakenFrom, ...]  # all photos, those among them that were left out of the scene
+    taken: tuple[PhotoPose, ...]  # all photos, those among them that were left out of the scene
 
     def as_corrected(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
         """Those of the same names."""
@@ -166,7 +166,7 @@ def read_or_correct_rig(
     }
     if not used:
         return None
-    taken = (TakenFrom(name, time_s, np.reshape(pose, (4, 4)), rise_m) for name, time_s, rise_m, pose in told["taken"])
+    taken = (PhotoPose(name, time_s, np.reshape(pose, (4, 4)), rise_m) for name, time_s, rise_m, pose in told["taken"])
     return CorrectedRig(tuple(replace(camera, **used[camera.name]) for camera in cameras), tuple(taken))
 
 
@@ -182,11 +182,11 @@ def known_points(data: SensorData, block: Block, found: RigCorrection) -> KnownP
     return KnownPoints(road, found.points)
 
 
-def photo_poses(given: Sequence[SensorFile], used: Sequence[SensorFile]) -> tuple[TakenFrom, ...]:
+def photo_poses(given: Sequence[SensorFile], used: Sequence[SensorFile]) -> tuple[PhotoPose, ...]:
     """Where the photos that are used of those given were taken."""
     logged = {(file.sensor, file.time_s): file.world_from_ego[2, 3] for file in given}
     return tuple(
-        TakenFrom(f.sensor, f.time_s, f.world_from_ego, float(f.world_from_ego[2, 3] - logged[f.sensor, f.time_s]))
+        PhotoPose(f.sensor, f.time_s, f.world_from_ego, float(f.world_from_ego[2, 3] - logged[f.sensor, f.time_s]))
         for f in used
     )
 
@@ -358,7 +358,7 @@ def load_or_build_scene(
                 if is_rig_corrected(block, settings.rig) and path.with_suffix(RIG_SUFFIX).exists():
                     read_or_correct_rig(path, block, cameras, masks)  # written again where it is damaged
                 return kept
-        agents, taken, found = block.agents, tuple[TakenFrom, ...](), None
+        agents, taken, found = block.agents, tuple[PhotoPose, ...](), None
         if is_rig_corrected(block, settings.rig):
             given = block.images
             block, cameras, found = correct_block_rig(path, block, cameras, masks)

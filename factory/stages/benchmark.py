@@ -42,7 +42,7 @@ def describe_benchmark(
 
     `follow_ups` of a clip that is left out is how many it has.
     """
-    rows = _Rows.read(store, identity)
+    rows = _RunRows.read(store, identity)
     clips: list[dict[str, Any]] = []
     left_out: list[dict[str, Any]] = []
     for ref in sorted(refs):
@@ -68,14 +68,14 @@ def describe_benchmark(
 
 
 @dataclass(frozen=True)
-class _Rows:
+class _RunRows:
     """What the tables say of this run's settings."""
 
     made: Mapping[tuple[str, str], set[int]]  # clip, expert -> candidates with a sample
     dropped: Mapping[str, str]  # clip -> why it has no sample, or no candidate, at all
 
     @classmethod
-    def read(cls, store: Store, identity: RunIdentity) -> "_Rows":
+    def read(cls, store: Store, identity: RunIdentity) -> "_RunRows":
         made: dict[tuple[str, str], set[int]] = defaultdict(set)
         for row in store.samples.read([*MADE_UNDER, "clip_id", "candidate_index"]).to_pylist():
             made_by = row["settings_hash"], row["stage_versions"]

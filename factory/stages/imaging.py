@@ -305,7 +305,7 @@ def scene_cache_counts() -> tuple[int, int]:
 
 
 @dataclass(frozen=True)
-class _Block:
+class _BlockKey:
     """A clip and how its block is drawn; in the caches of a worker, `key` stands for it."""
 
     key: tuple[object, ...]
@@ -314,25 +314,25 @@ class _Block:
     cache_dir: str = field(compare=False)
 
 
-def _block_key(clip: Clip, settings: RenderSettings, cache_dir: str) -> _Block:
+def _block_key(clip: Clip, settings: RenderSettings, cache_dir: str) -> _BlockKey:
     """Equal for all clips of a block, so that a worker that goes from clip to clip reads its scene once."""
     how = repr(settings)
-    of_clip = _Block((clip.clip_id, clip.content_digest, how, cache_dir), clip, settings, cache_dir)
+    of_clip = _BlockKey((clip.clip_id, clip.content_digest, how, cache_dir), clip, settings, cache_dir)
     return replace(of_clip, key=(_cached_scene_path(of_clip), how))
 
 
 @lru_cache(maxsize=16)
-def _cached_scene_path(of_clip: _Block) -> Path:
+def _cached_scene_path(of_clip: _BlockKey) -> Path:
     return scene_path(of_clip.clip, of_clip.settings, of_clip.cache_dir)
 
 
 @lru_cache(maxsize=2)
-def _cached_scene(block: _Block) -> RenderAsset | None:
+def _cached_scene(block: _BlockKey) -> RenderAsset | None:
     return load_or_build_scene(block.clip, block.settings, Path(block.cache_dir))
 
 
 @lru_cache(maxsize=2)
-def _cached_rig(block: _Block) -> CorrectedRig | None:
+def _cached_rig(block: _BlockKey) -> CorrectedRig | None:
     return load_or_correct_rig(block.clip, block.settings, Path(block.cache_dir))
 
 
@@ -369,5 +369,5 @@ def open_vehicle_photos(clip: Clip, asset: RenderAsset, settings: RenderSettings
 
 
 @lru_cache(maxsize=2)
-def _cached_vehicle_photos(block: _Block) -> VehiclePhotos:
+def _cached_vehicle_photos(block: _BlockKey) -> VehiclePhotos:
     return open_vehicle_photos(block.clip, _scene_of_block(block.clip, block.settings, block.cache_dir), block.settings)

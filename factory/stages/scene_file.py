@@ -35,7 +35,7 @@ from safetensors.numpy import save
 from factory.files import atomic_file
 from factory.store.schema import canonical_json
 from factory.wording import shown
-from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, OwnBody, RenderAsset, TakenFrom, ViewQuality
+from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, OwnBody, PhotoPose, RenderAsset, ViewQuality
 from tasks.render.scene.movers import NO_SHIFTS, BoxShifts
 from tasks.render.scene.sky import SkyMap
 from tasks.render.settings import SceneDtype
@@ -63,13 +63,13 @@ def write_scene(path: Path, asset: RenderAsset, dtype: SceneDtype = SceneDtype.F
 
     Raises ValueError for what 16 bits do not hold.
     """
-    tensors, described = tensors_of(asset, dtype), described_by(asset, dtype)
-    digest = digest_of(tensors, described)
+    tensors, described = scene_tensors(asset, dtype), scene_header(asset, dtype)
+    digest = scene_digest(tensors, described)
     header = described | {"digest": digest, "kept_as": path.stem}
     data = save(dict(tensors), metadata={KEY: canonical_json(header)})
     with atomic_file(path, len(data)) as draft:
         draft.write_bytes(data)
-    return scene_of(tensors, described, digest)
+    return scene_from_parts(tensors, described, digest)
 
 
 def read_scene(path: Path, kept_as: str = "") -> RenderAsset:
@@ -93,9 +93,9 @@ def read_scene(path: Path, kept_as: str = "") -> RenderAsset:
         stated, name = described.pop("digest"), described.pop("kept_as")
         if kept_as and name != kept_as:
             raise BadScene(f"{path}: it is of another block, written as {name}.safetensors")
-        if digest_of(tensors, described) != stated:
+        if scene_digest(tensors, described) != stated:
             raise BadScene(f"{path}: the content does not match its digest {stated}")
-        return scene_of(tensors, described, stated)
+        return scene_from_parts(tensors, described, stated)
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
         if isinstance(error, BadScene):
             raise
@@ -128,7 +128,7 @@ def read_dtype(path: Path) -> SceneDtype:
         raise BadScene(f"{path}: no scene: {type(error).__name__} {error}") from error
 
 
-def tensors_of(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> dict[str, NDArray[Any]]:
+def scene_tensors(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> dict[str, NDArray[Any]]:
     """The scene's arrays by their names in the file, contiguous. Raises ValueError for what 16 bits do not hold."""
     out: dict[str, NDArray[Any]] = {"origin": asset.origin, "sky": asset.sky.rgb}
     parts = {"background": asset.background} | {f"nodes.{i}": node for i, node in enumerate(asset.nodes.values())}
@@ -146,7 +146,7 @@ def tensors_of(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> di
     return {name: np.ascontiguousarray(array) for name, array in out.items()}
 
 
-def described_by(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> dict[str, Any]:
+def scene_header(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> dict[str, Any]:
     """What of the scene is no array, as plain JSON values; NaN is null."""
     block = asset.block
     rig = [_camera_to_json(camera) for camera in asset.rig]
@@ -166,8 +166,8 @@ def described_by(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> 
     } | {name: values for name, values in more.items() if values}
 
 
-def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> RenderAsset:
-    """The opposite of `tensors_of` and `described_by`. Raises KeyError, TypeError, ValueError where one is absent."""
+def scene_from_parts(tensors: Tensors, described: Mapping[str, Any], digest: str) -> RenderAsset:
+    """The opposite of `scene_tensors` and `scene_header`. Raises KeyError, TypeError, ValueError where one lacks."""
 
     def part(name: str) -> Gaussians:
         return _in_float32({field.name: tensors[f"{name}.{field.name}"] for field in fields(Gaussians)})
@@ -192,7 +192,7 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
         block=block,
         rig=tuple(_camera_from_json(camera) for camera in described.get("rig", ())),
         taken=tuple(
-            TakenFrom(camera, time_s, tensors["taken"][i], rise_m)
+            PhotoPose(camera, time_s, tensors["taken"][i], rise_m)
             for i, (camera, time_s, rise_m) in enumerate(described.get("taken", ()))
         ),
         shifts=BoxShifts(tuple(described["shifts"]), tensors["shifts"]) if "shifts" in described else NO_SHIFTS,
@@ -224,7 +224,7 @@ def _in_float32(arrays: Mapping[str, NDArray[Any]]) -> Gaussians:
     return Gaussians(**whole | {"quats": (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)})
 
 
-def digest_of(tensors: Tensors, described: Mapping[str, Any]) -> str:
+def scene_digest(tensors: Tensors, described: Mapping[str, Any]) -> str:
     """16 hex digits of the scene's content."""
     digest = hashlib.sha256(canonical_json(described).encode())
     for name, array in sorted(tensors.items()):

@@ -31,7 +31,7 @@ from tasks.render.scene.depth import confirm_depths
 from tasks.render.scene.sensed import Photo, Sweep
 from tasks.render.scene.stereo import choose_partners, wide_baseline_depth
 from tasks.render.settings import FitSettings, RenderMode, RenderSettings, SceneFrom
-from tasks.render.splatting.sh import turned
+from tasks.render.splatting.sh import rotate_coefficients
 from tasks.reward.epdms import prepare_scene, score
 from tasks.reward.labels import hit_after_s, vocabulary_labels
 from tasks.rollout.simulate import SeenTraffic, TrafficSettings, prepare_traffic, simulate
@@ -106,7 +106,7 @@ def compile_kernels(parts: Sequence[str], enough: Event | None = None) -> None:
         return
     try:
         make_cache_dir()
-        with (cache_dir() / f"lock-{_key()}").open("w") as lock:
+        with (cache_dir() / f"lock-{_part_key()}").open("w") as lock:
             if enough is None:  # somebody waits
                 print("compiling kernels, once for this version: about a minute", file=sys.stderr, flush=True)
             with _one_at_a_time, locked(lock):
@@ -121,16 +121,16 @@ def compile_kernels(parts: Sequence[str], enough: Event | None = None) -> None:
         raise NotReady(cache_write_error(error)) from error
 
 
-def _key() -> str:
+def _part_key() -> str:
     """8 hex digits of the processor and of what is called here for it to be compiled."""
     sha = hashlib.sha256(processor_key().encode())
     sha.update(Path(__file__).read_bytes())
     return sha.hexdigest()[:8]
 
 
-def marker(name: str) -> Path:
+def part_marker(name: str) -> Path:
     """The file that lists what a part has in the cache."""
-    return cache_dir() / f"compiled-{_key()}-{name}"
+    return cache_dir() / f"compiled-{_part_key()}-{name}"
 
 
 def _is_compiled(name: str) -> bool:
@@ -139,11 +139,13 @@ def _is_compiled(name: str) -> bool:
         files = [
             cache_dir() / file
             for file in without_checksum(marker(name).read_bytes(), marker(name).name).decode().splitlines()
+            cache_dir() / file
+            for file in unsealed(part_marker(name).read_bytes(), part_marker(name).name).decode().splitlines()
         ]
     except OSError:  # not there, or in a folder that cannot be: whoever then writes into it says so
         return False
     except Damaged as error:
-        log.warning("%s: %s; it is made again", marker(name), error)
+        log.warning("%s: %s; it is made again", part_marker(name), error)
         return False
     return all(file.is_file() for file in files)
 
@@ -182,13 +184,14 @@ def _compile_and_mark(name: str) -> int:
     try:
         for part in (name, *INCLUDED.get(name, ())):
             write_whole(marker(part), with_checksum(listed.encode(), marker(part).name))
+            write_whole(part_marker(part), sealed(listed.encode(), part_marker(part).name))
     except OSError as error:
         print(error, file=sys.stderr)
         return DISK_FULL
     return 0
 
 
-def _judge() -> None:
+def _compile_judge() -> None:
     """Scores, and all that an attempt among the log's traffic enters.
 
     `plan` is compiled meanwhile and takes half as long: it is there when the attempt asks for it.
@@ -202,7 +205,7 @@ def _judge() -> None:
     hit_after_s(prepare_traffic(scene, REPLAY), judged.prepared, judged.rollout.ego_states)
 
 
-def _plan() -> None:
+def _compile_plan() -> None:
     """The tracker, and what PDM-Closed proposes."""
     scene, ahead = _tiny_scene()
     simulate(scene, ahead, REPLAY)
@@ -210,13 +213,13 @@ def _plan() -> None:
     proposals(scene.ego_state, scene.centerline, seen, None, PdmSettings())
 
 
-def _drive() -> None:
+def _compile_drive() -> None:
     """Traffic around one ego."""
     scene, ahead = _tiny_scene()
     simulate(scene, ahead, TrafficSettings())
 
 
-class _Stands:
+class _StandingPolicy:
     """A traffic policy that is none."""
 
     def digest(self) -> str:
@@ -226,10 +229,10 @@ class _Stands:
         return np.pad(seen.boxes[-1, :-1, :3], ((0, 0), (0, 1)))
 
 
-def _policy() -> None:
+def _compile_policy() -> None:
     """Traffic that a policy of a user's own drives around one ego."""
     scene, ahead = _tiny_scene()
-    simulate(scene, ahead, TrafficSettings(mode="custom", policy=f"{__name__}:{_Stands.__name__}"))
+    simulate(scene, ahead, TrafficSettings(mode="custom", policy=f"{__name__}:{_StandingPolicy.__name__}"))
 
 
 # Every kernel of the render package, on the smallest scene that reaches all of them.
@@ -240,7 +243,7 @@ POINTS = ((8.0, 1.0, 1.0), (9.0, -1.0, 2.0))  # that the rig is adjusted to
 
 def compile_render_kernels() -> RenderAsset:
     """Builds and measures a scene of two 32 x 32 photos, some ground and one box that drives."""
-    turned(np.zeros((1, 3, 3), np.float32), np.diag([1.0, -1.0, 1.0]))
+    rotate_coefficients(np.zeros((1, 3, 3), np.float32), np.diag([1.0, -1.0, 1.0]))
     return build_asset(*_tiny_recording(), AssetSettings(hold_out_every=3))
 
 
@@ -293,19 +296,20 @@ def _tiny_recording() -> tuple[list[Photo], list[Sweep], AgentTracks]:
     return photos, sweeps, AgentTracks(("a",), (AgentKind.VEHICLE,), boxes, np.zeros((3, 1, 2)), there, *heights)
 
 
-def _fit() -> None:
+def _compile_fit() -> None:
     """Scenes that are built and drawn, and fitted: in one process, for they share kernels."""
     compile_render_kernels()
     compile_fit_kernels()
 
 
 PARTS = {
-    "judge": _judge,
-    "plan": _plan,
-    "drive": _drive,
-    "policy": _policy,
+    "judge": _compile_judge,
+    "plan": _compile_plan,
+    "drive": _compile_drive,
+    "answers": _compile_answers,
+    "policy": _compile_policy,
     "render": compile_render_kernels,
-    "fit": _fit,
+    "fit": _compile_fit,
     "rig": compile_rig_kernels,
 }
 INCLUDED = {"judge": ("plan",), "fit": ("render",)}

@@ -18,6 +18,7 @@ from factory.pipeline import logged_clip
 from factory.readers.pickles import load_tensors
 from factory.stages.scene_file import BadScene, described_by, read_dtype, read_scene
 from factory.store.location import BadCacheFile
+from factory.stages.scene_file import SUFFIX, BadScene, read_dtype, read_scene, read_view_qualities, scene_header
 from factory.wording import one_line
 from tasks.render.scene.asset import BlockRange, RenderAsset, ViewQuality
 from tasks.render.scene.movers import world_from_boxes
@@ -29,10 +30,10 @@ from tasks.render.splatting.formats import (
     from_checkpoint,
     from_ply,
     from_spz,
-    splatfacto,
     to_ply,
+    to_splatfacto,
     to_spz,
-    worldengine,
+    to_worldengine,
 )
 from tasks.render.splatting.gaussians import Gaussians, moved
 from tasks.render.splatting.project import ANTIALIASED, CLASSIC, ScreenFilter
@@ -227,6 +228,7 @@ def node_bytes(gaussians: Gaussians, suffix: str, screen: ScreenFilter) -> bytes
     if suffix in CHECKPOINTS:
         return _checkpoint_bytes(splatfacto(gaussians))
     return background_bytes(gaussians, suffix, np.zeros(3), screen)
+    return _saved(to_splatfacto(gaussians)) if suffix in CHECKPOINTS else _bytes(gaussians, suffix, screen)
 
 
 def read_nerfstudio_transform(path: Path) -> tuple[Array, float]:
@@ -345,7 +347,7 @@ def export_scene(
             raise BadScene(f"{name}: {error}") from error
     sky = np.rint(np.clip(asset.sky.rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
     (folder / "sky.png").write_bytes(cv2.imencode(".png", cv2.cvtColor(sky, cv2.COLOR_RGB2BGR))[1].tobytes())
-    described = described_by(asset) | {"origin": asset.origin.tolist(), "digest": asset.digest, "files": list(files)}
+    described = scene_header(asset) | {"origin": asset.origin.tolist(), "digest": asset.digest, "files": list(files)}
     (folder / "scene.json").write_text(json.dumps(described, indent=1))
     return [folder / name for name in (*files, "sky.png", "scene.json")]
 

@@ -86,10 +86,10 @@ def make_cache_dir() -> None:
         folder.mkdir(parents=True)
     except FileExistsError:  # of processes that begin at once one makes it
         return
-    remove_unused(folder.parent)
+    remove_unused_caches(folder.parent)
 
 
-def remove_unused(caches: Path) -> None:
+def remove_unused_caches(caches: Path) -> None:
     """Remove the folders of kernels that no process has used for UNUSED_S; each process that uses one marks it.
 
     Marked and renamed first: nobody else removes it too, and who begins to use one at this moment finds it whole, or
@@ -151,6 +151,7 @@ class KernelCache:
         path = self._path(signature)
         try:
             kept = without_checksum(path.read_bytes(), _key(path))
+            kept = unsealed(path.read_bytes(), _cache_key(path))
         except OSError:  # not there, or nobody's to read: compiled again, and save_overload says what is wrong
             return None
         except Damaged as error:
@@ -167,6 +168,7 @@ class KernelCache:
         try:
             make_cache_dir()
             write_whole(path, with_checksum(dumps(compiled._reduce()), _key(path)))
+            write_whole(path, sealed(dumps(compiled._reduce()), _cache_key(path)))
         except OSError as error:
             warnings.warn(cache_write_error(error), RuntimeWarning, stacklevel=1)
             return
@@ -182,7 +184,7 @@ class KernelCache:
             path.unlink(missing_ok=True)
 
 
-def _key(path: Path) -> str:
+def _cache_key(path: Path) -> str:
     """A kernel's file by its place in the cache: another one's machine code is not run for it."""
     return path.relative_to(cache_dir()).as_posix()
 

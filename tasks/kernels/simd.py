@@ -121,7 +121,7 @@ def prefetch(typing_context: Any, array: Any, at: Any) -> Any:
     return types.none(array, types.uint64), build
 
 
-def _called(builder: Any, name: str, arguments: Any) -> Any:
+def _call_llvm(builder: Any, name: str, arguments: Any) -> Any:
     """What one of LLVM's own functions makes of values of this type."""
     kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(arguments))
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments)
@@ -132,7 +132,7 @@ def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
     """a * b + c in one rounding."""
 
     def build(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        return _called(builder, "llvm.fma.v16f32", arguments)
+        return _call_llvm(builder, "llvm.fma.v16f32", arguments)
 
     return lanes(lanes, lanes, lanes), build
 
@@ -140,7 +140,7 @@ def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
 @intrinsic
 def sqrt(typing_context: Any, values: Any) -> Any:
     """Square roots; NaN of what is negative."""
-    return lanes(lanes), lambda context, builder, sig, arguments: _called(builder, "llvm.sqrt.v16f32", arguments)
+    return lanes(lanes), lambda context, builder, sig, arguments: _call_llvm(builder, "llvm.sqrt.v16f32", arguments)
 
 
 def _first_where(comparison: str) -> Any:

@@ -18,7 +18,7 @@ from tasks.render.scene.asset import OwnBody, RenderAsset, camera_psnr_db, compo
 from tasks.render.scene.engine import Backend, Vehicles, render, vehicles_at
 from tasks.render.scene.movers import BEYOND_M, behind_boxes, boxes_at, world_from_boxes
 from tasks.render.scene.sensed import Photo
-from tasks.render.scene.sky import directions
+from tasks.render.scene.sky import pixel_directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import GateSettings, RenderSettings
 from tasks.render.splatting.gaussians import Gaussians, rotations_of
@@ -170,7 +170,7 @@ def large_vehicles(there: Vehicles, eye: Pinhole, view: View, share: float) -> I
     free = np.ones((eye.height, eye.width), bool)
     for j in sorted(np.flatnonzero(possible), key=lambda j: nearest[j]):
         if rays is None:
-            rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
+            rays = pixel_directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
         outline = box_outline(there.boxes[j], eye, rays)
         hidden = (view.depth < nearest[j] - HIDDEN_M) & (view.alpha > 0.5)
         covered = float((outline & free & ~hidden).mean())
@@ -182,7 +182,7 @@ def large_vehicles(there: Vehicles, eye: Pinhole, view: View, share: float) -> I
 def box_outline(box: Array, eye: Pinhole, rays: Array | None = None) -> Bools:
     """(H, W) the pixels that look at a box (7,) in the world; `rays` (H * W, 3) where they are known."""
     if rays is None:
-        rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
+        rays = pixel_directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
     place = np.ascontiguousarray(eye.world_from_camera[:3, 3])
     met = behind_boxes(place + FAR_M * rays, place, np.ascontiguousarray(box[None]))
     return np.asarray(met).reshape(eye.height, eye.width)
@@ -261,7 +261,7 @@ def likeness_beside_photo(
     `box` (7,) is the vehicle's and `others` (N, 7) those that may hide it, as `eye` sees them. Likeness is the SSIM at
     half size over the places that both show, the best under small shifts of the photo. 0 and 0 where there is none.
     """
-    rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
+    rays = pixel_directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
     place, photo = eye.world_from_camera[:3, 3], taken.photo
     points, axis, side, along = intersect_box(box, place, rays)
     outline = along < np.inf
@@ -470,7 +470,7 @@ def measure_views(
     """Of the view that each camera has of a composed scene; nothing is missed where its `own` body is in front."""
     out = []
     for eye, seen, body in zip(eyes, views, own or [None] * len(eyes), strict=True):
-        rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height)
+        rays = pixel_directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height)
         road = meets_road(rays, eye.world_from_camera[:3, 3], world_from_ego)
         if body is not None:
             road &= ~body.in_front(eye.width, eye.height)

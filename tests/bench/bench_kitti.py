@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from factory.stages.scene_file import write_scene
 from tasks.render.fit.corrections import apply_exposure, corrected_pose
-from tasks.render.fit.losses import ssim, target_of
+from tasks.render.fit.losses import photo_target, ssim
 from tasks.render.fit.on_torch import TorchBackend
 from tasks.render.fit.reconstruct import (
     draw_photo,
@@ -115,7 +115,7 @@ class Trial:
 
 def scores(pictures: list[F32], photos: list[Photo]) -> str:
     """Mean PSNR and SSIM."""
-    targets = [target_of(p.rgb) for p in photos]
+    targets = [photo_target(p.rgb) for p in photos]
     clipped = [np.clip(image, 0.0, 1.0) for image in pictures]
     both = [(psnr(image, t.rgb), ssim(image, t)[0]) for image, t in zip(clipped, targets)]
     return "{:.2f} / {:.3f}".format(*np.mean(both, axis=0))

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from tasks.render.fit.backend import CpuBackend, FitBackend
 from tasks.render.fit.corrections import EXPOSURE_SIZE, POSE_SIZE
-from tasks.render.fit.losses import target_of
+from tasks.render.fit.losses import photo_target
 from tasks.render.fit.on_torch import TorchBackend, photo_loss
 from tasks.render.fit.reconstruct import finish_scene, run_iterations
 from tasks.render.fit.start import FitPhoto, FitProblem, PhotoTarget
@@ -159,7 +159,7 @@ def problem_of(n: int, width: int, height: int, threads: int) -> tuple[FitProble
         picture = forward(truth, k, pose, width, height, np.full(3, SKY, np.float32), threads).view.rgb
         rgb = np.rint(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
         photo = Photo("front", 0.1 * i, rgb, k, pose)
-        shots.append(FitPhoto(photo, None, PhotoTarget(target_of(rgb), np.zeros((height, width), bool))))
+        shots.append(FitPhoto(photo, None, PhotoTarget(photo_target(rgb), np.zeros((height, width), bool))))
     held_out = tuple(shots[i] for i in HELD_OUT)
     train = tuple(shot for i, shot in enumerate(shots) if i not in HELD_OUT)
     return FitProblem(np.zeros(3), train, held_out, Tracks(None, np.zeros(3)), None), shaken(truth, len(train))

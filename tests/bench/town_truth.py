@@ -6,14 +6,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.fit.losses import ssim, target_of
+from tasks.render.fit.losses import photo_target, ssim
 from tasks.render.fit.reconstruct import pixel_classes
 from tasks.render.fit.state import Road
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import Vehicles, render, vehicles_at
 from tasks.render.scene.movers import behind_boxes
 from tasks.render.scene.sensed import Photo, shift_pose
-from tasks.render.scene.sky import directions
+from tasks.render.scene.sky import pixel_directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.world.arrays import F32, Array
 from tasks.world.clip import AgentKind, AgentTracks, Pinhole
@@ -44,7 +44,9 @@ class Compared:
 
     @property
     def ssim(self) -> float:
-        target = target_of(np.rint(255.0 * self.truth).astype(np.uint8), None if self.inside is None else ~self.inside)
+        target = photo_target(
+            np.rint(255.0 * self.truth).astype(np.uint8), None if self.inside is None else ~self.inside
+        )
         return ssim(self.picture, target)[0]
 
 
@@ -120,7 +122,7 @@ class Truth:
             if _in_the_way(photo, boxes) or not near.any():
                 continue
             height, width = photo.rgb.shape[:2]
-            rays = directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3)
+            rays = pixel_directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3)
             inside = behind_boxes(rays * FAR_M + eye, eye, boxes[near]).reshape(height, width)
             if inside.sum() >= LEAST_PIXELS:
                 truth = _unit(self.painter_moved(photo.time_s, photo))

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.stages.warm import compile_kernels, marker
+from factory.stages.warm import compile_kernels, part_marker
 from factory.store.reader import SampleTable
 from tasks.caches import without_checksum
 from tasks.kernels.compiled import cache_dir
@@ -137,7 +137,7 @@ def give_compiled_kernels(head: Head) -> Path:
     compile_kernels(PARTS)
     cache = head.folder / "cache" / "driving-data-factory" / cache_dir().name
     for part in PARTS:
-        listing = marker(part)
+        listing = part_marker(part)
         for name in (listing.name, *without_checksum(listing.read_bytes(), listing.name).decode().splitlines()):
             (cache / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(cache_dir() / name, cache / name)

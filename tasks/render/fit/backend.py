@@ -22,7 +22,7 @@ from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyCells, look_up_sky, sky_cells
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
-from tasks.render.splatting.gradient import Gradients, backward, unmoved
+from tasks.render.splatting.gradient import Gradients, backward, untransformed_gradients
 from tasks.render.splatting.project import DEPTH
 from tasks.render.splatting.raster import ForwardPass, forward
 from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
@@ -252,7 +252,7 @@ def _gradients_by_owner(back: Gradients, parts: Sequence[OwnedGaussians]) -> tup
     for part in parts:
         span = slice(*np.searchsorted(back.index, [part.first, part.first + len(part.rows)]))
         piece = Gradients(**{name: getattr(back, name)[span] for name in _PER_GAUSSIAN}, camera=back.camera)
-        pieces.append(piece if part.scene_from_owner is None else unmoved(piece, part.scene_from_owner))
+        pieces.append(piece if part.scene_from_owner is None else untransformed_gradients(piece, part.scene_from_owner))
         rows.append(part.rows[piece.index - part.first])
     together = {name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in _PER_GAUSSIAN}
     return np.concatenate(rows), Gradients(**together, camera=back.camera)

@@ -24,7 +24,7 @@ class Target:
     weight: F32  # (H, W) 0: the pixel says nothing
 
 
-def target_of(rgb: Bytes, ignored: Bools | None = None) -> Target:
+def photo_target(rgb: Bytes, ignored: Bools | None = None) -> Target:
     """`rgb` (H, W, 3), `ignored` (H, W) pixels to leave out."""
     image = rgb.astype(np.float32) / np.float32(255.0)
     mean = _blur(image)
@@ -42,7 +42,7 @@ def ssim(rgb: F32, target: Target) -> tuple[float, F32]:
     back = np.empty((*rgb.shape[:2], 9), np.float32)
     share = target.weight / np.float32(3.0 * max(float(target.weight.sum()), 1.0))
     total = _similarity(_blur(_products(rgb, target.rgb)), target.mean, target.variance, share, back)
-    return total, _along(_blur(back), rgb, target.rgb)
+    return total, _chain_to_picture(_blur(back), rgb, target.rgb)
 
 
 @kernel
@@ -78,7 +78,7 @@ def _similarity(blurred: Any, mean: Any, variance: Any, share: Any, back: Any) -
 
 
 @kernel
-def _along(back: Any, x: Any, y: Any) -> Any:
+def _chain_to_picture(back: Any, x: Any, y: Any) -> Any:
     """Derivatives by x (H, W, 3), from those by x, x^2 and xy (H, W, 9)."""
     out = np.empty_like(x)
     for i in range(x.shape[0]):

@@ -33,7 +33,7 @@ from tasks.render.scene.movers import (
     world_from_boxes,
 )
 from tasks.render.scene.sensed import Photo, shift_pose
-from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap, directions
+from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap, pixel_directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import Backend, FitSettings
 from tasks.render.splatting.gaussians import moved
@@ -105,7 +105,7 @@ def boxes_at_photo(asset: RenderAsset, problem: FitProblem, photo: Photo) -> tup
 def pixel_classes(photo: Photo, vehicles: Array, road: Road | None) -> dict[str, Bools]:
     """Pixels (H, W) of a photo by class; `vehicles` (N, 7) boxes in its frame."""
     height, width = photo.rgb.shape[:2]
-    rays = directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3)
+    rays = pixel_directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3)
     eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
     on_vehicle = np.asarray(behind_boxes(eye + FAR_M * rays, eye, np.ascontiguousarray(vehicles)), bool)
     on_road = np.zeros(len(rays), bool) if road is None else rays_meet_road(road, eye, rays) & ~on_vehicle

@@ -14,7 +14,7 @@ from tasks.render.fit.corrections import (
     interpolate_in_time,
     with_common_exposure,
 )
-from tasks.render.fit.losses import Target, target_of
+from tasks.render.fit.losses import Target, photo_target
 from tasks.render.fit.state import (
     BACKGROUND,
     AdamArray,
@@ -31,7 +31,7 @@ from tasks.render.scene.depth import PhotoDepth, estimate_photo_depth, label_con
 from tasks.render.scene.features import NOTHING_KNOWN, KnownPoints, SurfacePoints, points_without_lidar
 from tasks.render.scene.movers import SHIFT_SIZE, behind_boxes
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse_sweeps, resize_photo, shift_pose
-from tasks.render.scene.sky import directions
+from tasks.render.scene.sky import pixel_directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians, concatenate, rotations_of
@@ -176,7 +176,7 @@ def _hidden_pixels(photo: Photo, tracks: Tracks, unknown: Bools) -> Bools | None
     if not (valid & unknown).any():
         return photo.own_body
     height, width = photo.rgb.shape[:2]
-    rays = directions(photo.intrinsics, photo.world_from_camera, width, height)
+    rays = pixel_directions(photo.intrinsics, photo.world_from_camera, width, height)
     eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
     far = rays.reshape(-1, 3) * FAR_M + eye
     hidden = np.asarray(behind_boxes(far, eye, boxes[valid & unknown]), bool).reshape(height, width)
@@ -185,9 +185,9 @@ def _hidden_pixels(photo: Photo, tracks: Tracks, unknown: Bools) -> Bools | None
 
 def _photo_target(photo: Photo, hidden: Bools | None) -> PhotoTarget:
     height, width = photo.rgb.shape[:2]
-    rays = directions(photo.intrinsics, photo.world_from_camera, width, height)
+    rays = pixel_directions(photo.intrinsics, photo.world_from_camera, width, height)
     ground = rays[..., 2] < -LOOKS_DOWN * np.linalg.norm(rays, axis=-1)
-    return PhotoTarget(target_of(photo.rgb, hidden), ground)
+    return PhotoTarget(photo_target(photo.rgb, hidden), ground)
 
 
 def _first_state(

@@ -30,7 +30,7 @@ from tasks.render.rig.adjust import (
 from tasks.render.scene.features import WIDE_M, driven_roads
 from tasks.render.scene.movers import behind_boxes
 from tasks.render.scene.sensed import Photo, Tracks
-from tasks.render.scene.sky import directions
+from tasks.render.scene.sky import pixel_directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.world.arrays import F32, Array, Bools, Bytes, Indices
 from tasks.world.clip import AgentTracks, Camera, SensorFile
@@ -465,7 +465,7 @@ def movable_mask(
     small = camera.resized(WIDTH, round(WIDTH * camera.height / camera.width))
     pose = file.world_from_ego @ camera.ego_from_camera
     eye = np.ascontiguousarray(pose[:3, 3])
-    rays = directions(small.intrinsics, pose, small.width, small.height)
+    rays = pixel_directions(small.intrinsics, pose, small.width, small.height)
     larger = boxes[there] + np.array([0.0, 0.0, 0.0, 0.0, LARGER_M, LARGER_M, LARGER_M])
     hidden = behind_boxes((rays * FAR_M).reshape(-1, 3) + eye, eye, larger)
     hidden = np.asarray(hidden.reshape(small.height, small.width))

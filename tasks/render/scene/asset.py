@@ -81,7 +81,7 @@ class OwnBody:
 
 
 @dataclass(frozen=True)
-class TakenFrom:
+class PhotoPose:
     """Where the ego was when a photo of the scene was taken, as the photos say."""
 
     camera: str
@@ -105,7 +105,7 @@ class RenderAsset:
     exposures: tuple[Exposure, ...] = ()  # of the photos, where they were aligned
     block: BlockRange | None = None  # filled by whoever knows the log
     rig: tuple[Camera, ...] = ()  # cameras that its photos were corrected to; empty: they are as given
-    taken: tuple[TakenFrom, ...] = ()  # its photos, where their poses were corrected
+    taken: tuple[PhotoPose, ...] = ()  # its photos, where their poses were corrected
     bodies: tuple[OwnBody, ...] = ()  # of the cameras that were said to see one
     shifts: BoxShifts = NO_SHIFTS  # of its tracks, where photos were asked
     screen: ScreenFilter = FITTED  # what its Gaussians were made to be drawn through
@@ -160,7 +160,7 @@ class RenderAsset:
         return np.asarray(first.affine + share * (last.affine - first.affine), np.float32)
 
 
-def photo_rises(taken: Sequence[TakenFrom]) -> tuple[Array, Array]:
+def photo_rises(taken: Sequence[PhotoPose]) -> tuple[Array, Array]:
     """Times (T,) of photos, ascending, and how much higher (T,) [m] they were taken than the log has it."""
     rows = np.array(sorted((photo.time_s, photo.rise_m) for photo in taken)).reshape(-1, 2)
     return rows[:, 0], rows[:, 1]

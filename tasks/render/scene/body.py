@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from tasks.kernels.compiled import kernel
 from tasks.render.scene.depth import SHALLOW, STREET, PhotoDepth
 from tasks.render.scene.sensed import Photo, Tracks
-from tasks.render.scene.sky import directions
+from tasks.render.scene.sky import pixel_directions
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import AgentKind
@@ -46,7 +46,7 @@ def _with_body_depth(photo: Photo, sight: PhotoDepth, tracks: Tracks) -> PhotoDe
     if not driving.any():
         return sight
     height, width = sight.depth.shape
-    rays = directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3)
+    rays = pixel_directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3)
     depth, first = nearest_box_along_rays(rays, eye, bodies)
     drives = (first >= 0) & driving[first]
     depth, drives = depth.reshape(height, width), drives.reshape(height, width)

@@ -18,7 +18,7 @@ from tasks.render.scene.engine import Vehicles, render
 from tasks.render.scene.features import NOTHING_KNOWN, KnownPoints, SurfacePoints, points_without_lidar
 from tasks.render.scene.movers import box_of_points, world_from_boxes
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse_sweeps, shift_pose
-from tasks.render.scene.sky import SkyMap, directions, sky_of_views
+from tasks.render.scene.sky import SkyMap, pixel_directions, sky_of_views
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.scene.surfels import (
     BACKGROUND,
@@ -26,7 +26,7 @@ from tasks.render.scene.surfels import (
     choose_discs,
     count_free_space,
     discs_of_photo,
-    gaussians_of,
+    discs_to_gaussians,
     with_mirror_image,
 )
 from tasks.render.settings import AssetSettings
@@ -129,8 +129,8 @@ def build_surfaces(
         if j == BACKGROUND or len(discs.points) < MIN_NODE_DISCS:
             continue
         whole = with_mirror_image(discs) if tracks.kinds[j] == AgentKind.VEHICLE else discs
-        nodes[tracks.ids[j]] = gaussians_of(whole)
-    return gaussians_of(kept[BACKGROUND]) if BACKGROUND in kept else EMPTY, nodes
+        nodes[tracks.ids[j]] = discs_to_gaussians(whole)
+    return discs_to_gaussians(kept[BACKGROUND]) if BACKGROUND in kept else EMPTY, nodes
 
 
 def _confirmed_by_photos(points: Array, guessed: Bools, photos: Sequence[Photo], carvers: Sequence[F32]) -> Bools:
@@ -149,7 +149,7 @@ def build_sky(photos: Sequence[Photo], seen: Sequence[PhotoDepth]) -> SkyMap:
         for photo, sight in zip(photos, seen):
             height, width = sight.depth.shape
             use = ~sight.passing
-            rays = directions(photo.intrinsics, photo.world_from_camera, width, height)[use]
+            rays = pixel_directions(photo.intrinsics, photo.world_from_camera, width, height)[use]
             yield rays, photo.light[use], sight.sky[use]
 
     return sky_of_views(views())

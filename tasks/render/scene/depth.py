@@ -15,7 +15,7 @@ from tasks.kernels.compiled import kernel
 from tasks.render.scene.features import SurfacePoints, road_depth
 from tasks.render.scene.movers import behind_boxes, world_from_boxes
 from tasks.render.scene.sensed import Photo, Tracks
-from tasks.render.scene.sky import directions, may_be_sky, sky_agrees
+from tasks.render.scene.sky import may_be_sky, pixel_directions, sky_agrees
 from tasks.render.scene.stereo import (
     FAR_M,
     MAX_BASELINE_M,
@@ -226,7 +226,7 @@ def estimate_photo_depth(
         np.concatenate(points), np.concatenate(labels), photo.intrinsics, photo.world_from_camera, width, height
     )
     depth, label = dense_depth(sparse, label, rgb)
-    rays = directions(photo.intrinsics, photo.world_from_camera, width, height)
+    rays = pixel_directions(photo.intrinsics, photo.world_from_camera, width, height)
     eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
 
     def behind(depth: F32, boxes: Array) -> Bools:

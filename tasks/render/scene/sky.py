@@ -125,7 +125,7 @@ def smooth_around(rgb: F32, among: Bools) -> Bools:
     return np.asarray(smooth > SMOOTH_SHARE * cv2.blur(among.astype(np.float32), wide))
 
 
-def directions(intrinsics: Array, world_from_camera: Array, width: int, height: int) -> Array:
+def pixel_directions(intrinsics: Array, world_from_camera: Array, width: int, height: int) -> Array:
     """(H, W, 3) viewing directions in the world, not normalised."""
     return np.asarray(camera_rays(intrinsics, width, height) @ world_from_camera[:3, :3].T)
 

@@ -134,7 +134,7 @@ def _tangents(points: Array, depth: F32, axis: int, flat: Array) -> Array:
     return np.asarray(step * (np.minimum(length, MAX_ELONGATION * shortest) / np.maximum(length, 1e-9))[..., None])
 
 
-def gaussians_of(discs: Discs) -> Gaussians:
+def discs_to_gaussians(discs: Discs) -> Gaussians:
     """Flat Gaussians that spread over each disc."""
     across, down = discs.across.astype(np.float64), discs.down.astype(np.float64)
     # Principal axes of across across^T + down down^T in its own plane.
@@ -211,7 +211,7 @@ def _box(size: tuple[float, float, float], kind: AgentKind) -> Gaussians:
         down.append(step2)
         colours.append(colour)
     stacked = np.concatenate(points)
-    return gaussians_of(
+    return discs_to_gaussians(
         Discs(
             stacked,
             np.concatenate(across).astype(np.float32),

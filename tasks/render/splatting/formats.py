@@ -252,12 +252,12 @@ def _is_splatfacto(content: Any) -> bool:
     return "pipeline" in content and not any("gaussian_models." in name for name in content["pipeline"])
 
 
-def splatfacto(gaussians: Gaussians) -> dict[str, Any]:
+def to_splatfacto(gaussians: Gaussians) -> dict[str, Any]:
     """What nerfstudio's splatfacto would have saved of them."""
     return {"step": 0, "pipeline": {f"_model.gauss_params.{name}": a for name, a in parameters_of(gaussians).items()}}
 
 
-def worldengine(background: Gaussians, origin: Array, vehicles: Sequence[LoggedVehicle] = ()) -> dict[str, Any]:
+def to_worldengine(background: Gaussians, origin: Array, vehicles: Sequence[LoggedVehicle] = ()) -> dict[str, Any]:
     """A street as WorldEngine reads it, `origin` (3,) [m] in the world, with its vehicles.
 
     Raises ValueError for a vehicle that is nowhere in the log.
@@ -265,21 +265,21 @@ def worldengine(background: Gaussians, origin: Array, vehicles: Sequence[LoggedV
     config = _config("VanillaGaussianSplattingModel", background)
     config["recon2world_translation"] = [float(value) for value in origin]
     street = {BACKGROUND: {"config": config, "state_dict": gauss_params(background)}}
-    return street | {f"{RIGID}{vehicle.token}": _logged(vehicle) for vehicle in vehicles}
+    return street | {f"{RIGID}{vehicle.token}": _vehicle_part(vehicle) for vehicle in vehicles}
 
 
 def _config(kind: str, gaussians: Gaussians) -> dict[str, Any]:
     return {"type": kind, "sh_degree": sh.COUNTS.index(gaussians.sh_rest.shape[1]), "scale_dim": 3}
 
 
-def _logged(vehicle: LoggedVehicle) -> dict[str, Any]:
+def _vehicle_part(vehicle: LoggedVehicle) -> dict[str, Any]:
     """A vehicle's part, as `_node` takes it back; stamps are microseconds (rigid_object.py)."""
     rotations, places = vehicle.scene_from_box[:, :3, :3], vehicle.scene_from_box[:, :3, 3]
     there = np.flatnonzero(np.isfinite(places).all(axis=1))
     if not len(there) or len(places) < 2:  # of one pose WorldEngine takes it for a thing that never moves
         raise ValueError(f"{vehicle.token}: it takes two instants, and a place at one of them, to write a vehicle")
     middle = rotations[there[len(there) // 2]]
-    gaussians = replace(vehicle.gaussians, sh_rest=sh.turned(vehicle.gaussians.sh_rest, middle))
+    gaussians = replace(vehicle.gaussians, sh_rest=sh.rotate_coefficients(vehicle.gaussians.sh_rest, middle))
     poses = np.tile([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, ABSENT_M], (len(places), 1))
     poses[there] = np.concatenate([quats_of(rotations[there]), places[there]], axis=1)
     config = _config("RigidSubModel", gaussians)
@@ -316,7 +316,7 @@ def _parts(content: object) -> dict[str, _StoredPart]:
     if not isinstance(content, Mapping):
         raise ValueError(f"checkpoint: expected names and values, found {type(content).__name__}")
     if isinstance(content.get("pipeline"), Mapping):
-        return _trained(content["pipeline"])
+        return _training_parts(content["pipeline"])
     if content and all(
         isinstance(part, Mapping) and {"config", "state_dict"} <= set(part) for part in content.values()
     ):
@@ -327,7 +327,7 @@ def _parts(content: object) -> dict[str, _StoredPart]:
     )
 
 
-def _trained(pipeline: Mapping[str, Any]) -> dict[str, _StoredPart]:
+def _training_parts(pipeline: Mapping[str, Any]) -> dict[str, _StoredPart]:
     """Of a training's checkpoint."""
     states: dict[str, dict[str, Array]] = {}
     for name, value in pipeline.items():
@@ -378,7 +378,7 @@ def _node(part: _StoredPart, name: str) -> Gaussians:
     if not len(there):
         return found
     box_from_world = rotations_of(quats[there[len(there) // 2]][None].astype(np.float32))[0].T
-    return replace(found, sh_rest=sh.turned(found.sh_rest, np.asarray(box_from_world, np.float64)))
+    return replace(found, sh_rest=sh.rotate_coefficients(found.sh_rest, np.asarray(box_from_world, np.float64)))
 
 
 def _gaussians(part: _StoredPart, name: str, traversal: int | None) -> Gaussians:

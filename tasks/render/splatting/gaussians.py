@@ -70,7 +70,7 @@ def moved(gaussians: Gaussians, target_from_source: Array) -> Gaussians:
     rotation = target_from_source[:3, :3]
     means = gaussians.means @ rotation.T + target_from_source[:3, 3]
     quats = turned_quats(quats_of(rotation[None])[0], gaussians.quats)
-    sh_rest = sh.turned(gaussians.sh_rest, rotation)
+    sh_rest = sh.rotate_coefficients(gaussians.sh_rest, rotation)
     return replace(gaussians, means=means.astype(np.float32), quats=quats.astype(np.float32), sh_rest=sh_rest)
 
 

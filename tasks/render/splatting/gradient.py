@@ -78,7 +78,7 @@ ROW = np.uint64(CHANNELS * TILE)
 
 
 @kernel
-def _load(
+def _load_tile(
     buffer: Any, x0: int, y0: int, d_rgb: Any, d_depth: Any, d_alpha: Any, rgb: Any, depth: Any, alpha: Any
 ) -> None:
     """A tile's upstream derivatives by rgb, sum of weight * depth and sum of weight; and in channel 1 those times the
@@ -137,7 +137,7 @@ def blend_gradient(
     for t in range(first_tile, last_tile):
         tx, ty = t % tiles_x, t // tiles_x
         x0, y0 = tx * TILE, ty * TILE
-        _load(buffer, x0, y0, d_rgb, d_depth, d_alpha, rgb, depth, alpha)
+        _load_tile(buffer, x0, y0, d_rgb, d_depth, d_alpha, rgb, depth, alpha)
         fetch_ahead(projected, tile_splats, tile_start[t], min(tile_start[t] + BATCH, ends[t]))
         for batch in range(tile_start[t], ends[t], BATCH):
             following = min(batch + BATCH, ends[t])
@@ -219,7 +219,7 @@ def _conic_gradient(block: Any) -> Any:
 
 
 @inlined
-def _between(value: Any, at: Any, least: Any, most: Any) -> Any:
+def _where_between(value: Any, at: Any, least: Any, most: Any) -> Any:
     """`value` where `at` is strictly between the limits, else 0."""
     return where_below(at, most, where_below(least, at, value))
 
@@ -273,9 +273,9 @@ def _pulled_back(block: Any, rows: Any, centre: Any, fx: Any, fy: Any, limits: A
     store(block, S2, du[2] * d_du[2] + dv[2] * d_dv[2])
     by_u, by_v = (s[0] * d_du[0], s[1] * d_du[1], s[2] * d_du[2]), (s[0] * d_dv[0], s[1] * d_dv[1], s[2] * d_dv[2])
     by_axes = (
-        _both(to_u, by_u[0], to_v, by_v[0]),
-        _both(to_u, by_u[1], to_v, by_v[1]),
-        _both(to_u, by_u[2], to_v, by_v[2]),
+        _weighted_sum(to_u, by_u[0], to_v, by_v[0]),
+        _weighted_sum(to_u, by_u[1], to_v, by_v[1]),
+        _weighted_sum(to_u, by_u[2], to_v, by_v[2]),
     )
     _store_quaternions(block, q, shorten, by_axes)
 
@@ -283,8 +283,8 @@ def _pulled_back(block: Any, rows: Any, centre: Any, fx: Any, fy: Any, limits: A
     pull_u, pull_v = _turned(rows, _mixed(axes, by_u)), _turned(rows, _mixed(axes, by_v))
     d_a, d_b = pull_u[0] - jx * pull_u[2], pull_v[1] - jy * pull_v[2]
     d_u, d_v = load(block, D_U), load(block, D_V)
-    d_tx = fx * d_u - _between(a * pull_u[2], tx, limits[0], limits[1])
-    d_ty = fy * d_v - _between(b * pull_v[2], ty, limits[2], limits[3])
+    d_tx = fx * d_u - _where_between(a * pull_u[2], tx, limits[0], limits[1])
+    d_ty = fy * d_v - _where_between(b * pull_v[2], ty, limits[2], limits[3])
     d_x, d_y = d_tx * nearness, d_ty * nearness
     d_z = load(block, BY_DEPTH) - (d_tx * tx + d_ty * ty + d_a * a + d_b * b) * nearness
     turn_x = y * d_z - z * d_y - a * jx * pull_u[1] - b * (jy * pull_v[1] + pull_v[2])
@@ -297,7 +297,7 @@ def _pulled_back(block: Any, rows: Any, centre: Any, fx: Any, fy: Any, limits: A
 
 
 @inlined
-def _both(a: Any, s: Any, b: Any, t: Any) -> Any:
+def _weighted_sum(a: Any, s: Any, b: Any, t: Any) -> Any:
     """s a + t b of triples a and b."""
     return (fma(a[0], s, b[0] * t), fma(a[1], s, b[1] * t), fma(a[2], s, b[2] * t))
 
@@ -305,7 +305,7 @@ def _both(a: Any, s: Any, b: Any, t: Any) -> Any:
 @inlined
 def _mixed(axes: Any, weights: Any) -> Any:
     """The sum of three triples, each times its weight."""
-    first, second = _both(axes[0], weights[0], axes[1], weights[1]), scaled(axes[2], weights[2])
+    first, second = _weighted_sum(axes[0], weights[0], axes[1], weights[1]), scaled(axes[2], weights[2])
     return first[0] + second[0], first[1] + second[1], first[2] + second[2]
 
 
@@ -445,7 +445,7 @@ def _pairs(
     return out
 
 
-def unmoved(gradients: Gradients, target_from_source: Array) -> Gradients:
+def untransformed_gradients(gradients: Gradients, target_from_source: Array) -> Gradients:
     """Derivatives by the Gaussians in the frame that `gaussians.moved` took them from.
 
     `target_from_source` (4, 4) as given there; what belongs to the picture or the camera stays.

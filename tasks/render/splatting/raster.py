@@ -404,7 +404,7 @@ def forward(
 def colours_seen(gaussians: Gaussians, camera_center: Array, index: Ints, threads: int = 1) -> F32:
     """rgb (M, 3) of the Gaussians at `index` (M,), as seen from `camera_center` (3,) in their frame; never negative."""
     center, out = np.ascontiguousarray(camera_center, np.float64), np.empty((len(index), 3), np.float32)
-    see = partial(sh.seen, gaussians.means, gaussians.colours, gaussians.sh_rest, center, index, out)
+    see = partial(sh.shade_from, gaussians.means, gaussians.colours, gaussians.sh_rest, center, index, out)
     run_in_chunks(see, len(index), GAUSSIANS_CHUNK, threads)
     return out
 

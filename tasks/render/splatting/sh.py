@@ -47,7 +47,9 @@ def basis(directions: Any, count: int) -> Any:
 
 
 @kernel
-def seen(means: Any, colours: Any, sh_rest: Any, center: Any, index: Any, out: Any, first: int, last: int) -> None:
+def shade_from(
+    means: Any, colours: Any, sh_rest: Any, center: Any, index: Any, out: Any, first: int, last: int
+) -> None:
     """Fills rgb (M, 3), never negative, of the Gaussians at `index` (M,) as seen from `center` (3,) float64, for rows
     `first` to `last`."""
     count = sh_rest.shape[1]
@@ -65,15 +67,15 @@ def seen(means: Any, colours: Any, sh_rest: Any, center: Any, index: Any, out: A
             out[k, c] = max(total, 0.0)
 
 
-def turned(sh_rest: F32, matrix: Array) -> F32:
+def rotate_coefficients(sh_rest: F32, matrix: Array) -> F32:
     """Coefficients (N, M, 3) of the same light in a frame turned, or mirrored, by the orthogonal `matrix` (3, 3)."""
     count = sh_rest.shape[1]
     if count == 0 or np.array_equal(matrix, np.eye(3)):
         return sh_rest
-    return np.einsum("ab,nbc->nac", turning(matrix, count), sh_rest).astype(np.float32)
+    return np.einsum("ab,nbc->nac", coefficient_rotation(matrix, count), sh_rest).astype(np.float32)
 
 
-def turning(matrix: Array, count: int) -> Array:
+def coefficient_rotation(matrix: Array, count: int) -> Array:
     """The orthogonal (count, count) matrix that takes coefficients to the frame turned by `matrix` (3, 3).
 
     The turned light f(matrix^T d) is again a sum of basis functions, so it is read off exactly from more directions

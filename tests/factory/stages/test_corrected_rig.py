@@ -14,7 +14,7 @@ from factory.readers.base import BadClip
 from factory.stages.assets import RIG_SUFFIX, correct_block_rig, is_rig_corrected, read_or_correct_rig
 from tasks.render.rig.adjust import motions_of_twists, twists_of
 from tasks.render.rig.correct import estimate_ground_height
-from tasks.render.scene.asset import RenderAsset, TakenFrom
+from tasks.render.scene.asset import PhotoPose, RenderAsset
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky import SkyMap
 from tasks.render.settings import Adjust, RigSettings
@@ -64,7 +64,7 @@ def test_photos_are_looked_at_from_where_the_scene_says_that_they_were_taken(blo
     scene left out are not looked at."""
     moved = np.eye(4)
     moved[0, 3] = 0.4
-    taken = [TakenFrom(file.sensor, file.time_s, moved @ file.world_from_ego) for file in block.images[2:]]
+    taken = [PhotoPose(file.sensor, file.time_s, moved @ file.world_from_ego) for file in block.images[2:]]
     asset = RenderAsset(np.zeros(3), EMPTY, {}, SkyMap(np.zeros((2, 2, 3), np.float32)), 30.0, taken=tuple(taken))
     found = asset.photos_of(block.images)
     assert [file.uri for file in found] == [file.uri for file in block.images[2:]]

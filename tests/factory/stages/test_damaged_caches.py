@@ -18,7 +18,7 @@ from factory.setup.settings import _recovery_table
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table, save_vocabulary
 from factory.stages.assets import RIG_SUFFIX, _resumed, _write_rig_file, damaged_blocks, read_rig_file
 from factory.stages.scene_file import BadScene, read_scene, write_scene
-from factory.stages.warm import _is_compiled, marker, tiny_clip
+from factory.stages.warm import _is_compiled, part_marker, tiny_clip
 from factory.store.location import BadCacheFile, Location, SceneFiles, encode_tree
 from tasks.caches import (
     SEAL_BYTES,
@@ -177,7 +177,7 @@ def test_compiled_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines
 
 def test_the_list_of_a_part_s_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: Lines) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    path = marker("judge")
+    path = part_marker("judge")
     path.parent.mkdir()
     (path.parent / "a.kernel").touch()
     path.write_bytes(with_checksum(b"a.kernel", path.name))
@@ -256,10 +256,10 @@ def test_what_is_half_done_and_a_list_of_kernels_are_not_another_s(
         np.savez(file, iteration=np.array(500), owner=np.arange(20))
     append_checksum(fit, fit.name)
     assert _resumed(fit.rename(tmp_path / "block-2.fit.npz"), start) is start  # type: ignore[comparison-overlap, arg-type]
-    marker("judge").parent.mkdir()
-    marker("judge").write_bytes(with_checksum(b"", marker("judge").name))
+    part_marker("judge").parent.mkdir()
+    part_marker("judge").write_bytes(sealed(b"", part_marker("judge").name))
     assert _is_compiled("judge")
-    marker("judge").rename(marker("fit"))
+    part_marker("judge").rename(part_marker("fit"))
     assert not _is_compiled("fit")
     assert [line.endswith(("begins again", "made again")) for line in lines()] == [True, True]
 

@@ -16,7 +16,7 @@ import pytest
 
 from factory.graph.steps import NotReady
 from factory.stages.warm import compile_kernels, compiling_ahead
-from tasks.kernels.compiled import cache_dir, kernel_sources, remove_unused, sources_digest
+from tasks.kernels.compiled import cache_dir, kernel_sources, remove_unused_caches, sources_digest
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 DECORATORS = {"njit", "jit", "kernel", "inlined", "inner_kernel", "hidden_kernel", "drawing_kernel"}
@@ -173,7 +173,7 @@ def test_kernels_that_nobody_has_used_for_a_month_are_removed_and_nothing_else(t
         kept_kernels(tmp_path, "kernels-6.1", 400.0),  # somebody else's
         kept_kernels(tmp_path, "towns", 400.0),
     ]
-    remove_unused(tmp_path)
+    remove_unused_caches(tmp_path)
     assert not [folder for folder in unused if folder.exists()]
     assert all((folder / "tasks" / "f.kernel").is_file() for folder in kept)
     assert sorted(tmp_path.iterdir()) == sorted(kept)
@@ -183,7 +183,7 @@ def test_several_that_remove_at_once_do_not_trip_over_each_other(tmp_path: Path)
     for k in range(40):
         kept_kernels(tmp_path, f"kernels-{k:016x}", 31.0)
     with ThreadPoolExecutor(8) as pool:
-        list(pool.map(remove_unused, [tmp_path] * 8))
+        list(pool.map(remove_unused_caches, [tmp_path] * 8))
     assert not list(tmp_path.iterdir())
 
 

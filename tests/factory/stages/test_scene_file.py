@@ -14,14 +14,14 @@ from factory.stages.scene_file import (
     IN_HALF,
     KEY,
     BadScene,
-    described_by,
-    digest_of,
     read_dtype,
     read_scene,
-    tensors_of,
+    scene_digest,
+    scene_header,
+    scene_tensors,
     write_scene,
 )
-from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, RenderAsset, TakenFrom, ViewQuality
+from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, PhotoPose, RenderAsset, ViewQuality
 from tasks.render.scene.movers import NO_SHIFTS, BoxShifts
 from tasks.render.scene.sky import SkyMap
 from tasks.render.settings import SceneDtype
@@ -49,7 +49,7 @@ def scene() -> RenderAsset:
         ),
         exposures=(Exposure("front", 0.5, np.eye(3, 4, dtype=np.float32) * 1.1),),
         block=BlockRange("av2", "log", 10.0, 30.0, np.array([-1.5, 2.0]), np.array([8.0, 3.25])),
-        taken=(TakenFrom("front", 0.1 + 0.2, np.eye(4) * 0.1),),
+        taken=(PhotoPose("front", 0.1 + 0.2, np.eye(4) * 0.1),),
         shifts=BoxShifts(("a",), np.arange(12, dtype=np.float32).reshape(1, 3, 4)),
         screen=CLASSIC,
     )
@@ -61,10 +61,10 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     back = read_scene(tmp_path / "deep" / "x.safetensors")
     assert back.digest == written.digest and len(back.digest) == 16
     assert list(back.nodes) == list(asset.nodes)  # the order of the nodes is kept
-    for name, array in tensors_of(asset).items():
-        stored = tensors_of(back)[name]
+    for name, array in scene_tensors(asset).items():
+        stored = scene_tensors(back)[name]
         assert (stored.dtype, stored.tobytes()) == (array.dtype, array.tobytes()), name
-    assert described_by(back) == described_by(asset) and back.screen == asset.screen == CLASSIC
+    assert scene_header(back) == scene_header(asset) and back.screen == asset.screen == CLASSIC
     assert back.views[0] == asset.views[0] and np.isnan(back.views[1].ssim) and np.isinf(back.views[1].psnr_db)
     assert back.block is not None and back.block.low.tolist() == [-1.5, 2.0]
     assert back.psnr_db == 27.123456789 and back.shifts.track_ids == ("a",)
@@ -99,8 +99,8 @@ def test_in_16_bits_places_stay_and_all_else_is_the_nearest_number_of_11_bits(tm
     write_scene(plain, whole)
     assert (read_dtype(path), read_dtype(plain)) == (SceneDtype.FLOAT16, SceneDtype.FLOAT32)
     assert path.stat().st_size < 0.56 * plain.stat().st_size  # 124 of 236 bytes a Gaussian, and the rest
-    for name, array in tensors_of(whole).items():
-        first, second = tensors_of(written)[name], tensors_of(back)[name]
+    for name, array in scene_tensors(whole).items():
+        first, second = scene_tensors(written)[name], scene_tensors(back)[name]
         assert first.tobytes() == second.tobytes() and second.dtype == array.dtype, name  # built or read: the same
         if name.startswith("background.") and name.rpartition(".")[2] in IN_HALF:
             error = 2.0 ** (-10 if name.endswith(".quats") else -11)  # a quaternion's length is put right
@@ -145,7 +145,9 @@ def test_what_16_bits_do_not_hold_is_named_and_nothing_is_written(tmp_path: Path
 )
 def test_the_digest_sees_every_part(changed: Callable[[RenderAsset], RenderAsset]) -> None:
     first, other = scene(), changed(scene())
-    assert digest_of(tensors_of(first), described_by(first)) != digest_of(tensors_of(other), described_by(other))
+    assert scene_digest(scene_tensors(first), scene_header(first)) != scene_digest(
+        scene_tensors(other), scene_header(other)
+    )
 
 
 def test_any_program_reads_the_file_without_this_project(tmp_path: Path) -> None:
@@ -161,7 +163,7 @@ def test_one_flipped_bit_anywhere_in_the_tensors_is_found(tmp_path: Path, dtype:
     path = tmp_path / "x"
     write_scene(path, scene(), dtype)
     whole = bytearray(path.read_bytes())
-    start = len(whole) - sum(array.nbytes for array in tensors_of(scene(), dtype).values())
+    start = len(whole) - sum(array.nbytes for array in scene_tensors(scene(), dtype).values())
     for at in np.linspace(start, len(whole) - 1, 7).astype(int):
         damaged = whole.copy()
         damaged[at] ^= 1
@@ -201,14 +203,14 @@ def test_a_foreign_header_is_named(tmp_path: Path, header: str, said: str) -> No
 
 
 def test_a_consistent_file_without_an_array_is_named(tmp_path: Path) -> None:
-    tensors, described = tensors_of(scene()), described_by(scene())
+    tensors, described = scene_tensors(scene()), scene_header(scene())
     del tensors["nodes.1.quats"]
-    header = json.dumps(described | {"digest": digest_of(tensors, described), "kept_as": "x"})
+    header = json.dumps(described | {"digest": scene_digest(tensors, described), "kept_as": "x"})
     save_file(tensors, tmp_path / "x", metadata={KEY: header})
     with pytest.raises(BadScene, match=r"KeyError 'nodes\.1\.quats'"):
         read_scene(tmp_path / "x")
 
 
 def test_every_field_of_the_gaussians_has_its_tensor() -> None:
-    names = set(tensors_of(scene()))
+    names = set(scene_tensors(scene()))
     assert {f"background.{field.name}" for field in fields(Gaussians)} <= names

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from factory.config.run import load_config, photos_alone
-from factory.stages.warm import compile_kernels, marker, parts_of
+from factory.stages.warm import compile_kernels, kernel_parts, part_marker
 from tasks.caches import without_checksum
 from tasks.kernels.compiled import cache_dir
 from tasks.render.settings import Adjust, RenderMode, RenderSettings, RigSettings
@@ -41,7 +41,7 @@ def done_with_these(parts: list[str], tmp_path: Path, *command: str) -> tuple[se
     compile_kernels(parts)
     cache = tmp_path / "cache" / cache_dir().name
     for part in parts:
-        listing = marker(part)
+        listing = part_marker(part)
         for name in (listing.name, *without_checksum(listing.read_bytes(), listing.name).decode().splitlines()):
             (cache / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(cache_dir() / name, cache / name)
@@ -102,6 +102,7 @@ def test_kernels_of_the_rig_s_correction_are_compiled_where_it_may_be_corrected(
     def asked(photos_alone: bool, **how: object) -> bool:
         render = RenderSettings(**how)  # type: ignore[arg-type]
         return "rig" in parts_of(True, "idm", render, photos_alone)
+        return "rig" in kernel_parts(True, "idm", None, render, photos_alone)
 
     assert asked(photos_alone=True) and not asked(photos_alone=False)
     assert asked(photos_alone=False, rig=RigSettings(adjust=Adjust.ON))

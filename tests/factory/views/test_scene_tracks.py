@@ -13,7 +13,7 @@ from factory.readers.base import ClipRef
 from factory.stages.scene_file import read_scene, write_scene
 from factory.store.samples import ClipCandidates, Store
 from factory.views.scene_files import logged_vehicles
-from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom
+from tasks.render.scene.asset import BlockRange, PhotoPose, RenderAsset
 from tasks.render.scene.engine import Vehicles, render, vehicles_at
 from tasks.render.scene.movers import boxes_at, world_from_boxes
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
@@ -94,7 +94,7 @@ def test_a_block_goes_out_with_its_vehicles_and_its_pictures_come_back(
 
 
 def test_poses_are_the_log_s_in_the_scene_s_frame_on_its_road_and_of_all_its_clips(run: Store, block: Path) -> None:
-    asset = replace(read_scene(block), taken=(TakenFrom("front", 0.0, np.eye(4), 0.4),))  # the road lies 0.4 m higher
+    asset = replace(read_scene(block), taken=(PhotoPose("front", 0.0, np.eye(4), 0.4),))  # the road lies 0.4 m higher
     vehicles, unseen = logged_vehicles(run, asset)
     assert unseen == ["never seen"] and len(vehicles) == 2
     first, later, _ = clips()

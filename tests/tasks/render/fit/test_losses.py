@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.render.fit.losses import opaque_loss, photo_loss, ssim, target_of
+from tasks.render.fit.losses import opaque_loss, photo_loss, photo_target, ssim
 
 RNG = np.random.default_rng(0)
 PHOTO = RNG.integers(0, 256, (17, 23, 3)).astype(np.uint8)
@@ -30,7 +30,7 @@ def slow_ssim(x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np
 
 
 def test_ssim_is_what_its_definition_says() -> None:
-    target = target_of(PHOTO)
+    target = photo_target(PHOTO)
     expected = slow_ssim(PICTURE.astype(np.float64), PHOTO / 255.0, np.ones(PHOTO.shape[:2]))
     assert ssim(PICTURE, target)[0] == pytest.approx(expected, abs=1e-5)
     assert ssim(target.rgb, target)[0] == pytest.approx(1.0, abs=1e-5)
@@ -39,7 +39,7 @@ def test_ssim_is_what_its_definition_says() -> None:
 def test_ssim_gradient_agrees_with_finite_differences() -> None:
     ignored = np.zeros(PHOTO.shape[:2], bool)
     ignored[4:9, 3:7] = True
-    target = target_of(PHOTO, ignored)
+    target = photo_target(PHOTO, ignored)
     gradient = ssim(PICTURE, target)[1]
     x, y, weight = PICTURE.astype(np.float64), PHOTO / 255.0, (~ignored).astype(np.float64)
     for at in [(0, 0, 0), (5, 4, 1), (8, 11, 2), (16, 22, 0), (3, 7, 1)]:
@@ -53,7 +53,7 @@ def test_ssim_gradient_agrees_with_finite_differences() -> None:
 def test_a_picture_that_equals_the_photo_loses_nothing_and_ignored_pixels_do_not_count() -> None:
     ignored = np.zeros(PHOTO.shape[:2], bool)
     ignored[:, :5] = True
-    target = target_of(PHOTO, ignored)
+    target = photo_target(PHOTO, ignored)
     assert photo_loss(target.rgb, target, 0.2)[0] == pytest.approx(0.0, abs=1e-5)
     painted = target.rgb.copy()
     painted[:, :5] = 0.0

@@ -10,7 +10,7 @@ import torch
 
 from tasks.render.fit.backend import CpuBackend, Derivatives
 from tasks.render.fit.losses import photo_loss as photo_loss_by_hand
-from tasks.render.fit.losses import target_of
+from tasks.render.fit.losses import photo_target
 from tasks.render.fit.on_torch import LearnedTensor, TorchBackend, lay_flat, photo_loss
 from tasks.render.fit.reconstruct import finish_scene, run_iterations
 from tasks.render.fit.start import FitProblem, prepare_fit
@@ -161,7 +161,7 @@ def test_the_loss_of_a_picture_is_the_one_written_by_hand(ssim_weight: float) ->
     rng = np.random.default_rng(2)
     photo, ignored = rng.integers(0, 256, (23, 31, 3), dtype=np.uint8), rng.random((23, 31)) < 0.2
     picture = rng.uniform(-0.1, 1.1, (23, 31, 3)).astype(np.float32)
-    target = target_of(photo, ignored)
+    target = photo_target(photo, ignored)
     loss, gradient = photo_loss_by_hand(picture, target, ssim_weight)
     given = torch.tensor(picture, requires_grad=True)
     found = photo_loss(given, torch.tensor(target.rgb), torch.tensor(target.weight), ssim_weight)

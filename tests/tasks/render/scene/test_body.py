@@ -12,7 +12,7 @@ from tasks.render.scene import body
 from tasks.render.scene.body import FAR_M, body_boxes, nearest_box_along_rays, unseen_body_gaussians, with_body_depths
 from tasks.render.scene.depth import SHALLOW, STREET, PhotoDepth
 from tasks.render.scene.sensed import Tracks
-from tasks.render.scene.sky import directions
+from tasks.render.scene.sky import pixel_directions
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.world.clip import AgentTracks
@@ -96,7 +96,7 @@ def sighted(
     flat = np.full(shape, depth_m, np.float32)
     seen = PhotoDepth(flat, np.full(shape, label, np.int32), np.ones(shape, bool), np.zeros(shape, bool))
     (found,) = with_body_depths([photo], [seen], Tracks(agents, np.zeros(3)))
-    rays = directions(photo.intrinsics, photo.world_from_camera, *shape[::-1]).reshape(-1, 3)
+    rays = pixel_directions(photo.intrinsics, photo.world_from_camera, *shape[::-1]).reshape(-1, 3)
     away, _ = nearest_box_along_rays(rays, photo.world_from_camera[:3, 3], np.stack(body_boxes(street.car_box(AT_S))))
     return seen, found, away.reshape(shape)
 

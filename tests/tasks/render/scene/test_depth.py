@@ -5,8 +5,8 @@ import pytest
 from slow_raster import covariances_of
 
 from tasks.render.scene.depth import dense_depth, sparse_depth
-from tasks.render.scene.sky import directions, sky_of_views
-from tasks.render.scene.surfels import BACKGROUND, PhotoDiscs, choose_discs, discs_of_photo, gaussians_of
+from tasks.render.scene.sky import pixel_directions, sky_of_views
+from tasks.render.scene.surfels import BACKGROUND, PhotoDiscs, choose_discs, discs_of_photo, discs_to_gaussians
 
 INTRINSICS = np.array([[80.0, 0.0, 40.0], [0.0, 80.0, 30.0], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 80, 60
@@ -86,7 +86,7 @@ def test_a_second_photo_from_the_same_place_adds_nothing() -> None:
 
 
 def test_discs_become_flat_gaussians_that_lie_in_their_surface() -> None:
-    gaussians = gaussians_of(look((1, 1, 1), 4.0, 0.0).discs)
+    gaussians = discs_to_gaussians(look((1, 1, 1), 4.0, 0.0).discs)
     covariances = covariances_of(gaussians)
     assert np.sqrt(covariances[:, 2, 2]).max() < 0.2 * np.sqrt(covariances[:, 0, 0]).min()
     assert np.abs(np.linalg.norm(gaussians.quats, axis=1) - 1.0).max() < 1e-5
@@ -102,7 +102,7 @@ def test_a_plain_wall_needs_few_discs_and_a_patterned_one_all() -> None:
 
 
 def test_the_sky_is_the_colour_that_was_seen_in_its_direction() -> None:
-    rays = directions(INTRINSICS, np.array([[0, 0, 1.0, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]), 80, 60)
+    rays = pixel_directions(INTRINSICS, np.array([[0, 0, 1.0, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]), 80, 60)
     up = rays[..., 2] > 0.02
     colours = np.zeros((60, 80, 3), np.float32)
     colours[..., 0] = np.linspace(0, 1, 80)[None, :]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap, directions
+from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap, pixel_directions
 
 RNG = np.random.default_rng(4)
 SIZE = (53, 31)
@@ -13,7 +13,7 @@ K = np.array([[40.0, 0.0, 24.0], [0.0, 43.0, 17.5], [0.0, 0.0, 1.0]])
 
 def slow_lookup(sky: SkyMap, pose: NDArray[np.float64]) -> NDArray[np.float32]:
     """(H, W, 3), linear between the four cells around each direction; columns go round, rows end at the poles."""
-    rays = directions(K, pose, *SIZE)
+    rays = pixel_directions(K, pose, *SIZE)
     elevation = np.arctan2(rays[..., 2], np.hypot(rays[..., 0], rays[..., 1]))
     azimuth = np.arctan2(rays[..., 1], rays[..., 0])
     rows, columns = (0.5 - elevation / np.pi) * ROWS - 0.5, (azimuth / (2 * np.pi) + 0.5) * COLUMNS - 0.5

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tasks.render.splatting import sh
-from tasks.render.splatting.formats import LoggedVehicle, from_checkpoint, gauss_params, splatfacto, worldengine
+from tasks.render.splatting.formats import LoggedVehicle, from_checkpoint, gauss_params, to_splatfacto, to_worldengine
 from tasks.render.splatting.gaussians import Gaussians, moved, rotations_of
 from tasks.render.splatting.project import ANTIALIASED
 from tasks.world.frames import planar_matrices
@@ -36,19 +36,19 @@ def light(scene: Gaussians, towards: np.ndarray) -> np.ndarray:
 def test_what_goes_out_comes_back(count: int) -> None:
     scene = some(40, count)
     for content, screen in (
-        (splatfacto(scene), None),
-        (worldengine(scene, np.array([1.0, 2.0, 3.0])), ANTIALIASED),
+        (to_splatfacto(scene), None),
+        (to_worldengine(scene, np.array([1.0, 2.0, 3.0])), ANTIALIASED),
         (trained({"background": gauss_params(scene)}), ANTIALIASED),
     ):
         found = from_checkpoint(content)
         assert found.screen == screen
         assert max(apart(scene, found.background).values()) < 2e-6 and not found.nodes
-    assert from_checkpoint(worldengine(scene, np.array([1.0, 2.0, 3.0]))).origin.tolist() == [1.0, 2.0, 3.0]  # type: ignore[union-attr]
+    assert from_checkpoint(to_worldengine(scene, np.array([1.0, 2.0, 3.0]))).origin.tolist() == [1.0, 2.0, 3.0]  # type: ignore[union-attr]
 
 
 def test_a_file_of_splatfacto_before_its_parameters_had_a_prefix_is_read() -> None:
     scene = some(10, 3)
-    old = {name.replace("gauss_params.", ""): value for name, value in splatfacto(scene)["pipeline"].items()}
+    old = {name.replace("gauss_params.", ""): value for name, value in to_splatfacto(scene)["pipeline"].items()}
     assert set(old) == {f"_model.{name}" for name in NAMES}
     assert max(apart(scene, from_checkpoint({"pipeline": old}).background).values()) < 2e-6
 
@@ -105,7 +105,7 @@ def logged(token: str, node: Gaussians) -> LoggedVehicle:
 @pytest.mark.parametrize("count", sh.COUNTS)
 def test_vehicles_go_out_with_their_poses_and_come_back(count: int) -> None:
     street, cars = some(10, count, 1), {"7f": some(6, count, 2), "a-8": some(4, 0, 3)}
-    content = worldengine(street, np.zeros(3), [logged(token, car) for token, car in cars.items()])
+    content = to_worldengine(street, np.zeros(3), [logged(token, car) for token, car in cars.items()])
     found = from_checkpoint(content)
     assert list(found.nodes) == list(cars) and found.screen == ANTIALIASED
     for token, car in cars.items():
@@ -117,7 +117,7 @@ def test_a_vehicle_s_part_has_what_worldengine_s_loader_asks_for() -> None:
     of `state_dict` each parameter under gauss_params., instance_trans and instance_quats, a row for each stamp [us];
     mtgs.py cuts the part's name at its last underscore and takes poses above 1 km for absent."""
     vehicle = logged("7f", some(6, 3))
-    parts = worldengine(some(3, 3), np.zeros(3), [vehicle])
+    parts = to_worldengine(some(3, 3), np.zeros(3), [vehicle])
     assert list(parts) == ["background", "rigid_object_7f"]
     config, state = parts["rigid_object_7f"]["config"], parts["rigid_object_7f"]["state_dict"]
     assert (config["type"], config["sh_degree"], config["scale_dim"]) == ("RigidSubModel", 1, 3)
@@ -143,13 +143,13 @@ def test_a_vehicle_that_is_nowhere_is_named() -> None:
         replace(vehicle, times_s=np.array([2.0]), scene_from_box=vehicle.scene_from_box[1:2]),
     ):
         with pytest.raises(ValueError, match="7f: it takes two instants"):
-            worldengine(some(3, 0), np.zeros(3), [bad])
+            to_worldengine(some(3, 0), np.zeros(3), [bad])
 
 
 def test_half_a_vehicle_is_mirrored_about_its_length() -> None:
     half = some(4, 3)
     part = {"config": {"type": "MirroredRigidSubModel"}, "state_dict": gauss_params(half)}
-    whole = from_checkpoint(worldengine(half, np.zeros(3)) | {"rigid_object_ab": part}).nodes["ab"]
+    whole = from_checkpoint(to_worldengine(half, np.zeros(3)) | {"rigid_object_ab": part}).nodes["ab"]
     mirror = np.diag([1.0, -1.0, 1.0])
     assert len(whole) == 8
     other = whole.take(slice(4, 8))
@@ -184,10 +184,10 @@ def test_colours_that_are_waves_are_their_mean() -> None:
         "config": {"type": "RigidSubModel", "fourier_in_space": "spatial"},
         "state_dict": state | {"gauss_params.features_dc": waves},
     }
-    spatial = from_checkpoint(worldengine(scene, np.zeros(3)) | {"rigid_object_ab": part}).nodes["ab"]
+    spatial = from_checkpoint(to_worldengine(scene, np.zeros(3)) | {"rigid_object_ab": part}).nodes["ab"]
     np.testing.assert_allclose(spatial.colours, scene.colours, atol=1e-6)
     part["config"] = {"type": "RigidSubModel", "fourier_in_space": "temporal"}
-    over_time = from_checkpoint(worldengine(scene, np.zeros(3)) | {"rigid_object_ab": part}).nodes["ab"]
+    over_time = from_checkpoint(to_worldengine(scene, np.zeros(3)) | {"rigid_object_ab": part}).nodes["ab"]
     phase = 2 * (
         2 * np.pi / 3
     )  # at the log's end; over it sin has the mean (1 - cos phase) / phase, cos sin phase / phase

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from tasks.render.splatting.gaussians import EMPTY, Gaussians, concatenate, moved
-from tasks.render.splatting.gradient import Gradients, backward, unmoved
+from tasks.render.splatting.gradient import Gradients, backward, untransformed_gradients
 from tasks.render.splatting.raster import ForwardPass, forward
 
 WIDTH, HEIGHT = 37, 29  # no multiple of a tile
@@ -115,7 +115,7 @@ def test_a_vehicle_gets_its_gradients_in_its_own_frame() -> None:
     drive = pose((0.3, 0.8, -0.4), (0.4, 0.2, 3.0))
     scene, ups = concatenate([street, moved(car, drive)]), upstream(10)
     fast = backward(traced(scene), scene, *ups[:1])
-    own = unmoved(fast, drive)
+    own = untransformed_gradients(fast, drive)
     leaves = slow_raster.slow(car)
     whole = slow_raster.slow_concatenate([slow_raster.slow(street), slow_raster.slow_moved(leaves, drive)])
     nothing = np.zeros((HEIGHT, WIDTH), np.float32)

@@ -76,13 +76,13 @@ def test_who_moves_along_with_a_vehicle_sees_the_same_colours(count: int) -> Non
 @pytest.mark.parametrize("count", sh.COUNTS)
 def test_a_mirror_image_looks_from_the_mirrored_place_like_the_original(count: int) -> None:
     car, eye, flip = shiny(5, count), np.array([4.0, 1.0, 0.5]), np.array([1.0, -1.0, 1.0])
-    mirrored = replace(car, means=car.means * flip, sh_rest=sh.turned(car.sh_rest, np.diag(flip)))
+    mirrored = replace(car, means=car.means * flip, sh_rest=sh.rotate_coefficients(car.sh_rest, np.diag(flip)))
     np.testing.assert_allclose(colours_seen(mirrored, eye * flip, ROWS), colours_seen(car, eye, ROWS), atol=1e-5)
 
 
 def test_turning_there_and_back_changes_nothing() -> None:
     rest, turn = shiny(6, 15).sh_rest, turned_pose()[:3, :3]
-    np.testing.assert_allclose(sh.turned(sh.turned(rest, turn), turn.T), rest, atol=1e-6)
+    np.testing.assert_allclose(sh.rotate_coefficients(sh.rotate_coefficients(rest, turn), turn.T), rest, atol=1e-6)
 
 
 def test_parts_of_different_degrees_make_a_whole_of_the_highest() -> None:
