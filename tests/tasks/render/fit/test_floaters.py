@@ -34,7 +34,7 @@ from tests.bench.by_kernels import by_kernels
 from tests.tasks.render.fit.test_reconstruct import fresh
 
 N = 5  # photos, every 0.25 s: the car 8 to 12 m before the camera, a little to the left
-SETTINGS = FitSettings(iterations=30, start_gaussians=800, most_gaussians=800, refine_every=5, refine_from=5)
+SETTINGS = FitSettings(iterations=30, start_gaussians=500, most_gaussians=500, refine_every=5, refine_from=5)
 RAG = np.array([0.9, 0.1, 0.9])  # a colour that nothing in the street has
 POST, GREEN = np.array([4.9, 0.9, 1.2]), np.array([0.1, 0.8, 0.1])  # before the car in the first photo alone
 Prepared = tuple[FitProblem, FitState]

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 WIDTH, HEIGHT, FOCAL = 960, 540, 700.0
 YAWS_DEG = {"front": 0.0, "left": 60.0, "back": 180.0, "right": -60.0}
 LENS = np.array([-0.2, 0.08, 0.001, -0.0005, -0.01])
-INSTANTS, NOISE_PX, POINTS = 12, 0.3, 1500
+INSTANTS, NOISE_PX, POINTS = 12, 0.3, 2000
 
 
 def mount(yaw_deg: float) -> Array:
