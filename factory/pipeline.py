@@ -312,7 +312,7 @@ class FactoryWork:
                 require_backend(self.render.backend)
             except BackendMissing as error:
                 raise NotReady(str(error)) from error
-        compile_kernels(parts_of(self._simulates, self.traffic.mode, self.render, self.photos_alone))
+        compile_kernels(kernel_parts(self._simulates, self.traffic.mode, self.render, self.photos_alone))
 
     @property
     def names(self) -> tuple[str, ...]:

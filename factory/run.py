@@ -59,12 +59,12 @@ def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:
     return "\n".join([f"{'stage':<12}{'tasks':>8}{'seconds':>10}{'each':>10}", *lines])
 
 
-def kernel_parts(config: RunConfig) -> list[str]:
+def run_kernel_parts(config: RunConfig) -> list[str]:
     """The parts of factory.stages.warm that the run will ask for."""
     from factory.setup.settings import simulates
     from factory.stages.warm import kernel_parts
 
-    return parts_of(simulates(config), config.traffic.mode, config.render, photos_alone(config))
+    return kernel_parts(simulates(config), config.traffic.mode, config.render, photos_alone(config))
 
 
 def needs_own_process(config: RunConfig) -> bool:
@@ -148,7 +148,7 @@ def _run(
     except (BadLocation, DamagedLog, OtherSchema) as error:
         raise ConfigError(str(error)) from error
     elsewhere = config.executor == "ray" and "RAY_ADDRESS" in os.environ  # a cluster's nodes compile for themselves
-    with nullcontext() if elsewhere else compiling_ahead(kernel_parts(config)):
+    with nullcontext() if elsewhere else compiling_ahead(run_kernel_parts(config)):
         assembled = assemble(config)
         refs = interleave_by_log(assembled.refs, config.workers or os.cpu_count() or 1)
         print(plan_text(assembled, refs), flush=True)

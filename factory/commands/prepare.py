@@ -142,7 +142,7 @@ def warm(request: WarmRequest) -> None:
     if unknown := sorted(set(request.parts) - PARTS.keys()):
         raise Refused(f"no part {', '.join(unknown)}; there are {', '.join(PARTS)}")
     try:
-        compile_kernels(list(request.parts) or ["judge", "plan", "answers", "fit", "rig"])
+        compile_kernels(list(request.parts) or ["judge", "plan", "drive", "fit", "rig"])
     except NotReady as error:
         raise Refused(str(error)) from error
     if not request.parts:

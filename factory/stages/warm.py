@@ -58,7 +58,7 @@ _one_at_a_time = Lock()
 log = logging.getLogger(__name__)
 
 
-def parts_of(simulates: bool, traffic: str, render: RenderSettings, photos_alone: bool) -> list[str]:
+def kernel_parts(simulates: bool, traffic: str, render: RenderSettings, photos_alone: bool) -> list[str]:
     """What a run enters.
 
     simulates: it has another expert than `human`; traffic: the mode of the drives' traffic, of which the public one,
@@ -138,9 +138,7 @@ def _is_compiled(name: str) -> bool:
     try:
         files = [
             cache_dir() / file
-            for file in without_checksum(marker(name).read_bytes(), marker(name).name).decode().splitlines()
-            cache_dir() / file
-            for file in unsealed(part_marker(name).read_bytes(), part_marker(name).name).decode().splitlines()
+            for file in without_checksum(part_marker(name).read_bytes(), part_marker(name).name).decode().splitlines()
         ]
     except OSError:  # not there, or in a folder that cannot be: whoever then writes into it says so
         return False
@@ -183,8 +181,7 @@ def _compile_and_mark(name: str) -> int:
     listed = "\n".join(sorted(path.relative_to(cache_dir()).as_posix() for path in USED))
     try:
         for part in (name, *INCLUDED.get(name, ())):
-            write_whole(marker(part), with_checksum(listed.encode(), marker(part).name))
-            write_whole(part_marker(part), sealed(listed.encode(), part_marker(part).name))
+            write_whole(part_marker(part), with_checksum(listed.encode(), part_marker(part).name))
     except OSError as error:
         print(error, file=sys.stderr)
         return DISK_FULL
@@ -306,7 +303,6 @@ PARTS = {
     "judge": _compile_judge,
     "plan": _compile_plan,
     "drive": _compile_drive,
-    "answers": _compile_answers,
     "policy": _compile_policy,
     "render": compile_render_kernels,
     "fit": _compile_fit,

@@ -16,9 +16,8 @@ import pyarrow as pa
 from factory.graph.steps import cache_key
 from factory.pipeline import logged_clip
 from factory.readers.pickles import load_tensors
-from factory.stages.scene_file import BadScene, described_by, read_dtype, read_scene
+from factory.stages.scene_file import BadScene, read_dtype, read_scene, scene_header
 from factory.store.location import BadCacheFile
-from factory.stages.scene_file import SUFFIX, BadScene, read_dtype, read_scene, read_view_qualities, scene_header
 from factory.wording import one_line
 from tasks.render.scene.asset import BlockRange, RenderAsset, ViewQuality
 from tasks.render.scene.movers import world_from_boxes
@@ -219,16 +218,15 @@ def background_bytes(
     Raises ValueError.
     """
     if suffix in CHECKPOINTS:
-        return _checkpoint_bytes(worldengine(gaussians, origin, vehicles))
+        return _checkpoint_bytes(to_worldengine(gaussians, origin, vehicles))
     return to_ply(gaussians) if suffix == ".ply" else to_spz(gaussians, screen.keeps_light)
 
 
 def node_bytes(gaussians: Gaussians, suffix: str, screen: ScreenFilter) -> bytes:
     """A vehicle's file; a checkpoint is splatfacto's. Raises ValueError."""
     if suffix in CHECKPOINTS:
-        return _checkpoint_bytes(splatfacto(gaussians))
+        return _checkpoint_bytes(to_splatfacto(gaussians))
     return background_bytes(gaussians, suffix, np.zeros(3), screen)
-    return _saved(to_splatfacto(gaussians)) if suffix in CHECKPOINTS else _bytes(gaussians, suffix, screen)
 
 
 def read_nerfstudio_transform(path: Path) -> tuple[Array, float]:

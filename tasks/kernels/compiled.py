@@ -150,8 +150,7 @@ class KernelCache:
         target.refresh()
         path = self._path(signature)
         try:
-            kept = without_checksum(path.read_bytes(), _key(path))
-            kept = unsealed(path.read_bytes(), _cache_key(path))
+            kept = without_checksum(path.read_bytes(), _cache_key(path))
         except OSError:  # not there, or nobody's to read: compiled again, and save_overload says what is wrong
             return None
         except Damaged as error:
@@ -167,8 +166,7 @@ class KernelCache:
         path = self._path(signature)
         try:
             make_cache_dir()
-            write_whole(path, with_checksum(dumps(compiled._reduce()), _key(path)))
-            write_whole(path, sealed(dumps(compiled._reduce()), _cache_key(path)))
+            write_whole(path, with_checksum(dumps(compiled._reduce()), _cache_key(path)))
         except OSError as error:
             warnings.warn(cache_write_error(error), RuntimeWarning, stacklevel=1)
             return

@@ -164,12 +164,6 @@ class SensorFile:
     time_s: float  # relative to the clip's start (its first step)
     world_from_ego: Array  # (4, 4) at this time
     ego_from_sensor: Array | None = None  # (4, 4) of a sweep whose points are in its sensor's frame; None: in the ego's
-    late_s: float = 0.0  # so much later than said was it taken, where photos say so; its pose is that of then
-
-    @property
-    def taken_s(self) -> float:
-        """When it was taken, on the clock of `time_s`, which it keeps as its name."""
-        return self.time_s + self.late_s
 
 
 STEP_S = 0.1  # every state array runs at 10 Hz

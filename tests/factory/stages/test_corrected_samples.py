@@ -89,7 +89,7 @@ def test_photos_are_cut_by_the_camera_and_stand_at_the_poses_that_the_rig_s_file
         (file,) = (f for f in clip.images if f.sensor == image["camera"] and abs(f.time_s - at_s) < 1e-6)
         (photo,) = load_photos([file], cameras, SETTINGS.width, SETTINGS.height)
         assert np.abs(decode_stored_image(image).astype(float) - photo.rgb).mean() < 1.0  # JPEG
-        off = decoded(image).astype(float) - photo.rgb
+        off = decode_stored_image(image).astype(float) - photo.rgb
         assert np.abs(off @ [0.299, 0.587, 0.114]).mean() < 1.0  # JPEG, which halves the size of colours
     again = Imaging(SETTINGS, str(tmp_path)).pictures(clip, None, judged)
     assert json.dumps(again["cameras"], default=list) == json.dumps(row["cameras"], default=list)

@@ -257,7 +257,7 @@ def test_what_is_half_done_and_a_list_of_kernels_are_not_another_s(
     append_checksum(fit, fit.name)
     assert _resumed(fit.rename(tmp_path / "block-2.fit.npz"), start) is start  # type: ignore[comparison-overlap, arg-type]
     part_marker("judge").parent.mkdir()
-    part_marker("judge").write_bytes(sealed(b"", part_marker("judge").name))
+    part_marker("judge").write_bytes(with_checksum(b"", part_marker("judge").name))
     assert _is_compiled("judge")
     part_marker("judge").rename(part_marker("fit"))
     assert not _is_compiled("fit")

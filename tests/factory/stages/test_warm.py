@@ -101,8 +101,7 @@ def test_a_block_whose_rig_is_corrected_compiles_nothing(tmp_path: Path) -> None
 def test_kernels_of_the_rig_s_correction_are_compiled_where_it_may_be_corrected() -> None:
     def asked(photos_alone: bool, **how: object) -> bool:
         render = RenderSettings(**how)  # type: ignore[arg-type]
-        return "rig" in parts_of(True, "idm", render, photos_alone)
-        return "rig" in kernel_parts(True, "idm", None, render, photos_alone)
+        return "rig" in kernel_parts(True, "idm", render, photos_alone)
 
     assert asked(photos_alone=True) and not asked(photos_alone=False)
     assert asked(photos_alone=False, rig=RigSettings(adjust=Adjust.ON))
