@@ -39,7 +39,7 @@ def plans(count: int) -> np.ndarray:
 def scored(origin: np.ndarray, **settings) -> Scores:
     start = drive(6.0, origin=origin)
     states = track(start[0, 0], to_world(origin, plans(40)))
-    prepared = street(TRAFFIC, EXTRA, ("turn",), past_of(start), origin, start[0, 0])
+    prepared = street(TRAFFIC, EXTRA, (("turn",), np.ones((41, 1), dtype=bool)), past_of(start), origin, start[0, 0])
     return score(prepared, states, **settings)
 
 
