@@ -80,7 +80,7 @@ def vocabulary_labels(rewards: Mapping[str, Array], vocabulary: str, k: int) -> 
             raise ValueError(f"{PROGRESS} is above 0 where a multiplier is 0: not as PROGRESS_MODE=gen_gt writes it")
         reference_m = NOMINAL_M * float(multiplier[~stopped].min(initial=1.0))
         raw_m = np.divide(ep * reference_m, multiplier, out=raw_m, where=~stopped)
-    return VocabularyLabels(vocabulary, "replay", reference_m, ep_raw_m=raw_m, **scores)
+    return VocabularyLabels(vocabulary, reference_m, ep_raw_m=raw_m, **scores)
 
 
 DATASET = "simscale"

@@ -213,9 +213,7 @@ def rows() -> dict[str, object]:
     halves, whole = np.arange(20) % 3 / 2.0, np.arange(20) % 2 * 1.0
     metres = np.linspace(0.0, 70.0, 20)
     labels = label_columns(
-        VocabularyLabels(
-            "digest", "replay", 20.0, halves, whole, halves[::-1], whole, whole[::-1], whole, whole, metres
-        )
+        VocabularyLabels("digest", 20.0, halves, whole, halves[::-1], whole, whole[::-1], whole, whole, metres)
     )
     out |= {name: np.frombuffer(value, np.uint8) for name, value in labels.items() if isinstance(value, bytes)}
     out["labels text"] = text_of(labels)
