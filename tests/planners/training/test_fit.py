@@ -27,7 +27,7 @@ from planners.training.checkpoint import (
     newest,
     read_record,
 )
-from planners.training.fit import LOSSES, VALIDATION, Loop, fit, total_steps
+from planners.training.fit import LOSSES, VALIDATION, Loop, Precision, fit, total_steps
 from planners.training.optim import TrainingSettings
 from planners.training.processes import TrainingProcess
 from tasks.caches import json_with_checksum
@@ -146,29 +146,33 @@ def gradient_of_the_first_batch(planner: Toy) -> tuple[torch.Tensor, ...]:
     return torch.autograd.grad(torch.stack(list(planner.losses(batch).values())).sum(), list(planner.parameters()))
 
 
-@pytest.mark.parametrize("parts", [1, 2, 4])
+@pytest.mark.parametrize(("parts", "precision"), [(1, "fp32"), (2, "fp32"), (4, "fp32"), (1, "fp16"), (4, "fp16")])
 def test_a_step_goes_against_the_gradient_of_the_whole_batch_whatever_parts_it_is_computed_in(
-    tmp_path: Path, stepped_by: list[Sgd], parts: int
+    tmp_path: Path, stepped_by: list[Sgd], parts: int, precision: Precision
 ) -> None:
     planner, training = without_chance(), TrainingSettings(epochs=1, batch_size=4, learning_rate=0.1)
     expected = [p.detach() - 0.1 * g for p, g in zip(planner.parameters(), gradient_of_the_first_batch(planner))]
-    fit(planner, ToyBatches(4, 4), training, Loop(1, 1, parts), ALONE, tmp_path, {})
+    fit(planner, ToyBatches(4, 4), training, Loop(1, 1, parts, precision), ALONE, tmp_path, {})
+    near = {"rtol": 1e-5, "atol": 1e-7} if precision == "fp32" else {"rtol": 0.0, "atol": 5e-4}
     for found, wanted in zip(planner.parameters(), expected):
-        torch.testing.assert_close(found.detach(), wanted, rtol=1e-5, atol=1e-7)
+        torch.testing.assert_close(found.detach(), wanted, **near)
 
 
 @pytest.mark.parametrize("share", [0.25, 4.0])
+@pytest.mark.parametrize("precision", ["fp32", "fp16"])
 def test_a_gradient_above_the_clip_is_shortened_to_it_and_one_below_is_left_alone(
-    tmp_path: Path, stepped_by: list[Sgd], share: float
+    tmp_path: Path, stepped_by: list[Sgd], precision: Precision, share: float
 ) -> None:
+    """In fp16 it is clipped without the scale of the loss."""
     planner = without_chance()
     gradient = gradient_of_the_first_batch(planner)
     norm = float(torch.cat([g.flatten() for g in gradient]).norm())
     training = TrainingSettings(epochs=1, batch_size=4, learning_rate=0.1, gradient_clip=share * norm)
     before = [p.detach().clone() for p in planner.parameters()]
-    fit(planner, ToyBatches(4, 4), training, Loop(1, 1), ALONE, tmp_path, {})
+    fit(planner, ToyBatches(4, 4), training, Loop(1, 1, precision=precision), ALONE, tmp_path, {})
+    near = {"rtol": 1e-4, "atol": 1e-6} if precision == "fp32" else {"rtol": 0.0, "atol": 5e-4 * norm}
     for was, found, full in zip(before, planner.parameters(), gradient):
-        torch.testing.assert_close(was - found.detach(), 0.1 * min(share, 1.0) * full, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(was - found.detach(), 0.1 * min(share, 1.0) * full, **near)
 
 
 def test_the_rate_of_a_step_is_the_schedules_and_the_one_that_is_logged(tmp_path: Path, stepped_by: list[Sgd]) -> None:

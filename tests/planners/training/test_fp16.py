@@ -18,17 +18,8 @@ from planners.training.fit import LOSSES, SCALER, Loop, fit
 from planners.training.optim import TrainingSettings
 from tests.planners.models import test_diffusiondrive, test_gtrs_dense, test_ltf
 from tests.planners.toy import Toy, ToyBatches, ToySettings
-from tests.planners.training.test_fit import (
-    ALONE,
-    Interrupted,
-    Sgd,
-    gradient_of_the_first_batch,
-    rows,
-    stepped_by,
-    without_chance,
-)
+from tests.planners.training.test_fit import ALONE, Interrupted, rows
 
-__all__ = ["stepped_by"]
 TRAINING = TrainingSettings(epochs=3, batch_size=4, learning_rate=0.01, optimiser="adamw")
 FIRST_SCALE = 65536.0  # torch.amp.GradScaler's, as in Lightning's 16-mixed
 
@@ -88,29 +79,6 @@ def test_a_resumed_training_has_the_scale_it_had(tmp_path: Path) -> None:
         assert torch.equal(resumed.state_dict()[name], weights), name
     with pytest.raises(ValueError, match="trained in fp16: go on in the same precision"):
         fit(loud(), ToyBatches(20, 4), TRAINING, Loop(1, 15), ALONE, out, {}, newest(out))
-
-
-@pytest.mark.parametrize("share", [0.25, 4.0])
-def test_the_gradient_is_clipped_without_its_scale(tmp_path: Path, stepped_by: list[Sgd], share: float) -> None:
-    planner = without_chance()
-    gradient = gradient_of_the_first_batch(planner)
-    norm = float(torch.cat([g.flatten() for g in gradient]).norm())
-    training = TrainingSettings(epochs=1, batch_size=4, learning_rate=0.1, gradient_clip=share * norm)
-    before = [p.detach().clone() for p in planner.parameters()]
-    fit(planner, ToyBatches(4, 4), training, Loop(1, 1, precision="fp16"), ALONE, tmp_path, {})
-    for was, found, full in zip(before, planner.parameters(), gradient):
-        expected = 0.1 * min(share, 1.0) * full
-        torch.testing.assert_close(was - found.detach(), expected, rtol=0.0, atol=5e-3 * 0.1 * norm)
-
-
-def test_the_gradient_of_parts_is_that_of_the_batch(tmp_path: Path, stepped_by: list[Sgd]) -> None:
-    ends = []
-    for parts in (1, 4):
-        planner, training = without_chance(), TrainingSettings(epochs=1, batch_size=4, learning_rate=0.1)
-        loop = Loop(1, 1, parts, precision="fp16")
-        fit(planner, ToyBatches(4, 4), training, loop, ALONE, tmp_path / str(parts), {})
-        ends.append(torch.cat([p.detach().flatten() for p in planner.parameters()]))
-    torch.testing.assert_close(*ends, rtol=0.0, atol=1e-4)
 
 
 class Again(ToyBatches):
