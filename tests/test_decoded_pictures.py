@@ -16,7 +16,7 @@ from factory.readers.pictures import read_header, without_exif
 from factory.stages.sensors import decode_image, opened_photos, read_masks
 from factory.store.reader import image_of
 from planners.data.batch import ImageLayout
-from planners.data.images import stitched
+from planners.data.images import stitch_sample
 from tasks.world.clip import Camera, SensorFile
 from tests.pictures import declared, turned
 from tests.planners import samples
@@ -58,7 +58,7 @@ def row(folder: Path, data: bytes) -> Pixels:
 
 def batch(folder: Path, data: bytes) -> Pixels:
     sample = samples.pictures({"front": data})
-    return stitched(sample, ImageLayout(("front",), WIDTH, HEIGHT, rows_cut=0.0, sides_cut=0.0))
+    return stitch_sample(sample, ImageLayout(("front",), WIDTH, HEIGHT, rows_cut=0.0, sides_cut=0.0))
 
 
 def agent(folder: Path, data: bytes) -> Pixels:

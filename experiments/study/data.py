@@ -16,7 +16,7 @@ from threading import Event
 from experiments.study.settings import settings_of
 from factory.config.arguments import INPUT_ERRORS, run_command
 from factory.exits import INTERRUPTED, Failed, Stopped, calling_on_stop_signal
-from planners.training.many import Means, exit_code
+from planners.training.many import SweepResources, exit_code
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Recipe:
 
 def make(recipe: Recipe) -> None:
     """Run what is missing. Raises ValueError, Stopped, Failed."""
-    out, means = Path(recipe.out), Means(minutes=recipe.minutes)
+    out, resources = Path(recipe.out), SweepResources(minutes=recipe.minutes)
     chosen = {name: words for name, words in recipe.runs.items() if not recipe.only or name.startswith(recipe.only)}
     if not chosen:
         raise ValueError(f"only={','.join(recipe.only)}: none of {', '.join(recipe.runs)} begins so")
@@ -46,7 +46,7 @@ def make(recipe: Recipe) -> None:
         if not (out / name / "cache").is_symlink():
             (out / name / "cache").symlink_to("../blocks")
     for name, settings in chosen.items():
-        factory("run", *settings.split(), f"out={out / name}", *means.words)
+        factory("run", *settings.split(), f"out={out / name}", *resources.overrides_left)
 
 
 def factory(*words: str) -> None:

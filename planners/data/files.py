@@ -36,6 +36,7 @@ class Footers:
         self._lock = Lock()
 
     def of(self, path: str) -> pq.FileMetaData | None:
+    def get(self, path: str) -> Footer | None:
         """The footer of a file; None where it must be read."""
         with self._lock:
             if path in self._footers:
@@ -43,6 +44,7 @@ class Footers:
             return self._footers.get(path)
 
     def keep(self, path: str, footer: pq.FileMetaData) -> None:
+    def put(self, path: str, footer: Footer) -> None:
         """Keep one footer more, and drop those that were not asked for the longest as far as need be."""
         with self._lock:
             if path not in self._footers:
@@ -81,7 +83,7 @@ class SampleFile:
     def _open(self, check_pages: bool) -> pq.ParquetFile:
         local = isinstance(self.filesystem, fs.LocalFileSystem)
         filesystem = fs.LocalFileSystem(use_mmap=True) if local else self.filesystem
-        footer = _FOOTERS.of(self.path)
+        footer = _FOOTERS.get(self.path)
         parquet = pq.ParquetFile(
             self.path,
             metadata=footer,
@@ -89,7 +91,7 @@ class SampleFile:
             page_checksum_verification=check_pages,
             pre_buffer=not local,
         )
-        _FOOTERS.keep(self.path, parquet.metadata)
+        _FOOTERS.put(self.path, parquet.metadata)
         return parquet
 
 

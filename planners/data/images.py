@@ -50,7 +50,7 @@ FACTORS = (1, 2, 4, 8)  # by which a JPEG can be decoded smaller, without its fi
 _THREAD = local()  # what each thread decodes into, so that memory is asked for once
 
 
-def stitched(sample: Mapping[str, Any], layout: ImageLayout) -> Bytes:
+def stitch_sample(sample: Mapping[str, Any], layout: ImageLayout) -> Bytes:
     """The picture (layout.height, layout.width, 3) uint8 RGB of a sample with the columns cameras and images.
 
     Raises ValueError where it has no cameras, no image of one of them at now, or a damaged one.
@@ -202,7 +202,7 @@ class DecodedPictures:
         out: (layout.height, layout.width, 3), in one piece. Raises ValueError for a damaged JPEG, OSError where the
         folder cannot be written.
         """
-        key = key_of(jpegs, layout)
+        key = picture_key(jpegs, layout)
         path = self.folder / key[:2] / f"{key[2:]}.rgb"
         if not _read(path, key, out):
             stitch(jpegs, layout, out)
@@ -238,7 +238,7 @@ class DecodedPictures:
             draft.replace(path)
 
 
-def key_of(jpegs: Sequence[Bytes], layout: ImageLayout) -> str:
+def picture_key(jpegs: Sequence[Bytes], layout: ImageLayout) -> str:
     """64 hex digits of everything that a picture's pixels depend on. Which cameras they are does not matter."""
     how = (PICTURE_FORMAT, DECODER, layout.width, layout.height, layout.rows_cut, layout.sides_cut, layout.decoding)
     sha = hashlib.sha256(repr((how, [len(jpeg) for jpeg in jpegs])).encode())

@@ -95,7 +95,7 @@ class SampleRows:
     def __len__(self) -> int:
         return len(self.attempt_id)
 
-    def taken(self, which: Ints | Bools) -> "SampleRows":
+    def select(self, which: Ints | Bools) -> "SampleRows":
         """Some of them, in the order of `which`."""
         return SampleRows(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
@@ -153,7 +153,7 @@ class Dataset:
         """Counts by side, expert and round, a line each."""
         lines = []
         for name, part in (("real", ~self.rows.simulated), ("simulated", self.rows.simulated)):
-            rows = self.rows.taken(part)
+            rows = self.rows.select(part)
             lines.append(f"{name}: {len(rows)} samples of {len(set(rows.clip_id.tolist()))} clips")
             for expert in sorted(set(rows.expert[rows.simulated].tolist())):
                 rounds = np.bincount(rows.round[rows.expert == expert])
@@ -189,13 +189,13 @@ def open_dataset(settings: DataSettings) -> Dataset:
     with ThreadPoolExecutor(OPEN_FILES) as pool:
         parts = list(pool.map(_rows_of, files, range(len(files))))
     rows = SampleRows(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(SampleRows)})
-    rows = rows.taken(np.argsort(rows.attempt_id, kind="stable"))
+    rows = rows.select(np.argsort(rows.attempt_id, kind="stable"))
     dataset = Dataset(settings, tuple(files), rows)
     twice = np.flatnonzero(rows.attempt_id[1:] == rows.attempt_id[:-1])
     if len(twice):
         both = " and ".join(files[f].table for f in rows.file[twice[0] : twice[0] + 2])
         raise ValueError(f"sample {rows.attempt_id[twice[0]]} and {len(twice) - 1} more stand twice, in {both}")
-    return replace(dataset, rows=rows.taken(_kept(settings, rows)))
+    return replace(dataset, rows=rows.select(_kept(settings, rows)))
 
 
 def _rows_of(file: SampleFile, number: int) -> SampleRows:

@@ -92,7 +92,7 @@ class Memory:
         lasting = ("_feed", "_staying", "pictures", "_checked")
         return {name: self.__dict__[name] for name in lasting} | {"_stay": {}}
 
-    def begin(self, windows: Sequence[Window], executor: Executor) -> None:
+    def start_epoch(self, windows: Sequence[Window], executor: Executor) -> None:
         """Start to read for an epoch; what an earlier one left is dropped, but what stays."""
         self._executor = executor
         self._to_come = [window for window in windows if window.key[0] not in self._staying]
@@ -102,7 +102,7 @@ class Memory:
                 self._stay[side] = self._submit(self._staying[side], 0)
         self._advance()
 
-    def ready(self, key: WindowKey) -> bool:
+    def is_ready(self, key: WindowKey) -> bool:
         """Whether the rows of a window are there."""
         return self._reading(key).is_done
 
@@ -110,7 +110,7 @@ class Memory:
         """Sample -> its row, once they are read. Raises OSError for a damaged file."""
         return self._reading(key).rows
 
-    def done(self, batch: int) -> None:
+    def release(self, batch: int) -> None:
         """No batch up to this one will ask again: windows that only they need are dropped, the next ones read."""
         for key in [key for key, reading in self._read.items() if reading.last <= batch]:
             del self._read[key]
@@ -301,12 +301,12 @@ class Loader:
         readers, decoders = ThreadPoolExecutor(READERS, "read"), ThreadPoolExecutor(self._workers, "decode")
         coming: deque[tuple[Ints, BatchBuffer, list[Future[None]]]] = deque()
         try:
-            self._memory.begin(_windows(order, rows, windows, first), readers)
+            self._memory.start_epoch(_windows(order, rows, windows, first), readers)
             batch = first
             while True:
                 while batch < n and len(coming) < ahead and (not coming or self._ready(order, windows[batch])):
                     coming.append(self._started(order, rows[batch], windows[batch], decoders))
-                    self._memory.done(batch)
+                    self._memory.release(batch)
                     batch += 1
                 if not coming:
                     return
@@ -318,7 +318,7 @@ class Loader:
                 executor.shutdown(wait=True, cancel_futures=True)
 
     def _ready(self, order: EpochOrder, windows: Ints) -> bool:
-        return all(self._memory.ready(order.keys[window]) for window in np.unique(windows))
+        return all(self._memory.is_ready(order.keys[window]) for window in np.unique(windows))
 
     def _started(
         self, order: EpochOrder, samples: Ints, windows: Ints, decoders: Executor

@@ -23,7 +23,7 @@ from factory.store.schema import LABEL_COLUMNS, NOW_INDEX, SCHEMA
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
 from planners.data.bev import bev_raster
 from planners.data.decode import BatchBuffer, StoredRows
-from planners.data.images import stitched
+from planners.data.images import stitch_sample
 from planners.data.index import BEV_COLUMNS
 from planners.evaluation.frames import LOGGED_KINDS, Benchmark, FrameKey
 from planners.evaluation.planner_names import EvaluatedPlanner, needs_of
@@ -85,7 +85,7 @@ class _StoredSample(StoredRows):
         return bev_raster(self._sample, layout)
 
     def picture(self, row: int, layout: ImageLayout, out: Bytes, keep: bool = False) -> None:
-        out[:] = stitched(self._sample, layout)
+        out[:] = stitch_sample(self._sample, layout)
 
 
 def batch_of(samples: Sequence[Mapping[str, Any]], needs: Needs) -> Batch:

@@ -97,7 +97,7 @@ STEPS = 1000
 BETA_FIRST, BETA_LAST = 1e-4, 0.02
 
 
-def kept() -> Tensor:
+def alphas_cumprod() -> Tensor:
     """A_t = prod_{s <= t} (1 - beta_s) for t = 0 .. 999, float32 (1000,); x_t = sqrt(A_t) x_0 + sqrt(1 - A_t) e.
 
     DDPM (Ho et al. 2020) with the beta of diffusers' "scaled_linear", which the public code's scheduler has.
@@ -359,7 +359,7 @@ class DiffusionDrive(Planner):
         fixed = torch.Generator().manual_seed(NOISE_SEED)
         self.register_buffer("anchors", anchors, persistent=False)
         self.register_buffer("first_noise", torch.randn(anchors.shape, generator=fixed), persistent=False)
-        self.register_buffer("kept", kept(), persistent=False)
+        self.register_buffer("alphas_cumprod", alphas_cumprod(), persistent=False)
         self.encoder = SceneEncoder(settings)
         self.decoder = DiffusionDecoder(settings)
         reach_m = max(settings.bev.ahead_m, settings.bev.side_m)
@@ -393,7 +393,7 @@ class DiffusionDrive(Planner):
         anchors = self.get_buffer("anchors")
         step = torch.randint(0, TRUNCATED, (len(batch),), device=anchors.device)
         noise = torch.randn((len(batch), *anchors.shape), device=anchors.device)
-        at = add_noise(normalise_points(anchors), noise, self.get_buffer("kept")[step].view(-1, 1, 1, 1))
+        at = add_noise(normalise_points(anchors), noise, self.get_buffer("alphas_cumprod")[step].view(-1, 1, 1, 1))
         decoded = self._decoded(at, step, scene)
         label = torch.where(batch.imitate[:, None, None], batch.plan_2hz, 0.0)
         nearest = (label[:, None, :, :2] - anchors).norm(dim=-1).mean(dim=-1).argmin(dim=1)
@@ -426,7 +426,7 @@ class DiffusionDrive(Planner):
 
     def denoised(self, scene: EncodedScene) -> Tensor:
         """Plans (B, 8, 3) from the noise that stays the same, or of a public planner is drawn here."""
-        n, levels, anchors = len(scene.ego), self.get_buffer("kept"), self.get_buffer("anchors")
+        n, levels, anchors = len(scene.ego), self.get_buffer("alphas_cumprod"), self.get_buffer("anchors")
         noise = self.get_buffer("first_noise").expand(n, -1, -1, -1)
         if self.settings.is_public:
             noise = torch.randn((n, *anchors.shape), device=anchors.device)

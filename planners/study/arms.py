@@ -21,7 +21,7 @@ from planners.evaluation.bootstrap import Interval, paired_interval
 from planners.evaluation.compare import CompareSettings, compare, difference_columns
 from planners.study.report import FRAMES, markdown_table, read_study
 from planners.study.setups import Setup
-from planners.training.many import Means, Training
+from planners.training.many import SweepResources, Training
 from tasks.world.arrays import Array
 
 Row = Mapping[str, Any]
@@ -92,12 +92,12 @@ def drive_settings(arms: Sequence[Training], out: str, drives: str) -> DriveSett
     return settings_of([*drives.split(), f"planners={{{named}}}", f"out={Path(out) / DRIVES}"])
 
 
-def drive_arms(arms: Sequence[Training], out: str, drives: str, means: Means) -> Stopped | None:
+def drive_arms(arms: Sequence[Training], out: str, drives: str, resources: SweepResources) -> Stopped | None:
     """Drive what is not driven, seed by seed; why it is not all. Raises Stopped where it is interrupted, Failed for
     drives that could not be made."""
     for seed, batch in groupby(arms, key=lambda one: one.facts["seed"]):
         chosen = drive_settings(list(batch), out, drives)
-        if means.left_s == 0.0:
+        if resources.left_s == 0.0:
             if driven(chosen)[1]:
                 continue
             return Stopped(f"drives of seed {seed} and those behind it are not made: the same command goes on")

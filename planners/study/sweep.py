@@ -23,7 +23,7 @@ from planners.evaluation.score_rows import read_record as read_evaluation
 from planners.study.report import FRAMES, rows_of, write_study, write_tables
 from planners.study.setups import Comparison, so_far
 from planners.training.checkpoint import read_record
-from planners.training.many import ONE_THREAD, Means, Training, folder_of, is_done, stops_after, train_all
+from planners.training.many import ONE_THREAD, SweepResources, Training, folder_of, is_done, stops_after, train_all
 
 EVALUATIONS = "evaluations"
 BATCH = 48  # planners that are trained and evaluated together: cores idle at the end of either
@@ -31,7 +31,7 @@ EVALUATED_TOGETHER = 24  # planners in one process at the most
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepSettings(Means):
+class SweepSettings(SweepResources):
     """What every sweep is told."""
 
     benchmark: str  # the folder that factory.run preset=hard_benchmark made of held-out clips
@@ -101,7 +101,9 @@ def batches(planned: Sequence[Training]) -> list[list[Training]]:
     return found
 
 
-def evaluate_all(everyone: Sequence[Training], out: Path, benchmark: str, means: Means, *more: str) -> None:
+def evaluate_all(
+    everyone: Sequence[Training], out: Path, benchmark: str, resources: SweepResources, *more: str
+) -> None:
     """Evaluate on a benchmark, into `out`/evaluations; those that are evaluated already are not again.
 
     Processes of `python -m planners evaluate` share the planners, a few each at a time, so that a kill costs little.
@@ -122,11 +124,11 @@ def evaluate_all(everyone: Sequence[Training], out: Path, benchmark: str, means:
 
     done = 0
     with (
-        stops_after(means.left_s) as stop,
+        stops_after(resources.left_s) as stop,
         Counter("evaluations", len(everyone)) as counter,
-        ThreadPoolExecutor(means.at_once) as pool,
+        ThreadPoolExecutor(resources.at_once) as pool,
     ):
-        shares = shares_of(everyone, means.at_once)
+        shares = shares_of(everyone, resources.at_once)
         for n in pool.map(lambda share: evaluate(share, "bounds=false", "tables=false"), shares):
             done += n
             counter.show(done)

@@ -202,14 +202,14 @@ def fit(
             step += 1
             looks = step % loop.log_every == 0 or step == loop.steps
             # Several processes must agree, and ask each other rarely.
-            stopping = process.anyone(asked.is_set()) if process.size == 1 or looks else False
+            stopping = process.any_process(asked.is_set()) if process.size == 1 or looks else False
             saves = _multiple(step, loop.checkpoint_every) or _multiple(step, loop.keep.every) or step == loop.steps
             saves = saves or stopping
             measured: dict[str, float] = {}
             if _multiple(step, loop.validate_every) or step == loop.steps:
                 measured = check(step)
                 if loop.keep.best is not None:
-                    saves = process.anyone(saves or _is_best(out, loop.keep.best, measured))
+                    saves = process.any_process(saves or _is_best(out, loop.keep.best, measured))
             if looks or saves:  # a checkpoint whose losses are not written would leave a gap after a kill
                 shown = f"{log(step):.4f}"
             counter.show(step, f"loss {shown}")

@@ -41,7 +41,7 @@ class Training:
 
 
 @dataclass(frozen=True)
-class Means:
+class SweepResources:
     """How a sweep runs."""
 
     jobs: int | None = None  # trainings at a time; null: one a core
@@ -62,7 +62,7 @@ class Means:
         return None if self.minutes is None else max(0.0, self.began + 60.0 * self.minutes - time.monotonic())
 
     @property
-    def words(self) -> list[str]:
+    def overrides_left(self) -> list[str]:
         """What is left, for another command."""
         return [] if self.left_s is None else [f"minutes={self.left_s / 60.0:.3f}"]
 
@@ -78,7 +78,7 @@ def is_done(out: Path, training: Training) -> bool:
     return path.is_file() and json.loads(path.read_text()) == list(training.overrides)
 
 
-def train_all(trainings: Sequence[Training], out: Path, means: Means) -> None:
+def train_all(trainings: Sequence[Training], out: Path, resources: SweepResources) -> None:
     """Train what is not done; ensembles need not be.
 
     Raises ValueError for two trainings of one label, Stopped where time ran out or somebody interrupted before all
@@ -92,8 +92,8 @@ def train_all(trainings: Sequence[Training], out: Path, means: Means) -> None:
     done, failed = len(trainings) - len(left), list[str]()
     with (
         Counter("trainings", len(trainings), done) as counter,
-        stops_after(means.left_s) as stop,
-        ThreadPoolExecutor(means.at_once) as pool,
+        stops_after(resources.left_s) as stop,
+        ThreadPoolExecutor(resources.at_once) as pool,
     ):
         codes = {pool.submit(train_one, training, out, stop.is_set): training for training in left}
         for future in as_completed(codes):

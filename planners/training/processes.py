@@ -40,7 +40,7 @@ class TrainingProcess:
         dist.all_reduce(total)
         return total / self.size
 
-    def anyone(self, flag: bool) -> bool:
+    def any_process(self, flag: bool) -> bool:
         """Whether the flag is set in any process."""
         if self.size == 1:
             return flag
@@ -55,7 +55,7 @@ class TrainingProcess:
 
 
 @contextmanager
-def joined(device: str, place: torch.device | None = None) -> Iterator[TrainingProcess]:
+def join_processes(device: str, place: torch.device | None = None) -> Iterator[TrainingProcess]:
     """What this process was started as: alone, by torchrun, or in a group that stands already (Ray Train).
 
     device: auto | cpu | cuda; place: the device itself, where that is known. Raises ValueError for cuda where there is

@@ -43,7 +43,7 @@ from planners.training.checkpoint import (
 )
 from planners.training.fit import Loop, Precision, fit, total_steps
 from planners.training.optim import TrainingSettings
-from planners.training.processes import RaySettings, TrainingProcess, joined
+from planners.training.processes import RaySettings, TrainingProcess, join_processes
 
 LARGEST_BATCH = 32
 FURTHER = frozenset({"steps", "processes", "accumulate"})  # what may be another with resume=further
@@ -140,7 +140,7 @@ def main(argv: Sequence[str]) -> None:
 
         train_on_ray(partial(train, config), config.ray, config.out)
     else:
-        with joined(config.device) as process:
+        with join_processes(config.device) as process:
             train(config, process)
 
 

@@ -24,7 +24,7 @@ import simplejpeg
 import torch
 
 from planners.data.batch import ImageLayout, Needs
-from planners.data.images import DecodedPictures, key_of, stitch
+from planners.data.images import DecodedPictures, picture_key, stitch
 from planners.data.index import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
@@ -97,14 +97,14 @@ def split(photos: Sequence[Sequence[Bytes]], layout: ImageLayout, folder: Path) 
     entries: list[float] = []
 
     def written(jpegs: Sequence[Bytes]) -> None:
-        key = key_of(jpegs, layout)
+        key = picture_key(jpegs, layout)
         (folder / key[:2] / f"{key[2:]}.rgb").unlink(missing_ok=True)
         kept.stitch(jpegs, layout, out)
 
     full_ms, whole_ms = each(lambda jpegs: decoded(jpegs, 1080, 1920)), each(lambda j: stitch(j, layout, out))
     half_ms, halves_ms = each(lambda jpegs: decoded(jpegs, 540, 960)), each(lambda j: stitch(j, reduced, out))
     written_ms, read_ms = each(written), each(lambda j: kept.stitch(j, layout, out))
-    key_ms = each(lambda jpegs: key_of(jpegs, layout))
+    key_ms = each(lambda jpegs: picture_key(jpegs, layout))
     for jpegs in photos:
         other = np.empty_like(out)
         stitch(jpegs, layout, out)

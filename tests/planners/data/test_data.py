@@ -87,7 +87,7 @@ def test_plans_to_learn_from_are_found_in_every_shard_and_row_group(tmp_path: Pa
 def test_filters_are_of_the_simulated_samples(out: str, settings: dict[str, Any], count: int, kept: Any) -> None:
     rows = opened(out, **settings).rows
     assert (~rows.simulated).sum() == N_CLIPS and rows.simulated.sum() == count
-    assert kept is None or kept(rows.taken(rows.simulated)).all()
+    assert kept is None or kept(rows.select(rows.simulated)).all()
 
 
 def test_a_share_of_the_real_clips_takes_their_simulated_samples_with_it(out: str) -> None:

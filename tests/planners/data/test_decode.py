@@ -13,7 +13,7 @@ from planners.data.batch import COMMANDS, BevLayout, ImageLayout, Needs
 from planners.data.bev import bev_raster, nearest_agents
 from planners.data.decode import BatchBuffer, StoredRows, count_labels
 from planners.data.files import Footers, files_of, group_bytes, leaves
-from planners.data.images import stitched
+from planners.data.images import stitch_sample
 from planners.data.index import BEV_COLUMNS, PLAN_COLUMNS
 from tasks.reward.label_bytes import VocabularyLabels
 from tasks.world.clip import AgentKind
@@ -103,7 +103,7 @@ def test_a_batch_is_what_its_rows_say(table: Path) -> None:
         assert np.array_equal(batch.history[i], one["ego_history_2hz"])
         assert np.array_equal(batch.plan_2hz[i], one["label_2hz"])
         assert np.array_equal(batch.plan_10hz[i], one["label_10hz"])
-        assert np.array_equal(batch.image[i].permute(1, 2, 0), stitched(one, IMAGE))
+        assert np.array_equal(batch.image[i].permute(1, 2, 0), stitch_sample(one, IMAGE))
         assert np.array_equal(batch.bev[i], bev_raster(one, BEV))
         boxes, valid = nearest_agents(one, BEV, 2)
         assert np.array_equal(batch.agents[i], boxes) and np.array_equal(batch.agents_valid[i], valid)
@@ -180,10 +180,10 @@ def test_footers_are_kept_up_to_their_bytes_and_the_last_used_stay(table: Path) 
     footer = file.open().metadata
     footers = Footers(2 * footer.serialized_size)
     for name in "ab":
-        footers.keep(name, footer)
-    assert footers.of("a") is footer
-    footers.keep("c", footer)
-    assert [footers.of(name) for name in "abc"] == [footer, None, footer]
+        footers.put(name, footer)
+    assert footers.get("a") is footer
+    footers.put("c", footer)
+    assert [footers.get(name) for name in "abc"] == [footer, None, footer]
     small = Footers(footer.serialized_size - 1)
-    small.keep("a", footer)
-    assert small.of("a") is None
+    small.put("a", footer)
+    assert small.get("a") is None

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from planners.data.batch import ImageLayout
-from planners.data.images import chosen_cameras, stitch, stitched
+from planners.data.images import chosen_cameras, stitch, stitch_sample
 from tests.planners.samples import FRONT_YAWS, Pixels, grey_pictures, jpeg, pictures, plain
 
 PUBLIC = ImageLayout(width=512, height=128)
@@ -57,7 +57,7 @@ def striped(n: int, stripe: int) -> Pixels:
 def test_the_public_cuts_put_every_column_where_it_belongs() -> None:
     """4096 x 1024 of three 1920 x 1080: at an eighth, the left camera's columns 416 .. 1504 are 0 .. 136, and so on."""
     views = {"left": striped(30, 10), "front": striped(30, 0), "right": striped(30, 22)}
-    picture = stitched(pictures({name: jpeg(view) for name, view in views.items()}), PUBLIC)
+    picture = stitch_sample(pictures({name: jpeg(view) for name, view in views.items()}), PUBLIC)
     assert picture.shape == (128, 512, 3)
     white = np.flatnonzero(picture.min(axis=(0, 2)) > 250 - NEAR)
     expected = [
@@ -72,7 +72,7 @@ def test_rows_are_cut_above_and_below() -> None:
     view = plain((0, 0, 0), 1920, 1080)
     view[:28], view[-28:] = 255, 255  # all of it, and nothing more, is cut
     view[28:32] = (200, 0, 0)
-    picture = stitched(pictures(dict.fromkeys(FRONT_YAWS, jpeg(view))), ImageLayout(width=1024, height=256))
+    picture = stitch_sample(pictures(dict.fromkeys(FRONT_YAWS, jpeg(view))), ImageLayout(width=1024, height=256))
     assert abs(picture[0].astype(int) - (200, 0, 0)).max() <= 8 * NEAR, "the first row shows the first four left"
     assert picture[2:].max() <= 2 * NEAR
 
@@ -81,7 +81,7 @@ def test_rows_are_cut_above_and_below() -> None:
 def test_any_number_of_cameras_in_any_order(cameras: tuple[str, ...]) -> None:
     colours = {"left": (200, 40, 40), "front": (40, 200, 40), "right": (40, 40, 200)}
     sample = pictures({name: jpeg(plain(colour, 96, 54)) for name, colour in colours.items()})
-    picture = stitched(sample, ImageLayout(cameras=cameras, width=120, height=32))
+    picture = stitch_sample(sample, ImageLayout(cameras=cameras, width=120, height=32))
     parts = np.split(
         picture, np.flatnonzero((np.abs(np.diff(picture[16].astype(int), axis=0)) > 60).any(axis=1)) + 1, 1
     )
@@ -95,7 +95,7 @@ def test_cameras_of_other_sizes_are_brought_to_one_height() -> None:
     sizes = {"left": (160, 120), "front": (120, 160), "right": (160, 120)}
     colours = {"left": (200, 0, 0), "front": (0, 200, 0), "right": (0, 0, 200)}
     sample = pictures({name: jpeg(plain(colours[name], *sizes[name])) for name in sizes})
-    picture = stitched(sample, ImageLayout(width=410, height=120, rows_cut=0.0, sides_cut=0.0))
+    picture = stitch_sample(sample, ImageLayout(width=410, height=120, rows_cut=0.0, sides_cut=0.0))
     assert [int((picture[60].argmax(axis=1) == i).sum()) for i in range(3)] == [160, 90, 160]
 
 
@@ -143,14 +143,14 @@ def test_a_small_picture_is_enlarged_and_a_huge_one_averaged() -> None:
 def test_what_cannot_be_stitched_says_why() -> None:
     sample = grey_pictures(100)
     with pytest.raises(ValueError, match=r"no image of camera left at now; there are \['front', 'right'\]"):
-        stitched(sample | {"images": [i for i in sample["images"] if i["camera"] != "left"]}, PUBLIC)
+        stitch_sample(sample | {"images": [i for i in sample["images"] if i["camera"] != "left"]}, PUBLIC)
     with pytest.raises(ValueError, match="not a JPEG"):
-        stitched(sample | {"images": [image | {"jpeg": b"picture"} for image in sample["images"]]}, PUBLIC)
+        stitch_sample(sample | {"images": [image | {"jpeg": b"picture"} for image in sample["images"]]}, PUBLIC)
     headless = [image | {"jpeg": image["jpeg"][:200]} for image in sample["images"]]
     with pytest.raises(ValueError, match="not a JPEG"):
-        stitched(sample | {"images": headless}, PUBLIC)
+        stitch_sample(sample | {"images": headless}, PUBLIC)
     whole = jpeg(seen(0, 320, 192))
     with pytest.raises(ValueError, match="not a JPEG that can be decoded: Premature end"):
-        stitched(pictures(dict.fromkeys(FRONT_YAWS, whole[: len(whole) // 2])), PUBLIC)
+        stitch_sample(pictures(dict.fromkeys(FRONT_YAWS, whole[: len(whole) // 2])), PUBLIC)
     with pytest.raises(ValueError, match="leave nothing of an image of 32 x 18"):
-        stitched(sample, ImageLayout(sides_cut=0.5))
+        stitch_sample(sample, ImageLayout(sides_cut=0.5))

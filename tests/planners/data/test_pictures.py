@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from planners.data.batch import ImageLayout, Needs
-from planners.data.images import CHECKSUM_BYTES, GB, PARTS, DecodedPictures, key_of, stitch
+from planners.data.images import CHECKSUM_BYTES, GB, PARTS, DecodedPictures, picture_key, stitch
 from planners.data.index import DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
@@ -35,7 +35,7 @@ def decoded(jpegs: Sequence[Bytes], kept: DecodedPictures | None = None, layout:
 
 
 def entry_of(kept: DecodedPictures, jpegs: Sequence[Bytes], layout: ImageLayout = LAYOUT) -> Path:
-    key = key_of(jpegs, layout)
+    key = picture_key(jpegs, layout)
     return kept.folder / key[:2] / f"{key[2:]}.rgb"
 
 
@@ -68,12 +68,12 @@ def test_other_content_or_another_layout_is_another_picture(kept: DecodedPicture
     changed = front.copy()
     changed[-30] ^= 1
     layouts = [replace(LAYOUT, **change) for change in ({"rows_cut": 0.1}, {"sides_cut": 0.1}, {"decoding": "full"})]
-    names = {key_of([left, front, right], layout) for layout in (LAYOUT, *layouts)}
-    names |= {key_of(jpegs, LAYOUT) for jpegs in ([left, changed, right], [right, front, left], [left, front])}
+    names = {picture_key([left, front, right], layout) for layout in (LAYOUT, *layouts)}
+    names |= {picture_key(jpegs, LAYOUT) for jpegs in ([left, changed, right], [right, front, left], [left, front])}
     whole = np.concatenate([left, front])
-    names |= {key_of([whole[:i], whole[i:], right], LAYOUT) for i in (100, len(left) + 1)}
+    names |= {picture_key([whole[:i], whole[i:], right], LAYOUT) for i in (100, len(left) + 1)}
     assert len(names) == 9
-    assert key_of([left, front, right], replace(LAYOUT, cameras=("a", "b", "c"))) in names
+    assert picture_key([left, front, right], replace(LAYOUT, cameras=("a", "b", "c"))) in names
     for layout in (LAYOUT, *layouts):
         assert (decoded(views(0), kept, layout) == decoded(views(0), None, layout)).all()
         assert (decoded(views(0), kept, layout) == decoded(views(0), None, layout)).all()
@@ -99,7 +99,7 @@ def test_a_damaged_entry_is_made_again(kept: DecodedPictures, damage: str, no_de
 def test_the_folder_never_takes_more_than_its_limit(tmp_path: Path) -> None:
     """Two entries fit into each of its 256 parts, and what finds its part full is decoded, to the same pixels."""
     kept = DecodedPictures(tmp_path, limit_gb=2.5 * PARTS * ENTRY_BYTES / GB)
-    keys = [key_of(views(number), LAYOUT)[:2] for number in range(700)]
+    keys = [picture_key(views(number), LAYOUT)[:2] for number in range(700)]
     for number in range(700):
         if keys.count(keys[number]) >= 4:
             assert (decoded(views(number), kept) == decoded(views(number))).all()
@@ -143,7 +143,7 @@ def test_processes_share_a_folder(tmp_path: Path) -> None:
         process.join()
     assert [process.exitcode for process in several] == [0, 0, 0]
     entries = sorted(path.name for path in tmp_path.rglob("*") if path.is_file() and path.name != "lock")
-    assert entries == sorted(f"{key_of(views(number), LAYOUT)[2:]}.rgb" for number in range(12))
+    assert entries == sorted(f"{picture_key(views(number), LAYOUT)[2:]}.rgb" for number in range(12))
 
 
 def test_batches_are_the_same_with_and_without(tmp_path: Path, no_decoder: list[str]) -> None:

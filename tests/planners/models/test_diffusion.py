@@ -12,13 +12,13 @@ from planners.models.diffusiondrive import (
     DiffusionDecoder,
     DiffusionDriveSettings,
     add_noise,
+    alphas_cumprod,
     checked_anchors,
     cluster_anchors,
     ddim_step,
     denormalise_points,
     focal_loss,
     grid_coordinates,
-    kept,
     normalise_points,
     sinusoids,
 )
@@ -62,7 +62,7 @@ def test_unfit_anchors_are_refused_by_name(tmp_path) -> None:  # type: ignore[no
 
 
 def test_the_noise_schedule_is_the_product_of_scaled_linear_betas() -> None:
-    levels = kept()
+    levels = alphas_cumprod()
     assert levels[0].item() == pytest.approx(1 - 1e-4)
     second = (1e-4**0.5 + (0.02**0.5 - 1e-4**0.5) / 999) ** 2
     assert levels[1].item() == pytest.approx((1 - 1e-4) * (1 - second))
@@ -72,7 +72,7 @@ def test_the_noise_schedule_is_the_product_of_scaled_linear_betas() -> None:
 
 def test_a_step_with_the_truth_leads_to_the_same_noise_at_the_earlier_level() -> None:
     torch.manual_seed(0)
-    truth, noise, levels = torch.rand(3, 8, 2) * 2 - 1, torch.randn(3, 8, 2), kept()
+    truth, noise, levels = torch.rand(3, 8, 2) * 2 - 1, torch.randn(3, 8, 2), alphas_cumprod()
     there = add_noise(truth, noise, levels[40])
     torch.testing.assert_close(
         ddim_step(there, truth, levels[40], levels[20]), add_noise(truth, noise, levels[20]), atol=1e-5, rtol=0
