@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from planners.data.batch import Batch, Needs
-from planners.models.planner import FloatArray, Planner, evaluating, imitation_l1, straight_on
+from planners.models.planner import FloatArray, Planner, constant_velocity_plan, evaluating, imitation_l1
 
 
 @dataclass(frozen=True)
@@ -53,4 +53,4 @@ class LinearPlanner(Planner):
 
     def _poses(self, batch: Batch) -> Tensor:
         seen = [batch.status, batch.history.flatten(1)] if self.settings.history else [batch.status]
-        return straight_on(batch) + self.layer(torch.cat(seen, -1)).float().view(-1, 8, 3)
+        return constant_velocity_plan(batch) + self.layer(torch.cat(seen, -1)).float().view(-1, 8, 3)

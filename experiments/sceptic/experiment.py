@@ -19,7 +19,7 @@ from planners.data.index import DataSettings, open_dataset
 from planners.study.arms import (
     HeldAgainst,
     against_bounds,
-    differences_of,
+    arm_differences,
     drive_arms,
     read_arm_drives,
     text_of,
@@ -201,7 +201,7 @@ def report_drives(settings: ExperimentSettings, arms: Sequence[Training], wanted
     pairs = [HeldAgainst(one.part, one.setup.label, one.reference.label) for one in wanted if one.reference]
     driven = read_arm_drives(arms, settings.out, settings.drives)
     if driven:
-        found = differences_of(driven, pairs)
+        found = arm_differences(driven, pairs)
         first = next(iter(settings.parts))
         held = against_bounds(report, [one.setup for one in wanted if one.part == first], settings.seeds)
         write_arms(report, driven, found, held)

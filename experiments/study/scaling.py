@@ -25,7 +25,7 @@ import numpy as np
 
 from experiments.study.settings import settings_of
 from factory.config.arguments import INPUT_ERRORS, run_command
-from planners.evaluation.aggregation import name_of, scores_in_percent, shown, write_csv
+from planners.evaluation.aggregation import score_column, scores_in_percent, stages_shown, write_csv
 from planners.study.report import FRAMES, StudyFrames, read_study
 from planners.study.setups import Budget, Comparison, Imitation, Setup, words_of
 from planners.study.sweep import SweepSettings, run
@@ -237,8 +237,8 @@ def scale(words: Sequence[str]) -> None:
     s = settings_of(ScalingSettings, Path(__file__).with_suffix(".yaml"), words)
     everything = trainings_of(s)
     run(s, everything, everything, comparisons_of(s))
-    report, final = Path(s.report or s.out), ("final", shown(s.human_filter)["final"])
-    curves = curves_of(read_study(report / FRAMES), name_of(*final))
+    report, final = Path(s.report or s.out), ("final", stages_shown(s.human_filter)["final"])
+    curves = curves_of(read_study(report / FRAMES), score_column(*final))
     write_csv(report / "curves.csv", [curve.row() for curve in curves])
     draw_curves(curves, f"two-stage EPDMS, {final[1]}", report / "scaling.png")
 

@@ -37,9 +37,9 @@ class StoredRows:
         self._stitched = stitched
         self._jpegs: list[tuple[Bytes, ...]] = []
         if "images" in table.column_names:
-            self._jpegs = _jpegs_at_now(_whole(table["images"]), cameras)
+            self._jpegs = _jpegs_at_now(_in_one_chunk(table["images"]), cameras)
             table = table.drop_columns(["images"])
-        self._values = {name: _values(COLUMNS[name], _whole(table[name])) for name in table.column_names}
+        self._values = {name: _row_getter(COLUMNS[name], _in_one_chunk(table[name])) for name in table.column_names}
         self._rasters: dict[tuple[int, BevLayout], Bytes] = {}
         self._pictures: dict[tuple[int, ImageLayout], Bytes] = {}
 
@@ -143,7 +143,7 @@ def count_labels(stored: StoredRows, row: int) -> int:
     return (len(stored.value("label_progress", row)) - CRC_BYTES) // 2
 
 
-def _whole(column: pa.ChunkedArray) -> pa.Array:
+def _in_one_chunk(column: pa.ChunkedArray) -> pa.Array:
     """In one piece. Of a single chunk `combine_chunks` would make a copy."""
     return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
 
@@ -165,7 +165,7 @@ def _jpegs_at_now(images: pa.ListArray, cameras: Sequence[tuple[str, ...]]) -> l
     return [tuple(jpeg_of(found[row, name]) for name in chosen) for row, chosen in enumerate(cameras)]
 
 
-def _values(column: Column, stored: pa.Array) -> Callable[[int], Any]:
+def _row_getter(column: Column, stored: pa.Array) -> Callable[[int], Any]:
     """Row -> value, in the declared shape."""
     if column.dtype in ("string", "binary"):
         return lambda row: stored[row].as_py()

@@ -109,6 +109,7 @@ def files_of(table: str | os.PathLike[str], storage_options: Mapping[str, str] |
 
 
 def leaves(file: pq.ParquetFile, columns: Sequence[str]) -> list[str]:
+def leaf_paths(file: StoredFile, columns: Sequence[str]) -> list[str]:
     """The paths of the leaves under columns and members (`label_2hz`, `images.jpeg`) of a file, for reading.
 
     Raises ValueError naming those it has not.

@@ -103,11 +103,11 @@ def stitch(jpegs: Sequence[Bytes], layout: ImageLayout, out: Bytes) -> None:
     Raises ValueError for what is not a JPEG, or a damaged one.
     """
     sizes = tuple(jpeg_size(jpeg)[::-1] for jpeg in jpegs)
-    for jpeg, part in zip(jpegs, _parts(sizes, layout)):
-        _place(_decoded(jpeg, part.decoded), part, out)
+    for jpeg, part in zip(jpegs, _picture_parts(sizes, layout)):
+        _draw_part(_decode_jpeg(jpeg, part.decoded), part, out)
 
 
-def _decoded(jpeg: Bytes, size: tuple[int, int]) -> Bytes:
+def _decode_jpeg(jpeg: Bytes, size: tuple[int, int]) -> Bytes:
     """(rows, columns, 3) RGB until the thread decodes again. size: its own over one of FACTORS, rounded up."""
     rows, columns = size
     room: Bytes | None = getattr(_THREAD, "room", None)
@@ -128,12 +128,12 @@ def stitch_pixels(images: Sequence[Bytes], layout: ImageLayout, out: Bytes) -> N
     What would have been decoded smaller is averaged to that size; the rest is equal to the last bit.
     """
     sizes = tuple((image.shape[0], image.shape[1]) for image in images)
-    for image, part in zip(images, _parts(sizes, layout)):
+    for image, part in zip(images, _picture_parts(sizes, layout)):
         whole = image if part.factor == 1 else cv2.resize(image, part.decoded[::-1], interpolation=cv2.INTER_AREA)
-        _place(np.asarray(whole, np.uint8), part, out)
+        _draw_part(np.asarray(whole, np.uint8), part, out)
 
 
-def _place(pixels: Bytes, part: "_Part", out: Bytes) -> None:
+def _draw_part(pixels: Bytes, part: "_Part", out: Bytes) -> None:
     pixels, into = pixels[part.rows, part.columns], out[:, part.into]
     if pixels.shape == into.shape:
         into[:] = pixels
@@ -154,7 +154,7 @@ class _Part:
 
 
 @lru_cache(maxsize=64)
-def _parts(sizes: tuple[tuple[int, int], ...], layout: ImageLayout) -> tuple[_Part, ...]:
+def _picture_parts(sizes: tuple[tuple[int, int], ...], layout: ImageLayout) -> tuple[_Part, ...]:
     """Where images of these sizes (rows, columns) go. Raises ValueError where the layout cuts all of one away."""
     cuts = [(layout.rows_cut, 0.0 if 2 * i == len(sizes) - 1 else layout.sides_cut) for i in range(len(sizes))]
     shown = [tuple(_inside(n, share) for n, share in zip(size, cut)) for size, cut in zip(sizes, cuts)]
@@ -190,7 +190,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class DecodedPictures:
+class PictureCache:
     """A folder of pictures, which need not be there yet."""
 
     folder: Path
@@ -210,7 +210,7 @@ class DecodedPictures:
 
     def held_bytes(self) -> int:
         """Of all entries that are there."""
-        return sum(_held(part) for part in self.folder.glob("??"))
+        return sum(_bytes_held(part) for part in self.folder.glob("??"))
 
     def check(self, layout: ImageLayout) -> None:
         """Raises ValueError where the limit does not leave every part of the folder one picture."""
@@ -229,7 +229,7 @@ class DecodedPictures:
             if _read(path, key, np.empty_like(picture)):  # another kept it meanwhile
                 return
             path.unlink(missing_ok=True)
-            if _held(path.parent) + size > self.limit_gb * GB / PARTS:
+            if _bytes_held(path.parent) + size > self.limit_gb * GB / PARTS:
                 return
             draft = path.parent / "draft"
             with draft.open("wb") as file:
@@ -265,7 +265,7 @@ def _checksum(key: str, picture: Bytes) -> bytes:
     return zlib.crc32(picture.data, zlib.crc32(key.encode())).to_bytes(CHECKSUM_BYTES, "little")
 
 
-def _held(part: Path) -> int:
+def _bytes_held(part: Path) -> int:
     with os.scandir(part) as entries:
         return sum(entry.stat().st_size for entry in entries if entry.name.endswith(".rgb"))
 

@@ -22,7 +22,7 @@ from factory.store.location import Location, raising_damaged_file
 from factory.store.reader import TIME_TOLERANCE_S, group_rows
 from factory.store.schema import LABEL_COLUMNS
 from planners.data.batch import ImageLayout, Needs, TrainingData
-from planners.data.files import SampleFile, files_of, group_bytes, leaves, read_all
+from planners.data.files import SampleFile, files_of, group_bytes, leaf_paths, read_all
 from planners.data.images import chosen_cameras
 from planners.data.mix import MixSettings, Samples, check_sides
 from tasks.settings import constant
@@ -143,7 +143,7 @@ class Dataset:
             here = np.flatnonzero(self.rows.file == number)
             with raising_damaged_file(self.files[number].where):
                 parquet = self.files[number].open()
-                stored = parquet.read(columns=leaves(parquet, ["label_2hz"]))["label_2hz"].combine_chunks()
+                stored = parquet.read(columns=leaf_paths(parquet, ["label_2hz"]))["label_2hz"].combine_chunks()
                 starts = np.concatenate([[0], np.cumsum(group_rows(parquet))])
                 values = stored.flatten().flatten().to_numpy().reshape(-1, 8, 3)
                 labels[here] = values[starts[self.rows.group[here]] + self.rows.place[here]]
@@ -195,14 +195,14 @@ def open_dataset(settings: DataSettings) -> Dataset:
     if len(twice):
         both = " and ".join(files[f].table for f in rows.file[twice[0] : twice[0] + 2])
         raise ValueError(f"sample {rows.attempt_id[twice[0]]} and {len(twice) - 1} more stand twice, in {both}")
-    return replace(dataset, rows=rows.select(_kept(settings, rows)))
+    return replace(dataset, rows=rows.select(_rows_passing(settings, rows)))
 
 
 def _rows_of(file: SampleFile, number: int) -> SampleRows:
     """The index columns of one file. Raises ValueError naming missing ones."""
     parquet = file.open()
     try:
-        columns = leaves(parquet, INDEX_COLUMNS)
+        columns = leaf_paths(parquet, INDEX_COLUMNS)
     except ValueError as error:
         raise ValueError(f"{file.table}: {error} in {file.path}; make the table again with this version") from error
     with raising_damaged_file(file.where):
@@ -233,7 +233,7 @@ def _index_of(file: SampleFile, number: int, parquet: pq.ParquetFile, table: pa.
     )
 
 
-def _kept(settings: DataSettings, rows: SampleRows) -> Ints:
+def _rows_passing(settings: DataSettings, rows: SampleRows) -> Ints:
     """Places of the rows that the filters leave. Raises ValueError naming the filter that leaves too few."""
     sim = rows.simulated
     if unknown := sorted(set(settings.experts) - set(rows.expert[sim].tolist())):
@@ -258,7 +258,7 @@ def _kept(settings: DataSettings, rows: SampleRows) -> Ints:
         there = np.flatnonzero(kept & sim)
         if len(there) < settings.limit_sim:
             raise ValueError(f"data.limit_sim={settings.limit_sim}, but there are {len(there)} simulated samples")
-        drawn = _by_lot(rows.attempt_id[there].tolist(), settings.seed)[: settings.limit_sim]
+        drawn = _shuffled_places(rows.attempt_id[there].tolist(), settings.seed)[: settings.limit_sim]
         kept[there] = False
         kept[there[drawn]] = True
     return np.flatnonzero(kept)
@@ -271,11 +271,11 @@ def _of_kept_clips(settings: DataSettings, rows: SampleRows) -> Bools:
         raise ValueError(
             f"data.real_share={settings.real_share} is of the real clips, and there are none: see data.real"
         )
-    drawn = _by_lot(clips, settings.seed)[: max(1, round(settings.real_share * len(clips)))]
+    drawn = _shuffled_places(clips, settings.seed)[: max(1, round(settings.real_share * len(clips)))]
     return np.isin(rows.clip_id, [clips[i] for i in drawn])
 
 
-def _by_lot(names: Sequence[str], seed: int) -> list[int]:
+def _shuffled_places(names: Sequence[str], seed: int) -> list[int]:
     """Places of names in an order drawn by the seed, in which every name's rank among others is its own chance."""
 
     def chance(place: int) -> bytes:
@@ -386,7 +386,7 @@ def _file_part(
     cameras: list[tuple[str, ...]] = [()] * len(here)
     if needs.image is not None:
         places = (np.cumsum(rows) - rows)[groups] + dataset.rows.place[here]
-        members = leaves(parquet, ["cameras.name", "cameras.ego_from_camera", "images.camera", "images.time_s"])
+        members = leaf_paths(parquet, ["cameras.name", "cameras.ego_from_camera", "images.camera", "images.time_s"])
         with raising_damaged_file(dataset.files[number].where):
             seen = read_all(parquet, members)
         cameras = _cameras(dataset, here, seen, places, needs.image)

@@ -28,8 +28,8 @@ import pyarrow as pa
 from factory.store.location import raising_damaged_file
 from planners.data.batch import Batch, Needs
 from planners.data.decode import BatchBuffer, StoredRows, count_labels
-from planners.data.files import leaves, read_group
-from planners.data.images import GB, DecodedPictures, stitch
+from planners.data.files import leaf_paths, read_group
+from planners.data.images import GB, PictureCache, stitch
 from planners.data.index import Dataset, Feed, make_feed, mixed_samples
 from planners.data.mix import EpochOrder, MixSettings, Side, WindowKey, make_order
 from tasks.world.arrays import Ints
@@ -48,7 +48,7 @@ class Window:
     last: int  # batch after which it can go
 
 
-class _Reading:
+class _PendingRows:
     """Samples that are being read, a future a file."""
 
     def __init__(self, futures: list[Future[dict[int, Place]]], last: int) -> None:
@@ -67,24 +67,24 @@ class _Reading:
         return {sample: place for future in self.futures for sample, place in future.result().items()}
 
 
-def pictures_of(feed: Feed) -> DecodedPictures | None:
+def open_picture_cache(feed: Feed) -> PictureCache | None:
     """Those of `data.pictures`, where there are pictures to be kept. Raises ValueError where too few can be."""
     settings, layout = feed.dataset.settings, feed.needs.image
     if settings.pictures is None or layout is None:
         return None
-    kept = DecodedPictures(Path(settings.pictures).expanduser(), settings.pictures_gb)
+    kept = PictureCache(Path(settings.pictures).expanduser(), settings.pictures_gb)
     kept.check(layout)
     return kept
 
 
-class Memory:
+class WindowMemory:
     """The rows of windows that are in use or about to be, and of sides that stay."""
 
     def __init__(self, feed: Feed, staying: Mapping[int, Ints]) -> None:
         """staying: side -> its samples, for those that fit into one window."""
         self._feed, self._staying = feed, staying
-        self.pictures = pictures_of(feed)
-        self._stay: dict[int, _Reading] = {}
+        self.pictures = open_picture_cache(feed)
+        self._stay: dict[int, _PendingRows] = {}
         self._checked: set[tuple[int, int]] = set()  # row groups whose pages were found undamaged
 
     def __getstate__(self) -> dict[str, Any]:
@@ -96,7 +96,7 @@ class Memory:
         """Start to read for an epoch; what an earlier one left is dropped, but what stays."""
         self._executor = executor
         self._to_come = [window for window in windows if window.key[0] not in self._staying]
-        self._read: dict[WindowKey, _Reading] = {}
+        self._read: dict[WindowKey, _PendingRows] = {}
         for side in sorted({window.key[0] for window in windows} & set(self._staying)):
             if side not in self._stay or self._stay[side].is_cancelled:
                 self._stay[side] = self._submit(self._staying[side], 0)
@@ -116,7 +116,7 @@ class Memory:
             del self._read[key]
         self._advance()
 
-    def _reading(self, key: WindowKey) -> _Reading:
+    def _reading(self, key: WindowKey) -> _PendingRows:
         if key[0] in self._staying:
             return self._stay[key[0]]
         if key not in self._read:  # a batch that is larger than two windows
@@ -135,10 +135,10 @@ class Memory:
                 waiting.append(window)
         self._to_come = waiting
 
-    def _submit(self, samples: Ints, last: int) -> _Reading:
+    def _submit(self, samples: Ints, last: int) -> _PendingRows:
         files = self._feed.dataset.rows.file[samples]
         tasks = [self._executor.submit(self._load, int(n), samples[files == n]) for n in np.unique(files)]
-        return _Reading(tasks, last)
+        return _PendingRows(tasks, last)
 
     def _load(self, number: int, samples: Ints) -> dict[int, Place]:
         """Rows of one file."""
@@ -148,7 +148,7 @@ class Memory:
         with raising_damaged_file(file.where):
             checked = all((number, group) in self._checked for group in groups.tolist())
             stored = file.open(check_pages=not checked)
-            paths = leaves(stored, self._feed.columns)
+            paths = leaf_paths(stored, self._feed.columns)
             for group in np.unique(groups).tolist():
                 found |= self._rows(read_group(stored, group, paths), samples[groups == group])
                 self._checked.add((number, group))
@@ -201,7 +201,7 @@ class Loader:
         samples = mixed_samples(self._feed)
         self._order = make_order(samples, mix, batch_size, seed)
         staying = {side.number: side.rows for side in self._order.sides if side.fits}
-        self._memory = Memory(self._feed, staying)
+        self._memory = WindowMemory(self._feed, staying)
         self._pictures_bytes = _kept_pictures(self._order.sides, needs, mix)
         sha = sha256(dataset.digest.encode())
         if len(staying) < len(self._order.sides):  # windows depend on where samples stand

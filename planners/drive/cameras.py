@@ -103,12 +103,12 @@ def sample_of(scene: Scene, cameras: DriveCameras, images: Images) -> Sample:
     }  # fmt: skip
 
 
-def states_at(scene: Scene, offset: int) -> Array:
+def ego_state_at(scene: Scene, offset: int) -> Array:
     """(1, 11) of the ego `offset` steps from the scene's, within its history."""
     return scene.ego_history[HISTORY_STEPS + offset][None]
 
 
-def ground_of(clip: Clip) -> Array:
+def ground_poses(clip: Clip) -> Array:
     """(L, 4, 4) poses that tell how the road lies, of the clip's ego and of its block's sensors."""
     files = () if clip.block is None else (*clip.block.images, *clip.block.sweeps)
     return np.concatenate([clip.world_from_ego, *(file.world_from_ego[None] for file in files)])
@@ -141,7 +141,7 @@ class PaintedCameras:
 
     def images(self, scene: Scene, offset: int) -> Images:
         """Raises ValueError where the clip is not the painter's."""
-        state = states_at(scene, offset)[0]
+        state = ego_state_at(scene, offset)[0]
         pose, taken = self.painter.pictures(scene.clip, self.cameras, scene.agents, scene.step + offset, state)
         names = (camera.name for camera in self.cameras)
         return [self._imaging.image(name, offset * STEP_S, pose, rgb) for name, rgb in zip(names, taken)]
@@ -175,7 +175,7 @@ class RenderedCameras:
     def images(self, scene: Scene, offset: int) -> Images:
         """As a sample's pictures are drawn (factory.stages.imaging)."""
         s, step = self.settings, scene.step + offset
-        poses = pose_on_ground(self.asset.on_road(ground_of(self.clip)), states_at(scene, offset))
+        poses = pose_on_ground(self.asset.on_road(ground_poses(self.clip)), ego_state_at(scene, offset))
         agents = self.asset.lifted(scene.agents, clip_offset_s(self.clip))
         seen = render_views(self.asset, self.cameras, poses, agents, [step], s.width, s.height, s.backend)[0]
         imaging = Imaging(s, "")

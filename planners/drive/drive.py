@@ -37,7 +37,7 @@ from factory.store.table import AnotherWriter, KeyedTable
 from planners.drive.drivers import make_driver
 from planners.drive.settings import DriveSettings, Pictures, settings_of
 from planners.drive.starts import LOGGED
-from planners.drive.summary import Row, differences_of, lines_of, summary_text, write_summary
+from planners.drive.summary import Row, picture_differences, summarise_drives, summary_text, write_summary
 from planners.drive.work import (
     FACTS,
     DriveItem,
@@ -46,6 +46,7 @@ from planners.drive.work import (
     DrivingPlanner,
     FailedDrive,
     RowCommitter,
+    is_town_reader,
     open_drives,
 )
 from planners.evaluation.planner_names import find_planners
@@ -84,7 +85,7 @@ def drive_all(settings: DriveSettings) -> tuple[list[Row], list[FailedDrive]]:
     """
     if unusable := why_unusable(settings.out):
         raise ConfigError(unusable)
-    asked = _asked(settings)
+    asked = _requested_drives(settings)
     table = open_drives(asked.work.out)
     failed = [FailedDrive(ref.clip_id, why) for ref, why in asked.broken.items()]
     try:
@@ -97,20 +98,21 @@ def drive_all(settings: DriveSettings) -> tuple[list[Row], list[FailedDrive]]:
     return asked.rows(table), failed
 
 
-def driven(settings: DriveSettings) -> tuple[list[Row], bool]:
+def read_drives(settings: DriveSettings) -> tuple[list[Row], bool]:
     """The rows that are there of all that were asked for, and whether that is all; nothing is driven.
 
     Raises ConfigError.
     """
-    asked = _asked(settings)
+    asked = _requested_drives(settings)
     table = open_drives(asked.work.out)
     return asked.rows(table), asked.is_made(table)
 
 
-def _asked(settings: DriveSettings) -> RequestedDrives:
+def _requested_drives(settings: DriveSettings) -> RequestedDrives:
     planners = _planners(settings)
     reader, index = open_reader(settings.clips)
     if any("truth" in kinds for _, kinds in planners) and painter_of(reader) is None:
+    if any("truth" in kinds for _, kinds in planners) and not is_town_reader(reader):
         raise ConfigError("pictures=truth is the painter's of the synthetic town: give pictures=engine for these clips")
     if any("engine" in kinds for _, kinds in planners):
         try:
@@ -178,7 +180,7 @@ def main(argv: Sequence[str]) -> None:
         need_run_extra("ray")
     rows, failed = drive_all(settings)
     if rows:
-        lines, apart = lines_of(rows, settings.confidence), differences_of(rows, settings.confidence)
+        lines, apart = summarise_drives(rows, settings.confidence), picture_differences(rows, settings.confidence)
         print(summary_text(lines, apart, settings.confidence))
         if work_folder := local_folder(settings.out):
             write_summary(work_folder, lines, apart)

@@ -9,7 +9,7 @@ import numpy as np
 
 from factory.store.reader import Sample
 from planners.evaluation.planner_names import EvaluatedPlanner, needs_of
-from planners.evaluation.planning import plans_of
+from planners.evaluation.planning import plan_samples
 from planners.evaluation.scoring import human_plans, pdm_plans
 from tasks.experts.pdm_closed import PdmClosed
 from tasks.experts.protocol import Plan
@@ -91,7 +91,7 @@ class PlannerDriver:
 
     def plan(self, scene: Scene, look: MakeSample) -> Array | DriveEnd:
         """Raises ValueError, naming the sample, for what is no plan."""
-        return to_world(scene.ego_state[: HEADING + 1], plans_of(self.made, [look()], self.device)[0])
+        return to_world(scene.ego_state[: HEADING + 1], plan_samples(self.made, [look()], self.device)[0])
 
 
 def make_driver(one: EvaluatedPlanner, pdm: PdmSettings, device: str = "cpu") -> Driver:

@@ -40,12 +40,12 @@ def write_film(out: Location, drive_id: str, made: ClosedLoop, rig: Rig, title: 
     """The film's file under `out`, written whole."""
     with TemporaryDirectory() as folder:
         path = Path(folder, "drive.mp4")
-        write_mp4(path, pictures_of(made, rig, title))
+        write_mp4(path, film_frames(made, rig, title))
         out.child(FILMS).write(f"{drive_id}.mp4", path.read_bytes())
     return f"{FILMS}/{drive_id}.mp4"
 
 
-def pictures_of(made: ClosedLoop, rig: Rig, title: str) -> Iterator[Image]:
+def film_frames(made: ClosedLoop, rig: Rig, title: str) -> Iterator[Image]:
     """RGB pictures (560, 1280, 3), one each 0.1 s, the last several times."""
     sheet = None
     for step in range(made.n_steps + 1):

@@ -57,7 +57,7 @@ class RouteAhead:
         return float(self.along_m[first + i] + share[i] * np.sqrt(square[i]))
 
 
-def road_from(centerline: Array, pose: Array, known: Array, bound_m: float) -> RouteAhead:
+def route_ahead(centerline: Array, pose: Array, known: Array, bound_m: float) -> RouteAhead:
     """The road along a centreline (P, >= 2) from a rear-axle pose (3,).
 
     It is known as far as all of it lies within `bound_m` of the places `known` (K, 2).
@@ -189,12 +189,12 @@ class _Course:
     def __init__(self, start: DriveStart, settings: LoopSettings) -> None:
         scene = start.scene
         self.start, self.settings = start, settings
-        self.road = road_from(scene.centerline, scene.ego_state[: HEADING + 1], start.known, settings.bound_m)
+        self.road = route_ahead(scene.centerline, scene.ego_state[: HEADING + 1], start.known, settings.bound_m)
         self.states, self.along_m, self.off_road = [scene.ego_state], [self.road.start_m], list[bool]()
         self.ended: DriveEnd | None = None
         self.hit: Hit | None = None
         # Who touches the ego from the start on is no collision, as in the public log replay, until it is apart.
-        self._excused = _touched(scene.ego_state, scene.agents, scene.step)
+        self._excused = _touching_agents(scene.ego_state, scene.agents, scene.step)
 
     def follow(self, rollout: Rollout, scores: Scores) -> int:
         """Take the rollout's next PLAN_STEPS, or those up to where the drive ends; how many."""
@@ -204,8 +204,8 @@ class _Course:
             state = rollout.ego_states[step]
             self.states.append(state)
             self.along_m.append(self.road.place_m(state[[X, Y]], self.along_m[-1]))
-            touched = _touched(state, rollout.agents, step)
-            self.hit = _hit(rollout, scores, step, np.setdiff1d(touched, self._excused))
+            touched = _touching_agents(state, rollout.agents, step)
+            self.hit = _collision_at(rollout, scores, step, np.setdiff1d(touched, self._excused))
             self._excused = np.intersect1d(touched, self._excused)
             self.ended = self._end(state)
             self.off_road.append(bool(flags[step]) and self.ended is not DriveEnd.ROAD_END)  # it has arrived
@@ -223,13 +223,13 @@ class _Course:
         return DriveEnd.TIME if len(self.states) > self.settings.n_steps else None
 
 
-def _touched(state: Array, agents: AgentTracks, step: int) -> Ints:
+def _touching_agents(state: Array, agents: AgentTracks, step: int) -> Ints:
     """Rows of the agents whose box touches the ego's body at a step."""
     found: Ints = np.flatnonzero(agents.valid[step] & touching(ego_boxes(state, PACIFICA), agents.boxes[step]))
     return found
 
 
-def _hit(rollout: Rollout, scores: Scores, step: int, touched: Ints) -> Hit | None:
+def _collision_at(rollout: Rollout, scores: Scores, step: int, touched: Ints) -> Hit | None:
     """The collision at a step, of those touched the first; scores: of the rollout, one row."""
     if len(touched) == 0:
         return None

@@ -9,7 +9,7 @@ from factory.config.datasets import reader_settings
 from factory.config.run import VocabularyChoice, own_settings, refuse_missing_root
 from factory.config.shapes import deep_merge, defaults_of
 from planners.drive.loop import LoopSettings
-from planners.evaluation.planner_names import composed
+from planners.evaluation.planner_names import compose_with_planner
 from tasks.render.settings import RenderSettings
 from tasks.settings import PdmSettings, PerturbSettings, TrafficSettings
 
@@ -73,7 +73,7 @@ class DriveSettings:
 
 def settings_of(argv: Sequence[str]) -> DriveSettings:
     """The settings of a command line. Raises ConfigError."""
-    settings = fill(DriveSettings, composed("drive", argv, DriveSettings, with_clips), "")
+    settings = fill(DriveSettings, compose_with_planner("drive", argv, DriveSettings, with_clips), "")
     refuse_missing_root(settings.clips)
     return settings
 

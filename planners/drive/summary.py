@@ -52,7 +52,7 @@ def start_kind(row: Row) -> str:
     return "logged" if row["start"] == LOGGED else "perturbed"
 
 
-def lines_of(rows: Sequence[Row], confidence: float = 0.95) -> list[DriveLine]:
+def summarise_drives(rows: Sequence[Row], confidence: float = 0.95) -> list[DriveLine]:
     """A line for each planner, kind of pictures and kind of start, in the order in which they first come."""
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
@@ -112,7 +112,7 @@ class PicturesDifference:
     shares: Mapping[str, Interval]  # b (engine) - a (truth)
 
 
-def differences_of(rows: Sequence[Row], confidence: float = 0.95) -> list[PicturesDifference]:
+def picture_differences(rows: Sequence[Row], confidence: float = 0.95) -> list[PicturesDifference]:
     """Over the starts that were driven with both. None where there are none."""
     both: dict[tuple[str, str], dict[tuple[str, int], dict[str, Row]]] = {}
     for row in rows:

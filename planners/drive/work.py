@@ -22,7 +22,7 @@ from planners.drive.films import write_film
 from planners.drive.loop import DRIVE_VERSION, ClosedLoop, DriveMeasures, drive, measure_drive
 from planners.drive.settings import DriveSettings, Pictures
 from planners.drive.starts import LOGGED, DriveStart, extend_clip, logged_start, perturbed_starts
-from planners.evaluation.planner_names import planner_of
+from planners.evaluation.planner_names import find_planner
 from tasks.perturb import Perturbation, perturb
 from tasks.rollout.simulate import traffic_record
 from tasks.stages import stage_versions
@@ -205,6 +205,7 @@ class DriveWork:
         clip, n_steps = read_clip(self.reader, item.ref), self.settings.loop.clip_steps(last)
         painter = painter_of(self.reader)
         return extend_clip(clip, n_steps, None if painter is None else painter.lights(clip, n_steps))
+        return extend_clip(clip, n_steps, town_lights(clip, n_steps) if is_town_reader(self.reader) else None)
 
     def _starts(self, clip: Clip, wanted: set[int]) -> dict[int, DriveStart]:
         found = [logged_start(clip)] if LOGGED in wanted else []
@@ -271,7 +272,7 @@ class DriveWork:
 @lru_cache(maxsize=8)
 def cached_driver(who: DrivingPlanner, changed: str, pdm: Any, device: str) -> Driver:
     """A worker's own, read once. Raises ValueError where it is another than was named when the command began."""
-    one = planner_of(who.spec, who.label, json.loads(changed))
+    one = find_planner(who.spec, who.label, json.loads(changed))
     if one.digest != who.digest:
         raise ValueError(f"{who.spec} has changed since the command began: run it again when its training is through")
     return make_driver(one, pdm, device)

@@ -110,7 +110,7 @@ def summarise_clips(clips: Sequence[ClipResult]) -> Summary:
     )
 
 
-def lines_of(planner: str, summary: Summary) -> list[SummaryLine]:
+def summary_lines(planner: str, summary: Summary) -> list[SummaryLine]:
     """The lines of one planner."""
     logged, follow_ups = 2 * summary.n_two_stage, 2 * summary.n_follow_ups
     n_frames = {"one_stage": summary.n_clips, "stage_one": logged, "final": logged + follow_ups}
@@ -138,7 +138,7 @@ def stage_columns(one_stage: FrameScores, two_stage: TwoStageScores | None, stag
     return scores.filtered if human_filter == "filtered" else scores.unfiltered
 
 
-def score_of(columns: Array) -> float:
+def total_score(columns: Array) -> float:
     """The last of COLUMNS."""
     return float(columns[COLUMNS.index("score")])
 
@@ -186,7 +186,7 @@ PAPER: HumanFilter = "unfiltered"  # what is held against the paper's tables
 BOUNDS = ("human", "pdm_closed", "constant_velocity")
 
 
-def shown(human_filter: HumanFilter) -> dict[str, str]:
+def stages_shown(human_filter: HumanFilter) -> dict[str, str]:
     """Stage -> the filter under which it stands in a table of so filtered scores."""
     return {stage: which for stage, which in MEASURES if which in (human_filter, "none")}
 
@@ -194,14 +194,14 @@ def shown(human_filter: HumanFilter) -> dict[str, str]:
 def scores_in_percent(clips: Sequence[ClipResult]) -> dict[str, float]:
     """Of one planner: name_of(stage, filter) -> EPDMS in percent, and its share of uniform fallbacks."""
     found = {}
-    for line in lines_of("", summarise_clips(clips)):
-        found[name_of(line.stage, line.human_filter)] = 100.0 * score_of(line.columns)
+    for line in summary_lines("", summarise_clips(clips)):
+        found[score_column(line.stage, line.human_filter)] = 100.0 * total_score(line.columns)
         if line.stage == "final":
             found["uniform_share"] = line.uniform_share
     return found
 
 
-def name_of(stage: str, human_filter: str) -> str:
+def score_column(stage: str, human_filter: str) -> str:
     """Column of a score."""
     return stage if human_filter == "none" else f"{stage}_{human_filter}"
 
@@ -221,7 +221,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 @dataclass(frozen=True)
-class Measured:
+class RunScores:
     """One column of S runs on C clips."""
 
     clips: tuple[str, ...]
@@ -230,7 +230,7 @@ class Measured:
     weights: Array  # (S, C) how much a clip's score counts in a mean: rows or groups that it is the mean of
 
 
-def measured(runs: Sequence[Sequence[ClipResult]], column: str) -> dict[tuple[str, str], Measured]:
+def collect_scores(runs: Sequence[Sequence[ClipResult]], column: str) -> dict[tuple[str, str], RunScores]:
     """(stage, filter) -> scores of the runs; stages that a run lacks, or that are not numbers, are left out.
 
     Raises ValueError where the runs are not over the same clips, naming what differs.
@@ -244,14 +244,14 @@ def measured(runs: Sequence[Sequence[ClipResult]], column: str) -> dict[tuple[st
     return {name: values for name, values in found.items() if np.isfinite(values.scores).all()}
 
 
-def _of_stage(runs: Sequence[Sequence[ClipResult]], stage: str, human_filter: str, column: str) -> Measured:
+def _of_stage(runs: Sequence[Sequence[ClipResult]], stage: str, human_filter: str, column: str) -> RunScores:
     place = COLUMNS.index(column)
 
     def score(clip: ClipResult) -> float:
         two_stage = None if stage == "one_stage" else clip.two_stage
         return float(stage_columns(clip.one_stage, two_stage, stage, human_filter)[place])
 
-    return Measured(
+    return RunScores(
         clips=tuple(clip.clip_id for clip in runs[0]),
         logs=tuple(clip.log_id for clip in runs[0]),
         scores=np.array([[score(clip) for clip in run] for run in runs]),

@@ -25,10 +25,10 @@ from planners.evaluation import navsim
 from planners.evaluation.aggregation import (
     FILTERS_NOTE,
     ClipResult,
-    Measured,
+    RunScores,
     check_same_clips,
+    collect_scores,
     group_by_clip,
-    measured,
 )
 from planners.evaluation.bootstrap import LEVELS, Interval, clusters_of, paired_interval
 from planners.evaluation.score_rows import read_record, read_rows
@@ -57,11 +57,11 @@ def compare(
 ) -> dict[Measure, ByLevel]:
     """Difference of the runs b from the runs a. Raises ValueError where their clips differ."""
     check_same_clips([*a, *b])
-    return intervals(measured(a, settings.column), measured(b, settings.column), settings)
+    return intervals(collect_scores(a, settings.column), collect_scores(b, settings.column), settings)
 
 
 def intervals(
-    of_a: Mapping[Measure, Measured], of_b: Mapping[Measure, Measured], settings: CompareSettings
+    of_a: Mapping[Measure, RunScores], of_b: Mapping[Measure, RunScores], settings: CompareSettings
 ) -> dict[Measure, ByLevel]:
     """Difference of what runs scored on the same clips, of measures that both sides have, over clips, logs and towns.
 
@@ -70,7 +70,7 @@ def intervals(
     return {name: _by_level(of_a[name], of_b[name], settings) for name in of_a if name in of_b}
 
 
-def _by_level(a: Measured, b: Measured, settings: CompareSettings) -> ByLevel:
+def _by_level(a: RunScores, b: RunScores, settings: CompareSettings) -> ByLevel:
     if a.clips != b.clips:
         raise ValueError("the runs were not scored on the same clips")
     return {

@@ -39,11 +39,11 @@ from factory.config.compose import ConfigError, fill
 from factory.config.datasets import find_function, words_of
 from factory.config.shapes import to_plain
 from factory.graph.progress import Counter
-from planners.evaluation.aggregation import SummaryLine, lines_of, summarise, table_text, write_table
+from planners.evaluation.aggregation import SummaryLine, summarise, summary_lines, table_text, write_table
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.frames import Benchmark, FrameKey
 from planners.evaluation.navsim import write_tables
-from planners.evaluation.planner_names import EvaluatedPlanner, composed, find_planners, needs_of
+from planners.evaluation.planner_names import EvaluatedPlanner, compose_with_planner, find_planners, needs_of
 from planners.evaluation.planning import all_plans
 from planners.evaluation.score_rows import RECORD, FrameRow, is_done, read_rows, write_record, write_rows
 from planners.evaluation.scoring import (
@@ -133,14 +133,14 @@ def evaluate(benchmark: Benchmark, who: Sequence[EvaluatedPlanner], settings: Ev
     ]
     plans = all_plans(benchmark, keys, planning, settings.batch_size, settings.planners_at_once, settings.device)
     if waiting:
-        rows = _scored(benchmark, keys, waiting, plans, settings.rules)
+        rows = _score_clips(benchmark, keys, waiting, plans, settings.rules)
         for one in waiting:
             (out / one.label / RECORD).unlink(missing_ok=True)  # what the folder holds is about to be replaced
             write_rows(out / one.label, rows[one.label])
             if benchmark.tokens:
                 write_tables(out / one.label, rows[one.label], benchmark.tokens)
             write_record(out / one.label, {**identities[one.label], "planner": one.label, "frames": len(keys)})
-    lines = [line for one in who for line in lines_of(one.label, summarise(read_rows(out / one.label)))]
+    lines = [line for one in who for line in summary_lines(one.label, summarise(read_rows(out / one.label)))]
     if settings.tables:
         write_table(out, lines)
     return lines
@@ -163,7 +163,7 @@ def _keys(benchmark: Benchmark, limit: int | None) -> list[FrameKey]:
     return [key for key in benchmark.keys if key.clip_id in set(clips)]
 
 
-def _scored(
+def _score_clips(
     benchmark: Benchmark,
     keys: Sequence[FrameKey],
     who: Sequence[EvaluatedPlanner],
@@ -223,7 +223,7 @@ def settings_of(argv: Sequence[str]) -> EvaluateSettings:
             return values | {"two_stage_traffic": to_plain(TrafficSettings(mode="navsim"))}
         return values
 
-    return fill(EvaluateSettings, composed("evaluate", argv, EvaluateSettings, completed), "evaluate")
+    return fill(EvaluateSettings, compose_with_planner("evaluate", argv, EvaluateSettings, completed), "evaluate")
 
 
 def _folder(settings: EvaluateSettings) -> str:
@@ -240,10 +240,10 @@ def _folder(settings: EvaluateSettings) -> str:
 @command("evaluate", EvaluateSettings)
 def main(argv: Sequence[str]) -> None:
     """The command. Raises as `evaluated`."""
-    evaluated(settings_of(argv))
+    run_evaluation(settings_of(argv))
 
 
-def evaluated(settings: EvaluateSettings) -> None:
+def run_evaluation(settings: EvaluateSettings) -> None:
     """Evaluate and print what settings ask for. Raises ConfigError, or OSError for a folder that is none."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     who = find_planners(settings.planner, settings.planners, settings.bounds, settings.settings)

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from factory.config.compose import ConfigError
-from planners.evaluation.aggregation import HumanFilter, Measured, Summary, group_by_clip, summarise_clips
+from planners.evaluation.aggregation import HumanFilter, RunScores, Summary, group_by_clip, summarise_clips
 from planners.evaluation.bootstrap import Interval
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow
@@ -242,7 +242,7 @@ def read_tables(paths: Sequence[str]) -> list[list[PublicTable]]:
     return runs
 
 
-def table_scores(runs: Sequence[Sequence[PublicTable]], column: str) -> dict[Measure, Measured]:
+def table_scores(runs: Sequence[Sequence[PublicTable]], column: str) -> dict[Measure, RunScores]:
     """(stage, filter) -> one column of the runs over their tokens; what a run does not hold is left out.
 
     Raises ConfigError where runs are not over the same tokens, or some of a stage failed.
@@ -256,7 +256,7 @@ def table_scores(runs: Sequence[Sequence[PublicTable]], column: str) -> dict[Mea
     return found
 
 
-def check_same_tokens(first: Mapping[Measure, Measured], second: Mapping[Measure, Measured]) -> None:
+def check_same_tokens(first: Mapping[Measure, RunScores], second: Mapping[Measure, RunScores]) -> None:
     """Raises ConfigError where the sides share no stage, or hold one of other tokens."""
     if not first.keys() & second.keys():
         stages = [sorted({name[0] for name in side}) for side in (first, second)]
@@ -295,7 +295,7 @@ def _which(human_filter: str) -> HumanFilter:
     return "filtered" if human_filter == "filtered" else "unfiltered"
 
 
-def _paired(runs: Sequence[Sequence[PublicTable]], rows: Sequence[Mapping[str, Array]], column: str) -> Measured:
+def _paired(runs: Sequence[Sequence[PublicTable]], rows: Sequence[Mapping[str, Array]], column: str) -> RunScores:
     tokens = tuple(sorted(rows[0]))
     for run, one in zip(runs, rows):
         if other := one.keys() ^ rows[0].keys():
@@ -306,7 +306,7 @@ def _paired(runs: Sequence[Sequence[PublicTable]], rows: Sequence[Mapping[str, A
     scores = np.array([[one[token][COLUMNS.index(column)] for token in tokens] for one in rows])
     known = np.isfinite(scores).all(axis=0)  # extended comfort alone is not of every frame
     kept = tuple(token for token, there in zip(tokens, known) if there)
-    return Measured(kept, ("",) * len(kept), scores[:, known], np.ones((len(rows), len(kept))))
+    return RunScores(kept, ("",) * len(kept), scores[:, known], np.ones((len(rows), len(kept))))
 
 
 def _published(runs: Sequence[Sequence[PublicTable]], column: str) -> dict[Measure, float]:

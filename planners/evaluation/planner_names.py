@@ -52,7 +52,7 @@ class EvaluatedPlanner:
     spec: str = ""  # that named it
 
 
-def planner_of(spec: str, label: str | None = None, changed: Mapping[str, Any] | None = None) -> EvaluatedPlanner:
+def find_planner(spec: str, label: str | None = None, changed: Mapping[str, Any] | None = None) -> EvaluatedPlanner:
     """Who `spec` names; changed: settings of trained planners, see load_planner. Raises ConfigError for nobody."""
     spec = "+".join(expand_home(member, "planner") for member in spec.split("+"))
     return replace(_named(spec, label, changed), spec=spec)
@@ -71,8 +71,10 @@ def _named(spec: str, label: str | None, changed: Mapping[str, Any] | None) -> E
         return EvaluatedPlanner(name, spec, partial(_built, spec))
     members = spec.split("+")
     if all(Path(member).is_dir() for member in members):
-        newest = [checkpoint.newest(Path(member)) for member in members]  # now: trainings may go on and write others
-        parts = [*map(checkpoint.digest, newest), *([json.dumps(changed, sort_keys=True)] if changed else [])]
+        newest = [
+            checkpoint.newest_checkpoint(Path(member)) for member in members
+        ]  # now: trainings may go on and write others
+        parts = [*map(checkpoint.planner_digest, newest), *([json.dumps(changed, sort_keys=True)] if changed else [])]
         digest = parts[0] if len(parts) == 1 else hashlib.sha256(" ".join(parts).encode()).hexdigest()[:16]
         return EvaluatedPlanner(name, digest, partial(_trained, newest, changed))
     if ":" in spec:
@@ -108,7 +110,7 @@ def find_planners(
     if not named:
         raise ConfigError("planner is missing: give planner=<training folder> or planners=[human,...]")
     first = [(None, name) for name in (*PRIVILEGED, *UNTRAINED) if bounds]
-    found = [planner_of(spec, label, changed) for label, spec in dict.fromkeys([*first, *named])]
+    found = [find_planner(spec, label, changed) for label, spec in dict.fromkeys([*first, *named])]
     labels = [one.label for one in found]
     twice = sorted({label for label in labels if labels.count(label) > 1})
     if twice:
@@ -116,7 +118,7 @@ def find_planners(
     return found
 
 
-def composed(
+def compose_with_planner(
     name: str,
     argv: Sequence[str],
     shape: type[Any],

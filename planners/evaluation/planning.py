@@ -88,7 +88,7 @@ class _StoredSample(StoredRows):
         out[:] = stitch_sample(self._sample, layout)
 
 
-def batch_of(samples: Sequence[Mapping[str, Any]], needs: Needs) -> Batch:
+def batch_samples(samples: Sequence[Mapping[str, Any]], needs: Needs) -> Batch:
     """The batch that a planner plans for. Raises ValueError, naming the sample, where it lacks what `needs` asks."""
     buffer = BatchBuffer(len(samples), replace(needs, labels=None), 0)
     for i, sample in enumerate(samples):
@@ -105,7 +105,7 @@ Samples = Sequence[Mapping[str, Any]]
 PLANS = "plans.npz"  # kept, so that scoring may begin again without planning
 
 
-def plans_of(made: Any, samples: Samples, device: str = "cpu") -> Array:
+def plan_samples(made: Any, samples: Samples, device: str = "cpu") -> Array:
     """(B, 40, 3) plans of one planner. Raises ValueError, naming the sample, for what is no plan."""
     return _answers(made, _shown_to(needs_of(made), samples, device), samples)
 
@@ -176,12 +176,12 @@ def _loaded(one: EvaluatedPlanner, device: str) -> Any:
 
 def _shown_to(needs: Needs | None, samples: Samples, device: str) -> Batch | Samples:
     shown = [as_shown(sample) for sample in samples]
-    return shown if needs is None else batch_of(shown, needs).to(device)
+    return shown if needs is None else batch_samples(shown, needs).to(device)
 
 
 def _answers(made: Any, shown: Batch | Samples, samples: Samples) -> Array:
     if isinstance(shown, Batch):
-        plans = list(plans_for(made, shown))
+        plans = list(plan_batch(made, shown))
     else:
         plans = [np.asarray(made.plan(sample), dtype=np.float64) for sample in shown]
     for sample, plan in zip(samples, plans):
@@ -195,7 +195,7 @@ def check_plan(plan: Array, name: str) -> None:
         raise ValueError(f"{name}: a plan must be (8 or 40, 3) finite numbers, got {plan.shape}")
 
 
-def plans_for(made: Any, batch: Batch) -> Array:
+def plan_batch(made: Any, batch: Batch) -> Array:
     """What a planner answers to a batch, (B, 8 or 40, 3). Raises ValueError for anything else."""
     with torch.inference_mode():
         plans = made.plan(batch)

@@ -31,8 +31,8 @@ from factory.views.pictures import (
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.evaluate import check_needs
 from planners.evaluation.frames import Benchmark, FrameKey, Pair
-from planners.evaluation.planner_names import EvaluatedPlanner, composed, planner_of
-from planners.evaluation.planning import plans_of
+from planners.evaluation.planner_names import EvaluatedPlanner, compose_with_planner, find_planner
+from planners.evaluation.planning import plan_samples
 from planners.evaluation.scoring import ClipFrames, PreparedPair, Rules, prepare_clip, score_pair
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.reward.aggregate import COLUMNS, FrameScores
@@ -60,7 +60,7 @@ class ReplaySettings:
 
 
 @dataclass(frozen=True)
-class Shown:
+class ReplayStage:
     """One frame, planned from and driven."""
 
     title: str
@@ -71,7 +71,7 @@ class Shown:
     scores: FrameScores
 
 
-def film(shown: Shown, logged: Array | None) -> Iterator[Image]:
+def film_frames(shown: ReplayStage, logged: Array | None) -> Iterator[Image]:
     """Pictures (560, 1280, 3) RGB at 10 Hz, -1.5 .. 4 s; logged: (M, >= 3) what the human drove, world."""
     frame = shown.pair.now
     scene, drive = frame.scene, shown.rollout
@@ -132,7 +132,7 @@ def replay(
     clip = prepared.logged.now.scene.clip
     for shown in stages:
         last = None
-        for last in film(shown, clip.ego_states[shown.pair.now.scene.step :]):
+        for last in film_frames(shown, clip.ego_states[shown.pair.now.scene.step :]):
             yield last
         if last is not None:
             yield from [last] * HOLD
@@ -144,7 +144,7 @@ def _plans(benchmark: Benchmark, one: EvaluatedPlanner, prepared: ClipFrames) ->
     assert one.load is not None
     made = one.load()
     keys = [key for key in benchmark.keys if key.clip_id == prepared.clip_id]
-    return dict(zip(keys, plans_of(made, [benchmark.sample(key) for key in keys])))
+    return dict(zip(keys, plan_samples(made, [benchmark.sample(key) for key in keys])))
 
 
 def _shown(
@@ -153,11 +153,11 @@ def _shown(
     keys: Pair[FrameKey],
     pair: PreparedPair,
     plans: Mapping[FrameKey, Array],
-) -> Shown:
+) -> ReplayStage:
     (scores, drive), _ = score_pair(pair, [plans[key] for key in keys])
     plan = to_world(pair.now.scene.ego_state[: HEADING + 1], plans[keys[0]])
     rollout = roll_out(pair.now.traffic, drive.states)
-    return Shown(title, benchmark.sample(keys[0]), pair, plan, rollout, scores)
+    return ReplayStage(title, benchmark.sample(keys[0]), pair, plan, rollout, scores)
 
 
 def _nearest(prepared: ClipFrames, plan: Array) -> int | None:
@@ -185,7 +185,7 @@ def find_clip(benchmark: Benchmark, wanted: str) -> str:
 
 def settings_of(argv: Sequence[str]) -> ReplaySettings:
     """The settings of a command line. Raises ConfigError."""
-    return fill(ReplaySettings, composed("replay", argv, ReplaySettings), "replay")
+    return fill(ReplaySettings, compose_with_planner("replay", argv, ReplaySettings), "replay")
 
 
 @command("replay", ReplaySettings)
@@ -193,7 +193,7 @@ def main(argv: Sequence[str]) -> None:
     """The command."""
     settings = settings_of(argv)
     benchmark = BenchmarkFolder(settings.benchmark)
-    one = planner_of(settings.planner)
+    one = find_planner(settings.planner)
     clip_id = find_clip(benchmark, str(settings.clip))
     check_needs(benchmark, [key for key in benchmark.keys if key.clip_id == clip_id], [one])
     rules = Rules(two_stage=settings.two_stage_traffic, pdm=settings.pdm)

@@ -77,7 +77,7 @@ def prepare_frame(scene: Scene, traffic: TrafficSettings, pdm: PdmSettings, logg
     return _with_human(frame)
 
 
-def among_other_traffic(frame: PreparedFrame, traffic: TrafficSettings) -> PreparedFrame:
+def with_traffic(frame: PreparedFrame, traffic: TrafficSettings) -> PreparedFrame:
     """The same frame with traffic that moves otherwise."""
     return _with_human(replace(frame, traffic=prepare_traffic(frame.scene, traffic), human=None))
 
@@ -169,7 +169,7 @@ def prepare_clip(scenes: ClipScenes, rules: Rules) -> ClipFrames:
     logged = pair(scenes.logged, True, "the logged frames")
     alone = logged
     if rules.one_stage != rules.two_stage:
-        alone = PreparedPair(*(among_other_traffic(frame, rules.one_stage) for frame in logged))
+        alone = PreparedPair(*(with_traffic(frame, rules.one_stage) for frame in logged))
     follow_ups = {i: pair(frames, False, f"follow-up {i}") for i, frames in scenes.follow_ups.items()}
     return ClipFrames(scenes.clip_id, alone, logged, follow_ups)
 

@@ -53,7 +53,7 @@ class Backbone(nn.Module, ABC):
         std = torch.tensor(IMAGENET_STD if imagenet else (1.0, 1.0, 1.0)).view(3, 1, 1)
         self.register_buffer("shift", -mean / std, persistent=False)
         self.register_buffer("scale", 1.0 / (255.0 * std), persistent=False)
-        self.register_load_state_dict_post_hook(_weights_came)
+        self.register_load_state_dict_post_hook(_mark_weights_loaded)
 
     def normalised(self, image: Tensor) -> Tensor:
         """uint8 RGB (B, 3, h, w) as the float that `pixels` says; a float input as it is.
@@ -73,7 +73,7 @@ class Backbone(nn.Module, ABC):
         """The features after one block after the other."""
         again = self.recompute and torch.is_grad_enabled()
         for block in blocks:
-            features = recomputed(block, features) if again else block(features)
+            features = checkpointed_block(block, features) if again else block(features)
         return features
 
     def train(self, mode: bool = True) -> Self:
@@ -101,12 +101,12 @@ class Backbone(nn.Module, ABC):
         return maps[1:]
 
 
-def _weights_came(module: nn.Module, _: object) -> None:
+def _mark_weights_loaded(module: nn.Module, _: object) -> None:
     assert isinstance(module, Backbone)
     module.weights_missing = False
 
 
-def recomputed(block: nn.Module, features: Tensor) -> Tensor:
+def checkpointed_block(block: nn.Module, features: Tensor) -> Tensor:
     """block(features), with its gradients and running statistics; of memory, what its input takes."""
 
     def contexts() -> tuple[AbstractContextManager[None], AbstractContextManager[None]]:

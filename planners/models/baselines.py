@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from planners.data.batch import Batch, BevLayout, Needs
 from planners.data.bev import BevClass
-from planners.models.planner import PlanFrom, Planner, add_base_plan, evaluating, imitation_l1, straight_on
+from planners.models.planner import PlanFrom, Planner, add_base_plan, constant_velocity_plan, evaluating, imitation_l1
 from tasks.world.arrays import FloatArray
 
 
@@ -42,7 +42,7 @@ class ConstantVelocity(Planner):
         raise ValueError("constant_velocity has nothing to train: evaluate it as it is")
 
     def plan(self, batch: Batch) -> Tensor:
-        return straight_on(batch)
+        return constant_velocity_plan(batch)
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ WEIGHTINGS: dict[WeightingName, Weighting] = {
 }
 
 
-def total(scores: Mapping[str, Tensor], weighting: Weighting) -> Tensor:
+def weighted_total(scores: Mapping[str, Tensor], weighting: Weighting) -> Tensor:
     """One number (B, K) from probabilities (B, K) by name, comparable within a row only."""
     inside = sum(weight * scores[name].float() for name, weight in weighting.inside.items())
     assert isinstance(inside, Tensor)
@@ -83,7 +83,7 @@ def total(scores: Mapping[str, Tensor], weighting: Weighting) -> Tensor:
 
 def choose(scores: Mapping[str, Tensor], weighting: Weighting) -> Tensor:
     """Index (B,) of the best of K; of equals the first."""
-    return total(scores, weighting).argmax(dim=1)
+    return weighted_total(scores, weighting).argmax(dim=1)
 
 
 def _log(x: Tensor) -> Tensor:

@@ -201,7 +201,7 @@ class LatentFusion(nn.Module):
         self.channels = self.image.channels
         self.to_image = nn.ModuleList(nn.Conv2d(c, c, 1) for c in self.channels)
         self.to_latent = nn.ModuleList(nn.Conv2d(c, c, 1) for c in self.channels)
-        self.exchanges = nn.ModuleList(Exchange(c, settings) for c in self.channels)
+        self.exchanges = nn.ModuleList(TokenExchange(c, settings) for c in self.channels)
         bev = settings.bev_channels
         self.lateral = nn.Conv2d(self.channels[-1], bev, 1)
         self.up = nn.ModuleList(nn.Conv2d(bev, bev, 3, padding=1) for _ in range(2))
@@ -218,8 +218,8 @@ class LatentFusion(nn.Module):
             tokens = F.adaptive_avg_pool2d(seen, self.settings.image_tokens)
             latent_tokens = self.to_image[i](F.adaptive_avg_pool2d(above, self.settings.latent_tokens))
             to_seen, to_above = self.exchanges[i](tokens, latent_tokens)
-            seen = seen + _stretched(to_seen, seen)
-            above = above + _stretched(self.to_latent[i](to_above), above)
+            seen = seen + _resized_like(to_seen, seen)
+            above = above + _resized_like(self.to_latent[i](to_above), above)
         bev = F.relu(self.lateral(above))
         for convolve, stride in zip(self.up, (STRIDES[-1] // 2, STRIDES[0])):
             size = self.settings.latent_size // stride
@@ -227,11 +227,11 @@ class LatentFusion(nn.Module):
         return Fused(seen, above, bev)
 
 
-def _stretched(tokens: Tensor, like: Tensor) -> Tensor:
+def _resized_like(tokens: Tensor, like: Tensor) -> Tensor:
     return F.interpolate(tokens, like.shape[2:], mode="bilinear")
 
 
-class Exchange(nn.Module):
+class TokenExchange(nn.Module):
     """Transformer blocks over the tokens of both views.
 
     Published code draws their weights with deviation 0.02 at any width (planners.models.layers), which torch's own
@@ -373,7 +373,7 @@ def initialise_as_public(model: nn.Module) -> None:
     other one until it is read.
     """
     for module in model.modules():
-        if isinstance(module, Exchange):
+        if isinstance(module, TokenExchange):
             _as_gpt(module)
         elif isinstance(module, BasicBlock):
             nn.init.zeros_(module.bn2.weight)
@@ -390,7 +390,7 @@ def copy_first_layer(layers: nn.ModuleList) -> None:
         layer.load_state_dict(layers[0].state_dict())
 
 
-def _as_gpt(exchange: Exchange) -> None:
+def _as_gpt(exchange: TokenExchange) -> None:
     for module in exchange.modules():
         if isinstance(module, nn.Linear):
             nn.init.normal_(module.weight, std=GPT_DEVIATION)

@@ -140,10 +140,10 @@ def imitation_l1(plan: Tensor, batch: Batch) -> Tensor:
 
 def add_base_plan(base: PlanFrom, regressed: Tensor, batch: Batch) -> Tensor:
     """The plans (B, 8, 3) of what was regressed."""
-    return regressed + straight_on(batch) if base == "constant_velocity" else regressed
+    return regressed + constant_velocity_plan(batch) if base == "constant_velocity" else regressed
 
 
-def straight_on(batch: Batch) -> Tensor:
+def constant_velocity_plan(batch: Batch) -> Tensor:
     """(B, 8, 3) poses at 0.5 .. 4.0 s of an ego that keeps the speed of now and does not turn.
 
     Speed is the length of the velocity, as in navsim/agents/constant_velocity_agent.py (autonomousvision/navsim

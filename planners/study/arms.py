@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from factory.exits import Failed, Stopped
-from planners.drive.drive import drive_all, driven
+from planners.drive.drive import drive_all, read_drives
 from planners.drive.settings import DriveSettings, settings_of
 from planners.drive.summary import M_PER_KM, SHARES, highest_level, start_kind
-from planners.evaluation.aggregation import BOUNDS, name_of, scores_in_percent, write_csv
+from planners.evaluation.aggregation import BOUNDS, score_column, scores_in_percent, write_csv
 from planners.evaluation.bootstrap import Interval, paired_interval
 from planners.evaluation.compare import CompareSettings, compare, difference_columns
 from planners.study.report import FRAMES, markdown_table, read_study
@@ -98,7 +98,7 @@ def drive_arms(arms: Sequence[Training], out: str, drives: str, resources: Sweep
     for seed, batch in groupby(arms, key=lambda one: one.facts["seed"]):
         chosen = drive_settings(list(batch), out, drives)
         if resources.left_s == 0.0:
-            if driven(chosen)[1]:
+            if read_drives(chosen)[1]:
                 continue
             return Stopped(f"drives of seed {seed} and those behind it are not made: the same command goes on")
         _, failed = drive_all(chosen)
@@ -112,7 +112,7 @@ def drive_arms(arms: Sequence[Training], out: str, drives: str, resources: Sweep
 def read_arm_drives(arms: Sequence[Training], out: str, drives: str) -> list[ArmDrives]:
     """What is driven so far, by kind of start: seeds with which every arm has driven, starts that all have made."""
     trained = [one for one in arms if (Path(out) / "trainings" / one.label).is_dir()]
-    rows = driven(drive_settings(trained, out, drives))[0] if trained else []
+    rows = read_drives(drive_settings(trained, out, drives))[0] if trained else []
     found = []
     for kind in KINDS:
         by_label: dict[str, dict[Start, Row]] = {}
@@ -140,7 +140,7 @@ def _paired(kind: str, by_label: Mapping[str, Mapping[Start, Row]], labels: Sequ
     )
 
 
-def differences_of(found: Sequence[ArmDrives], pairs: Sequence[HeldAgainst]) -> list[dict[str, Any]]:
+def arm_differences(found: Sequence[ArmDrives], pairs: Sequence[HeldAgainst]) -> list[dict[str, Any]]:
     """Rows of driving_differences.csv: pairs of arms, and each arm beside the bounds that drive."""
     arms = list(dict.fromkeys(one.arm for one in pairs) | dict.fromkeys(one.reference for one in pairs))
     rows = []
@@ -168,7 +168,7 @@ def against_bounds(report: Path, setups: Sequence[Setup], seeds: int) -> list[di
                 continue
             intervals = compare([clips[bound]], runs, RULES)
             for stage in STAGES:
-                each = [scores_in_percent(run)[name_of(*stage)] for run in runs]
+                each = [scores_in_percent(run)[score_column(*stage)] for run in runs]
                 facts = {"arm": setup.label, "reference": bound, "seeds": len(runs), "stage": stage[0]}
                 rows.append(facts | {"epdms": float(np.mean(each))} | difference_columns(intervals.get(stage)))
     return rows

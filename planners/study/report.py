@@ -28,10 +28,10 @@ from planners.evaluation.aggregation import (
     ClipResult,
     HumanFilter,
     group_by_clip,
-    name_of,
+    score_column,
     scores_in_percent,
-    shown,
     stage_title,
+    stages_shown,
     write_csv,
 )
 from planners.evaluation.benchmark_folder import read_clip_logs
@@ -157,7 +157,7 @@ def write_tables(frames: Path, out: Path, human_filter: HumanFilter) -> None:
     out.mkdir(parents=True, exist_ok=True)
     scores = {label: scores_in_percent(clips) for label, clips in study.clips.items()}
     bounds = [{"planner": name, **scores[name]} for name in BOUNDS if name in scores]
-    rows = compared(study)
+    rows = comparison_rows(study)
     write_csv(out / "comparisons.csv", rows)
     if bounds:
         write_csv(out / "bounds.csv", bounds)
@@ -165,7 +165,7 @@ def write_tables(frames: Path, out: Path, human_filter: HumanFilter) -> None:
     (out / "tables.md").write_text(markdown_of(rows, human_filter), encoding="utf-8")
 
 
-def compared(frames: StudyFrames) -> list[Row]:
+def comparison_rows(frames: StudyFrames) -> list[Row]:
     """A row for each comparison and each of MEASURES, in percent: mean over seeds, difference, 95 % intervals."""
     rows = []
     for one in frames.comparisons:
@@ -173,7 +173,7 @@ def compared(frames: StudyFrames) -> list[Row]:
         intervals = compare(sides[1], sides[0], RULES) if one.reference else {}
         scores = [scores_in_percent(clips) for clips in sides[0]]
         for stage, human_filter in MEASURES:
-            each = [score[name_of(stage, human_filter)] for score in scores]
+            each = [score[score_column(stage, human_filter)] for score in scores]
             row = {**one.facts, "stage": stage, "human_filter": human_filter, "epdms": float(np.mean(each))}
             row["each"] = " ".join(f"{score:.1f}" for score in each)
             row["reference"] = one.reference.label if one.reference else ""
@@ -189,7 +189,7 @@ def markdown_of(rows: Sequence[Row], human_filter: HumanFilter) -> str:
     held against it.
     """
     mine = [row for row in rows if row["human_filter"] in (human_filter, "none")]
-    stages = [stage for stage in shown(human_filter) if any(row["stage"] == stage for row in mine)]
+    stages = [stage for stage in stages_shown(human_filter) if any(row["stage"] == stage for row in mine)]
     head = ("planner", "trained on", "equal", "seeds", *map(stage_title, stages), "final of each seed")
     lines = [*wrap(f"Scores are {human_filter}: {FILTERS_NOTE[0]}; {FILTERS_NOTE[1]}.", 120), ""]
     lines += [*wrap(INTERVALS, 120), ""]

@@ -95,7 +95,7 @@ def words_of(row: Mapping[str, Any], counted: bool = True) -> str:
     return ", ".join(said)
 
 
-def so_far(found: Sequence[Comparison], evaluated: Collection[str]) -> list[Comparison]:
+def completed_comparisons(found: Sequence[Comparison], evaluated: Collection[str]) -> list[Comparison]:
     """Comparisons of which both sides are evaluated with the same seeds, all of a part with equally many.
 
     A part is left out as long as nothing of it is held against anything: other parts share what it would begin with.

@@ -16,14 +16,14 @@ from typing import Any
 from factory.exits import Failed, Stopped
 from factory.graph.progress import Counter
 from planners.evaluation.aggregation import BOUNDS, PAPER, HumanFilter
-from planners.evaluation.planner_names import planner_of
+from planners.evaluation.planner_names import find_planner
 from planners.evaluation.score_rows import RECORD
 from planners.evaluation.score_rows import is_done as evaluation_is_done
 from planners.evaluation.score_rows import read_record as read_evaluation
 from planners.study.report import FRAMES, rows_of, write_study, write_tables
-from planners.study.setups import Comparison, so_far
+from planners.study.setups import Comparison, completed_comparisons
 from planners.training.checkpoint import read_record
-from planners.training.many import ONE_THREAD, SweepResources, Training, folder_of, is_done, stops_after, train_all
+from planners.training.many import ONE_THREAD, SweepResources, Training, folder_of, is_done, stop_event, train_all
 
 EVALUATIONS = "evaluations"
 BATCH = 48  # planners that are trained and evaluated together: cores idle at the end of either
@@ -57,14 +57,14 @@ def run(
             evaluate_all(batch, out, settings.benchmark, settings, *settings.evaluate)
     except Stopped as stopped:
         print(stopped, file=sys.stderr)
-    done = evaluated(known, out)
-    if standing := so_far(wanted, done):
+    done = evaluated_labels(known, out)
+    if standing := completed_comparisons(wanted, done):
         write_report(standing, [one for one in known if one.label in done and not one.members], settings)
     if not done >= labels:
         raise Stopped(f"{len(labels & done)} of {len(labels)} planners are evaluated: the same command goes on")
 
 
-def evaluated(planned: Sequence[Training], out: Path) -> set[str]:
+def evaluated_labels(planned: Sequence[Training], out: Path) -> set[str]:
     """Labels of all that is trained to its end and evaluated as it is now, by this command or one before it."""
     trained = {one.label for one in planned if not one.members and is_done(out, one)}
     whole = [one for one in planned if trained.issuperset(one.members or (one.label,))]
@@ -124,7 +124,7 @@ def evaluate_all(
 
     done = 0
     with (
-        stops_after(resources.left_s) as stop,
+        stop_event(resources.left_s) as stop,
         Counter("evaluations", len(everyone)) as counter,
         ThreadPoolExecutor(resources.at_once) as pool,
     ):
@@ -148,4 +148,4 @@ def is_evaluated(out: Path, one: Training) -> bool:
     if not (bound / RECORD).is_file():
         return False
     shared = {k: v for k, v in read_evaluation(bound).items() if k not in ("planner", "planner_digest")}
-    return evaluation_is_done(mine, {"planner_digest": planner_of(one.spec(out)).digest, **shared})
+    return evaluation_is_done(mine, {"planner_digest": find_planner(one.spec(out)).digest, **shared})

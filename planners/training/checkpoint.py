@@ -64,7 +64,7 @@ def save_checkpoint(
     unfinished = folder.with_name(f".{folder.name}.{os.getpid()}")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
-    who = {"planner": {"name": planner.chosen_as, "settings": as_record(planner.settings)}, "step": step}
+    who = {"planner": {"name": planner.chosen_as, "settings": settings_record(planner.settings)}, "step": step}
     save_file({k: v.contiguous() for k, v in planner.state_dict().items()}, unfinished / WEIGHTS)
     np.savez(unfinished / ARRAYS, **planner.arrays)  # type: ignore[arg-type]
     torch.save(dict(training), unfinished / TRAINING)
@@ -72,20 +72,20 @@ def save_checkpoint(
     (unfinished / RECORD).write_text(json_with_checksum({**who, **record, **files}))
     shutil.rmtree(folder, ignore_errors=True)
     os.replace(unfinished, folder)
-    stays = None if keep.best is None else best(out, keep.best)
+    stays = None if keep.best is None else best_checkpoint(out, keep.best)
     for old in checkpoints(out)[:-KEPT]:
         if old != stays and not (keep.every and int(old.name) % keep.every == 0):
             shutil.rmtree(old)
     return folder
 
 
-def best(out: Path, measure: str) -> Path | None:
+def best_checkpoint(out: Path, measure: str) -> Path | None:
     """The earliest checkpoint with the least of a measure among those that were validated; None where none was."""
     measured = {path: read_record(path).get("validation", {}).get(measure) for path in checkpoints(out)}
     return min((path for path, value in measured.items() if value is not None), key=measured.__getitem__, default=None)
 
 
-def as_record(settings: Any) -> dict[str, Any]:
+def settings_record(settings: Any) -> dict[str, Any]:
     """A planner's settings as a checkpoint keeps them, those that configuration offers."""
     record: dict[str, Any] = json.loads(json.dumps(to_plain(settings)))
     return record
@@ -96,7 +96,7 @@ def checkpoints(out: Path) -> list[Path]:
     return sorted(path for path in (out / FOLDER).glob("[0-9]*") if (path / TRAINING).is_file())
 
 
-def newest(path: Path) -> Path:
+def newest_checkpoint(path: Path) -> Path:
     """The checkpoint that `path` is or whose newest it holds. Raises ConfigError where there is none."""
     if (path / RECORD).is_file():
         return path
@@ -110,6 +110,7 @@ def read_record(path: Path) -> dict[str, Any]:
     """What a checkpoint says of itself. Raises ConfigError."""
     try:
         record = parse_json_with_checksum((newest(path) / RECORD).read_bytes())
+        record = unsealed_json((newest_checkpoint(path) / RECORD).read_bytes())
         record["planner"]["name"], record["planner"]["settings"], record["step"], record[FILES]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{path}: its {RECORD} cannot be read ({error}): restore the checkpoint") from error
@@ -122,7 +123,7 @@ def load_planner(path: str | Path, changed: Mapping[str, Any] | None = None) -> 
     changed: settings of planning alone (`Planner.free_settings`) that are to be others than it was trained with.
     Raises ConfigError.
     """
-    folder = newest(Path(path))
+    folder = newest_checkpoint(Path(path))
     record = read_record(folder)
     choice = PlannerChoice(**record["planner"])
     bound = sorted(set(changed or {}) - planner_class(choice.name).free_settings)
@@ -199,9 +200,9 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def digest(path: str | Path) -> str:
+def planner_digest(path: str | Path) -> str:
     """16 hex digits of a planner's weights, arrays and settings: what it plans depends on nothing else."""
-    folder = newest(Path(path))
+    folder = newest_checkpoint(Path(path))
     found = hashlib.sha256(json.dumps(read_record(folder)["planner"], sort_keys=True).encode())
     for name in (WEIGHTS, ARRAYS):
         found.update((folder / name).read_bytes())

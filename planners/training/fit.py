@@ -22,7 +22,14 @@ from factory.exits import Stopped, calling_on_stop_signal
 from factory.graph.progress import Counter
 from planners.data.batch import Batch
 from planners.models.planner import Planner
-from planners.training.checkpoint import Keep, best, load_training, load_weights, read_record, save_checkpoint
+from planners.training.checkpoint import (
+    Keep,
+    best_checkpoint,
+    load_training,
+    load_weights,
+    read_record,
+    save_checkpoint,
+)
 from planners.training.optim import TrainingSettings, build_optimiser, learning_rate, set_rate
 from planners.training.processes import TrainingProcess
 
@@ -203,10 +210,12 @@ def fit(
             looks = step % loop.log_every == 0 or step == loop.steps
             # Several processes must agree, and ask each other rarely.
             stopping = process.any_process(asked.is_set()) if process.size == 1 or looks else False
-            saves = _multiple(step, loop.checkpoint_every) or _multiple(step, loop.keep.every) or step == loop.steps
+            saves = (
+                _is_multiple(step, loop.checkpoint_every) or _is_multiple(step, loop.keep.every) or step == loop.steps
+            )
             saves = saves or stopping
             measured: dict[str, float] = {}
-            if _multiple(step, loop.validate_every) or step == loop.steps:
+            if _is_multiple(step, loop.validate_every) or step == loop.steps:
                 measured = check(step)
                 if loop.keep.best is not None:
                     saves = process.any_process(saves or _is_best(out, loop.keep.best, measured))
@@ -256,7 +265,7 @@ def _step(
     return sums, [before, (scaler.scale(one) < before).float()] if scaler.is_enabled() else []
 
 
-def _multiple(step: int, every: int) -> bool:
+def _is_multiple(step: int, every: int) -> bool:
     return every > 0 and step % every == 0
 
 
@@ -264,7 +273,7 @@ def _is_best(out: Path, measure: str, measured: Mapping[str, float]) -> bool:
     """Whether no checkpoint is as good; never in a process that has not measured."""
     if measure not in measured:
         return False
-    before = best(out, measure)
+    before = best_checkpoint(out, measure)
     return before is None or measured[measure] < read_record(before)["validation"][measure]
 
 

@@ -92,7 +92,7 @@ def train_all(trainings: Sequence[Training], out: Path, resources: SweepResource
     done, failed = len(trainings) - len(left), list[str]()
     with (
         Counter("trainings", len(trainings), done) as counter,
-        stops_after(resources.left_s) as stop,
+        stop_event(resources.left_s) as stop,
         ThreadPoolExecutor(resources.at_once) as pool,
     ):
         codes = {pool.submit(train_one, training, out, stop.is_set): training for training in left}
@@ -147,7 +147,7 @@ def exit_code(
 
 
 @contextlib.contextmanager
-def stops_after(after_s: float | None) -> Iterator[threading.Event]:
+def stop_event(after_s: float | None) -> Iterator[threading.Event]:
     """Set after so many seconds, or at SIGINT and SIGTERM."""
     stop = threading.Event()
     timer = threading.Timer(after_s or 0.0, stop.set)

@@ -32,14 +32,14 @@ from planners.models.backbones import load_pretrained, set_recompute
 from planners.models.planner import Planner, PlannerChoice, build_planner, planner_class, settings_of
 from planners.training.checkpoint import (
     Keep,
-    as_record,
-    best,
+    best_checkpoint,
     checkpoints,
-    digest,
     load_arrays,
     load_weights,
-    newest,
+    newest_checkpoint,
+    planner_digest,
     read_record,
+    settings_record,
 )
 from planners.training.fit import Loop, Precision, fit, total_steps
 from planners.training.optim import TrainingSettings
@@ -49,7 +49,7 @@ LARGEST_BATCH = 32
 FURTHER = frozenset({"steps", "processes", "accumulate"})  # what may be another with resume=further
 
 
-def validation(
+def make_validation(
     data: DataSettings, planner: Planner, process: TrainingProcess, workers: int
 ) -> Callable[[Planner], dict[str, float]]:
     """A function that plans for all human samples of the tables `data.val`: ade_m and fde_m, mean and final distance.
@@ -187,7 +187,7 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
         pinned=process.device.type == "cuda",
     )
     steps = total_steps(loader, training, config.steps)
-    check = validation(config.data, planner, process, config.workers) if config.data.val else None
+    check = make_validation(config.data, planner, process, config.workers) if config.data.val else None
     identity = _identity(config, dataset, steps, process)
     resume_from = _checkpoint_to_resume(out, config, identity)
     before = {} if resume_from is None else read_record(resume_from)
@@ -217,9 +217,9 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
     process.wait()  # nobody looks for checkpoints any more
     fit(planner, loader, training, loop, process, out, record, resume_from, check)
     if process.writes:
-        print(f"trained: {newest(out)}")
+        print(f"trained: {newest_checkpoint(out)}")
         if config.keep_best is not None:
-            print(f"least {config.keep_best}: {best(out, config.keep_best)}")
+            print(f"least {config.keep_best}: {best_checkpoint(out, config.keep_best)}")
 
 
 def _with_fitting_batch(config: TrainConfig, dataset: Dataset, process: TrainingProcess) -> TrainConfig:
@@ -241,8 +241,8 @@ def _planner(config: TrainConfig, settings: Any, dataset: Dataset) -> Planner:
     """The planner, built around what the samples give it; trained further, around what it was trained with."""
     if config.init_from is not None:
         before = read_record(Path(config.init_from))["planner"]
-        if before == {"name": config.planner.name, "settings": as_record(settings)}:
-            return build_planner(config.planner, load_arrays(newest(Path(config.init_from))))
+        if before == {"name": config.planner.name, "settings": settings_record(settings)}:
+            return build_planner(config.planner, load_arrays(newest_checkpoint(Path(config.init_from))))
     try:
         arrays = planner_class(config.planner.name).fixed_arrays(settings, dataset.training_data())
     except (ValueError, OSError) as error:
@@ -254,7 +254,7 @@ def _first_weights(planner: Planner, config: TrainConfig) -> dict[str, str]:
     """Fills in the weights that a training begins with; backbone -> where its weights are from."""
     if config.init_from is None:
         return load_pretrained(planner)
-    folder = newest(Path(config.init_from))
+    folder = newest_checkpoint(Path(config.init_from))
     load_weights(planner, folder)
     backbones: dict[str, str] = read_record(folder)["backbones"]
     return backbones
@@ -274,7 +274,7 @@ def _identity(config: TrainConfig, dataset: Dataset, steps: int, process: Traini
         "samples": dataset.digest,
         "steps": steps,
         "seed": config.seed,
-        "init_from": None if config.init_from is None else digest(config.init_from),
+        "init_from": None if config.init_from is None else planner_digest(config.init_from),
         "precision": config.precision,
         "accumulate": config.accumulate,
         "processes": process.size,
@@ -288,7 +288,11 @@ def _checkpoint_to_resume(out: Path, config: TrainConfig, identity: Mapping[str,
     if not checkpoints(out):
         return None
     record = read_record(out)
-    now = {**identity, "planner.name": config.planner.name, "planner.settings": as_record(settings_of(config.planner))}
+    now = {
+        **identity,
+        "planner.name": config.planner.name,
+        "planner.settings": settings_record(settings_of(config.planner)),
+    }
     who = record["planner"]
     then = {**record["trained"], "planner.name": who["name"], "planner.settings": who["settings"]}
     differs = {key: f"{key} {then.get(key)} -> {value}" for key, value in now.items() if then.get(key) != value}
@@ -301,7 +305,7 @@ def _checkpoint_to_resume(out: Path, config: TrainConfig, identity: Mapping[str,
         )
     if record["step"] > identity["steps"]:
         raise ConfigError(f"out={config.out} has done {record['step']} steps: ask for as many in all, or more")
-    return newest(out)
+    return newest_checkpoint(out)
 
 
 def _earlier_settings(before: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, Any]:
@@ -316,11 +320,13 @@ def _earlier_settings(before: Mapping[str, Any], identity: Mapping[str, Any]) ->
 
 def _plan_text(config: TrainConfig, record: Mapping[str, Any], loader: Loader, resume_from: Path | None) -> str:
     begins = f"goes on from {resume_from}" if resume_from is not None else "begins"
+    first = config.init_from
+    begun = [] if first is None else [f"weights to begin with: {newest_checkpoint(Path(first))}"]
     weights = ", ".join(f"{name}: {source}" for name, source in record["backbones"].items()) or "there are none"
     return "\n".join(
         [
             f"{config.planner.name}: {record['parameters']:,} parameters; pretrained backbones: {weights}",
-            *([] if config.init_from is None else [f"weights to begin with: {newest(Path(config.init_from))}"]),
+            *begun,
             loader.text(),
             f"{record['trained']['steps']} steps; {begins}; out: {config.out}",
         ]

@@ -24,7 +24,7 @@ import simplejpeg
 import torch
 
 from planners.data.batch import ImageLayout, Needs
-from planners.data.images import DecodedPictures, picture_key, stitch
+from planners.data.images import PictureCache, picture_key, stitch
 from planners.data.index import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
@@ -82,7 +82,7 @@ def made_up() -> list[bytes]:
 
 def split(photos: Sequence[Sequence[Bytes]], layout: ImageLayout, folder: Path) -> None:
     """CPU ms a sample of each step, on one thread, and how far a reduced picture is from the full one."""
-    kept = DecodedPictures(folder, 100.0)
+    kept = PictureCache(folder, 100.0)
     room, out = np.empty(1920 * 1080 * 3, np.uint8), np.empty((layout.height, layout.width, 3), np.uint8)
     reduced = replace(layout, decoding="reduced")
 

@@ -19,7 +19,7 @@ from factory.config.plugins import plugin_named, plugins_by_name
 from factory.config.run import compose_run, load_config
 from factory.run import main as run_main
 from factory.store.reader import SampleTable
-from planners.evaluation.planner_names import planner_of
+from planners.evaluation.planner_names import find_planner
 from planners.models.planner import planner_class
 from planners.training.train import main as train_main
 from tasks.kernels.compiled import cache_dir
@@ -77,9 +77,9 @@ def test_a_reader_an_expert_and_a_planner_work_by_name(
     small = "planner=mine planner.settings.history=true planner.training.batch_size=2 steps=1 workers=0 device=cpu"
     data = [f"data.real=[{tmp_path / 'out'}]", f"data.sim=[{tmp_path / 'out'}]", f"out={tmp_path / 'linear'}"]
     assert train_main([*small.split(), *data]) == 0, capsys.readouterr().err
-    loaded = planner_of(str(tmp_path / "linear")).load
+    loaded = find_planner(str(tmp_path / "linear")).load
     assert loaded is not None and type(loaded()) is planner_class("mine")
-    assert planner_of("mine").label == "mine"
+    assert find_planner("mine").label == "mine"
 
 
 def experts_of(home: Path) -> set[str]:
@@ -120,7 +120,7 @@ def test_an_unknown_name_lists_what_is_installed_and_which_is_meant(site: Path) 
     with pytest.raises(
         ConfigError, match=r"planner=mein: neither a folder nor one of .*, mine; did you mean mine\?; or"
     ):
-        planner_of("mein")
+        find_planner("mein")
 
 
 def test_help_and_completion_list_what_is_installed_and_import_none_of_it(
@@ -147,7 +147,7 @@ def test_help_and_completion_list_what_is_installed_and_import_none_of_it(
         lambda: load_config(["clips=mine"]),
         lambda: load_config(["experts=[mine]"]),
         lambda: compose("train", ["planner=mine"]),
-        lambda: planner_of("mine"),
+        lambda: find_planner("mine"),
     ],
     ids=("reader", "expert", "planner to train", "planner to evaluate"),
 )
@@ -182,7 +182,7 @@ def test_a_folder_of_the_same_name_is_told_apart(site: Path, tmp_path: Path, mon
     (tmp_path / "mine").mkdir()
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=r"a folder here and a planner of somebody 1\.2: planner=\./mine"):
-        planner_of("mine")
+        find_planner("mine")
 
 
 def test_without_plug_ins_nothing_is_offered_and_nothing_is_imported(site: Path) -> None:

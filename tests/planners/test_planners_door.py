@@ -12,7 +12,7 @@ from factory.exits import BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED, Faile
 from planners.drive.settings import DriveSettings
 from planners.evaluation.compare import CompareSettings
 from planners.evaluation.evaluate import EvaluateSettings
-from planners.evaluation.planner_names import planner_of
+from planners.evaluation.planner_names import find_planner
 from planners.evaluation.replay import ReplaySettings
 from planners.published.import_planner import ImportConfig
 from planners.training.train import TrainConfig
@@ -69,9 +69,9 @@ def test_a_planner_of_the_home_folder_is_evaluated_alone_and_in_an_ensemble(
         (tmp_path / name).mkdir()
     for spec in ("~/a", "~/a+~/b"):
         with pytest.raises(ValueError, match=f"{tmp_path}/a.*no.*checkpoint"):
-            planner_of(spec)
+            find_planner(spec)
     with pytest.raises(ConfigError, match=r"^planner=~nobody\.here/a: there is no home folder ~nobody\.here"):
-        planner_of("~nobody.here/a")
+        find_planner("~nobody.here/a")
 
 
 def test_a_fault_of_the_program_is_not_hidden() -> None:

@@ -12,7 +12,7 @@ from factory.store.schema import COLUMNS, LABEL_COLUMNS
 from planners.data.batch import COMMANDS, BevLayout, ImageLayout, Needs
 from planners.data.bev import bev_raster, nearest_agents
 from planners.data.decode import BatchBuffer, StoredRows, count_labels
-from planners.data.files import Footers, files_of, group_bytes, leaves
+from planners.data.files import Footers, files_of, group_bytes, leaf_paths
 from planners.data.images import stitch_sample
 from planners.data.index import BEV_COLUMNS, PLAN_COLUMNS
 from tasks.reward.label_bytes import VocabularyLabels
@@ -56,7 +56,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def stored(table: Path, columns: list[str], cameras: tuple[str, ...] = ()) -> StoredRows:
     (file,) = files_of(table)
     parquet = file.open()
-    return StoredRows(parquet.read_row_group(0, columns=leaves(parquet, columns)), [cameras] * 3)
+    return StoredRows(parquet.read_row_group(0, columns=leaf_paths(parquet, columns)), [cameras] * 3)
 
 
 def test_every_column_is_read_as_the_sample_reader_reads_it(table: Path) -> None:
@@ -126,7 +126,7 @@ def test_progress_is_normalised_as_the_planner_asks(tmp_path: Path, normalise: s
     write_table(tmp_path / "out", [sample(0, **label_columns(made))])
     (file,) = files_of(tmp_path / "out")
     parquet = file.open()
-    needed = leaves(parquet, [*PLAN_COLUMNS, *LABEL_COLUMNS])
+    needed = leaf_paths(parquet, [*PLAN_COLUMNS, *LABEL_COLUMNS])
     buffer = BatchBuffer(1, Needs(labels="vocabulary-1", normalise=normalise), 3)  # type: ignore[arg-type]
     buffer.fill(0, StoredRows(parquet.read_row_group(0, columns=needed), [()]), 0)
     batch = buffer.batch(["a"], np.array([False]), np.array([True]))
@@ -136,7 +136,7 @@ def test_progress_is_normalised_as_the_planner_asks(tmp_path: Path, normalise: s
 def test_pictures_leave_the_table(table: Path) -> None:
     (file,) = files_of(table)
     parquet = file.open()
-    read = parquet.read_row_group(0, columns=leaves(parquet, ["images.camera", "images.time_s", "images.jpeg"]))
+    read = parquet.read_row_group(0, columns=leaf_paths(parquet, ["images.camera", "images.time_s", "images.jpeg"]))
     whole = read["images"].chunk(0).values.field("jpeg").buffers()[2]
     for pictures in (StoredRows(read, [("left", "front")] * 3).jpegs(row) for row in range(3)):
         for picture in pictures:
@@ -146,10 +146,10 @@ def test_pictures_leave_the_table(table: Path) -> None:
 def test_of_a_struct_single_members_are_read(table: Path) -> None:
     (file,) = files_of(table)
     parquet = file.open()
-    assert leaves(parquet, ["images.jpeg"]) == ["images.list.element.jpeg"]
-    assert [path.split(".")[-1] for path in leaves(parquet, ["images"])] == ["camera", "time_s", "element", "jpeg"]
+    assert leaf_paths(parquet, ["images.jpeg"]) == ["images.list.element.jpeg"]
+    assert [path.split(".")[-1] for path in leaf_paths(parquet, ["images"])] == ["camera", "time_s", "element", "jpeg"]
     with pytest.raises(ValueError, match=r"columns images\.png, label_4hz are missing"):
-        leaves(parquet, ["images.png", "label_2hz", "label_4hz"])
+        leaf_paths(parquet, ["images.png", "label_2hz", "label_4hz"])
 
 
 def test_sizes_are_those_of_the_footer(table: Path) -> None:
@@ -170,7 +170,7 @@ def test_a_footer_is_parsed_once(table: Path) -> None:
     Path(file.path).write_bytes(content[:-8] + bytes(8))  # no reader would find the footer now
     try:
         assert again.open().metadata == first.metadata
-        assert again.open().read_row_group(0, columns=leaves(first, PLAN_COLUMNS)).num_rows == 3
+        assert again.open().read_row_group(0, columns=leaf_paths(first, PLAN_COLUMNS)).num_rows == 3
     finally:
         Path(file.path).write_bytes(content)
 

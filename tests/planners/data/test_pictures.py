@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from planners.data.batch import ImageLayout, Needs
-from planners.data.images import CHECKSUM_BYTES, GB, PARTS, DecodedPictures, picture_key, stitch
+from planners.data.images import CHECKSUM_BYTES, GB, PARTS, PictureCache, picture_key, stitch
 from planners.data.index import DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
@@ -28,20 +28,20 @@ def views(number: int) -> list[Bytes]:
     return [np.frombuffer(jpeg(shade), np.uint8) for shade in shades]
 
 
-def decoded(jpegs: Sequence[Bytes], kept: DecodedPictures | None = None, layout: ImageLayout = LAYOUT) -> Pixels:
+def decoded(jpegs: Sequence[Bytes], kept: PictureCache | None = None, layout: ImageLayout = LAYOUT) -> Pixels:
     picture = np.full((layout.height, layout.width, 3), 99, np.uint8)
     (stitch if kept is None else kept.stitch)(jpegs, layout, picture)
     return picture
 
 
-def entry_of(kept: DecodedPictures, jpegs: Sequence[Bytes], layout: ImageLayout = LAYOUT) -> Path:
+def entry_of(kept: PictureCache, jpegs: Sequence[Bytes], layout: ImageLayout = LAYOUT) -> Path:
     key = picture_key(jpegs, layout)
     return kept.folder / key[:2] / f"{key[2:]}.rgb"
 
 
 @pytest.fixture
-def kept(tmp_path: Path) -> DecodedPictures:
-    return DecodedPictures(tmp_path / "pictures", limit_gb=1.0)
+def kept(tmp_path: Path) -> PictureCache:
+    return PictureCache(tmp_path / "pictures", limit_gb=1.0)
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def no_decoder(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_a_kept_picture_is_the_decoded_one_and_is_not_decoded_again(
-    kept: DecodedPictures, no_decoder: list[str], monkeypatch: pytest.MonkeyPatch
+    kept: PictureCache, no_decoder: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patched:
         patched.setattr("planners.data.images.stitch", stitch)
@@ -62,7 +62,7 @@ def test_a_kept_picture_is_the_decoded_one_and_is_not_decoded_again(
     assert (decoded(views(1), kept) == 99).all() and no_decoder == ["stitch"]
 
 
-def test_other_content_or_another_layout_is_another_picture(kept: DecodedPictures) -> None:
+def test_other_content_or_another_layout_is_another_picture(kept: PictureCache) -> None:
     """Whatever the pixels depend on is in the name; the names of cameras are not."""
     left, front, right = views(0)
     changed = front.copy()
@@ -80,7 +80,7 @@ def test_other_content_or_another_layout_is_another_picture(kept: DecodedPicture
 
 
 @pytest.mark.parametrize("damage", ["a bit", "short", "long", "empty", "of another"])
-def test_a_damaged_entry_is_made_again(kept: DecodedPictures, damage: str, no_decoder: list[str]) -> None:
+def test_a_damaged_entry_is_made_again(kept: PictureCache, damage: str, no_decoder: list[str]) -> None:
     path = entry_of(kept, views(0))
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("planners.data.images.stitch", stitch)
@@ -98,7 +98,7 @@ def test_a_damaged_entry_is_made_again(kept: DecodedPictures, damage: str, no_de
 
 def test_the_folder_never_takes_more_than_its_limit(tmp_path: Path) -> None:
     """Two entries fit into each of its 256 parts, and what finds its part full is decoded, to the same pixels."""
-    kept = DecodedPictures(tmp_path, limit_gb=2.5 * PARTS * ENTRY_BYTES / GB)
+    kept = PictureCache(tmp_path, limit_gb=2.5 * PARTS * ENTRY_BYTES / GB)
     keys = [picture_key(views(number), LAYOUT)[:2] for number in range(700)]
     for number in range(700):
         if keys.count(keys[number]) >= 4:
@@ -110,14 +110,14 @@ def test_the_folder_never_takes_more_than_its_limit(tmp_path: Path) -> None:
 
 
 def test_a_limit_for_less_than_a_picture_in_each_part_is_refused(tmp_path: Path) -> None:
-    DecodedPictures(tmp_path, limit_gb=0.81).check(ImageLayout())
+    PictureCache(tmp_path, limit_gb=0.81).check(ImageLayout())
     with pytest.raises(ValueError, match=r"data.pictures_gb=0.8: pictures of 2048 x 512 need at least 0.81, 256 of"):
-        DecodedPictures(tmp_path, limit_gb=0.8).check(ImageLayout())
+        PictureCache(tmp_path, limit_gb=0.8).check(ImageLayout())
     with pytest.raises(ValueError, match=r"data.pictures=s3://b: must be a folder of this machine"):
         DataSettings(pictures="s3://b")
 
 
-def test_the_draft_of_a_killed_process_is_in_nobodys_way(kept: DecodedPictures) -> None:
+def test_the_draft_of_a_killed_process_is_in_nobodys_way(kept: PictureCache) -> None:
     path = entry_of(kept, views(0))
     path.parent.mkdir(parents=True)
     (path.parent / "draft").write_bytes(b"half a picture" * 1000)
@@ -127,7 +127,7 @@ def test_the_draft_of_a_killed_process_is_in_nobodys_way(kept: DecodedPictures) 
 
 def _decode_all(folder: str, rounds: int) -> None:
     """One process of several, in an order of its own; wrong pixels end it."""
-    kept = DecodedPictures(Path(folder), limit_gb=1.0)
+    kept = PictureCache(Path(folder), limit_gb=1.0)
     for seed in range(rounds):
         for number in np.random.default_rng(seed).permutation(12).tolist():
             if not (decoded(views(number), kept) == decoded(views(number))).all():

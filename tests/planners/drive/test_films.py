@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from factory.stages.sensors import encode_jpeg
-from planners.drive.films import BEV_PX, CAMERA_PX, HOLD, pictures_of
+from planners.drive.films import BEV_PX, CAMERA_PX, HOLD, film_frames
 from planners.drive.loop import LoopSettings, drive
 from tasks.render.settings import ImageSource
 from tasks.world.clip import Scene
@@ -34,7 +34,7 @@ class RedEyes:
 @pytest.mark.parametrize("cameras", [None, RedEyes()])
 def test_a_film_has_a_picture_for_every_tenth_of_a_second(cameras: RedEyes | None) -> None:
     made = drive(start_on(street_with(car(50.0)), SETTINGS), Steady(8.0), SETTINGS, cameras)
-    pictures = list(pictures_of(made, None if cameras is None else cameras.rig, "a"))
+    pictures = list(film_frames(made, None if cameras is None else cameras.rig, "a"))
     assert len(pictures) == made.n_steps + 1 + HOLD == 23
     assert {picture.shape for picture in pictures} == {(BEV_PX[1], BEV_PX[0] + CAMERA_PX[0], 3)}
     middle = pictures[0][CAMERA_PX[1] // 2, BEV_PX[0] + CAMERA_PX[0] // 2].astype(int)

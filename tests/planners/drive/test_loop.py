@@ -8,7 +8,7 @@ import pytest
 from planners.drive.drivers import DriveEnd, HumanDriver, make_driver
 from planners.drive.loop import LoopSettings, drive, measure_drive
 from planners.drive.starts import logged_start
-from planners.evaluation.planner_names import planner_of
+from planners.evaluation.planner_names import find_planner
 from tasks.settings import PdmSettings, TrafficSettings
 from tasks.world.clip import NOW
 from tasks.world.frames import PACIFICA, VX, X, Y
@@ -16,7 +16,7 @@ from tests.planners.drive.streets import FAR, Steady, car, nobody, start_on, str
 from tests.tasks.streets import moved, street_clip
 
 REPLAY = replace(FAR, traffic=TrafficSettings(mode="replay"))
-CONSTANT_VELOCITY = make_driver(planner_of("constant_velocity"), PdmSettings())
+CONSTANT_VELOCITY = make_driver(find_planner("constant_velocity"), PdmSettings())
 
 
 def test_constant_velocity_drives_a_straight_road_to_its_end() -> None:
@@ -90,7 +90,7 @@ def test_the_human_drives_as_its_log_and_ends_with_it() -> None:
 def test_pdm_closed_keeps_clear_of_who_stands_ahead() -> None:
     settings = LoopSettings(seconds=12.0, bound_m=1000.0)
     made = drive(
-        start_on(street_with(car(50.0)), settings), make_driver(planner_of("pdm_closed"), PdmSettings()), settings
+        start_on(street_with(car(50.0)), settings), make_driver(find_planner("pdm_closed"), PdmSettings()), settings
     )
     assert made.ended is DriveEnd.TIME
     assert made.ego_states[-1, VX] < 0.5

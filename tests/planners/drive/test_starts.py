@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from planners.drive.loop import road_from
+from planners.drive.loop import route_ahead
 from planners.drive.starts import extend_clip, known_places, perturbed_starts
 from tasks.settings import PdmSettings, TrafficSettings
 from tasks.world.clip import CLIP_STEPS, NOW, Block, SensorFile
@@ -67,7 +67,7 @@ def test_a_place_is_found_near_the_one_before_where_a_road_crosses_itself() -> N
     """A loop of 200 m that comes back over its own beginning: the crossing lies at 50 m and at 250 m of the road."""
     corners = np.array([[0.0, 0.0], [100.0, 0.0], [100.0, 50.0], [50.0, 50.0], [50.0, -50.0]])
     line = np.column_stack([corners, np.zeros(len(corners))])
-    road = road_from(line, np.zeros(3), np.zeros((1, 2)), bound_m=1e6)
+    road = route_ahead(line, np.zeros(3), np.zeros((1, 2)), bound_m=1e6)
     crossing = np.array([50.0, 0.0])
     assert road.place_m(crossing, 48.0) == pytest.approx(50.0)
     assert road.place_m(crossing, 248.0) == pytest.approx(250.0)
@@ -75,6 +75,8 @@ def test_a_place_is_found_near_the_one_before_where_a_road_crosses_itself() -> N
 
 def test_a_road_is_known_up_to_its_first_unknown_place() -> None:
     line = np.column_stack([np.arange(0.0, 301.0), np.zeros(301), np.zeros(301)])
-    road = road_from(line, np.array([10.0, 1.0, 0.0]), np.array([[10.0, 0.0], [60.0, 0.0], [200.0, 0.0]]), bound_m=30.0)
+    road = route_ahead(
+        line, np.array([10.0, 1.0, 0.0]), np.array([[10.0, 0.0], [60.0, 0.0], [200.0, 0.0]]), bound_m=30.0
+    )
     assert (road.start_m, road.known_m) == (10.0, 90.0)
     assert road.length_m == 80.0

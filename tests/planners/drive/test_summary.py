@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from planners.drive.summary import differences_of, lines_of, summary_text
+from planners.drive.summary import picture_differences, summarise_drives, summary_text
 
 
 def row(clip: int, *, planner: str = "a", pictures: str = "none", start: int = -1, **more: Any) -> dict[str, Any]:
@@ -17,7 +17,7 @@ def row(clip: int, *, planner: str = "a", pictures: str = "none", start: int = -
 
 def test_metres_between_failures_are_all_metres_over_all_failures() -> None:
     """3 km with 2 failures in one of three clips: a bootstrap draws 0 to 3 times that clip of three."""
-    (line,) = lines_of([row(0, off_road_events=1, at_fault_collision=True), row(1), row(2)])
+    (line,) = summarise_drives([row(0, off_road_events=1, at_fault_collision=True), row(1), row(2)])
     mean, low, high = line.m_between_failures
     assert (line.km, line.failures, mean) == (3.0, 2, pytest.approx(1500.0))
     assert (low, high) == (pytest.approx(500.0), np.inf)
@@ -25,13 +25,13 @@ def test_metres_between_failures_are_all_metres_over_all_failures() -> None:
 
 
 def test_without_a_failure_there_is_no_bound() -> None:
-    (line,) = lines_of([row(0), row(1)])
+    (line,) = summarise_drives([row(0), row(1)])
     assert line.m_between_failures == (np.inf, np.inf, np.inf)
 
 
 def test_a_longer_drive_counts_by_its_metres() -> None:
     """One failure in 1 km of one clip and none in 9 km of the other: 10 km each."""
-    (line,) = lines_of([row(0, off_road_events=1), row(1, distance_m=9000.0)])
+    (line,) = summarise_drives([row(0, off_road_events=1), row(1, distance_m=9000.0)])
     assert line.m_between_failures[0] == pytest.approx(10_000.0)
 
 
@@ -39,14 +39,14 @@ def test_whole_towns_are_drawn_and_from_one_nothing_can_be() -> None:
     spread, alone = (
         [row(clip, log_id=f"town-{town}-0000-x") for clip, town in enumerate(towns)] for towns in ((0, 1), (0, 0))
     )
-    assert lines_of(spread)[0].level == "town"
-    (line,) = lines_of(alone)
+    assert summarise_drives(spread)[0].level == "town"
+    (line,) = summarise_drives(alone)
     assert line.level == "clip"
 
 
 def test_planners_pictures_and_kinds_of_starts_are_told_apart() -> None:
     rows = [row(0), row(0, start=0), row(0, start=1), row(0, planner="b", pictures="truth")]
-    assert [(line.planner, line.pictures, line.start, line.drives) for line in lines_of(rows)] == [
+    assert [(line.planner, line.pictures, line.start, line.drives) for line in summarise_drives(rows)] == [
         ("a", "none", "logged", 1),
         ("a", "none", "perturbed", 2),
         ("b", "truth", "logged", 1),
@@ -57,21 +57,21 @@ def test_what_the_engine_changes_is_over_the_starts_that_both_were_driven_from()
     """Three starts with the painter's pictures, of which two were driven with the engine's as well."""
     truth = [row(i, pictures="truth", route_completed=0.5) for i in range(3)]
     engine = [row(i, pictures="engine", route_completed=0.5 - 0.1 * i) for i in range(2)]
-    (one,) = differences_of([*truth, *engine])
+    (one,) = picture_differences([*truth, *engine])
     assert one.drives == 2
     assert one.shares["route_completed"].difference == pytest.approx(-0.05)
     assert one.shares["route_completed"].low == pytest.approx(-0.1)
     assert one.shares["at_fault_collision"].difference == 0.0
-    assert differences_of(truth) == []
+    assert picture_differences(truth) == []
 
 
 def test_of_one_drive_there_is_no_interval_and_the_text_has_a_dash() -> None:
-    told = summary_text(lines_of([row(0)]), [], 0.95)
+    told = summary_text(summarise_drives([row(0)]), [], 0.95)
     assert "[-, -]" in told and "nan" not in told
 
 
 def test_the_text_names_every_planner_and_what_its_brackets_are() -> None:
     rows = [row(0, pictures="truth"), row(1, pictures="truth"), row(0, pictures="engine"), row(1, pictures="engine")]
-    told = summary_text(lines_of(rows), differences_of(rows), 0.95)
+    told = summary_text(summarise_drives(rows), picture_differences(rows), 0.95)
     assert "engine - truth" in told
     assert told.endswith("[95 % intervals over towns; -: from one alone nothing can be drawn]")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from planners.evaluation.aggregation import group_by_clip, lines_of, score_of, summarise
+from planners.evaluation.aggregation import group_by_clip, summarise, summary_lines, total_score
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow, read_rows, write_rows
 from tasks.reward.aggregate import COLUMNS, FrameScores
@@ -42,16 +42,16 @@ def two_clips() -> list[FrameRow]:
 def test_two_clips_and_three_follow_ups_add_up_as_on_paper() -> None:
     summary = summarise(two_clips())
     assert summary.two_stage is not None
-    assert score_of(summary.one_stage.unfiltered) == pytest.approx(0.8)  # (0.9 + 0.7) / 2
-    assert score_of(summary.two_stage.stage_one.filtered) == pytest.approx(0.725)  # (0.8 + 0.6 + 1 + 0.5) / 4
+    assert total_score(summary.one_stage.unfiltered) == pytest.approx(0.8)  # (0.9 + 0.7) / 2
+    assert total_score(summary.two_stage.stage_one.filtered) == pytest.approx(0.725)  # (0.8 + 0.6 + 1 + 0.5) / 4
     # groups: a now 0.888650, a before (0.4 + 0.2) / 2, b 0.3 and 0.7
-    assert score_of(summary.two_stage.stage_two) == pytest.approx((0.888650 + 0.3 + 0.3 + 0.7) / 4, abs=1e-6)
-    assert score_of(summary.two_stage.follow_ups) == pytest.approx(3.1 / 6)  # of 1, 0.4, 0.5, 0.2, 0.3, 0.7
-    assert score_of(summary.two_stage.final.filtered) == pytest.approx(0.385230, abs=1e-6)
+    assert total_score(summary.two_stage.stage_two) == pytest.approx((0.888650 + 0.3 + 0.3 + 0.7) / 4, abs=1e-6)
+    assert total_score(summary.two_stage.follow_ups) == pytest.approx(3.1 / 6)  # of 1, 0.4, 0.5, 0.2, 0.3, 0.7
+    assert total_score(summary.two_stage.final.filtered) == pytest.approx(0.385230, abs=1e-6)
     assert (summary.n_clips, summary.n_two_stage, summary.n_follow_ups) == (2, 2, 3)
     clip_a = group_by_clip(two_clips())[0].two_stage
     assert clip_a is not None
-    assert score_of(clip_a.final.filtered) == pytest.approx(0.445460, abs=1e-6)
+    assert total_score(clip_a.final.filtered) == pytest.approx(0.445460, abs=1e-6)
 
 
 def test_every_column_is_aggregated_alike() -> None:
@@ -64,7 +64,7 @@ def test_the_share_of_clips_in_the_uniform_fallback_is_counted() -> None:
     summary = summarise(two_clips())
     assert summary.uniform_share == 0.5  # b: 30 m away; a is near
     assert summary.uniform_share_before == 0.5  # a: 4 m away; b is 1 m away
-    lines = lines_of("mine", summary)
+    lines = summary_lines("mine", summary)
     assert [(line.stage, line.human_filter, line.n_frames) for line in lines] == [
         ("one_stage", "unfiltered", 2),
         ("one_stage", "filtered", 2),
@@ -85,16 +85,16 @@ def test_the_filter_reaches_the_final_score_through_stage_one() -> None:
     rows[1] = replace(rows[1], scores=forgiven)  # stage one of a now: 0, or 1 with the filter
     final = summarise(rows).two_stage
     assert final is not None
-    assert score_of(final.final.unfiltered) == pytest.approx(((0.0 + 0.18) / 2 + 0.325) / 2)
-    assert score_of(final.final.filtered) == pytest.approx(((0.888650 + 0.18) / 2 + 0.325) / 2, abs=1e-6)
+    assert total_score(final.final.unfiltered) == pytest.approx(((0.0 + 0.18) / 2 + 0.325) / 2)
+    assert total_score(final.final.filtered) == pytest.approx(((0.888650 + 0.18) / 2 + 0.325) / 2, abs=1e-6)
 
 
 def test_the_order_of_rows_and_clips_changes_nothing() -> None:
     rows = two_clips()
-    expected = [line.columns for line in lines_of("mine", summarise(rows))]
+    expected = [line.columns for line in summary_lines("mine", summarise(rows))]
     for seed in range(5):
         shuffled = [rows[i] for i in np.random.default_rng(seed).permutation(len(rows))]
-        for line, columns in zip(lines_of("mine", summarise(shuffled)), expected):
+        for line, columns in zip(summary_lines("mine", summarise(shuffled)), expected):
             np.testing.assert_array_equal(line.columns, columns)
 
 
@@ -114,13 +114,13 @@ def test_a_planner_without_plans_in_stage_two_has_no_final_score() -> None:
     two = summarise(rows).two_stage
     assert two is not None
     assert np.isnan(two.stage_two).all() and np.isnan(two.follow_ups).all() and np.isnan(two.final.filtered).all()
-    assert score_of(two.stage_one.filtered) == pytest.approx(0.725)
+    assert total_score(two.stage_one.filtered) == pytest.approx(0.725)
 
 
 def test_clips_without_follow_ups_count_in_one_stage_only() -> None:
     alone = clip_rows("c", 0.2, (0.0, 0.0), ((0.0, 0.0), (0.0, 0.0)), [])
     with_c, without = summarise([*two_clips(), *alone]), summarise(two_clips())
-    assert score_of(with_c.one_stage.unfiltered) == pytest.approx(0.6)
+    assert total_score(with_c.one_stage.unfiltered) == pytest.approx(0.6)
     assert with_c.two_stage is not None and without.two_stage is not None
     np.testing.assert_array_equal(with_c.two_stage.final.filtered, without.two_stage.final.filtered)
     assert summarise(alone).two_stage is None

@@ -5,7 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from planners.evaluation.aggregation import ClipResult, group_by_clip, lines_of, measured, score_of, summarise
+from planners.evaluation.aggregation import (
+    ClipResult,
+    collect_scores,
+    group_by_clip,
+    summarise,
+    summary_lines,
+    total_score,
+)
 from planners.evaluation.bootstrap import paired_interval
 from planners.evaluation.compare import CompareSettings, compare, difference_columns, is_clear, is_clear_row, text_of
 from planners.evaluation.score_rows import FrameRow
@@ -170,10 +177,10 @@ def test_runs_are_compared_in_every_stage() -> None:
 
 
 def test_means_over_clips_are_those_of_the_table() -> None:
-    found = measured([run()], "score")
+    found = collect_scores([run()], "score")
     means = {name: (one.scores * one.weights).sum() / one.weights.sum() for name, one in found.items()}
-    for line in lines_of("run", summarise([row for clip in range(6) for row in clip_of(clip)])):
-        assert means[line.stage, line.human_filter] == pytest.approx(score_of(line.columns))
+    for line in summary_lines("run", summarise([row for clip in range(6) for row in clip_of(clip)])):
+        assert means[line.stage, line.human_filter] == pytest.approx(total_score(line.columns))
     values = [0.1 * i + 0.1 for i in range(6)]
     assert means["stage_two", "none"] == pytest.approx(sum(values) / 6)  # a clip has two groups
     assert means["follow_ups", "none"] == pytest.approx(sum(v * (1 + i % 2) for i, v in enumerate(values)) / 9)

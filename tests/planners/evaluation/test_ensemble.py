@@ -8,7 +8,7 @@ import torch
 
 from factory.config.compose import ConfigError
 from planners.data.batch import ImageLayout
-from planners.evaluation.planner_names import planner_of
+from planners.evaluation.planner_names import find_planner
 from planners.models.gtrs_dense import Ensemble, average_scores
 from planners.training.checkpoint import load_planner, save_checkpoint
 from tests.planners.models.test_gtrs_dense import TINY, labelled, planner
@@ -44,16 +44,16 @@ def saved(out: Path, seed: int) -> str:
 def test_trainings_joined_by_plus_are_evaluated_as_their_ensemble(tmp_path: Path) -> None:
     batch, _ = labelled(4)
     a, b = saved(tmp_path / "a", 0), saved(tmp_path / "b", 1)
-    both = planner_of(f"{a}+{b}", "both")
-    assert len({both.digest, planner_of(a).digest, planner_of(b).digest}) == 3
+    both = find_planner(f"{a}+{b}", "both")
+    assert len({both.digest, find_planner(a).digest, find_planner(b).digest}) == 3
     made = both.load()
     assert torch.equal(made.plan(batch), Ensemble([("a", load_planner(a)), ("b", load_planner(b))]).plan(batch))
 
 
 def test_only_settings_of_planning_change_after_training(tmp_path: Path) -> None:
     a = saved(tmp_path / "a", 0)
-    few = planner_of(a, "few", {"inference_entries": 3})
-    assert few.digest != planner_of(a).digest
+    few = find_planner(a, "few", {"inference_entries": 3})
+    assert few.digest != find_planner(a).digest
     assert len(few.load().choices) == 3
     with pytest.raises(ConfigError, match="encoder of gtrs_dense cannot change after training; free: inf"):
         load_planner(a, {"encoder": "fused"})
@@ -63,4 +63,4 @@ def test_an_ensemble_of_planners_without_scores_is_refused(tmp_path: Path) -> No
     torch.manual_seed(0)
     save_checkpoint(tmp_path / "toy", 1, Toy(ToySettings(), {}), {}, {"version": 1})
     with pytest.raises(ConfigError, match=r"averages the scores of gtrs_dense models, not .*toy"):
-        planner_of(f"{saved(tmp_path / 'a', 0)}+{tmp_path / 'toy'}").load()
+        find_planner(f"{saved(tmp_path / 'a', 0)}+{tmp_path / 'toy'}").load()

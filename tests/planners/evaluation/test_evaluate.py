@@ -17,8 +17,8 @@ from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
 from planners.evaluation.aggregation import SummaryLine
 from planners.evaluation.evaluate import EvaluateSettings, evaluate, fallback_notes, main, settings_of
 from planners.evaluation.frames import FrameKey
-from planners.evaluation.planner_names import EvaluatedPlanner, find_planners, planner_of
-from planners.evaluation.planning import all_plans, as_shown, plans_of
+from planners.evaluation.planner_names import EvaluatedPlanner, find_planner, find_planners
+from planners.evaluation.planning import all_plans, as_shown, plan_samples
 from planners.evaluation.score_rows import read_record, read_rows
 from planners.training.checkpoint import save_checkpoint
 from tasks.reward.aggregate import COLUMNS
@@ -141,7 +141,7 @@ def test_a_checkpoint_is_scored_again_when_its_weights_changed(benchmark: Street
         for parameter in toy.parameters():
             torch.nn.init.constant_(parameter, weight)
         save_checkpoint(training, step, toy, {}, {})
-        lines = evaluate(benchmark, [planner_of(str(training), "toy")], settings(out))
+        lines = evaluate(benchmark, [find_planner(str(training), "toy")], settings(out))
         return lines, read_record(out / "toy")["planner_digest"]
 
     first, digest = scored(1, 0.0)  # it stands where it is
@@ -247,7 +247,7 @@ def test_a_batch_planner_must_answer_for_every_sample(benchmark: StreetBenchmark
             return super().plan(batch)[:-1]
 
     with pytest.raises(ValueError, match=r"batch of 3 returned \(2, 8, 3\)"):
-        plans_of(Short(), [benchmark.sample(key) for key in benchmark.keys[:3]])
+        plan_samples(Short(), [benchmark.sample(key) for key in benchmark.keys[:3]])
 
 
 @pytest.mark.parametrize(
@@ -264,12 +264,12 @@ def test_a_batch_planner_must_answer_for_every_sample(benchmark: StreetBenchmark
 )
 def test_nobody_is_evaluated_under_a_name_that_means_nobody(spec: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        planner_of(spec)
+        find_planner(spec)
 
 
 def test_a_folder_without_a_checkpoint_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no checkpoint"):
-        planner_of(str(tmp_path))
+        find_planner(str(tmp_path))
 
 
 def test_labels_are_unique_and_bounds_come_once() -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from factory.config.compose import ConfigError
-from planners.evaluation.planner_names import planner_of
+from planners.evaluation.planner_names import find_planner
 from planners.evaluation.replay import HOLD, ReplaySettings, find_clip, replay, settings_of
 from planners.evaluation.scoring import Rules
 from tests.planners.small_benchmark import StreetBenchmark
@@ -20,14 +20,14 @@ def benchmark() -> StreetBenchmark:
 
 @pytest.mark.slow
 def test_both_stages_are_shown_from_history_to_the_end(benchmark: StreetBenchmark) -> None:
-    pictures = list(replay(benchmark, planner_of("pdm_closed"), "a", Rules()))
+    pictures = list(replay(benchmark, find_planner("pdm_closed"), "a", Rules()))
     assert len(pictures) == 2 * (INSTANTS + HOLD)
     assert {picture.shape for picture in pictures} == {(560, 1280, 3)}
     assert (pictures[0] != pictures[30]).any()
 
 
 def test_nobody_drives_like_the_human_after_stage_one(benchmark: StreetBenchmark) -> None:
-    assert len(list(replay(benchmark, planner_of("human"), "a", Rules()))) == INSTANTS + HOLD
+    assert len(list(replay(benchmark, find_planner("human"), "a", Rules()))) == INSTANTS + HOLD
 
 
 def test_the_camera_shows_the_latest_picture_up_to_now(benchmark: StreetBenchmark) -> None:
@@ -38,7 +38,7 @@ def test_the_camera_shows_the_latest_picture_up_to_now(benchmark: StreetBenchmar
     key = benchmark.keys[0]
     camera = {"name": "front", "ego_from_camera": [0, 0, 1, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 0, 1]}
     benchmark._rows[key] |= {"cameras": [camera], "images": [image(-0.5, 60), image(0.0, 200), image(0.5, 250)]}
-    pictures = list(replay(benchmark, planner_of("human"), "a", Rules()))
+    pictures = list(replay(benchmark, find_planner("human"), "a", Rules()))
     middle = [int(picture[200, 920].mean()) for picture in pictures]
     assert np.abs(np.array(middle[:15]) - 60).max() <= 2
     assert np.abs(np.array(middle[15:]) - 200).max() <= 2
@@ -49,7 +49,7 @@ def test_a_clip_or_follow_up_that_is_not_there_is_named(benchmark: StreetBenchma
     with pytest.raises(ConfigError, match="clip=b: 2 of 3"):
         find_clip(benchmark, "b")
     with pytest.raises(ConfigError, match="follow_up=7: clip a has"):
-        list(replay(benchmark, planner_of("pdm_closed"), "a", Rules(), follow_up=7))
+        list(replay(benchmark, find_planner("pdm_closed"), "a", Rules(), follow_up=7))
 
 
 def test_the_command_line_is_typed() -> None:

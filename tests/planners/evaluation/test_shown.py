@@ -11,7 +11,7 @@ from planners.data.batch import BevLayout, ImageLayout, Needs
 from planners.data.index import DataSettings, open_dataset
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
-from planners.evaluation.planning import as_shown, batch_of, columns_shown
+from planners.evaluation.planning import as_shown, batch_samples, columns_shown
 from tests.planners.samples import grey_pictures, sample, write_table
 
 NEEDS = Needs(image=ImageLayout(width=48, height=12), bev=BevLayout(cell_m=1.0), n_agents=3)
@@ -33,7 +33,7 @@ def test_a_batch_is_the_loaders_but_for_the_plans(table: Path) -> None:
     dataset = open_dataset(DataSettings(real=str(table), sim=str(table)))
     (loaded,) = Loader(dataset, NEEDS, MixSettings(), batch_size=8, workers=1).epoch(0)
     rows = SampleTable(table)
-    shown = batch_of([as_shown(rows.sample(name, columns_shown(NEEDS))) for name in loaded.attempt_ids], NEEDS)
+    shown = batch_samples([as_shown(rows.sample(name, columns_shown(NEEDS))) for name in loaded.attempt_ids], NEEDS)
     assert shown.attempt_ids == loaded.attempt_ids
     for name in ("status", "history", "image", "bev", "agents", "agents_valid", "simulated"):
         mine, theirs = getattr(shown, name), getattr(loaded, name)
@@ -53,4 +53,4 @@ def test_a_sample_without_its_picture_is_named(table: Path) -> None:
     row = dict(SampleTable(table)[0])
     row["images"] = None
     with pytest.raises(ValueError, match=r"sample attempt00000: no image of camera"):
-        batch_of([row], NEEDS)
+        batch_samples([row], NEEDS)

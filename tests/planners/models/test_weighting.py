@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from planners.models.gtrs_dense import WEIGHTINGS, choose, total
+from planners.models.gtrs_dense import WEIGHTINGS, choose, weighted_total
 from tasks.subscores import LABELLED
 
 
@@ -21,7 +21,7 @@ def test_total_is_the_log_weighted_sum_worked_out_by_hand() -> None:
     log = math.log
     release = 0.03 * log(0.1) + 0.1 * log(0.6) + 0.1 * log(0.9) + 0.9 * log(0.8) + 0.2 * log(0.7)
     release += 6.0 * log(7.0 * 0.5 + 7.0 * 0.4 + 3.0 * 0.3)
-    assert total(scores, WEIGHTINGS["release"]).item() == pytest.approx(release, rel=1e-6)
+    assert weighted_total(scores, WEIGHTINGS["release"]).item() == pytest.approx(release, rel=1e-6)
 
 
 def test_the_release_weighs_progress_more_than_collisions() -> None:
@@ -32,7 +32,7 @@ def test_the_release_weighs_progress_more_than_collisions() -> None:
 def test_of_equals_the_first_is_chosen_and_a_probability_of_zero_stays_finite() -> None:
     scores = named(imitation=[0.0, 0.0, 0.0], nc=[0.0, 0.5, 0.5])
     assert choose(scores, WEIGHTINGS["release"]).tolist() == [1]
-    assert total(scores, WEIGHTINGS["release"]).isfinite().all()
+    assert weighted_total(scores, WEIGHTINGS["release"]).isfinite().all()
 
 
 @pytest.mark.parametrize("name", WEIGHTINGS)

@@ -24,10 +24,10 @@ from factory.datasets.town.town import write_logs
 from factory.run import main as run
 from factory.stages.sensors import decode_image, encode_jpeg
 from factory.store.reader import SampleTable, decode_stored_image
-from planners.evaluation.planning import plans_of
+from planners.evaluation.planning import plan_samples
 from planners.navsim.agent import RemotePlanner, shown
 from planners.navsim.serve import FRONT, Pilot, seen_of
-from planners.training.checkpoint import load_planner, newest
+from planners.training.checkpoint import load_planner, newest_checkpoint
 from planners.training.train import main as train
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import Clip
@@ -220,9 +220,9 @@ def test_a_planner_of_one_step_drives_as_an_agent_in_the_exported_logs_and_is_sc
     cameras = f"planner.settings.image.cameras=[{','.join(name.upper() for name in FRONT)}]"
     out = chain.root / "trained"
     assert train(["planner=ltf_small", cameras, *data, "steps=1", f"out={out}"]) == 0
-    assert json.loads((newest(out) / "record.json").read_text())["step"] == 1
+    assert json.loads((newest_checkpoint(out) / "record.json").read_text())["step"] == 1
     scenes, rows, clip = chain.scenes(), chain.rows(), _clip(chain)
-    expected = plans_of(load_planner(out), rows)
+    expected = plan_samples(load_planner(out), rows)
     remote = RemotePlanner(str(out), sys.executable)
     plans = {key: remote.plan(agent_input(scene), 40) for key, scene in scenes.items()}
     remote.close()

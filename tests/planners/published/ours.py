@@ -13,7 +13,7 @@ from torch import Tensor
 from factory.config.compose import ConfigError, compose, fill
 from planners.data.batch import Batch
 from planners.models.diffusiondrive import DiffusionDrive, EncodedScene
-from planners.models.gtrs_dense import IMITATION, WEIGHTINGS, GtrsDense, total
+from planners.models.gtrs_dense import IMITATION, WEIGHTINGS, GtrsDense, weighted_total
 from planners.models.ltf import Ltf
 from planners.models.planner import Planner, PlannerChoice, evaluating
 from planners.published.import_planner import SCORES, Imported, imported
@@ -144,7 +144,7 @@ def _scored(planner: GtrsDense, batch: Batch) -> dict[str, Tensor]:
     logits = planner.logits(batch, batch.status, planner.get_buffer("choices"))
     chance = {name: x.softmax(dim=1) if name == IMITATION else x.sigmoid() for name, x in logits.items()}
     named = {name: logits[ours] for name, ours in SCORES.items() if ours in logits}
-    scores = total(chance, WEIGHTINGS[planner.settings.weighting])
+    scores = weighted_total(chance, WEIGHTINGS[planner.settings.weighting])
     return {"trajectory": planner.plan(batch), "imi": logits[IMITATION], "scores": scores, **named}
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from planners.evaluation.planner_names import planner_of as evaluated_planner
+from planners.evaluation.planner_names import find_planner as evaluated_planner
 from planners.published.import_planner import main
 from planners.training.checkpoint import read_record
 from tests.planners.published.formula import inputs

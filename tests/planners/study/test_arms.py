@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from planners.study import arms as module
-from planners.study.arms import ArmDrives, HeldAgainst, clean_route, differences_of, read_arm_drives, text_of
+from planners.study.arms import ArmDrives, HeldAgainst, arm_differences, clean_route, read_arm_drives, text_of
 from planners.training.many import Training
 from tests.planners.drive.test_summary import row
 
@@ -26,7 +26,7 @@ def drives_of(
     for one in everyone:
         (tmp_path / "trainings" / one.label).mkdir(parents=True, exist_ok=True)
     monkeypatch.setattr(module, "drive_settings", lambda *_: None)
-    monkeypatch.setattr(module, "driven", lambda _: (rows, True))
+    monkeypatch.setattr(module, "read_drives", lambda _: (rows, True))
     return read_arm_drives(everyone, str(tmp_path), "")
 
 
@@ -43,7 +43,7 @@ def test_arms_are_held_against_each_other_where_all_have_driven(monkeypatch: pyt
     rows += [row(i, planner="constant_velocity", route_completed=0.2) for i in range(3)]
     (found,) = drives_of(monkeypatch, tmp_path, rows)
     assert (found.kind, found.level, len(found.clusters)) == ("logged", "town", 3)
-    apart = {(one["arm"], one["reference"], one["measure"]): one for one in differences_of([found], [PAIR])}
+    apart = {(one["arm"], one["reference"], one["measure"]): one for one in arm_differences([found], [PAIR])}
     more = apart[ARMS[1], ARMS[0], "clean_route"]
     assert [more[name] for name in ("difference", "low", "high")] == pytest.approx([10.0, 10.0, 10.0])
     assert apart[ARMS[0], "constant_velocity", "route_completed"]["difference"] == pytest.approx(30.0)

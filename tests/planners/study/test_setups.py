@@ -6,7 +6,7 @@ from itertools import groupby
 
 import pytest
 
-from planners.study.setups import Comparison, Setup, so_far, words_of
+from planners.study.setups import Comparison, Setup, completed_comparisons, words_of
 from planners.study.sweep import BATCH, EVALUATED_TOGETHER, batches, shares_of
 from planners.training.many import Training
 
@@ -53,15 +53,15 @@ def test_a_setup_is_called_after_what_is_not_as_usual() -> None:
 
 def test_comparisons_so_far_have_the_seeds_that_both_sides_have() -> None:
     begun, first, second = labels("begin", 0), labels("main", 0), labels("main", 1)
-    assert {one.part for one in so_far(WANTED, begun)} == {"begin"}
-    whole = so_far(WANTED, [*begun, *first])
+    assert {one.part for one in completed_comparisons(WANTED, begun)} == {"begin"}
+    whole = completed_comparisons(WANTED, [*begun, *first])
     assert [one.setup for one in whole] == [one.setup for one in WANTED if one.part != "ratio"]
     assert {one.seeds for one in whole} == {1}
-    both = so_far(WANTED, [*begun, *first, *second])
+    both = completed_comparisons(WANTED, [*begun, *first, *second])
     assert {one.seeds for one in both if one.part == "main"} == {2}
     without = [label for label in second if label != REAL.label_of(1)]
-    assert so_far(WANTED, [*begun, *first, *without]) == whole, "means of other seeds would stand beside"
-    assert so_far(WANTED, second) == []
+    assert completed_comparisons(WANTED, [*begun, *first, *without]) == whole, "means of other seeds would stand beside"
+    assert completed_comparisons(WANTED, second) == []
 
 
 def units(*counts: tuple[str, int, int]) -> list[Training]:

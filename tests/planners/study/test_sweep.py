@@ -11,11 +11,11 @@ import torch
 from factory.exits import Stopped
 from planners.evaluation.aggregation import group_by_clip, scores_in_percent
 from planners.evaluation.evaluate import EvaluateSettings, evaluate
-from planners.evaluation.planner_names import planner_of
+from planners.evaluation.planner_names import find_planner
 from planners.evaluation.score_rows import read_rows
 from planners.study import sweep as sweep_module
 from planners.study.setups import Comparison, Setup
-from planners.study.sweep import EVALUATIONS, SweepSettings, evaluated, run
+from planners.study.sweep import EVALUATIONS, SweepSettings, evaluated_labels, run
 from planners.training.checkpoint import save_checkpoint
 from planners.training.many import DONE, Training, folder_of
 from tests.planners.evaluation.test_evaluate import settings
@@ -33,31 +33,31 @@ def train(out: Path, training: Training, weight: float = 0.0, step: int = 1) -> 
 
 
 def score(out: Path, rules: EvaluateSettings, *trainings: Training) -> None:
-    trained = [planner_of(str(folder_of(out, one)), one.label) for one in trainings]
-    evaluate(StreetBenchmark(), [planner_of("constant_velocity"), *trained], rules)
+    trained = [find_planner(str(folder_of(out, one)), one.label) for one in trainings]
+    evaluate(StreetBenchmark(), [find_planner("constant_velocity"), *trained], rules)
 
 
 def test_what_is_evaluated_is_reported_and_what_changed_since_is_not(tmp_path: Path) -> None:
     rules = settings(tmp_path / EVALUATIONS)
     a, b, c = (Training(label, (f"seed={label}",)) for label in "abc")
     planned = [a, b, c, Training("ab", members=("a", "b"))]
-    assert evaluated(planned, tmp_path) == set()
+    assert evaluated_labels(planned, tmp_path) == set()
     train(tmp_path, a)
-    assert evaluated(planned, tmp_path) == set(), "nothing is evaluated yet"
+    assert evaluated_labels(planned, tmp_path) == set(), "nothing is evaluated yet"
     score(tmp_path, rules, a)
-    assert evaluated(planned, tmp_path) == {"a"}
+    assert evaluated_labels(planned, tmp_path) == {"a"}
     train(tmp_path, c)
     score(tmp_path, rules, c)
-    assert evaluated(planned, tmp_path) == {"a", "c"}, "a part behind one that is not done counts"
+    assert evaluated_labels(planned, tmp_path) == {"a", "c"}, "a part behind one that is not done counts"
 
     other_overrides = [replace(a, overrides=("seed=9",)), *planned[1:]]
-    assert evaluated(other_overrides, tmp_path) == {"c"}
+    assert evaluated_labels(other_overrides, tmp_path) == {"c"}
     train(tmp_path, a, weight=0.1, step=2)
-    assert evaluated(planned, tmp_path) == {"c"}, "it was trained again since"
+    assert evaluated_labels(planned, tmp_path) == {"c"}, "it was trained again since"
     score(tmp_path, rules, a)
-    assert evaluated(planned, tmp_path) == {"a", "c"}
+    assert evaluated_labels(planned, tmp_path) == {"a", "c"}
     score(tmp_path, replace(rules, one_stage_traffic=rules.two_stage_traffic), c)
-    assert evaluated(planned, tmp_path) == {"c"}, "the other was evaluated by other rules"
+    assert evaluated_labels(planned, tmp_path) == {"c"}, "the other was evaluated by other rules"
 
 
 @pytest.mark.slow

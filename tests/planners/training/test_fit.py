@@ -19,12 +19,12 @@ from planners.data.batch import Batch
 from planners.models.planner import PlannerChoice, build_planner
 from planners.training.checkpoint import (
     Keep,
-    best,
+    best_checkpoint,
     checkpoints,
-    digest,
     load_planner,
     load_training,
-    newest,
+    newest_checkpoint,
+    planner_digest,
     read_record,
 )
 from planners.training.fit import LOSSES, VALIDATION, Loop, Precision, fit, total_steps
@@ -79,7 +79,7 @@ def test_an_interrupted_training_resumes_to_the_identical_curve_and_weights(tmp_
     out = tmp_path / "cut"
     with pytest.raises(Stopped, match=f"after step {stop_after} of 15"):
         train(out, Interrupted(20, 4, stop_after), validate_every=5)
-    resumed = train(out, ToyBatches(20, 4), newest(out), validate_every=5)
+    resumed = train(out, ToyBatches(20, 4), newest_checkpoint(out), validate_every=5)
     assert (out / LOSSES).read_text() == (tmp_path / "whole" / LOSSES).read_text()
     assert (out / VALIDATION).read_text() == (tmp_path / "whole" / VALIDATION).read_text()
     for name, value in whole.state_dict().items():
@@ -103,8 +103,8 @@ def test_a_killed_training_repeats_what_came_after_its_last_checkpoint(tmp_path:
     with pytest.raises(Killed):
         train(out, Dying(20, 4), checkpoint_every=3, log_every=1)
     assert [int(row["step"]) for row in rows(out / LOSSES)] == list(range(8))
-    assert newest(out).name == "00000006"
-    train(out, ToyBatches(20, 4), newest(out), checkpoint_every=3, log_every=1)
+    assert newest_checkpoint(out).name == "00000006"
+    train(out, ToyBatches(20, 4), newest_checkpoint(out), checkpoint_every=3, log_every=1)
     assert (out / LOSSES).read_text() == (whole / LOSSES).read_text()
 
 
@@ -233,8 +233,8 @@ def test_a_checkpoint_is_the_planner_and_only_the_newest_stay(tmp_path: Path) ->
     loaded = load_planner(tmp_path)
     batch = toy_batch(torch.arange(3).numpy())
     assert torch.equal(loaded.plan(batch), trained.eval().plan(batch))
-    assert len(digest(tmp_path)) == 16
-    assert digest(tmp_path) != digest(checkpoints(tmp_path)[0])
+    assert len(planner_digest(tmp_path)) == 16
+    assert planner_digest(tmp_path) != planner_digest(checkpoints(tmp_path)[0])
 
 
 def test_every_nth_checkpoint_stays_beside_the_newest(tmp_path: Path) -> None:
@@ -262,12 +262,12 @@ def test_the_best_checkpoint_stays_whatever_interrupts(tmp_path: Path, stop_afte
     else:
         with pytest.raises(Stopped):
             go_on(Interrupted(20, 4, stop_after))
-        go_on(ToyBatches(20, 4), newest(tmp_path))
+        go_on(ToyBatches(20, 4), newest_checkpoint(tmp_path))
     assert [int(path.name) for path in checkpoints(tmp_path)] == [4, 10, 15]
-    found = best(tmp_path, "off_m")
+    found = best_checkpoint(tmp_path, "off_m")
     assert found is not None and found.name == "00000004"
     assert read_record(found)["validation"] == {"off_m": 1.0}
-    assert best(tmp_path, "another") is None
+    assert best_checkpoint(tmp_path, "another") is None
 
 
 def test_a_training_killed_behind_its_best_checkpoint_goes_on_from_it_without_a_gap(tmp_path: Path) -> None:
@@ -275,21 +275,21 @@ def test_a_training_killed_behind_its_best_checkpoint_goes_on_from_it_without_a_
         pass
 
     def once(planner: Any) -> dict[str, float]:
-        if best(tmp_path, "weight") is not None:
+        if best_checkpoint(tmp_path, "weight") is not None:
             raise Killed
         return measured(planner)
 
     loop = Loop(seed=1, steps=15, validate_every=2, log_every=20, keep=Keep(best="weight"))
     with pytest.raises(Killed):
         fit(toy(), ToyBatches(20, 4), TRAINING, loop, ALONE, tmp_path, {}, None, once)
-    assert newest(tmp_path).name == "00000002"
-    train(tmp_path, ToyBatches(20, 4), newest(tmp_path))
+    assert newest_checkpoint(tmp_path).name == "00000002"
+    train(tmp_path, ToyBatches(20, 4), newest_checkpoint(tmp_path))
     assert [int(row["step"]) for row in rows(tmp_path / LOSSES)] == list(range(15))
 
 
 def test_a_checkpoint_of_another_planner_is_refused_by_name(tmp_path: Path) -> None:
     train(tmp_path, ToyBatches(20, 4))
-    record = newest(tmp_path) / "record.json"
+    record = newest_checkpoint(tmp_path) / "record.json"
     changed = json.loads(record.read_text())
     changed["planner"]["settings"]["hidden"] = 9
     del changed["sha256"]
@@ -311,7 +311,7 @@ def test_folders_without_a_checkpoint_and_planners_nobody_knows_are_refused(tmp_
 
 def test_a_flipped_bit_in_any_file_of_a_checkpoint_is_found_and_named(tmp_path: Path) -> None:
     train(tmp_path, ToyBatches(20, 4))
-    folder = newest(tmp_path)
+    folder = newest_checkpoint(tmp_path)
     for path in sorted(folder.iterdir()):
         whole = path.read_bytes()
         for at in range(0, len(whole), max(1, len(whole) // 50)):

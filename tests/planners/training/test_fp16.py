@@ -13,7 +13,7 @@ from torch import Tensor
 from factory.exits import Stopped
 from planners.data.batch import Batch
 from planners.models.planner import Planner
-from planners.training.checkpoint import load_training, newest
+from planners.training.checkpoint import load_training, newest_checkpoint
 from planners.training.fit import LOSSES, SCALER, Loop, fit
 from planners.training.optim import TrainingSettings
 from tests.planners.models import test_diffusiondrive, test_gtrs_dense, test_ltf
@@ -56,7 +56,7 @@ def test_a_step_that_overflows_is_left_out_and_the_scale_halved(tmp_path: Path) 
     for name, weights in before.state_dict().items():
         assert torch.equal(after.state_dict()[name], weights), name
         assert not torch.equal(behind.state_dict()[name], weights), name
-    steps = load_training(newest(tmp_path / str(first + 1)))["optimiser"]["state"].values()
+    steps = load_training(newest_checkpoint(tmp_path / str(first + 1)))["optimiser"]["state"].values()
     assert {int(state["step"]) for state in steps} <= {first}, "Adam has not counted it either"
     train(tmp_path / "all", loud(), 15)
     curve = rows(tmp_path / "all" / LOSSES)
@@ -72,13 +72,13 @@ def test_a_resumed_training_has_the_scale_it_had(tmp_path: Path) -> None:
     stop = loud_steps()[0] + 1
     with pytest.raises(Stopped):
         train(out, loud(), 15, Interrupted(20, 4, stop))
-    assert load_training(newest(out))[SCALER]["scale"] == FIRST_SCALE / 2
-    resumed = train(out, loud(), 15, resume=newest(out))
+    assert load_training(newest_checkpoint(out))[SCALER]["scale"] == FIRST_SCALE / 2
+    resumed = train(out, loud(), 15, resume=newest_checkpoint(out))
     assert (out / LOSSES).read_text() == (tmp_path / "whole" / LOSSES).read_text()
     for name, weights in whole.state_dict().items():
         assert torch.equal(resumed.state_dict()[name], weights), name
     with pytest.raises(ValueError, match="trained in fp16: go on in the same precision"):
-        fit(loud(), ToyBatches(20, 4), TRAINING, Loop(1, 15), ALONE, out, {}, newest(out))
+        fit(loud(), ToyBatches(20, 4), TRAINING, Loop(1, 15), ALONE, out, {}, newest_checkpoint(out))
 
 
 class Again(ToyBatches):

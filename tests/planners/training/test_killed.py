@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from planners.data.batch import Batch
-from planners.training.checkpoint import WEIGHTS, checkpoints, load_training, newest, read_record
+from planners.training.checkpoint import WEIGHTS, checkpoints, load_training, newest_checkpoint, read_record
 from planners.training.fit import LOSSES
 from planners.training.train import main
 from tests.planners.samples import sample, write_table
@@ -142,7 +142,7 @@ class Trainings:
         for part in parts:
             part.kill()
         assert codes(parts) == [-signal.SIGKILL] * processes
-        done = int(newest(out).name)
+        done = int(newest_checkpoint(out).name)
         assert 0 < done < len(self.notes(out)) < STEPS, "it was to be killed on its way, behind a checkpoint"
         return out
 
@@ -156,8 +156,8 @@ def trainings(tmp_path_factory: pytest.TempPathFactory) -> Trainings:
 def test_the_same_number_goes_on_to_the_same_weights_to_the_last_bit(trainings: Trainings, processes: int) -> None:
     whole, resumed = trainings.whole(processes), trainings.goes_on(processes, processes)
     assert (resumed / LOSSES).read_text() == (whole / LOSSES).read_text()
-    assert (newest(resumed) / WEIGHTS).read_bytes() == (newest(whole) / WEIGHTS).read_bytes()
-    ours, theirs = (load_training(newest(out)) for out in (resumed, whole))
+    assert (newest_checkpoint(resumed) / WEIGHTS).read_bytes() == (newest_checkpoint(whole) / WEIGHTS).read_bytes()
+    ours, theirs = (load_training(newest_checkpoint(out)) for out in (resumed, whole))
     for index, state in theirs["optimiser"]["state"].items():
         for name, value in state.items():
             assert torch.equal(ours["optimiser"]["state"][index][name], value), (index, name)
@@ -167,7 +167,7 @@ def test_the_same_number_goes_on_to_the_same_weights_to_the_last_bit(trainings: 
 def test_any_number_goes_on_with_the_samples_that_were_left(trainings: Trainings, before: int, after: int) -> None:
     name = trainings.folder / f"{before}-to-{after}"
     resumed = name if name.exists() else trainings.goes_on(before, after)
-    done = int(newest(trainings.killed(before)).name)
+    done = int(newest_checkpoint(trainings.killed(before)).name)
     steps = trainings.notes(trainings.killed(before))[:done] + trainings.notes(resumed)
     assert steps == trainings.notes(trainings.whole(1))
     for first in range(0, STEPS, EPOCH):

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from factory.run import main as run_factory
-from planners.training.checkpoint import load_planner, newest, read_record
+from planners.training.checkpoint import load_planner, newest_checkpoint, read_record
 from planners.training.fit import LOSSES, VALIDATION
 from planners.training.train import main
 from tests.pages import commands
@@ -161,7 +161,7 @@ def test_a_planner_is_trained_further_from_the_weights_of_another_training(
     assert main(command(table, first)) == 0
     further = ("seed=5", "steps=1", f"init_from={first}", "planner.training.learning_rate=1e-9")
     assert main(command(table, second, *further, sim=False)) == 0
-    assert f"weights to begin with: {newest(first)}" in capsys.readouterr().out
+    assert f"weights to begin with: {newest_checkpoint(first)}" in capsys.readouterr().out
     begun, learnt = (load_planner(folder).state_dict() for folder in (second, first))
     for name, weights in learnt.items():
         torch.testing.assert_close(begun[name], weights, rtol=0.0, atol=1e-8)

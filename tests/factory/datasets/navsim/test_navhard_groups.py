@@ -16,7 +16,7 @@ from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.evaluate import EvaluateSettings, evaluate
-from planners.evaluation.planner_names import planner_of
+from planners.evaluation.planner_names import find_planner
 from planners.evaluation.score_rows import read_rows
 from tasks.reward.aggregate import COLUMNS
 from tests.factory.datasets.navsim.geopackage_writer import CITIES, stub_rows, write_geopackage
@@ -92,7 +92,7 @@ def test_rows_weights_and_final_score_are_the_public_code_s(made: Path, tmp_path
     assert COLUMNS == ("nc", "dac", "tlc", "ddc", "ep", "ttc", "lk", "hc", "ec", "score")
     benchmark = BenchmarkFolder(str(made / "out"))
     settings = EvaluateSettings(str(made / "out"), out=str(tmp_path / "eval"), bounds=False, tables=False)
-    lines = evaluate(benchmark, [planner_of("constant_velocity")], settings)
+    lines = evaluate(benchmark, [find_planner("constant_velocity")], settings)
     clips = list(dict.fromkeys(key.clip_id for key in benchmark.keys))  # in the order of the split's groups
     rows = [row for row in read_rows(tmp_path / "eval/constant_velocity") if row.stage != "one_stage"]
     ours = {(clips.index(r.key.clip_id), r.key.kind, r.key.candidate_index): r.scores.filtered for r in rows}
