@@ -290,7 +290,9 @@ def export(
     stale = _tidy(journal, planned, splits)
     todo = [sample for sample in planned.values() if not _is_whole(journal, sample)]
     say(f"{len(planned):,} samples chosen, {len(planned) - len(todo):,} of them are there already")
-    if not (todo or stale or journal.interrupted) and _is_done(journal, trajectories):
+    wanted = set() if trajectories is None else {vocabulary(len(trajectories))}
+    is_whole = bool(journal.files) and all(journal.whole(file) for file in journal.files)
+    if not (todo or stale or journal.interrupted) and is_whole and wanted <= {file.path for file in journal.files}:
         return _summary(journal, 0, journal.facts, journal.files)
     journal.begin()
     _write_logs(table, journal, settings, todo, each, say)
@@ -298,7 +300,11 @@ def export(
     say("splits, rewards, checksums")
     files = [*_split_files(to, settings, logs, splits)]
     rewards, without = _reward_files(table, to, splits)
-    files += [*rewards, *_vocabulary_file(to, trajectories)]
+    files += rewards
+    if trajectories is not None:
+        data = BytesIO()
+        np.save(data, trajectories.astype(np.float32))
+        files.append(write_file(to, vocabulary(len(trajectories)), data.getvalue()))
     facts = _facts(planned, logs, without)
     journal.finish(facts, logs, files)
     return _summary(journal, len(todo), facts, files)
@@ -415,13 +421,6 @@ def _made_of(row: Sample) -> str:
     return canonical_json([row["attempt_id"], row["settings_hash"], row["stage_versions"]])
 
 
-def _is_done(journal: Journal, trajectories: Array | None) -> bool:
-    """Everything was written by an earlier call, the vocabulary too where it is known now."""
-    asked = set() if trajectories is None else {vocabulary(len(trajectories))}
-    there = {file.path for file in journal.files}
-    return bool(there) and asked <= there and all(journal.whole(file) for file in journal.files)
-
-
 def _summary(journal: Journal, written: int, facts: Mapping[str, Any], files: Sequence[File]) -> ExportSummary:
     n_bytes = sum(file.bytes for file in (*files, *(file for log in journal.logs.values() for file in log.files)))
     return ExportSummary(written, len(journal.logs), n_bytes, tuple(_notes(facts, [file.path for file in files])))
@@ -496,13 +495,6 @@ def _labelled(table: KeyedTable, samples: Iterable[Planned]) -> Iterator[tuple[s
     for (path, group), here in sorted(wanted.items()):
         rows = read_rows(open_parquet(table.location, path), group, live[path], ("attempt_id", *LABEL_COLUMNS))
         yield from ((sample.token, rows[sample.number]) for sample in sorted(here, key=lambda sample: sample.number))
-
-
-def _vocabulary_file(root: Path, trajectories: Array | None) -> Iterator[File]:
-    if trajectories is not None:
-        data = BytesIO()
-        np.save(data, trajectories.astype(np.float32))
-        yield write_file(root, vocabulary(len(trajectories)), data.getvalue())
 
 
 def _facts(planned: Mapping[tuple[str, str], Planned], logs: Sequence[Written], without_rewards: int) -> dict[str, Any]:

@@ -187,7 +187,7 @@ def frame_of(item: Any, file: str, place: str) -> Frame:
     values = Values(item, file, place)
     translation = values.numbers("ego2global_translation", (3,))
     pose, world_from_ego = pose_of(values, "ego2global_rotation", translation)
-    location = values.text("map_location")
+    location, lidar_path = values.text("map_location"), values.get("lidar_path")  # None or empty: no lidar
     return Frame(
         token=values.text("token"),
         timestamp_us=values.integer("timestamp"),
@@ -201,7 +201,7 @@ def frame_of(item: Any, file: str, place: str) -> Frame:
         lights=lights_of(values),
         command=command_of(values),
         cameras=cameras_of(values.inner("cams")),
-        lidar_path=lidar_path_of(values),
+        lidar_path=None if lidar_path is None else values.text("lidar_path", may_be_empty=True) or None,
         boxes=boxes_of(values.inner("anns")) if item.get("anns") is not None else None,
     )
 
@@ -231,9 +231,7 @@ def lights_of(values: Values) -> tuple[tuple[str, bool], ...]:
         raise values.bad("traffic_lights", f"is a {type(lights).__name__}, expected a list")
     out = []
     for light in lights:
-        if not isinstance(light, list | tuple) or len(light) != 2:
-            raise values.bad("traffic_lights", f"holds {shown(light)}, expected (lane connector id, is_red)")
-        lane_id, is_red = light
+        lane_id, is_red = light if isinstance(light, list | tuple) and len(light) == 2 else (None, None)
         name = id_text(lane_id)
         if name is None or not isinstance(is_red, bool | np.bool_ | int):
             raise values.bad("traffic_lights", f"holds {shown(light)}, expected (lane connector id, is_red)")
@@ -247,11 +245,6 @@ def command_of(values: Values) -> str:
     if sorted(one_hot.tolist()) != [0.0, 0.0, 0.0, 1.0]:
         raise values.bad("driving_command", f"{one_hot.tolist()} is no one-hot of left, forward, right, unknown")
     return COMMANDS[int(np.argmax(one_hot))]
-
-
-def lidar_path_of(values: Values) -> str | None:
-    """`lidar_path`; None where it is None or empty, as in logs without lidar. Raises BadClip."""
-    return None if values.get("lidar_path") is None else values.text("lidar_path", may_be_empty=True) or None
 
 
 def cameras_of(cams: Values) -> tuple[FrameCamera, ...]:
@@ -357,15 +350,12 @@ class SyntheticScene:
 
 
 def read_scene_pickle(path: Path, *, as_shown: bool = False) -> SyntheticScene:
-    """The scene in this pickle; as_shown: what an agent is shown of it. Raises BadClip, naming frame and key."""
-    return scene_of_pickle(load_records(bytes_of(path), str(path), CLASSES), str(path), as_shown=as_shown)
+    """The scene in this pickle; as_shown: what an agent is shown, four frames without boxes, whatever else is there.
 
-
-def scene_of_pickle(value: Any, file: str, *, as_shown: bool = False) -> SyntheticScene:
-    """What a scene's pickle holds, checked; as_shown: four frames without boxes, whatever else is there or not.
-
-    Raises BadClip.
+    Raises BadClip, naming frame and key.
     """
+    file = str(path)
+    value = load_records(bytes_of(path), file, CLASSES)
     if not isinstance(value, Mapping):
         raise BadClip(file, "scene", f"holds a {type(value).__name__}, expected a dict")
     values = Values(value, file)

@@ -44,11 +44,8 @@ KEYS: Mapping[str, tuple[str, ...]] = {  # layer -> columns of integers that mus
     "lane_groups_polygons": (),
     "lane_group_connectors": ("from_lane_group_fid", "to_lane_group_fid"),
     "intersections": (),
-    "stop_polygons": (),
     "crosswalks": (),
-    "walkways": (),
     "carpark_areas": (),
-    "generic_drivable_areas": (),
 }
 NUMBERS: Mapping[str, tuple[str, ...]] = {  # columns where NULL is NaN
     "lanes_polygons": ("speed_limit_mps",),
@@ -233,7 +230,7 @@ def _parts(path: Path, layer: str, fids: Ints, shapes: NDArray[np.object_]) -> t
 
 # A city's tables on disk, in the user's cache: read from the GeoPackage once, then within a fraction of a second.
 
-FORMAT = 2  # raise by hand whenever a GeoPackage gives other tables, or they are kept otherwise
+FORMAT = 3  # raise by hand whenever a GeoPackage gives other tables, or they are kept otherwise
 
 
 def cache_file(path: Path) -> Path:
@@ -294,11 +291,7 @@ def _opened(path: Path, location: str, size: int, changed_ns: int) -> "City":
 
 
 class City:
-    """All lanes and areas of one city, found by place.
-
-    `tables` also hold what the reward does not see, as in the public code: generic drivable areas, which the public
-    metric never loads, walkways and stop polygons.
-    """
+    """All lanes and areas of one city, found by place."""
 
     def __init__(self, location: str, path: Path, tables: dict[str, Table]) -> None:
         """`path` is what errors name. Raises BadClip where lanes lack a polygon or a baseline, or share an id."""
