@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from factory.exits import COMPLETE
-from planners.navsim.agent import shown
-from planners.navsim.serve import FRONT, Pilot, seen_of
+from planners.navsim.agent import agent_input_arrays
+from planners.navsim.serve import FRONT, AgentPlanner, observation_of
 from tests.pages import REPOSITORY
 from tests.planners.navsim.agent_inputs import agent_input
 from tests.planners.navsim.test_submit import files as files  # the fixture
@@ -50,13 +50,13 @@ np.save(sys.stdout.buffer, again["first_stage_predictions"][0]["token"].poses)
 
 def test_navsim_s_own_code_takes_the_agent(tmp_path: Path) -> None:
     folder, given = saved(made("ltf_small"), tmp_path / "training"), agent_input(FRONT)
-    arrays = shown(given, FRONT)
+    arrays = agent_input_arrays(given, FRONT)
     np.savez(tmp_path / "seen.npz", **arrays)
     path = os.pathsep.join([str(REPOSITORY), *filter(None, [os.environ.get("NAVSIM_PATH")])])
     command = [NAVSIM_PYTHON, "-c", AGENT, str(tmp_path / "seen.npz"), folder, sys.executable]
     done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, timeout=200)
     assert done.returncode == 0, done.stderr.decode()
-    expected = Pilot(folder).plan(seen_of(arrays, FRONT), 8)
+    expected = AgentPlanner(folder).plan(observation_of(arrays, FRONT), 8)
     np.testing.assert_allclose(np.load(io.BytesIO(done.stdout)), expected, atol=1e-5)
 
 

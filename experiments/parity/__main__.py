@@ -16,7 +16,7 @@ import numpy as np
 
 from factory.config.compose import ConfigError
 from factory.readers.pickles import load_tensors
-from planners.published.import_planner import imported, read_public
+from planners.published.import_planner import import_weights, read_public_weights
 from tests.planners.published.lesson import (
     Lesson,
     apart,
@@ -76,7 +76,7 @@ def outputs_alike(asked: argparse.Namespace, case: str, folder: Path) -> bool:
     run_beside(asked, "outputs", words, folder)
     recorded = read_recorded(said)
     keep(asked, said, f"{case}_{asked.width}x{asked.height}.npz")
-    found = planner_of(recorded, read_public(checkpoint) if asked.checkpoints else None)
+    found = planner_of(recorded, read_public_weights(checkpoint) if asked.checkpoints else None)
     aside = sum(value.numel() for value in found.aside.values())
     ours = sum(parameter.numel() for parameter in found.planner.parameters())
     print(f"{case}, {asked.width} x {asked.height}; public code: {recorded.origin}")
@@ -98,7 +98,7 @@ def begun_alike(asked: argparse.Namespace, case: str, folder: Path) -> bool:
     """How each array of weights is spread before a training."""
     picture, drawn = (asked.width, asked.height), folder / "drawn.ckpt"
     run_beside(asked, "start", [case, *map(str, picture), str(drawn)], folder)
-    planner = imported(preset(case, picture), read_public(drawn), case).planner
+    planner = import_weights(preset(case, picture), read_public_weights(drawn), case).planner
     public, arrays = start_kind(planner), {name: np.asarray(array) for name, array in planner.arrays.items()}
     origin = load_tensors(drawn)["origin"]
     if asked.record is not None:

@@ -80,7 +80,7 @@ class RemotePlanner:
 
         Raises ValueError for an input that is not what the planner was trained on, RuntimeError where it fails.
         """
-        question = shown(agent_input, self.cameras)
+        question = agent_input_arrays(agent_input, self.cameras)
         with suppress(BrokenPipeError):  # it has ended, and _answer says how
             send(self._pipe(self._process.stdin), {**question, "n_poses": n_poses})
         return self._answer()["poses"]
@@ -104,7 +104,7 @@ class RemotePlanner:
         return pipe
 
 
-def shown(agent_input: Any, cameras: Sequence[str]) -> dict[str, Any]:
+def agent_input_arrays(agent_input: Any, cameras: Sequence[str]) -> dict[str, Any]:
     """What a planner reads of an AgentInput, as arrays: history (4, 3), status (8,), and of each camera five.
 
     Raises ValueError where it has another history, no picture of a camera at now, or poses that are not local.

@@ -33,7 +33,7 @@ FRONT = ("cam_l0", "cam_f0", "cam_r0")  # the front camera and its neighbours, l
 
 
 @dataclass(frozen=True)
-class CameraShot:
+class CameraObservation:
     """What one camera shows at now."""
 
     camera: Camera
@@ -46,12 +46,12 @@ class CameraShot:
 
 
 @dataclass(frozen=True)
-class Sighting:
+class AgentObservation:
     """What NAVSIM shows an agent at one moment."""
 
     history: Array  # (4, 3) x, y [m], heading [rad] at -1.5 .. 0 s in the ego frame at now
     status: Array  # (8,) command one-hot (COMMANDS), vx, vy [m/s], ax, ay [m/s2]
-    views: tuple[CameraShot, ...] = ()  # left to right
+    views: tuple[CameraObservation, ...] = ()  # left to right
 
     def __post_init__(self) -> None:
         for name, shape in (("history", (HISTORY, 3)), ("status", (len(COMMANDS) + 4,))):
@@ -62,7 +62,7 @@ class Sighting:
             raise ValueError(f"driving_command {self.status[: len(COMMANDS)]}: one of {', '.join(COMMANDS)} must be 1")
 
 
-class Pilot:
+class AgentPlanner:
     """Someone who plans from what NAVSIM shows."""
 
     def __init__(self, planner: str, cameras: Sequence[str] = (), undistort: bool = False, device: str = "cpu") -> None:
@@ -83,9 +83,9 @@ class Pilot:
         self._made = made.to(device) if isinstance(made, torch.nn.Module) else made
         self._needs, self._undistort, self._device = needs, undistort, device
         self._by_direction = needs.image is not None and not (cameras or needs.image.cameras)
-        self.cameras = cameras_for(needs.image, cameras)
+        self.cameras = agent_cameras(needs.image, cameras)
 
-    def plan(self, seen: Sighting, n_poses: int) -> Array:
+    def plan(self, seen: AgentObservation, n_poses: int) -> Array:
         """(8 or 40, 3) float32 poses, 4 s. Raises ValueError where a plan is none, or the cameras look elsewhere."""
         batch = self.batch_of(seen).to(self._device)
         plan = plans_for(self._made, batch)[0]
@@ -94,7 +94,7 @@ class Pilot:
             plan = at_ten_hz(plan[None])[0] if n_poses == HORIZON_STEPS else plan[4::5]
         return plan.astype(np.float32)
 
-    def batch_of(self, seen: Sighting) -> Batch:
+    def batch_of(self, seen: AgentObservation) -> Batch:
         """The batch of one that a row of the same content makes."""
         views = seen.views
         if self._by_direction:
@@ -105,12 +105,12 @@ class Pilot:
                 raise ValueError(f"{', '.join(FRONT)} do not look left, ahead and right: name others by cameras=")
         images = [undistorted(view.image, view.camera) if self._undistort else view.image for view in views]
         buffer = BatchBuffer(1, self._needs, 0)
-        buffer.fill(0, _SeenRow(seen, images), 0)
+        buffer.fill(0, _ObservationRow(seen, images), 0)
         nobody = np.zeros(1, bool)
         return buffer.batch(["navsim"], nobody, nobody)
 
 
-def cameras_for(layout: ImageLayout | None, given: Sequence[str] = ()) -> tuple[str, ...]:
+def agent_cameras(layout: ImageLayout | None, given: Sequence[str] = ()) -> tuple[str, ...]:
     """NAVSIM's cameras for a planner's picture, left to right: those given, else of its names, else by direction.
 
     Raises ConfigError for a camera that NAVSIM has not, naming what to say.
@@ -130,8 +130,8 @@ def cameras_for(layout: ImageLayout | None, given: Sequence[str] = ()) -> tuple[
     return names
 
 
-def seen_of(arrays: Mapping[str, Any], cameras: Sequence[str]) -> Sighting:
-    """What `planners.navsim.agent.shown` wrote. NAVSIM's lidar frame is the ego's. Raises ValueError."""
+def observation_of(arrays: Mapping[str, Any], cameras: Sequence[str]) -> AgentObservation:
+    """What `planners.navsim.agent.agent_input_arrays` wrote. NAVSIM's lidar frame is the ego's. Raises ValueError."""
     views = []
     for name in cameras:
         image = arrays[f"{name}.image"]
@@ -141,14 +141,14 @@ def seen_of(arrays: Mapping[str, Any], cameras: Sequence[str]) -> Sighting:
         pose[:3, :3], pose[:3, 3] = arrays[f"{name}.rotation"], arrays[f"{name}.translation"]
         intrinsics, distortion = (np.asarray(arrays[f"{name}.{k}"], np.float64) for k in ("intrinsics", "distortion"))
         camera = Camera(name, image.shape[1], image.shape[0], intrinsics, distortion, pose)
-        views.append(CameraShot(camera, image))
-    return Sighting(arrays["history"], arrays["status"], tuple(views))
+        views.append(CameraObservation(camera, image))
+    return AgentObservation(arrays["history"], arrays["status"], tuple(views))
 
 
-class _SeenRow(StoredRows):
+class _ObservationRow(StoredRows):
     """What was seen, as the loader's rows are read; zeros for the plans, which nobody knows."""
 
-    def __init__(self, seen: Sighting, images: Sequence[Bytes]) -> None:
+    def __init__(self, seen: AgentObservation, images: Sequence[Bytes]) -> None:
         status = seen.status
         self._images = images
         self._seen = {
@@ -180,14 +180,14 @@ def main(request: Request) -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever prints must not come between the answers
     with suppress(BrokenPipeError):  # who asked has gone
         try:
-            pilot = Pilot(request.planner, request.cameras, request.undistort, request.device)
+            pilot = AgentPlanner(request.planner, request.cameras, request.undistort, request.device)
         except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: a device that is not there
             send(answers, {"error": str(error)})
             raise Refused(str(error)) from error
         send(answers, {"cameras": np.array(pilot.cameras, dtype=str)})
         while (question := receive(sys.stdin.buffer)) is not None:
             try:
-                poses = pilot.plan(seen_of(question, pilot.cameras), int(question["n_poses"]))
+                poses = pilot.plan(observation_of(question, pilot.cameras), int(question["n_poses"]))
             except ValueError as error:
                 send(answers, {"error": str(error)})
             else:

@@ -25,14 +25,14 @@ from factory.datasets.navsim.reader import (
     read_selection,
     scene_frames,
 )
-from factory.datasets.navsim.window import blobs_of, rig_of
+from factory.datasets.navsim.window import cameras_with_pictures, sensor_files
 from factory.graph.progress import Counter
 from factory.readers.base import BadClip
 from factory.stages.sensors import decode_image
 from factory.wording import one_line
 from planners.data.batch import COMMANDS
 from planners.navsim.agent import HISTORY
-from planners.navsim.serve import CameraShot, Pilot, Sighting
+from planners.navsim.serve import AgentObservation, AgentPlanner, CameraObservation
 from tasks.kernels.compiled import write_whole
 from tasks.world.arrays import Array
 from tasks.world.frames import to_local
@@ -41,7 +41,7 @@ SCENES, BLOBS = "synthetic_scene_pickles", "sensor_blobs"  # of navhard_two_stag
 
 
 @dataclass(frozen=True)
-class ShownScene:
+class ObservedScene:
     """One scene up to now."""
 
     token: str  # of the frame at now
@@ -49,15 +49,15 @@ class ShownScene:
     sensors: Path | None  # folder of their pictures
     file: str  # that they were read from
 
-    def sighting(self, cameras: Sequence[str]) -> Sighting:
+    def observation(self, cameras: Sequence[str]) -> AgentObservation:
         """What an agent is shown, with these cameras at now, left to right. Raises BadClip."""
         now = self.frames[-1]
         history = to_local(now.pose, np.stack([frame.pose for frame in self.frames]))
         one_hot = np.array([one == now.command for one in COMMANDS])
         status = np.concatenate([one_hot, now.dynamic_state])
-        return Sighting(history.astype(np.float32), status.astype(np.float32), self._views(cameras))
+        return AgentObservation(history.astype(np.float32), status.astype(np.float32), self._views(cameras))
 
-    def _views(self, names: Sequence[str]) -> tuple[CameraShot, ...]:
+    def _views(self, names: Sequence[str]) -> tuple[CameraObservation, ...]:
         if not names:
             return ()
         assert self.sensors is not None
@@ -65,15 +65,15 @@ class ShownScene:
         if lacking := [name for name in names if name not in own]:
             raise BadClip(self.file, f"token {self.token}", f"the frame names no picture of {', '.join(lacking)}")
         now = replace(self.frames[-1], cameras=tuple(own[name] for name in names))
-        images = blobs_of([now], self.sensors).images
+        images = sensor_files([now], self.sensors).images
         if not images:
             raise BadClip(str(self.sensors / now.cameras[0].path), "image", f"missing, of token {self.token}")
         return tuple(
-            CameraShot(
+            CameraObservation(
                 replace(camera, name=camera.name.lower()),
                 decode_image(Path(image.uri).read_bytes(), image.uri, camera),
             )
-            for camera, image in zip(rig_of(now, images, self.file), images)
+            for camera, image in zip(cameras_with_pictures(now, images, self.file), images)
         )
 
 
@@ -91,14 +91,14 @@ class SplitScenes:
     def __len__(self) -> int:
         return sum(map(len, self.logged.values())) + len(self.synthetic)
 
-    def first_stage(self) -> Iterator[ShownScene]:
+    def first_stage(self) -> Iterator[ObservedScene]:
         """Log by log, one open at a time. Raises BadClip."""
         for path, windows in self.logged.items():
             frames = read_frames(path).frames
             for now in windows:
-                yield ShownScene(frames[now].token, frames[now - HISTORY + 1 : now + 1], self.sensors, str(path))
+                yield ObservedScene(frames[now].token, frames[now - HISTORY + 1 : now + 1], self.sensors, str(path))
 
-    def second_stage(self) -> Iterator[ShownScene | None]:
+    def second_stage(self) -> Iterator[ObservedScene | None]:
         """Scene by scene; None for one that the public loader leaves out. Raises BadClip."""
         chosen = self.scene_filter
         for path in self.synthetic:
@@ -110,10 +110,10 @@ class SplitScenes:
             wanted = scene.original_scene in self.final_tokens if named is None else scene.token in named
             left_out = of_another_log or not wanted
             blobs = path.parent.parent / BLOBS
-            yield None if left_out else ShownScene(scene.token, scene.frames, blobs, str(path))
+            yield None if left_out else ObservedScene(scene.token, scene.frames, blobs, str(path))
 
 
-def scenes_of(selection: Selection, logs: Path, sensors: Path | None, root: Path | None) -> SplitScenes:
+def split_scenes(selection: Selection, logs: Path, sensors: Path | None, root: Path | None) -> SplitScenes:
     """The scenes of a split among these folders; root: of the second stage, as import navhard takes it.
 
     What an agent is asked to plan, as the public loader chooses it: rules of navsim/common/dataloader.py:19-173
@@ -237,10 +237,10 @@ def main(request: Request) -> None:
     try:
         logs, sensors, root = (_folder(key, getattr(request, key)) for key in ("logs", "sensors", "root"))
         assert logs is not None
-        pilot = Pilot(request.planner, request.cameras, request.undistort, request.device)
+        pilot = AgentPlanner(request.planner, request.cameras, request.undistort, request.device)
         if pilot.cameras and request.sensors is None:
             raise Refused(f"sensors=... is missing: planner={request.planner} looks at {', '.join(pilot.cameras)}")
-        scenes = scenes_of(read_selection(request.split), logs, sensors, root)
+        scenes = split_scenes(read_selection(request.split), logs, sensors, root)
         with Counter("scenes planned", len(scenes)) as progress:
             first = _planned(scenes.first_stage(), pilot, progress, 0)
             second = _planned(scenes.second_stage(), pilot, progress, len(first))
@@ -254,13 +254,15 @@ def main(request: Request) -> None:
         print(f"{left_out:,} tokens of the split are no scenes by its own rules, and NAVSIM's script plans none there")
 
 
-def _planned(stage: Iterable[ShownScene | None], pilot: Pilot, progress: Counter, before: int) -> dict[str, Array]:
+def _planned(
+    stage: Iterable[ObservedScene | None], pilot: AgentPlanner, progress: Counter, before: int
+) -> dict[str, Array]:
     """Token -> plan. Raises BadClip."""
     plans: dict[str, Array] = {}
     for done, scene in enumerate(stage, start=before + 1):
         if scene is not None:
             try:
-                plans[scene.token] = pilot.plan(scene.sighting(pilot.cameras), N_POSES)
+                plans[scene.token] = pilot.plan(scene.observation(pilot.cameras), N_POSES)
             except ValueError as error:
                 raise BadClip(scene.file, f"token {scene.token}", str(error)) from error
         progress.show(done)

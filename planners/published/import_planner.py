@@ -37,8 +37,8 @@ from tasks.world.arrays import FloatArray
 
 # A public state dict read into a planner's: every number of it is moved, or named as left aside.
 #
-# `Moves` refuses what nobody spoke of. Below it, family by family, what of a public model goes where in ours; a call
-# is a sentence: theirs, then ours. Names are those of OpenDriveLab/SimScale 04cda10,
+# `WeightMoves` refuses what nobody spoke of. Below it, family by family, what of a public model goes where in ours; a
+# call is a sentence: theirs, then ours. Names are those of OpenDriveLab/SimScale 04cda10,
 # navsim/agents/{transfuser,diffusiondrive,gtrs_dense}.
 
 Arrays = dict[str, FloatArray]
@@ -49,7 +49,7 @@ ANCHOR = "_status_encoding.weight"  # in every family's model, at its top
 
 
 @dataclass
-class Moves:
+class WeightMoves:
     """Public names still to be told of, and what ours have become so far."""
 
     public: dict[str, Tensor]
@@ -58,59 +58,59 @@ class Moves:
     aside: dict[str, Tensor] = field(default_factory=dict)  # what a planner of ours does not have
     came_from: dict[str, tuple[str, ...]] = field(default_factory=dict)  # ours -> public names
 
-    def one(self, name: str, ours: str, turned: Callable[[Tensor], Tensor] = lambda x: x) -> None:
+    def move(self, name: str, ours: str, turned: Callable[[Tensor], Tensor] = lambda x: x) -> None:
         """One number array. Raises ConfigError where the checkpoint lacks it."""
         self.ours[ours], self.came_from[ours] = turned(self._taken(name)), (name,)
 
-    def all(self, prefix: str, ours: str) -> None:
+    def move_all(self, prefix: str, ours: str) -> None:
         """All that begins with a prefix, under the same words behind another. Raises ConfigError where nothing does."""
         for name in self._under(prefix):
-            self.one(name, ours + name.removeprefix(prefix))
+            self.move(name, ours + name.removeprefix(prefix))
 
-    def layer(self, name: str, ours: str, turned: Callable[[Tensor], Tensor] = lambda x: x) -> None:
+    def move_layer(self, name: str, ours: str, turned: Callable[[Tensor], Tensor] = lambda x: x) -> None:
         """Weight and bias of a linear map; `turned` is for the weight."""
-        self.one(f"{name}.weight", f"{ours}.weight", turned)
-        self.one(f"{name}.bias", f"{ours}.bias")
+        self.move(f"{name}.weight", f"{ours}.weight", turned)
+        self.move(f"{name}.bias", f"{ours}.bias")
 
-    def joined(self, names: Sequence[str], ours: str) -> None:
+    def move_joined(self, names: Sequence[str], ours: str) -> None:
         """Weights and biases of several linear maps as those of one, their outputs one after the other."""
         for kind in ("weight", "bias"):
             parts = tuple(f"{name}.{kind}" for name in names)
             self.ours[f"{ours}.{kind}"] = torch.cat([self._taken(part) for part in parts])
             self.came_from[f"{ours}.{kind}"] = parts
 
-    def attention(self, name: str, ours: str) -> None:
+    def move_attention(self, name: str, ours: str) -> None:
         """torch's MultiheadAttention, whose three maps are one, as planners.models.layers.Attention."""
         for kind in ("weight", "bias"):
             whole = self._taken(f"{name}.in_proj_{kind}")
             for part, values in zip(("query", "key", "value"), whole.chunk(3)):
                 self.ours[f"{ours}.{part}.{kind}"] = values.clone()
                 self.came_from[f"{ours}.{part}.{kind}"] = (f"{name}.in_proj_{kind}",)
-        self.layer(f"{name}.out_proj", f"{ours}.out")
+        self.move_layer(f"{name}.out_proj", f"{ours}.out")
 
-    def decoder(self, name: str, ours: str) -> None:
+    def move_decoder(self, name: str, ours: str) -> None:
         """torch's TransformerDecoder as planners.models.layers.Decoder."""
         numbers = sorted({int(key.removeprefix(f"{name}.layers.").split(".")[0]) for key in self._under(name)})
         for number in numbers:
             theirs, here = f"{name}.layers.{number}", f"{ours}.layers.{number}"
-            self.attention(f"{theirs}.self_attn", f"{here}.own")
-            self.attention(f"{theirs}.multihead_attn", f"{here}.cross")
+            self.move_attention(f"{theirs}.self_attn", f"{here}.own")
+            self.move_attention(f"{theirs}.multihead_attn", f"{here}.cross")
             for other, own in (("norm1", "own_norm"), ("norm2", "cross_norm"), ("norm3", "feedforward_norm")):
-                self.layer(f"{theirs}.{other}", f"{here}.{own}")
-            self.layer(f"{theirs}.linear1", f"{here}.feedforward.0")
-            self.layer(f"{theirs}.linear2", f"{here}.feedforward.3")
+                self.move_layer(f"{theirs}.{other}", f"{here}.{own}")
+            self.move_layer(f"{theirs}.linear1", f"{here}.feedforward.0")
+            self.move_layer(f"{theirs}.linear2", f"{here}.feedforward.3")
 
-    def leave(self, prefix: str) -> None:
+    def set_aside(self, prefix: str) -> None:
         """All that begins with a prefix is no part of our planner."""
         for name in self._under(prefix):
             self.aside[name] = self._taken(name)
 
-    def kept(self, name: str) -> Tensor:
+    def take_frozen(self, name: str) -> Tensor:
         """What is not learned and becomes an array that our planner is built around."""
         self.aside[name] = self._taken(name)
         return self.aside[name]
 
-    def done(self) -> None:
+    def check_complete(self) -> None:
         """Raises ConfigError where something was not told of."""
         if self.public:
             raise ConfigError(f"{self.source} holds {_listed(list(self.public))}, of which this planner knows nothing")
@@ -127,7 +127,7 @@ class Moves:
         return found
 
 
-def read_public(path: Path) -> dict[str, Tensor]:
+def read_public_weights(path: Path) -> dict[str, Tensor]:
     """The weights of a Lightning checkpoint under the names of the public model, without what wraps it.
 
     Only tensors and plain values are read back; nothing of the file runs. Raises ConfigError.
@@ -138,10 +138,10 @@ def read_public(path: Path) -> dict[str, Tensor]:
         raise ConfigError(f"{path}: {error}") from error
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    return model_weights(content, str(path))
+    return unwrapped_weights(content, str(path))
 
 
-def model_weights(content: object, source: str) -> dict[str, Tensor]:
+def unwrapped_weights(content: object, source: str) -> dict[str, Tensor]:
     """`content` of a Lightning checkpoint, or a bare state dict, as names of the public model. Raises ConfigError."""
     if isinstance(content, Mapping) and isinstance(content.get("state_dict"), Mapping):
         content = content["state_dict"]
@@ -164,119 +164,119 @@ def _listed(names: list[str], most: int = 3) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def fusion(moves: Moves, ours: str) -> None:
+def move_fusion(moves: WeightMoves, ours: str) -> None:
     """TransfuserBackbone as LatentFusion: two residual networks, four exchanges of tokens, the upsampled view."""
-    moves.all("_backbone.image_encoder.", f"{ours}image.")
-    moves.all("_backbone.lidar_encoder.", f"{ours}latent.")
-    moves.one("_backbone.lidar_latent", f"{ours}picture")
-    moves.all("_backbone.lidar_channel_to_img.", f"{ours}to_image.")
-    moves.all("_backbone.img_channel_to_lidar.", f"{ours}to_latent.")
+    moves.move_all("_backbone.image_encoder.", f"{ours}image.")
+    moves.move_all("_backbone.lidar_encoder.", f"{ours}latent.")
+    moves.move("_backbone.lidar_latent", f"{ours}picture")
+    moves.move_all("_backbone.lidar_channel_to_img.", f"{ours}to_image.")
+    moves.move_all("_backbone.img_channel_to_lidar.", f"{ours}to_latent.")
     for scale in range(4):
         theirs, here = f"_backbone.transformers.{scale}", f"{ours}exchanges.{scale}"
-        moves.one(f"{theirs}.pos_emb", f"{here}.position")
-        moves.layer(f"{theirs}.ln_f", f"{here}.norm")
+        moves.move(f"{theirs}.pos_emb", f"{here}.position")
+        moves.move_layer(f"{theirs}.ln_f", f"{here}.norm")
         block = 0
         while f"{theirs}.blocks.{block}.ln1.weight" in moves.public:
             name, own = f"{theirs}.blocks.{block}", f"{here}.blocks.{block}"
-            moves.layer(f"{name}.ln1", f"{own}.norm_attention")
-            moves.layer(f"{name}.ln2", f"{own}.norm_forward")
-            moves.joined([f"{name}.attn.{part}" for part in ("query", "key", "value")], f"{own}.query_key_value")
-            moves.layer(f"{name}.attn.proj", f"{own}.project")
-            moves.layer(f"{name}.mlp.0", f"{own}.feed_forward.0")
-            moves.layer(f"{name}.mlp.2", f"{own}.feed_forward.2")
+            moves.move_layer(f"{name}.ln1", f"{own}.norm_attention")
+            moves.move_layer(f"{name}.ln2", f"{own}.norm_forward")
+            moves.move_joined([f"{name}.attn.{part}" for part in ("query", "key", "value")], f"{own}.query_key_value")
+            moves.move_layer(f"{name}.attn.proj", f"{own}.project")
+            moves.move_layer(f"{name}.mlp.0", f"{own}.feed_forward.0")
+            moves.move_layer(f"{name}.mlp.2", f"{own}.feed_forward.2")
             block += 1
-    moves.layer("_backbone.c5_conv", f"{ours}lateral")
-    moves.layer("_backbone.up_conv5", f"{ours}up.0")
-    moves.layer("_backbone.up_conv4", f"{ours}up.1")
+    moves.move_layer("_backbone.c5_conv", f"{ours}lateral")
+    moves.move_layer("_backbone.up_conv5", f"{ours}up.0")
+    moves.move_layer("_backbone.up_conv4", f"{ours}up.1")
 
 
-def heads(moves: Moves) -> None:
+def move_heads(moves: WeightMoves) -> None:
     """What is learnt beside planning: boxes of vehicles and classes of cells."""
-    moves.layer("_agent_head._mlp_states.0", "agent_head.box.0")
-    moves.layer("_agent_head._mlp_states.2", "agent_head.box.2")
-    moves.layer("_agent_head._mlp_label.0", "agent_head.there")
-    moves.layer("_bev_semantic_head.0", "bev_head.layers.0")
-    moves.layer("_bev_semantic_head.2", "bev_head.layers.2")
+    moves.move_layer("_agent_head._mlp_states.0", "agent_head.box.0")
+    moves.move_layer("_agent_head._mlp_states.2", "agent_head.box.2")
+    moves.move_layer("_agent_head._mlp_label.0", "agent_head.there")
+    moves.move_layer("_bev_semantic_head.0", "bev_head.layers.0")
+    moves.move_layer("_bev_semantic_head.2", "bev_head.layers.2")
 
 
-def ltf(moves: Moves, settings: LtfSettings) -> Arrays:
+def move_ltf(moves: WeightMoves, settings: LtfSettings) -> Arrays:
     """TransfuserModel as Ltf."""
-    fusion(moves, "fusion.")
-    moves.layer("_bev_downscale", "reduce")
-    moves.layer("_status_encoding", "status")
-    moves.one("_keyval_embedding.weight", "key_position", lambda x: x[None])
-    moves.one("_query_embedding.weight", "queries", lambda x: x[None])
-    moves.all("_tf_decoder.", "decoder.")
-    moves.layer("_trajectory_head._mlp.0", "plan_head.0")
-    moves.layer("_trajectory_head._mlp.2", "plan_head.2")
-    heads(moves)
+    move_fusion(moves, "fusion.")
+    moves.move_layer("_bev_downscale", "reduce")
+    moves.move_layer("_status_encoding", "status")
+    moves.move("_keyval_embedding.weight", "key_position", lambda x: x[None])
+    moves.move("_query_embedding.weight", "queries", lambda x: x[None])
+    moves.move_all("_tf_decoder.", "decoder.")
+    moves.move_layer("_trajectory_head._mlp.0", "plan_head.0")
+    moves.move_layer("_trajectory_head._mlp.2", "plan_head.2")
+    move_heads(moves)
     return {}
 
 
-def diffusiondrive(moves: Moves, settings: DiffusionDriveSettings) -> Arrays:
+def move_diffusiondrive(moves: WeightMoves, settings: DiffusionDriveSettings) -> Arrays:
     """V2TransfuserModel as DiffusionDrive."""
-    fusion(moves, "encoder.fusion.")
-    moves.layer("_bev_downscale", "encoder.narrow")
-    moves.layer("_status_encoding", "encoder.status")
-    moves.one("_keyval_embedding.weight", "encoder.places")
-    moves.one("_query_embedding.weight", "encoder.queries")
-    moves.decoder("_tf_decoder", "encoder.decoder")
-    moves.all("bev_proj.", "encoder.join.")
+    move_fusion(moves, "encoder.fusion.")
+    moves.move_layer("_bev_downscale", "encoder.narrow")
+    moves.move_layer("_status_encoding", "encoder.status")
+    moves.move("_keyval_embedding.weight", "encoder.places")
+    moves.move("_query_embedding.weight", "encoder.queries")
+    moves.move_decoder("_tf_decoder", "encoder.decoder")
+    moves.move_all("bev_proj.", "encoder.join.")
     head = "_trajectory_head"
-    moves.layer(f"{head}.plan_anchor_encoder.0", "decoder.feature.0", _points_reordered)
-    moves.layer(f"{head}.plan_anchor_encoder.2", "decoder.feature.2")
-    moves.layer(f"{head}.plan_anchor_encoder.3", "decoder.feature.3")
-    moves.layer(f"{head}.time_mlp.1", "decoder.step.0")
-    moves.layer(f"{head}.time_mlp.3", "decoder.step.2")
+    moves.move_layer(f"{head}.plan_anchor_encoder.0", "decoder.feature.0", _points_reordered)
+    moves.move_layer(f"{head}.plan_anchor_encoder.2", "decoder.feature.2")
+    moves.move_layer(f"{head}.plan_anchor_encoder.3", "decoder.feature.3")
+    moves.move_layer(f"{head}.time_mlp.1", "decoder.step.0")
+    moves.move_layer(f"{head}.time_mlp.3", "decoder.step.2")
     for number in range(REFINEMENTS):
         name, own = f"{head}.diff_decoder.layers.{number}", f"decoder.layers.{number}"
-        moves.layer(f"{name}.cross_bev_attention.attention_weights", f"{own}.along.weights")
-        moves.layer(f"{name}.cross_bev_attention.value_proj.0", f"{own}.along.value.0")
-        moves.layer(f"{name}.cross_bev_attention.output_proj", f"{own}.along.out")
-        moves.attention(f"{name}.cross_agent_attention", f"{own}.agents")
-        moves.attention(f"{name}.cross_ego_attention", f"{own}.ego")
+        moves.move_layer(f"{name}.cross_bev_attention.attention_weights", f"{own}.along.weights")
+        moves.move_layer(f"{name}.cross_bev_attention.value_proj.0", f"{own}.along.value.0")
+        moves.move_layer(f"{name}.cross_bev_attention.output_proj", f"{own}.along.out")
+        moves.move_attention(f"{name}.cross_agent_attention", f"{own}.agents")
+        moves.move_attention(f"{name}.cross_ego_attention", f"{own}.ego")
         for theirs, here in (("norm1", "agents_norm"), ("norm2", "ego_norm"), ("norm3", "norm")):
-            moves.layer(f"{name}.{theirs}", f"{own}.{here}")
-        moves.all(f"{name}.ffn.", f"{own}.feedforward.")
-        moves.layer(f"{name}.time_modulation.scale_shift_mlp.1", f"{own}.modulation.1")
-        moves.all(f"{name}.task_decoder.plan_cls_branch.", f"{own}.confidence.")
-        moves.all(f"{name}.task_decoder.plan_reg_branch.", f"{own}.offsets.")
-    heads(moves)
-    return {"anchors": moves.kept(f"{head}.plan_anchor").double().numpy()}
+            moves.move_layer(f"{name}.{theirs}", f"{own}.{here}")
+        moves.move_all(f"{name}.ffn.", f"{own}.feedforward.")
+        moves.move_layer(f"{name}.time_modulation.scale_shift_mlp.1", f"{own}.modulation.1")
+        moves.move_all(f"{name}.task_decoder.plan_cls_branch.", f"{own}.confidence.")
+        moves.move_all(f"{name}.task_decoder.plan_reg_branch.", f"{own}.offsets.")
+    move_heads(moves)
+    return {"anchors": moves.take_frozen(f"{head}.plan_anchor").double().numpy()}
 
 
-def gtrs_dense(moves: Moves, settings: GtrsDenseSettings) -> Arrays:
+def move_gtrs_dense(moves: WeightMoves, settings: GtrsDenseSettings) -> Arrays:
     """HydraModel as GtrsDense. Its decoder and agents' head at the top are in the file and in no forward pass."""
     if settings.encoder == "fused":
-        fusion(moves, "tokens.fusion.")
-        moves.layer("_bev_downscale", "tokens.narrow")
+        move_fusion(moves, "tokens.fusion.")
+        moves.move_layer("_bev_downscale", "tokens.narrow")
     else:
-        moves.all("_backbone.image_encoder.", "tokens.backbone.")
-        moves.layer("downscale_layer", "tokens.narrow")
-    moves.one("_keyval_embedding.weight", "tokens.places")
-    moves.layer("_status_encoding", "scorer.status")
+        moves.move_all("_backbone.image_encoder.", "tokens.backbone.")
+        moves.move_layer("downscale_layer", "tokens.narrow")
+    moves.move("_keyval_embedding.weight", "tokens.places")
+    moves.move_layer("_status_encoding", "scorer.status")
     head = "_trajectory_head"
-    moves.all(f"{head}.pos_embed.", "scorer.embed.")
+    moves.move_all(f"{head}.pos_embed.", "scorer.embed.")
     for theirs, here in (("to_q", "query"), ("to_k", "key"), ("to_v", "value"), ("to_out", "out")):
-        moves.one(f"{head}.encoder.self_attn.{theirs}.weight", f"scorer.among.own.{here}.weight")
+        moves.move(f"{head}.encoder.self_attn.{theirs}.weight", f"scorer.among.own.{here}.weight")
     for theirs, here in (("norm1", "own_norm"), ("norm3", "feedforward_norm")):
-        moves.layer(f"{head}.encoder.{theirs}", f"scorer.among.{here}")
-    moves.layer(f"{head}.encoder.linear1", "scorer.among.feedforward.0")
-    moves.layer(f"{head}.encoder.linear2", "scorer.among.feedforward.3")
-    moves.decoder(f"{head}.transformer", "scorer.decoder")
-    moves.all(f"{head}.heads.imi.", f"scorer.heads.{IMITATION}.")
+        moves.move_layer(f"{head}.encoder.{theirs}", f"scorer.among.{here}")
+    moves.move_layer(f"{head}.encoder.linear1", "scorer.among.feedforward.0")
+    moves.move_layer(f"{head}.encoder.linear2", "scorer.among.feedforward.3")
+    moves.move_decoder(f"{head}.transformer", "scorer.decoder")
+    moves.move_all(f"{head}.heads.imi.", f"scorer.heads.{IMITATION}.")
     for theirs, here in SCORES.items():
         if here in settings.sub_scores:
-            moves.all(f"{head}.heads.{theirs}.", f"scorer.heads.{here}.")
-    moves.leave("_tf_decoder.")
-    moves.leave("_agent_head.")
-    return {"vocabulary": moves.kept(f"{head}.vocab").double().numpy()}
+            moves.move_all(f"{head}.heads.{theirs}.", f"scorer.heads.{here}.")
+    moves.set_aside("_tf_decoder.")
+    moves.set_aside("_agent_head.")
+    return {"vocabulary": moves.take_frozen(f"{head}.vocab").double().numpy()}
 
 
-FAMILIES: Mapping[str, Callable[[Moves, Any], Arrays]] = {  # each takes its own planner's settings
-    "ltf": ltf,
-    "diffusiondrive": diffusiondrive,
-    "gtrs_dense": gtrs_dense,
+FAMILIES: Mapping[str, Callable[[WeightMoves, Any], Arrays]] = {  # each takes its own planner's settings
+    "ltf": move_ltf,
+    "diffusiondrive": move_diffusiondrive,
+    "gtrs_dense": move_gtrs_dense,
 }
 
 
@@ -328,8 +328,8 @@ def import_to(config: ImportConfig) -> Path:
         raise ConfigError(f"out={config.out} holds a training already: choose another folder")
     if not path.is_file():
         raise ConfigError(f"checkpoint={config.checkpoint}: there is no such file")
-    public = read_public(path)
-    found = imported(config.planner, public, str(path))
+    public = read_public_weights(path)
+    found = import_weights(config.planner, public, str(path))
     source = f"{path.name} {file_digest(path)}"
     record = {
         "trained": {"imported": source},
@@ -337,13 +337,13 @@ def import_to(config: ImportConfig) -> Path:
         "parameters": sum(parameter.numel() for parameter in found.planner.parameters()),
     }
     folder = save_checkpoint(out, 0, found.planner, record, {})
-    print(account(found, public))
+    print(describe_import(found, public))
     print(f"imported: {folder}")
     return folder
 
 
 @dataclass(frozen=True)
-class Imported:
+class ImportedPlanner:
     """A planner, and an account of every number of the public model."""
 
     planner: Planner
@@ -351,7 +351,7 @@ class Imported:
     came_from: dict[str, tuple[str, ...]]  # our weight -> the public ones it was made of
 
 
-def imported(choice: PlannerChoice, public: Mapping[str, Tensor], source: str) -> Imported:
+def import_weights(choice: PlannerChoice, public: Mapping[str, Tensor], source: str) -> ImportedPlanner:
     """The planner of a choice with the weights of a public model, in evaluation.
 
     source: for messages. Raises ConfigError where a weight is missing, unknown, or of another shape.
@@ -359,19 +359,19 @@ def imported(choice: PlannerChoice, public: Mapping[str, Tensor], source: str) -
     if choice.name not in FAMILIES:
         raise ConfigError(f"planner.name={choice.name}: only {', '.join(FAMILIES)} have public checkpoints")
     settings = settings_of(choice)
-    moves = Moves(dict(public), source)
+    moves = WeightMoves(dict(public), source)
     try:
         arrays = FAMILIES[choice.name](moves, settings)
-        moves.done()
+        moves.check_complete()
     except ConfigError as error:
-        raise ConfigError(f"{error}; its weights look like planner={looks_like(public)}") from error
+        raise ConfigError(f"{error}; its weights look like planner={likely_preset(public)}") from error
     chosen = inference_arrays(settings) if isinstance(settings, GtrsDenseSettings) else {}
     planner = build_planner(choice, {**arrays, **chosen})
     put_weights(planner, moves.ours, f"{source} does not fit planner={choice.name} with these settings")
-    return Imported(planner.eval(), moves.aside, moves.came_from)
+    return ImportedPlanner(planner.eval(), moves.aside, moves.came_from)
 
 
-def looks_like(public: Mapping[str, Tensor]) -> str:
+def likely_preset(public: Mapping[str, Tensor]) -> str:
     """The file of conf/planner whose public model has such weights."""
     if any(name.startswith("_backbone.image_encoder.stem.") for name in public):
         return "gtrs_dense_v2_99_public"
@@ -380,7 +380,7 @@ def looks_like(public: Mapping[str, Tensor]) -> str:
     return "diffusiondrive_public" if "_trajectory_head.plan_anchor" in public else "ltf_public"
 
 
-def account(found: Imported, public: dict[str, Tensor]) -> str:
+def describe_import(found: ImportedPlanner, public: dict[str, Tensor]) -> str:
     """How many numbers of a public model went where."""
     moved = {name for names in found.came_from.values() for name in names}
     count = sum(public[name].numel() for name in moved)

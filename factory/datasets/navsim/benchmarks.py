@@ -16,18 +16,18 @@ from pathlib import Path
 from factory.datasets.navsim.import_rows import (
     HISTORY_FRAMES,
     SCENE_FRAMES,
-    Entry,
-    Origin,
-    identity_of,
+    ImportEntry,
+    SceneOrigin,
+    import_identity,
     import_rows,
     label_columns_of,
-    logged_label,
-    pictures,
-    scene_of,
+    logged_label_columns,
+    picture_columns,
+    scene_of_frames,
     world_columns,
 )
 from factory.datasets.navsim.log import read_frames, read_scene_pickle
-from factory.datasets.navsim.reader import Selection, log_files, scene_frames, table_at
+from factory.datasets.navsim.reader import Selection, cached_or_read_table, log_files, scene_frames
 from factory.datasets.navsim.window import ego_states, road_around
 from factory.files import matching
 from factory.graph.execute import RunSummary
@@ -86,7 +86,7 @@ class SceneGroup:
 
 
 @dataclass(frozen=True)
-class LoneToken:
+class OneStageFrame:
     """One frame of a benchmark of one stage."""
 
     token: str
@@ -113,7 +113,7 @@ class FrameReader:
         self._open = lru_cache(maxsize=1)(read_frames)
         self._rows = lru_cache(maxsize=1)(self._read_group)
 
-    def token_row(self, one: LoneToken) -> Row:
+    def token_row(self, one: OneStageFrame) -> Row:
         """The columns of one frame. Raises BadClip."""
         scene, columns = self._logged(one.log, one.token, one.clip_id)
         self._scenes.store(OneStageClip(scene.clip))
@@ -137,7 +137,7 @@ class FrameReader:
                 (now, _), (before, _) = logged
                 follow_ups = [(number, (one.clip, two.clip)) for number, ((one, _), (two, _)) in enumerate(pairs)]
                 self._scenes.store(GivenScenes(now.clip, before.clip, tuple(follow_ups)))
-                parent = logged_label(now)["parent_states"]
+                parent = logged_label_columns(now)["parent_states"]
                 return {frame: {**row, "parent_states": parent} for frame, row in zip(group.frames, rows)}
         except BadClip as error:
             return error
@@ -151,11 +151,11 @@ class FrameReader:
             raise BadClip(log.file, f"token {token}", "not here with 1.5 s before and 4 s after it")
         frames, now = log.frames[first : first + SCENE_FRAMES], log.frames[at]
         road = road_around(self.places.maps, now, ego_states(frames)[:, :2], now.pose, log.file, at)
-        scene = scene_of(frames, road, self._origin(log.file, log.name, clip_id, token))
+        scene = scene_of_frames(frames, road, self._origin(log.file, log.name, clip_id, token))
         seen: Row = dict(NO_IMAGES)
         if self.places.sensors is not None:
-            seen = pictures(frames[:HISTORY_FRAMES], self.places.sensors, ImageSource.PHOTO, log.file)
-        return scene, {**world_columns(scene, now.command), **logged_label(scene), **seen}
+            seen = picture_columns(frames[:HISTORY_FRAMES], self.places.sensors, ImageSource.PHOTO, log.file)
+        return scene, {**world_columns(scene, now.command), **logged_label_columns(scene), **seen}
 
     def _synthetic(self, token: str, group: SceneGroup) -> tuple[Scene, Row]:
         """A scene of the second stage. Raises BadClip."""
@@ -168,16 +168,16 @@ class FrameReader:
         xy, now = ego_states(history)[:, :2], history[-1]
         road = road_around(self.places.maps, now, xy, now.pose, str(path), HISTORY_FRAMES - 1)
         origin = self._origin(str(path), group.log_id, group.clip_id, token)
-        scene = scene_of(found.frames, road, origin, HISTORY_FRAMES)
+        scene = scene_of_frames(found.frames, road, origin, HISTORY_FRAMES)
         label = label_columns_of(scene, plan_for(scene, PdmSettings()).driven[1:, : HEADING + 1])
         seen: Row = dict(NO_IMAGES)
         if self.places.sensors is not None:
-            seen = pictures(history, self.places.scenes / "sensor_blobs", ImageSource.RENDER, str(path))
+            seen = picture_columns(history, self.places.scenes / "sensor_blobs", ImageSource.RENDER, str(path))
         return scene, {**world_columns(scene, now.command), **label, **seen}
 
-    def _origin(self, file: str, log: str, clip_id: str, token: str) -> Origin:
+    def _origin(self, file: str, log: str, clip_id: str, token: str) -> SceneOrigin:
         digest = sha256(token.encode()).hexdigest()
-        return Origin(file, clip_id, self.dataset, log, "test", LICENCE, digest, None)
+        return SceneOrigin(file, clip_id, self.dataset, log, "test", LICENCE, digest, None)
 
 
 def import_navhard(store: Store, selection: Selection, places: NavsimFolders) -> tuple[RunSummary, str]:
@@ -185,13 +185,15 @@ def import_navhard(store: Store, selection: Selection, places: NavsimFolders) ->
 
     Raises ValueError and BadClip where nothing can begin, and what `import_rows` raises.
     """
-    groups, reader = groups_of(selection, places.logs), FrameReader(NAVHARD, places, store)
+    groups, reader = scene_groups(selection, places.logs), FrameReader(NAVHARD, places, store)
     entries = [
-        Entry(group.clip_id, NAVHARD, group.log_id, kind, 0, number, partial(reader.group_row, group, kind, number))
+        ImportEntry(
+            group.clip_id, NAVHARD, group.log_id, kind, 0, number, partial(reader.group_row, group, kind, number)
+        )
         for group in groups
         for kind, number in group.frames
     ]
-    identity = identity_of(NAVHARD, {"pictures": places.sensors is not None, "split": selection.name})
+    identity = import_identity(NAVHARD, {"pictures": places.sensors is not None, "split": selection.name})
     summary = import_rows(store, identity, entries)
     names = ["clip_id", "expert", "candidate_index"]
     made = {tuple(row.values()) for row in store.samples.read(names).select(names).to_pylist()}
@@ -211,7 +213,7 @@ def import_navhard(store: Store, selection: Selection, places: NavsimFolders) ->
     return summary, f"benchmark {store.location.uri}: {counted}; left out {len(left_out)}"
 
 
-def groups_of(selection: Selection, logs: Path) -> list[SceneGroup]:
+def scene_groups(selection: Selection, logs: Path) -> list[SceneGroup]:
     """The groups of a split and their logs. Raises ValueError where it has none, one is none, or no token is here.
 
     A log that is named and not here is left out: what needs it fails by name. Raises BadClip for a broken one.
@@ -233,7 +235,7 @@ def groups_of(selection: Selection, logs: Path) -> list[SceneGroup]:
     paths = matching(logs, "*.pkl") if names is None else [logs / f"{name}.pkl" for name in sorted(names)]
     log_of: dict[str, Path] = {}
     for path in (path for path in paths if path.is_file()):
-        log_of |= {token: path for token in table_at(path).tokens.tolist() if token in tokens}
+        log_of |= {token: path for token in cached_or_read_table(path).tokens.tolist() if token in tokens}
     if not log_of:
         raise ValueError(f"logs={logs}: none of the {len(tokens)} stage-one tokens is in the logs here")
     return [replace(group, log=log_of.get(group.now)) for group in groups]
@@ -247,13 +249,13 @@ def import_navtest(store: Store, selection: Selection, places: NavsimFolders) ->
     (`infer_start_adjacent_mapping`, navsim/planning/script/run_pdm_score_one_stage.py), so a clip names that one's
     clip. Raises ValueError and BadClip where nothing can begin, and what `import_rows` raises.
     """
-    tokens, absent = lone_tokens(selection, places.logs)
+    tokens, absent = one_stage_frames(selection, places.logs)
     reader = FrameReader(NAVTEST, places, store)
     entries = [
-        Entry(one.clip_id, NAVTEST, one.log.stem, HUMAN, 0, NO_CANDIDATE, partial(reader.token_row, one))
+        ImportEntry(one.clip_id, NAVTEST, one.log.stem, HUMAN, 0, NO_CANDIDATE, partial(reader.token_row, one))
         for one in tokens
     ]
-    identity = identity_of(NAVTEST, {"pictures": places.sensors is not None, "split": selection.name})
+    identity = import_identity(NAVTEST, {"pictures": places.sensors is not None, "split": selection.name})
     summary = import_rows(store, identity, entries)
     made = set(store.samples.read(["clip_id"]).column("clip_id").to_pylist())
     made &= set(SceneFiles(store.location.child("scenes")).clip_ids())
@@ -271,17 +273,17 @@ def import_navtest(store: Store, selection: Selection, places: NavsimFolders) ->
     return summary, f"benchmark {store.location.uri}: {len(clips)} frames; left out {len(left_out)}"
 
 
-def lone_tokens(selection: Selection, logs: Path) -> tuple[list[LoneToken], list[str]]:
+def one_stage_frames(selection: Selection, logs: Path) -> tuple[list[OneStageFrame], list[str]]:
     """The frames that the selection's scene filter chooses, log by log in time, and its tokens that are no frame here.
 
     A log that is named and not here is left out with its tokens. Raises BadClip for a log that is broken, and
     ValueError where nothing is chosen.
     """
-    found: list[LoneToken] = []
+    found: list[OneStageFrame] = []
     for path, table, frames in scene_frames(selection.scene_filter, log_files(logs)):
         starts = table.start_ms
         found += [
-            LoneToken(str(table.tokens[at]), path, int(table.timestamps_us[at]), int(starts[at])) for at in frames
+            OneStageFrame(str(table.tokens[at]), path, int(table.timestamps_us[at]), int(starts[at])) for at in frames
         ]
     if not found:
         raise ValueError(f"logs={logs}: none of the frames that {selection.name} names is in the logs here")

@@ -29,10 +29,10 @@ from factory.datasets.navsim.frames import (
     SplitNames,
     black_picture,
     is_simulated,
-    log_frames,
-    place_of,
+    openscene_frames,
+    public_map_location,
     sample_names,
-    shown,
+    sample_pictures,
     split_names,
 )
 from factory.datasets.navsim.pickles import dumps, write_rewards
@@ -54,7 +54,7 @@ FORMAT = "simscale-1"
 
 
 @dataclass(frozen=True)
-class File:
+class WrittenFile:
     """One file, by its path below the export's folder."""
 
     path: str
@@ -63,7 +63,7 @@ class File:
 
 
 @dataclass(frozen=True)
-class Written:
+class WrittenLog:
     """A log that is whole."""
 
     folder: str  # of its split
@@ -78,21 +78,21 @@ class Written:
     distorted: bool  # these are as a lens makes them
     absent_pictures: int  # of the history's 32
     left_out_cameras: tuple[str, ...]
-    files: tuple[File, ...]  # the pickle last
+    files: tuple[WrittenFile, ...]  # the pickle last
 
 
-def write_file(root: Path, path: str, data: bytes) -> File:
+def write_file(root: Path, path: str, data: bytes) -> WrittenFile:
     """A whole file or none. Raises DiskFull."""
     with atomic_file(root / path, len(data)) as draft:
         draft.write_bytes(data)
-    return File(path, len(data), hashlib.sha256(data).hexdigest())
+    return WrittenFile(path, len(data), hashlib.sha256(data).hexdigest())
 
 
-def file_of(root: Path, path: str) -> File:
+def checksummed_file(root: Path, path: str) -> WrittenFile:
     """A file that is there, read through once."""
     with (root / path).open("rb") as file:
         digest = hashlib.file_digest(file, "sha256")
-    return File(path, (root / path).stat().st_size, digest.hexdigest())
+    return WrittenFile(path, (root / path).stat().st_size, digest.hexdigest())
 
 
 class Journal:
@@ -101,31 +101,31 @@ class Journal:
     def __init__(self, root: Path, settings: Mapping[str, Any]) -> None:
         """Raises ValueError where the folder holds an export with other settings, OSError where it is no folder."""
         self.root, self.settings = root, json.loads(canonical_json(settings))
-        self.logs: dict[tuple[str, str], Written] = {}  # by folder and log
+        self.logs: dict[tuple[str, str], WrittenLog] = {}  # by folder and log
         self.facts: dict[str, Any] = {}  # of a finished export: what its header says
-        self.files: list[File] = []  # of a finished export: those of all logs
+        self.files: list[WrittenFile] = []  # of a finished export: those of all logs
         root.mkdir(parents=True, exist_ok=True)
         self.interrupted = (root / JOURNAL).exists()
         for name in (MANIFEST, JOURNAL):
             self._read(root / name)
 
-    def begin(self) -> None:
+    def open(self) -> None:
         """From here on what is written is noted. Raises DiskFull."""
         if not (self.root / JOURNAL).exists():
             self._append({"format": FORMAT, "settings": self.settings})
 
-    def add(self, logs: Iterable[Written]) -> None:
+    def add(self, logs: Iterable[WrittenLog]) -> None:
         """Logs whose files are whole. Raises DiskFull."""
         for log in logs:
             self.logs[log.folder, log.log] = log
             self._append({"log": asdict(log)})
 
-    def whole(self, file: File) -> bool:
+    def is_whole(self, file: WrittenFile) -> bool:
         """Whether a file is still there, by its size."""
         path = self.root / file.path
         return path.exists() and path.stat().st_size == file.bytes
 
-    def finish(self, facts: Mapping[str, Any], logs: Iterable[Written], files: Iterable[File]) -> File:
+    def finish(self, facts: Mapping[str, Any], logs: Iterable[WrittenLog], files: Iterable[WrittenFile]) -> WrittenFile:
         """Replace the journal by the manifest, its lines in order."""
         header = {"format": FORMAT, "settings": self.settings, **facts}
         lines = [header, *({"log": asdict(log)} for log in logs), *({"file": asdict(file)} for file in files)]
@@ -153,7 +153,7 @@ class Journal:
                 log = _written(entry["log"])
                 self.logs[log.folder, log.log] = log
             else:
-                self.files.append(File(**entry["file"]))
+                self.files.append(WrittenFile(**entry["file"]))
 
     def _append(self, line: Mapping[str, Any]) -> None:
         path, data = self.root / JOURNAL, canonical_json(line) + "\n"
@@ -163,10 +163,10 @@ class Journal:
             os.fsync(file.fileno())
 
 
-def _written(stored: Mapping[str, Any]) -> Written:
-    files = tuple(File(**file) for file in stored["files"])
+def _written(stored: Mapping[str, Any]) -> WrittenLog:
+    files = tuple(WrittenFile(**file) for file in stored["files"])
     lists = {name: tuple(stored[name]) for name in ("sizes", "left_out_cameras")}
-    return Written(**{**stored, **lists, "files": files})
+    return WrittenLog(**{**stored, **lists, "files": files})
 
 
 # The YAML files that name a split's logs and tokens to the public code.
@@ -174,7 +174,7 @@ def _written(stored: Mapping[str, Any]) -> Written:
 LISTS = {"test": "test_logs", "train": "train_logs", "val": "val_logs"}  # by a sample's split
 
 
-def scene_filter_yaml(logs: Sequence[Written]) -> str:
+def scene_filter_yaml(logs: Sequence[WrittenLog]) -> str:
     """Of navsim.common.dataclasses.SceneFilter; unknown keys would be refused (NS dataclasses.py:733-778)."""
     return "".join(
         (
@@ -191,7 +191,7 @@ def split_yaml(names: SplitNames) -> str:
     return f"data_split: {names.folder}\ndefaults:\n- scene_filter: {names.yaml}\n"
 
 
-def log_split_yaml(logs: Sequence[Written]) -> str:
+def log_split_yaml(logs: Sequence[WrittenLog]) -> str:
     """Which logs a training takes, and which it validates on (SS training/dataset.py:129-146)."""
     return "".join(_list(key, (log.log for log in logs if log.data_split == name)) for name, key in LISTS.items())
 
@@ -202,7 +202,7 @@ def _list(key: str, values: Iterable[str]) -> str:
     return f"{key}:\n" + "".join(f'- "{value}"\n' for value in listed) if listed else f"{key}: []\n"
 
 
-def vocabulary(k: int) -> str:
+def vocabulary_path(k: int) -> str:
     """Where the released configuration looks for its trajectories (gtrs_dense_vov.yaml:23)."""
     return f"devkit/traj_final/{k}.npy"
 
@@ -218,8 +218,8 @@ DRAWN = (
 )
 SAY_EVERY_S = 10.0
 Say = Callable[[str], None]
-WriteGroup = Callable[["RowGroup"], list["Written"]]
-Each = Callable[[WriteGroup, Iterable["RowGroup"]], Generator[list["Written"], None, None]]  # in any order
+WriteGroup = Callable[["RowGroup"], list["WrittenLog"]]
+Each = Callable[[WriteGroup, Iterable["RowGroup"]], Generator[list["WrittenLog"], None, None]]  # in any order
 
 
 @dataclass(frozen=True)
@@ -236,7 +236,7 @@ class RowGroup:
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedSample:
     """One sample, before it is read whole."""
 
     split: SplitNames
@@ -263,7 +263,7 @@ class ExportSummary:
     notes: tuple[str, ...]  # what its user should know
 
 
-def one_after_the_other(write: WriteGroup, groups: Iterable[RowGroup]) -> Generator[list[Written], None, None]:
+def in_this_process(write: WriteGroup, groups: Iterable[RowGroup]) -> Generator[list[WrittenLog], None, None]:
     """In this process."""
     yield from map(write, groups)
 
@@ -273,7 +273,7 @@ def export(
     to: Path,
     settings: ExportSettings,
     trajectories: Array | None = None,
-    each: Each = one_after_the_other,
+    each: Each = in_this_process,
     say: Say = print,
 ) -> ExportSummary:
     """Write all samples that `settings` choose below `to`; what a call before has written stays.
@@ -282,19 +282,19 @@ def export(
     which must see `to` by the same path. Raises CannotExport for samples that cannot be written, ValueError where `to`
     holds another export, OSError where the disk cannot be written or is full, and what `each` does.
     """
-    planned = plan(table, settings)
+    planned = plan_export(table, settings)
     journal = Journal(to, asdict(settings))
-    splits: dict[SplitNames, list[Planned]] = defaultdict(list)
+    splits: dict[SplitNames, list[PlannedSample]] = defaultdict(list)
     for sample in planned.values():
         splits[sample.split].append(sample)
     stale = _tidy(journal, planned, splits)
     todo = [sample for sample in planned.values() if not _is_whole(journal, sample)]
     say(f"{len(planned):,} samples chosen, {len(planned) - len(todo):,} of them are there already")
-    wanted = set() if trajectories is None else {vocabulary(len(trajectories))}
-    is_whole = bool(journal.files) and all(journal.whole(file) for file in journal.files)
+    wanted = set() if trajectories is None else {vocabulary_path(len(trajectories))}
+    is_whole = bool(journal.files) and all(journal.is_whole(file) for file in journal.files)
     if not (todo or stale or journal.interrupted) and is_whole and wanted <= {file.path for file in journal.files}:
         return _summary(journal, 0, journal.facts, journal.files)
-    journal.begin()
+    journal.open()
     _write_logs(table, journal, settings, todo, each, say)
     logs = [journal.logs[key] for key in sorted(planned)]
     say("splits, rewards, checksums")
@@ -304,15 +304,15 @@ def export(
     if trajectories is not None:
         data = BytesIO()
         np.save(data, trajectories.astype(np.float32))
-        files.append(write_file(to, vocabulary(len(trajectories)), data.getvalue()))
+        files.append(write_file(to, vocabulary_path(len(trajectories)), data.getvalue()))
     facts = _facts(planned, logs, without)
     journal.finish(facts, logs, files)
     return _summary(journal, len(todo), facts, files)
 
 
-def plan(table: KeyedTable, settings: ExportSettings) -> dict[tuple[str, str], Planned]:
+def plan_export(table: KeyedTable, settings: ExportSettings) -> dict[tuple[str, str], PlannedSample]:
     """Every chosen sample by its split's folder and log. Raises CannotExport where names clash or none is chosen."""
-    found: dict[tuple[str, str], Planned] = {}
+    found: dict[tuple[str, str], PlannedSample] = {}
     seen: dict[str, set[str]] = defaultdict(set)
     tokens: dict[tuple[str, str], str] = {}
     for sample in _all_rows(table, settings.tag):
@@ -321,7 +321,7 @@ def plan(table: KeyedTable, settings: ExportSettings) -> dict[tuple[str, str], P
             seen[name].add(value)
         if not _chosen(row, settings):
             continue
-        place_of(row, settings)
+        public_map_location(row, settings)
         here = (sample.split.folder, sample.token)
         if sample.key in found or here in tokens:
             other = tokens.get(here) or found[sample.key].row["attempt_id"]
@@ -342,7 +342,7 @@ def plan(table: KeyedTable, settings: ExportSettings) -> dict[tuple[str, str], P
     return found
 
 
-def write_group(table: Location, root: Path, settings: ExportSettings, group: RowGroup) -> list[Written]:
+def write_row_group(table: Location, root: Path, settings: ExportSettings, group: RowGroup) -> list[WrittenLog]:
     """Write the logs and pictures of one row group's wanted rows; each pickle last. For workers anywhere.
 
     Raises CannotExport, DiskFull.
@@ -357,13 +357,13 @@ def write_group(table: Location, root: Path, settings: ExportSettings, group: Ro
     return [_write_log(root, settings, rows[i]) for i in group.rows]
 
 
-def _write_log(root: Path, settings: ExportSettings, row: Sample) -> Written:
+def _write_log(root: Path, settings: ExportSettings, row: Sample) -> WrittenLog:
     names, split = sample_names(row), split_names(row, settings.tag)
-    seen = shown(row, names, settings)
-    frames = log_frames(row, names, seen.cams, settings)
+    seen = sample_pictures(row, names, settings)
+    frames = openscene_frames(row, names, seen.cams, settings)
     files = [write_file(root, split.picture(path), jpeg) for path, jpeg in seen.pictures]
     files.append(write_file(root, split.log(names.log), dumps(frames)))
-    return Written(
+    return WrittenLog(
         split.folder,
         names.log,
         names.token,
@@ -381,7 +381,7 @@ def _write_log(root: Path, settings: ExportSettings, row: Sample) -> Written:
 
 
 def _write_logs(
-    table: KeyedTable, journal: Journal, settings: ExportSettings, todo: Sequence[Planned], each: Each, say: Say
+    table: KeyedTable, journal: Journal, settings: ExportSettings, todo: Sequence[PlannedSample], each: Each, say: Say
 ) -> None:
     live = table.live_files()
     wanted: dict[tuple[str, int], list[int]] = defaultdict(list)
@@ -390,7 +390,7 @@ def _write_logs(
     groups = [
         RowGroup(path, dict(live[path]), number, tuple(sorted(rows))) for (path, number), rows in sorted(wanted.items())
     ]
-    work = partial(write_group, table.location, journal.root, settings)
+    work = partial(write_row_group, table.location, journal.root, settings)
     began = said = time.monotonic()
     done = 0
     with closing(each(work, groups)) as results:
@@ -403,13 +403,15 @@ def _write_logs(
                 say(f"{done:,} of {len(todo):,} logs, {rate_text(rate, ' logs')}, {left} left")
 
 
-def _all_rows(table: KeyedTable, tag: str) -> Iterator[Planned]:
+def _all_rows(table: KeyedTable, tag: str) -> Iterator[PlannedSample]:
     for path, partition in sorted(table.live_files().items()):
         file = open_parquet(table.location, path)
         for group in range(file.metadata.num_row_groups):
             for number, row in enumerate(read_rows(file, group, partition, PLANNED)):
                 names = sample_names(row)
-                yield Planned(split_names(row, tag), names.log, names.token, _made_of(row), row, path, group, number)
+                yield PlannedSample(
+                    split_names(row, tag), names.log, names.token, _made_of(row), row, path, group, number
+                )
 
 
 def _chosen(row: Sample, settings: ExportSettings) -> bool:
@@ -421,18 +423,18 @@ def _made_of(row: Sample) -> str:
     return canonical_json([row["attempt_id"], row["settings_hash"], row["stage_versions"]])
 
 
-def _summary(journal: Journal, written: int, facts: Mapping[str, Any], files: Sequence[File]) -> ExportSummary:
+def _summary(journal: Journal, written: int, facts: Mapping[str, Any], files: Sequence[WrittenFile]) -> ExportSummary:
     n_bytes = sum(file.bytes for file in (*files, *(file for log in journal.logs.values() for file in log.files)))
     return ExportSummary(written, len(journal.logs), n_bytes, tuple(_notes(facts, [file.path for file in files])))
 
 
-def _is_whole(journal: Journal, sample: Planned) -> bool:
+def _is_whole(journal: Journal, sample: PlannedSample) -> bool:
     """Written before, of the same row, and its pickle is still there."""
     log = journal.logs.get(sample.key)
-    return log is not None and log.made_of == sample.made_of and journal.whole(log.files[-1])
+    return log is not None and log.made_of == sample.made_of and journal.is_whole(log.files[-1])
 
 
-def _tidy(journal: Journal, planned: Mapping[tuple[str, str], Planned], splits: Iterable[SplitNames]) -> bool:
+def _tidy(journal: Journal, planned: Mapping[tuple[str, str], PlannedSample], splits: Iterable[SplitNames]) -> bool:
     """Take away the logs of rows that are no more, and what a killed export had half written; whether there were."""
     stale = sorted(journal.logs.keys() - planned.keys())
     for key in stale:
@@ -446,8 +448,8 @@ def _tidy(journal: Journal, planned: Mapping[tuple[str, str], Planned], splits: 
 
 
 def _split_files(
-    root: Path, settings: ExportSettings, logs: Sequence[Written], splits: Iterable[SplitNames]
-) -> Iterator[File]:
+    root: Path, settings: ExportSettings, logs: Sequence[WrittenLog], splits: Iterable[SplitNames]
+) -> Iterator[WrittenFile]:
     """The YAML files of each split, of the logs that the public loader takes, and its black picture."""
     folder = f"{CONFIG}/common/train_test_split"
     for split in sorted(splits):
@@ -461,13 +463,13 @@ def _split_files(
 
 
 def _reward_files(
-    table: KeyedTable, root: Path, splits: Mapping[SplitNames, Sequence[Planned]]
-) -> tuple[list[File], int]:
+    table: KeyedTable, root: Path, splits: Mapping[SplitNames, Sequence[PlannedSample]]
+) -> tuple[list[WrittenFile], int]:
     """The rewards of each split, those of simulated rounds with all earlier ones; how many samples have no labels."""
     digests = {sample.row["label_vocabulary"] for of_split in splits.values() for sample in of_split} - {None}
     if len(digests) > 1:
         raise CannotExport(f"the samples' labels are of {len(digests)} vocabularies: {', '.join(sorted(digests))}")
-    files: list[File] = []
+    files: list[WrittenFile] = []
     earlier: dict[str, Path] = {}  # by expert, of the newest round so far
     without = 0
     for split, of_split in sorted(splits.items(), key=lambda item: (item[1][0].row["expert"], item[1][0].row["round"])):
@@ -481,15 +483,15 @@ def _reward_files(
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(path, 0) as draft:
             write_rewards(draft, _labelled(table, labelled), before)
-        files.append(file_of(root, split.rewards))
+        files.append(checksummed_file(root, split.rewards))
         earlier[first["expert"]] = path
     return files, without
 
 
-def _labelled(table: KeyedTable, samples: Iterable[Planned]) -> Iterator[tuple[str, Sample]]:
+def _labelled(table: KeyedTable, samples: Iterable[PlannedSample]) -> Iterator[tuple[str, Sample]]:
     """Tokens and rows with their labels, one row group in memory."""
     live = table.live_files()
-    wanted: dict[tuple[str, int], list[Planned]] = defaultdict(list)
+    wanted: dict[tuple[str, int], list[PlannedSample]] = defaultdict(list)
     for sample in samples:
         wanted[sample.path, sample.group].append(sample)
     for (path, group), here in sorted(wanted.items()):
@@ -497,7 +499,9 @@ def _labelled(table: KeyedTable, samples: Iterable[Planned]) -> Iterator[tuple[s
         yield from ((sample.token, rows[sample.number]) for sample in sorted(here, key=lambda sample: sample.number))
 
 
-def _facts(planned: Mapping[tuple[str, str], Planned], logs: Sequence[Written], without_rewards: int) -> dict[str, Any]:
+def _facts(
+    planned: Mapping[tuple[str, str], PlannedSample], logs: Sequence[WrittenLog], without_rewards: int
+) -> dict[str, Any]:
     """What the manifest says of all of it."""
     rows = [sample.row for sample in planned.values()]
     return {

@@ -78,7 +78,7 @@ def is_simulated(row: Mapping[str, Any]) -> bool:
     return bool(row["candidate_index"] >= 0)
 
 
-def source_log(dataset: str, log_id: str) -> str:
+def source_log_name(dataset: str, log_id: str) -> str:
     """The source log's name with exactly one dash, from which WorldEngine cuts it off again.
 
     A log named so already (nuPlan's `..._veh-35_...`) keeps its name. Of another, what is no letter, digit, dot or _
@@ -90,7 +90,7 @@ def source_log(dataset: str, log_id: str) -> str:
     return f"{plain.replace('-', '_')}-{hex16(dataset, log_id)[:8]}"
 
 
-def instant_token(row: Mapping[str, Any], time_s: float) -> str:
+def frame_token(row: Mapping[str, Any], time_s: float) -> str:
     """The name of the source log's frame at `time_s` since its first instant: the log's own at T and T+H, else a hash.
 
     The hash is of data set, log and milliseconds, so that overlapping windows agree on it.
@@ -130,9 +130,9 @@ def sample_names(row: Mapping[str, Any]) -> SampleNames:
     now_s = float(row["clip_start_s"]) + float(row["now_s"])
     times_s = tuple(now_s + (i - NOW_FRAME) * FRAME_S for i in range(N_FRAMES))
     suffix = f"-{int(row['round']):03d}" if is_simulated(row) else ""
-    tokens = tuple(instant_token(row, time_s) + suffix for time_s in times_s)
-    scene = instant_token(row, now_s - HORIZON_S if suffix else now_s) + suffix
-    return SampleNames(f"{source_log(row['dataset'], row['log_id'])}-{scene}", scene, tokens, times_s, suffix)
+    tokens = tuple(frame_token(row, time_s) + suffix for time_s in times_s)
+    scene = frame_token(row, now_s - HORIZON_S if suffix else now_s) + suffix
+    return SampleNames(f"{source_log_name(row['dataset'], row['log_id'])}-{scene}", scene, tokens, times_s, suffix)
 
 
 CONFIG = "devkit/navsim/planning/script/config"  # below NAVSIM_DEVKIT_ROOT, once devkit/ is copied over it
@@ -182,7 +182,7 @@ MOTION = (
 
 
 @dataclass(frozen=True)
-class FrameMotion:
+class EgoMotion:
     """The ego at N_FRAMES instants; velocity and acceleration in ego axes, at the rear axle."""
 
     poses: Array  # (12, 3) x, y [m], heading [rad], world
@@ -193,7 +193,7 @@ class FrameMotion:
     yaw_rates: Array  # (12,) rad/s
 
 
-def frame_motion(row: Mapping[str, Any]) -> FrameMotion:
+def ego_motion(row: Mapping[str, Any]) -> EgoMotion:
     """Of a row with the columns MOTION: what it holds exactly where it does, else from its poses at 10 Hz."""
     local = np.concatenate([row["ego_history_10hz"], row["label_10hz"]]).astype(np.float64)  # (56, 3)
     dynamics, yaw_rates = (derived[INSTANTS] for derived in derivatives(local))
@@ -208,8 +208,8 @@ def frame_motion(row: Mapping[str, Any]) -> FrameMotion:
     else:  # that log at T is now, and at T+H the last frame
         logged = np.asarray(row["parent_states"])[:, [VX, VY, AX, AY]]
         dynamics[[NOW_FRAME, N_FRAMES - 1]] = logged
-    matrices, quaternions = in_space(poses, known_poses(row))
-    return FrameMotion(poses, to_local(poses[NOW_FRAME], poses), matrices, quaternions, dynamics, yaw_rates)
+    matrices, quaternions = poses_in_space(poses, stored_poses(row))
+    return EgoMotion(poses, to_local(poses[NOW_FRAME], poses), matrices, quaternions, dynamics, yaw_rates)
 
 
 def derivatives(poses: Array) -> tuple[Array, Array]:
@@ -232,14 +232,14 @@ def derivatives(poses: Array) -> tuple[Array, Array]:
     return np.hstack(turned), yaw_rate
 
 
-def known_poses(row: Mapping[str, Any]) -> Array:
+def stored_poses(row: Mapping[str, Any]) -> Array:
     """(P, 4, 4) every 3-D pose of the ego that the row holds: at now, and of its pictures; level at 0 m without any."""
     found = [] if row["world_from_ego"] is None else [np.asarray(row["world_from_ego"])]
     found += [np.asarray(image["ego_pose"]).reshape(4, 4) for image in row["images"] or ()]
     return np.stack(found) if found else np.eye(4)[None]
 
 
-def in_space(poses: Array, known: Array) -> tuple[Array, Array]:
+def poses_in_space(poses: Array, known: Array) -> tuple[Array, Array]:
     """Planar poses (F, 3) as (F, 4, 4) matrices and (F, 4) quaternions w, x, y, z, on the plane of the nearest `known`.
 
     The heading is what the public code reads as such, pyquaternion's `yaw_pitch_roll[0]`: the rotation is one about x,
@@ -260,11 +260,11 @@ RED = 3
 Frame = dict[str, Any]
 
 
-def log_frames(
+def openscene_frames(
     row: Mapping[str, Any], names: SampleNames, cams: tuple[Mapping[str, Any], ...], settings: ExportSettings
 ) -> list[Frame]:
     """The frames of one sample. Raises CannotExport for a place that the public code does not know."""
-    motion, place = frame_motion(row), place_of(row, settings)
+    motion, place = ego_motion(row), public_map_location(row, settings)
     command = np.array([row["command"] == name for name in COMMANDS], dtype=np.int64)
     return [
         {
@@ -299,7 +299,7 @@ def log_frames(
     ]
 
 
-def place_of(row: Mapping[str, Any], settings: ExportSettings) -> str:
+def public_map_location(row: Mapping[str, Any], settings: ExportSettings) -> str:
     """One of MAP_LOCATIONS. Raises CannotExport."""
     place = settings.map_location or str(row["map_location"])
     if place not in MAP_LOCATIONS:
@@ -316,7 +316,7 @@ def connector_number(lane_id: str) -> int:
     return int(lane_id) if lane_id.isascii() and lane_id.isdecimal() else int(hex16(lane_id)[:15], 16)
 
 
-def _can_bus(motion: FrameMotion, i: int) -> Any:
+def _can_bus(motion: EgoMotion, i: int) -> Any:
     """(18,) position, quaternion, acceleration, velocity, angular rate, two zeros; the vectors in ego axes."""
     vx, vy, ax, ay = motion.dynamics[i]
     turning = [ax, ay, 0.0, vx, vy, 0.0, 0.0, 0.0, motion.yaw_rates[i], 0.0, 0.0]
@@ -329,7 +329,7 @@ def _lights(row: Mapping[str, Any], i: int) -> list[tuple[int, bool]]:
     return [(number, bool(state[INSTANTS[i]] == RED)) for number, state in zip(ids, states)]
 
 
-def _annotations(row: Mapping[str, Any], names: SampleNames, motion: FrameMotion, i: int) -> dict[str, Any]:
+def _annotations(row: Mapping[str, Any], names: SampleNames, motion: EgoMotion, i: int) -> dict[str, Any]:
     """Boxes and velocities in the frame of the ego at this instant, turned by its heading alone, as they are read."""
     step, ego = INSTANTS[i], motion.local[i]
     shape = (len(row["agent_ids"]), AGENT_STEPS)
@@ -373,7 +373,7 @@ MOST_DEG = 30.0  # off the direction that a camera stands for
 NOMINAL_VIEW_DEG = 63.7  # horizontal, of nuPlan's cameras: 1920 px at a focal length of 1545 px
 
 
-def slots(cameras: Sequence[Camera]) -> Mapping[str, Camera]:
+def match_cameras(cameras: Sequence[Camera]) -> Mapping[str, Camera]:
     """NAVSIM's name -> the rig's camera: by name where the rig has these names, else by viewing direction.
 
     Directions are paired so that their squared differences sum up to the least, and none differs by more than MOST_DEG.
@@ -395,7 +395,7 @@ BLACK = "black.jpg"  # beside the folders of pictures
 
 
 @dataclass(frozen=True)
-class RowPictures:
+class SamplePictures:
     """A sample's pictures."""
 
     pictures: tuple[tuple[str, bytes], ...]  # where below the split's folder of pictures, and the JPEG
@@ -406,13 +406,13 @@ class RowPictures:
     distorted: bool  # as a lens makes them; else of pinholes
 
 
-def shown(row: Mapping[str, Any], names: SampleNames, settings: ExportSettings) -> RowPictures:
+def sample_pictures(row: Mapping[str, Any], names: SampleNames, settings: ExportSettings) -> SamplePictures:
     """The pictures of a row (columns cameras, images) under its names.
 
     Raises CannotExport where one of the history's is absent and settings.missing is "refuse".
     """
     rig = [_camera(camera) for camera in row["cameras"] or ()]
-    chosen = slots(rig)
+    chosen = match_cameras(rig)
     stored = {name: _by_frame(row["images"] or (), camera.name) for name, camera in chosen.items()}
     absent = [(name, i) for name in CAMERAS for i in range(N_HISTORY) if i not in stored.get(name, {})]
     if absent and settings.missing == "refuse":
@@ -437,7 +437,7 @@ def shown(row: Mapping[str, Any], names: SampleNames, settings: ExportSettings) 
     left_out = tuple(sorted({camera.name for camera in rig} - {camera.name for camera in chosen.values()}))
     sizes = tuple(sorted({f"{width}x{height}" for width, height in written.values()}))
     distorted = any(camera.distortion.any() for camera in chosen.values())
-    return RowPictures(tuple(pictures), tuple(cams), len(absent), left_out, sizes, distorted)
+    return SamplePictures(tuple(pictures), tuple(cams), len(absent), left_out, sizes, distorted)
 
 
 @cache

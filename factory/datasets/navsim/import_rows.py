@@ -21,12 +21,12 @@ from factory.datasets.navsim.window import (
     FRAMES_BEFORE,
     WINDOW_FRAMES,
     RoadAhead,
-    blobs_of,
+    cameras_with_pictures,
     ego_states,
-    lights,
     n_steps,
     read_jpeg,
-    rig_of,
+    sensor_files,
+    traffic_lights,
     window_agents,
     world_from_ego,
 )
@@ -63,7 +63,7 @@ SCENE_FRAMES = HISTORY_FRAMES + 8  # with the 4 s that are driven
 
 
 @dataclass(frozen=True)
-class Origin:
+class SceneOrigin:
     """What a scene is called, and what it was read from."""
 
     file: str  # named in errors
@@ -76,7 +76,7 @@ class Origin:
     frame_tokens: tuple[str, str] | None
 
 
-def scene_of(frames: Sequence[Frame], road: RoadAhead, origin: Origin, driven: int | None = None) -> Scene:
+def scene_of_frames(frames: Sequence[Frame], road: RoadAhead, origin: SceneOrigin, driven: int | None = None) -> Scene:
     """The scene at T of 4 to 12 frames that are 0.5 s apart; the ego is known in the first `driven`, None: in all."""
     assert HISTORY_FRAMES <= len(frames) <= SCENE_FRAMES
     states, space = ego_states(frames[:driven]), world_from_ego(frames[:driven])
@@ -114,7 +114,7 @@ def _agents(frames: Sequence[Frame]) -> AgentTracks:
 
 def _lights(frames: Sequence[Frame], lane_ids: Sequence[str]) -> TrafficLights:
     """96 steps, unknown after the last frame."""
-    found = lights(frames, lane_ids)
+    found = traffic_lights(frames, lane_ids)
     after = ((0, CLIP_STEPS - len(found.states)), (0, 0))
     return replace(found, states=np.pad(found.states, after, constant_values=LightState.UNKNOWN))
 
@@ -124,7 +124,7 @@ def world_columns(scene: Scene, command: str) -> dict[str, object]:
     return scene_columns(scene, scene.agents, scene.clip.world_from_ego[NOW], command)
 
 
-def logged_label(scene: Scene) -> dict[str, object]:
+def logged_label_columns(scene: Scene) -> dict[str, object]:
     """The columns that hold the drive from T on, of a scene whose 12 frames hold it."""
     states = scene.clip.ego_states[NOW : NOW + HORIZON_STEPS + 1]
     return {**label_columns_of(scene, states[1:, : HEADING + 1]), "parent_states": states[[0, HORIZON_STEPS]]}
@@ -136,16 +136,16 @@ def label_columns_of(scene: Scene, poses: Array) -> dict[str, object]:
     return {"label_10hz": label, "label_2hz": label[FRAME_STEPS - 1 :: FRAME_STEPS]}
 
 
-def pictures(frames: Sequence[Frame], folder: Path, source: ImageSource, file: str) -> dict[str, object]:
+def picture_columns(frames: Sequence[Frame], folder: Path, source: ImageSource, file: str) -> dict[str, object]:
     """The columns of the pictures of frames that end now: the files' own bytes but for Exif, with the rig of now.
 
     Raises BadClip. file: whose frames they are, named where they have none.
     """
-    images = blobs_of(frames, folder).images
+    images = sensor_files(frames, folder).images
     if not images:
         raise BadClip(file, "cams", f"none of its pictures is in {folder}; pictures=false imports it without")
     now_s = (len(frames) - 1) * FRAME_STEPS * STEP_S
-    rig = {camera.name: camera for camera in rig_of(frames[-1], images, file)}
+    rig = {camera.name: camera for camera in cameras_with_pictures(frames[-1], images, file)}
     return {
         "cameras": [
             {
@@ -191,7 +191,7 @@ Make = Callable[[], Mapping[str, object]]
 
 
 @dataclass(frozen=True)
-class Entry:
+class ImportEntry:
     """One row to be, named before its file is opened."""
 
     clip_id: str
@@ -218,13 +218,13 @@ class Entry:
         )
 
 
-def identity_of(source: str, settings: Mapping[str, object]) -> RunIdentity:
+def import_identity(source: str, settings: Mapping[str, object]) -> RunIdentity:
     """What imported rows are made under: where from, and what was asked for."""
     said = {IMPORTED: source} | {f"import.{name}": value for name, value in settings.items()}
     return RunIdentity(said, {"import": VERSION}, NO_VOCABULARY, UNLISTED)
 
 
-def import_rows(store: Store, identity: RunIdentity, entries: Sequence[Entry]) -> RunSummary:
+def import_rows(store: Store, identity: RunIdentity, entries: Sequence[ImportEntry]) -> RunSummary:
     """Write the rows that the store has not, in files of up to 128 MB, each committed with the failures before it.
 
     Raises ChangedRun where the store holds rows of anything else.
@@ -296,7 +296,7 @@ class _Batch:
         self._failed, self._licences = [], set()
 
 
-def _try(batch: _Batch, entry: Entry, stamp: Stamp) -> bool:
+def _try(batch: _Batch, entry: ImportEntry, stamp: Stamp) -> bool:
     """Whether it failed, as an outcome of its own."""
     try:
         with failures_as_bad_clip(f"log {entry.log_id}"):

@@ -27,7 +27,7 @@ MISSING = object()
 
 
 @dataclass(frozen=True)
-class Values:
+class CheckedValues:
     """The items of one dict; `place` says where it stands in the file, as `frames[3].`."""
 
     items: Mapping[Any, Any]
@@ -45,12 +45,12 @@ class Values:
             raise self.bad(key, "missing")
         return value
 
-    def inner(self, key: str) -> "Values":
+    def inner(self, key: str) -> "CheckedValues":
         """A dict within. Raises BadClip."""
         value = self.get(key)
         if not isinstance(value, Mapping):
             raise self.bad(key, f"is a {type(value).__name__}, expected a dict")
-        return Values(value, self.file, f"{self.place}{key}.")
+        return CheckedValues(value, self.file, f"{self.place}{key}.")
 
     def text(self, key: str, *, may_be_empty: bool = False) -> str:
         """Raises BadClip where it is no text, or empty and must not be."""
@@ -156,15 +156,15 @@ class LogFrames:
 
 def read_frames(path: Path) -> LogFrames:
     """The log in this pickle. Raises BadClip, naming frame and key."""
-    return frames_of(load_plain(bytes_of(path), str(path)), path)
+    return parse_frames(load_plain(bytes_of(path), str(path)), path)
 
 
-def frames_of(value: Any, path: Path) -> LogFrames:
+def parse_frames(value: Any, path: Path) -> LogFrames:
     """What a log's pickle holds, checked. Raises BadClip."""
     file = str(path)
     if not isinstance(value, list) or not value:
         raise BadClip(file, "frames", f"holds a {type(value).__name__}, expected a list of frames, one or more")
-    frames = tuple(frame_of(item, file, f"frames[{i}].") for i, item in enumerate(value))
+    frames = tuple(parse_frame(item, file, f"frames[{i}].") for i, item in enumerate(value))
     for i, (before, frame) in enumerate(pairwise(frames), 1):
         if frame.timestamp_us <= before.timestamp_us:
             raise BadClip(file, f"frames[{i}].timestamp", "time does not go on")
@@ -180,13 +180,13 @@ def frames_of(value: Any, path: Path) -> LogFrames:
     return LogFrames(file, path.stem, frames)
 
 
-def frame_of(item: Any, file: str, place: str) -> Frame:
+def parse_frame(item: Any, file: str, place: str) -> Frame:
     """One frame's dict, checked; `place` names it in errors. Raises BadClip."""
     if not isinstance(item, Mapping):
         raise BadClip(file, place.rstrip("."), f"is a {type(item).__name__}, expected a dict")
-    values = Values(item, file, place)
+    values = CheckedValues(item, file, place)
     translation = values.numbers("ego2global_translation", (3,))
-    pose, world_from_ego = pose_of(values, "ego2global_rotation", translation)
+    pose, world_from_ego = parse_pose(values, "ego2global_rotation", translation)
     location, lidar_path = values.text("map_location"), values.get("lidar_path")  # None or empty: no lidar
     return Frame(
         token=values.text("token"),
@@ -198,15 +198,15 @@ def frame_of(item: Any, file: str, place: str) -> Frame:
         pose=pose,
         world_from_ego=world_from_ego,
         dynamic_state=values.numbers("ego_dynamic_state", (4,)).astype(np.float32).astype(np.float64),  # as NAVSIM does
-        lights=lights_of(values),
-        command=command_of(values),
-        cameras=cameras_of(values.inner("cams")),
+        lights=parse_lights(values),
+        command=parse_command(values),
+        cameras=parse_cameras(values.inner("cams")),
         lidar_path=None if lidar_path is None else values.text("lidar_path", may_be_empty=True) or None,
-        boxes=boxes_of(values.inner("anns")) if item.get("anns") is not None else None,
+        boxes=parse_boxes(values.inner("anns")) if item.get("anns") is not None else None,
     )
 
 
-def pose_of(values: Values, key: str, translation: Array) -> tuple[Array, Array]:
+def parse_pose(values: CheckedValues, key: str, translation: Array) -> tuple[Array, Array]:
     """The pose (3,) and its matrix (4, 4) by the quaternion w, x, y, z under `key`. Raises BadClip.
 
     The heading is the public reader's, pyquaternion's first Tait-Bryan angle of R = Rx Ry Rz. In a frame that is
@@ -224,7 +224,7 @@ def pose_of(values: Values, key: str, translation: Array) -> tuple[Array, Array]
     return np.array([translation[0], translation[1], heading]), world_from_ego
 
 
-def lights_of(values: Values) -> tuple[tuple[str, bool], ...]:
+def parse_lights(values: CheckedValues) -> tuple[tuple[str, bool], ...]:
     """`traffic_lights`: (lane connector id, whether it is red) each. Raises BadClip."""
     lights = values.get("traffic_lights")
     if not isinstance(lights, list | tuple):
@@ -239,7 +239,7 @@ def lights_of(values: Values) -> tuple[tuple[str, bool], ...]:
     return tuple(out)
 
 
-def command_of(values: Values) -> str:
+def parse_command(values: CheckedValues) -> str:
     """`driving_command`, the one-hot of left, forward, right, unknown. Raises BadClip."""
     one_hot = values.numbers("driving_command", (len(COMMANDS),))
     if sorted(one_hot.tolist()) != [0.0, 0.0, 0.0, 1.0]:
@@ -247,7 +247,7 @@ def command_of(values: Values) -> str:
     return COMMANDS[int(np.argmax(one_hot))]
 
 
-def cameras_of(cams: Values) -> tuple[FrameCamera, ...]:
+def parse_cameras(cams: CheckedValues) -> tuple[FrameCamera, ...]:
     """`cams`: all eight, by their names in any case; those without a picture are left out. Raises BadClip."""
     by_name = {key.upper(): key for key in cams.items if isinstance(key, str)}
     if missing := [name for name in CAMERA_NAMES if name not in by_name]:
@@ -273,7 +273,7 @@ def cameras_of(cams: Values) -> tuple[FrameCamera, ...]:
     return tuple(found)
 
 
-def boxes_of(anns: Values, names: Mapping[str, str] | None = None) -> FrameBoxes:
+def parse_boxes(anns: CheckedValues, names: Mapping[str, str] | None = None) -> FrameBoxes:
     """`anns`: five keys of equal length. Raises BadClip.
 
     names: other names of the five keys, as those of NAVSIM's own `Annotations`.
@@ -358,7 +358,7 @@ def read_scene_pickle(path: Path, *, as_shown: bool = False) -> SyntheticScene:
     value = load_records(bytes_of(path), file, CLASSES)
     if not isinstance(value, Mapping):
         raise BadClip(file, "scene", f"holds a {type(value).__name__}, expected a dict")
-    values = Values(value, file)
+    values = CheckedValues(value, file)
     about = values.inner("scene_metadata")
     items = _list(values, "frames")
     if len(items) != about.integer("num_history_frames") + about.integer("num_future_frames"):
@@ -366,7 +366,7 @@ def read_scene_pickle(path: Path, *, as_shown: bool = False) -> SyntheticScene:
     if about.integer("num_history_frames") != HISTORY_FRAMES:
         raise about.bad("num_history_frames", f"expected {HISTORY_FRAMES}")
     history = [
-        _frame(Values(item, file, f"frames[{i}]."), about, as_shown=as_shown)
+        _frame(CheckedValues(item, file, f"frames[{i}]."), about, as_shown=as_shown)
         for i, item in enumerate(items[:HISTORY_FRAMES])
     ]
     if history[-1].token != about.text("initial_token"):
@@ -383,7 +383,7 @@ def read_scene_pickle(path: Path, *, as_shown: bool = False) -> SyntheticScene:
     )
 
 
-def _frame(values: Values, about: Values, *, as_shown: bool) -> Frame:
+def _frame(values: CheckedValues, about: CheckedValues, *, as_shown: bool) -> Frame:
     """One frame's dict. Raises BadClip."""
     if not isinstance(values.items, Mapping):
         raise BadClip(values.file, values.place.rstrip("."), f"is a {type(values.items).__name__}, expected a dict")
@@ -403,17 +403,17 @@ def _frame(values: Values, about: Values, *, as_shown: bool) -> Frame:
         pose=pose,
         world_from_ego=_level(*pose),
         dynamic_state=np.concatenate(motion),
-        lights=lights_of(values),
-        command=command_of(ego),
-        cameras=cameras_of(
-            Values(_without_paths(values.get("camera_dict")), values.file, f"{values.place}camera_dict.")
+        lights=parse_lights(values),
+        command=parse_command(ego),
+        cameras=parse_cameras(
+            CheckedValues(_without_paths(values.get("camera_dict")), values.file, f"{values.place}camera_dict.")
         ),
         lidar_path=None,
-        boxes=None if as_shown else boxes_of(values.inner("annotations"), ANNOTATIONS),
+        boxes=None if as_shown else parse_boxes(values.inner("annotations"), ANNOTATIONS),
     )
 
 
-def _later(values: Values, now: Frame) -> list[Frame]:
+def _later(values: CheckedValues, now: Frame) -> list[Frame]:
     """The frames after the last, 0.5 s apart. Raises BadClip."""
     tracks, lights = _list(values, "extended_detections_tracks"), _list(values, "extended_traffic_light_data")
     if len(tracks) < FUTURE_FRAMES or len(lights) < FUTURE_FRAMES:
@@ -432,7 +432,7 @@ def _later(values: Values, now: Frame) -> list[Frame]:
     ]
 
 
-def _lights(values: Values, statuses: Any, place: str) -> tuple[tuple[str, bool], ...]:
+def _lights(values: CheckedValues, statuses: Any, place: str) -> tuple[tuple[str, bool], ...]:
     found = _list(_fields(values, statuses, "TrafficLightStatuses", place), "traffic_lights")
     out = []
     for k, light in enumerate(found):
@@ -441,7 +441,7 @@ def _lights(values: Values, statuses: Any, place: str) -> tuple[tuple[str, bool]
     return tuple(out)
 
 
-def _boxes(values: Values, tracks: Any, place: str, now: Frame) -> FrameBoxes:
+def _boxes(values: CheckedValues, tracks: Any, place: str, now: Frame) -> FrameBoxes:
     """The objects of one instant, in the frame of the ego at now."""
     holder = _fields(values, tracks, "DetectionsTracks", place)
     inner = f"{place}.tracked_objects"
@@ -474,28 +474,28 @@ def _boxes(values: Values, tracks: Any, place: str, now: Frame) -> FrameBoxes:
     return FrameBoxes(boxes, tuple(kinds), velocities, tuple(names))
 
 
-def _fields(values: Values, record: Any, name: str | None, place: str) -> Values:
+def _fields(values: CheckedValues, record: Any, name: str | None, place: str) -> CheckedValues:
     """The fields of an object of the class `name`, of Agent or StaticObject where it is None. Raises BadClip."""
     wanted = ("Agent", "StaticObject") if name is None else (name,)
     if not isinstance(record, Record) or record.name not in wanted:
         got = record.name if isinstance(record, Record) else type(record).__name__
         raise values.bad(place, f"is a {got}, expected {' or '.join(wanted)}")
-    return Values(record.state, values.file, f"{place}.")
+    return CheckedValues(record.state, values.file, f"{place}.")
 
 
-def _enum(values: Values, key: str, name: str) -> int:
+def _enum(values: CheckedValues, key: str, name: str) -> int:
     """The number of an enumeration's member. Raises BadClip."""
     record = values.get(key)
     if not isinstance(record, Record) or record.name != name or len(record.arguments) != 1:
         raise values.bad(key, f"is no {name}")
-    return Values({key: record.arguments[0]}, values.file, values.place).integer(key)
+    return CheckedValues({key: record.arguments[0]}, values.file, values.place).integer(key)
 
 
-def _number(values: Values, key: str) -> float:
+def _number(values: CheckedValues, key: str) -> float:
     return float(values.numbers(key, ()))
 
 
-def _list(values: Values, key: str) -> list[Any]:
+def _list(values: CheckedValues, key: str) -> list[Any]:
     found = values.get(key)
     if not isinstance(found, list):
         raise values.bad(key, f"is a {type(found).__name__}, expected a list")

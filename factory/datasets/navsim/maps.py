@@ -57,7 +57,7 @@ ONE_PART = {"lanes_polygons", "gen_lane_connectors_scaled_width_polygons"}  # of
 
 
 @dataclass(frozen=True)
-class Table:
+class LayerTable:
     """One layer: N rows in file order; an area of several parts has a row for each, the largest first."""
 
     fid: Ints  # (N,)
@@ -107,7 +107,7 @@ def map_file(maps_root: Path, location: str) -> Path:
     return path
 
 
-def read_geopackage(path: Path) -> dict[str, Table]:
+def read_geopackage(path: Path) -> dict[str, LayerTable]:
     """Every layer of KEYS by its name. Raises BadClip naming layer, column and fid, ImportError naming the extra."""
     try:
         import pyogrio
@@ -146,7 +146,7 @@ def _projected_system(path: Path) -> str:
     return str(systems["projectedCoordSystem"])
 
 
-def _table(path: Path, layer: str, target: str) -> Table:
+def _table(path: Path, layer: str, target: str) -> LayerTable:
     wanted = [*KEYS[layer], *NUMBERS.get(layer, ())]
     meta, fids, wkb, values = _read(path, layer, wanted)
     given = dict(zip(meta["fields"].tolist(), values))
@@ -171,9 +171,9 @@ def _table(path: Path, layer: str, target: str) -> Table:
     kept = {name: column[rows] for name, column in columns.items()}
     if not len(rows):
         nothing = np.zeros(1, dtype=np.int64)
-        return Table(fids[rows], kept, np.empty((0, 2)), (nothing,) if layer in LINES else (nothing, nothing))
+        return LayerTable(fids[rows], kept, np.empty((0, 2)), (nothing,) if layer in LINES else (nothing, nothing))
     _, xy, offsets = shapely.to_ragged_array(parts)
-    return Table(fids[rows], kept, xy, tuple(offsets))
+    return LayerTable(fids[rows], kept, xy, tuple(offsets))
 
 
 def _projected(path: Path, layer: str, source: str | None, target: str, fids: Ints, wkb: Any) -> NDArray[np.object_]:
@@ -240,7 +240,7 @@ def cache_file(path: Path) -> Path:
     return user_cache() / "maps" / f"{path.parent.parent.name}-{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
 
 
-def kept_tables(path: Path) -> dict[str, Table]:
+def cached_tables(path: Path) -> dict[str, LayerTable]:
     """The tables of a GeoPackage, from the cache where it is in order. Raises BadClip, ImportError."""
     kept = cache_file(path)
     if kept.is_file():
@@ -262,10 +262,10 @@ def kept_tables(path: Path) -> dict[str, Table]:
     return tables
 
 
-def _kept_table(stored: np.lib.npyio.NpzFile, layer: str) -> Table:
+def _kept_table(stored: np.lib.npyio.NpzFile, layer: str) -> LayerTable:
     columns = {name: stored[f"{layer}.{name}"] for name in (*KEYS[layer], *NUMBERS.get(layer, ()))}
     offsets = tuple(stored[f"{layer}.offsets{i}"] for i in range(1 if layer in LINES else 2))
-    return Table(stored[f"{layer}.fid"], columns, stored[f"{layer}.xy"], offsets)
+    return LayerTable(stored[f"{layer}.fid"], columns, stored[f"{layer}.xy"], offsets)
 
 
 LANES, CONNECTORS = "lanes_polygons", "lane_connectors"
@@ -287,13 +287,13 @@ def open_city(maps_root: Path, location: str) -> "City":
 
 @lru_cache(maxsize=8)
 def _opened(path: Path, location: str, size: int, changed_ns: int) -> "City":
-    return City(location, path, kept_tables(path))
+    return City(location, path, cached_tables(path))
 
 
 class City:
     """All lanes and areas of one city, found by place."""
 
-    def __init__(self, location: str, path: Path, tables: dict[str, Table]) -> None:
+    def __init__(self, location: str, path: Path, tables: dict[str, LayerTable]) -> None:
         """`path` is what errors name. Raises BadClip where lanes lack a polygon or a baseline, or share an id."""
         self.location, self.path, self.tables = location, path, tables
         lanes, connectors = tables[LANES], tables[CONNECTORS]
@@ -374,7 +374,7 @@ class City:
         """(P, 3) x, y, heading of a lane or connector. Raises KeyError."""
         return self._lane(self._index_of[lane_id]).centerline
 
-    def _rows_of(self, layer: str, column: str, owners: Table) -> NDArray[np.int64]:
+    def _rows_of(self, layer: str, column: str, owners: LayerTable) -> NDArray[np.int64]:
         """(N,) the one row of a layer that names each of the owners. Raises BadClip."""
         named = self.tables[layer].columns[column].astype(np.float64)
         rows = np.flatnonzero(np.isfinite(named))
@@ -474,7 +474,7 @@ def _near(tree: shapely.STRtree, around: Any, radius_m: float) -> list[int]:
     return sorted(tree.query(around, predicate="dwithin", distance=radius_m).tolist())
 
 
-def _headed(table: Table) -> Array:
+def _headed(table: LayerTable) -> Array:
     """(T, 3) the points of a layer of lines with the direction of the segment that starts there; a last one repeats."""
     steps = np.diff(table.xy, axis=0, append=0.0)
     heading, last = np.arctan2(steps[:, 1], steps[:, 0]), table.offsets[0][1:] - 1
@@ -482,7 +482,7 @@ def _headed(table: Table) -> Array:
     return np.column_stack([table.xy, heading])
 
 
-def _ends(table: Table, rows: NDArray[np.int64]) -> Array:
+def _ends(table: LayerTable, rows: NDArray[np.int64]) -> Array:
     """(N, 2, 2) first and last point of lines."""
     points = table.offsets[0]
     return np.stack([table.xy[points[rows]], table.xy[points[rows + 1] - 1]], axis=1)

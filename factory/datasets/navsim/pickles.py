@@ -33,7 +33,7 @@ def dumps(value: object, known_as: Mapping[type, str] | None = None) -> bytes:
     return data
 
 
-def write_dict(file: BinaryIO, entries: Iterable[tuple[str, object]], after: Path | None = None) -> None:
+def write_pickled_dict(file: BinaryIO, entries: Iterable[tuple[str, object]], after: Path | None = None) -> None:
     """Pickle a dictionary of any size into `file`, one entry in memory.
 
     after: a file written by this function, whose entries come first.
@@ -95,7 +95,7 @@ def write_rewards(draft: Path, labelled: Iterable[tuple[str, Mapping[str, Any]]]
     A file is cumulative because SimScale opens the last round's for each of the rounds (gtrs_agent.py:231-235).
     """
     with draft.open("w+b") as file:
-        write_dict(file, ((token, reward_arrays(row)) for token, row in labelled), earlier)
+        write_pickled_dict(file, ((token, reward_arrays(row)) for token, row in labelled), earlier)
 
 
 # A reward pickle of SimScale, {token: {metric: float16 (K,)}}: opened by its index, read token by token.

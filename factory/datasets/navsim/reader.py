@@ -20,19 +20,19 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.datasets.navsim.log import LogFrames, frames_of, read_frames
+from factory.datasets.navsim.log import LogFrames, parse_frames, read_frames
 from factory.datasets.navsim.maps import DOWNLOAD, map_file
 from factory.datasets.navsim.settings import NavsimClips
 from factory.datasets.navsim.window import (
     FRAMES_BEFORE,
     HORIZON_FRAMES,
     WINDOW_FRAMES,
-    blobs_of,
+    cameras_with_pictures,
     ego_states,
-    lights,
-    rig_of,
     road_around,
+    sensor_files,
     stretch_agents,
+    traffic_lights,
     window_agents,
     world_from_ego,
 )
@@ -286,7 +286,7 @@ class FrameTable:
 
 
 @dataclass(frozen=True)
-class Choice:
+class WindowChoice:
     """Which windows are wanted."""
 
     stride_frames: int = 1  # between two, where no scene filter names them
@@ -295,7 +295,7 @@ class Choice:
     scene_filter: SceneFilter | None = None  # its scenes, whatever the stride and the speed
 
 
-def table_of(log: LogFrames) -> FrameTable:
+def frame_table(log: LogFrames) -> FrameTable:
     """The table of a log that is open."""
     frames = log.frames
     return FrameTable(
@@ -310,7 +310,7 @@ def table_of(log: LogFrames) -> FrameTable:
     )
 
 
-def kept_table(path: Path, cache_dir: Path) -> FrameTable | None:
+def cached_table(path: Path, cache_dir: Path) -> FrameTable | None:
     """The table of the log at `path`, if one was kept of just this file. Raises BadClip where there is no such file."""
     try:
         kept = _kept(path, cache_dir)
@@ -324,20 +324,21 @@ def kept_table(path: Path, cache_dir: Path) -> FrameTable | None:
         return None
 
 
-def table_at(path: Path) -> FrameTable:
+def cached_or_read_table(path: Path) -> FrameTable:
     """The table of the log at `path`; one that was not kept is made in another process. Raises BadClip."""
     cache_dir = user_cache() / "navsim"
     return kept_table(path, cache_dir) or OtherProcess(partial(make_table, cache_dir=cache_dir))(path, str(path))
+    return cached_table(path, cache_dir) or Apart(partial(read_and_cache_table, cache_dir=cache_dir))(path, str(path))
 
 
-def make_table(path: Path, cache_dir: Path) -> FrameTable:
+def read_and_cache_table(path: Path, cache_dir: Path) -> FrameTable:
     """The table of the log at `path`, read and kept. Raises BadClip."""
-    table = table_of(read_frames(path))
-    keep_table(table, path, cache_dir)
+    table = frame_table(read_frames(path))
+    cache_table(table, path, cache_dir)
     return table
 
 
-def keep_table(table: FrameTable, path: Path, cache_dir: Path) -> None:
+def cache_table(table: FrameTable, path: Path, cache_dir: Path) -> None:
     """Keeps the table of the log at `path`, for as long as that file is as it is. Raises BadClip, OSError."""
     columns: dict[str, NDArray[Any]] = {**vars(table)}
     rows = np.zeros(len(table), [(name, column.dtype) for name, column in columns.items()])
@@ -359,7 +360,7 @@ def _kept(path: Path, cache_dir: Path) -> Path:
     return cache_dir / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.npy"
 
 
-def wanted_windows(table: FrameTable, choice: Choice, tokens: Collection[str] | None) -> list[int]:
+def wanted_windows(table: FrameTable, choice: WindowChoice, tokens: Collection[str] | None) -> list[int]:
     """The frame T of every window that is wanted, in order, whether or not it can be a clip.
 
     tokens: of the scene filter, as a set; None: it names none. A window of a scene filter is the public loader's
@@ -383,13 +384,13 @@ def scene_frames(chosen: SceneFilter, logs: Mapping[str, Path]) -> Iterator[tupl
     tokens, left = None if chosen.tokens is None else frozenset(chosen.tokens), chosen.max_scenes
     for name, path in logs.items():
         if chosen.log_names is None or name in chosen.log_names:
-            table = table_at(path)
-            frames = wanted_windows(table, Choice(scene_filter=chosen), tokens)[:left]
+            table = cached_or_read_table(path)
+            frames = wanted_windows(table, WindowChoice(scene_filter=chosen), tokens)[:left]
             left = None if left is None else left - len(frames)
             yield path, table, frames
 
 
-def usable(table: FrameTable, windows: list[int], choice: Choice) -> tuple[list[int], Counter[str]]:
+def usable_windows(table: FrameTable, windows: list[int], choice: WindowChoice) -> tuple[list[int], Counter[str]]:
     """Those windows that are clips, and how many are not, by reason."""
     kept: list[int] = []
     dropped: Counter[str] = Counter()
@@ -452,7 +453,7 @@ class NavsimReader:
         self.root, self.maps = (Path(folder).expanduser().absolute() for folder in (root, maps))
         self.sensors = None if given.sensors is None else Path(given.sensors).expanduser().absolute()
         self.selection = read_selection(given.scene_filter, given.scene_filters) if given.scene_filter else None
-        self.choice = Choice(
+        self.choice = WindowChoice(
             stride_frames=given.stride_frames,
             first_frame=given.first_window * given.stride_frames,
             min_top_speed_mps=given.min_top_speed_mps,
@@ -504,7 +505,7 @@ class NavsimReader:
             if wanted and (no_map := self._no_map(table.location, cities)):
                 broken[ClipRef(self.name, log_id, 0)] = str(no_map)
                 continue
-            kept, reasons = usable(table, wanted, self.choice)
+            kept, reasons = usable_windows(table, wanted, self.choice)
             dropped += reasons
             start_ms = table.start_ms
             refs += [ClipRef(self.name, log_id, int(start_ms[now - FRAMES_BEFORE])) for now in kept]
@@ -535,13 +536,13 @@ class NavsimReader:
         cameras: tuple[Camera, ...] = ()
         block: Block | None = None
         if self.sensors is not None:
-            blobs = blobs_of(window, self.sensors)
+            blobs = sensor_files(window, self.sensors)
             if not blobs.images and not blobs.sweeps:
                 problem = f"no picture of the frames {start} to {start + WINDOW_FRAMES - 1} of {ref.log_id} is here"
                 raise BadClip(str(self.sensors), "blobs", f"{problem}; clips.sensors=null reads clips without pictures")
             images, sweeps = blobs.images, blobs.sweeps
             block = self._with_others(ref, self._block(opened, start))
-            cameras = rig_of(frames[now], block.images, opened.log.file)
+            cameras = cameras_with_pictures(frames[now], block.images, opened.log.file)
         clip = Clip(
             clip_id=ref.clip_id,
             dataset=self.name,
@@ -554,7 +555,7 @@ class NavsimReader:
             road_map=road.road_map,
             route=road.route,
             centerline=road.centerline,
-            lights=lights(window, tuple(road.road_map.lanes)),
+            lights=traffic_lights(window, tuple(road.road_map.lanes)),
             cameras=cameras,
             images=images,
             sweeps=sweeps,
@@ -608,10 +609,11 @@ class NavsimReader:
         """The table of each log, or what is wrong with it; what takes long is told on stderr."""
         began, made, told = time.monotonic(), 0, 0.0
         made_apart = OtherProcess(partial(make_table, cache_dir=self.cache_dir))
+        made_apart = Apart(partial(read_and_cache_table, cache_dir=self.cache_dir))
         for i, (log_id, path) in enumerate(logs.items(), start=1):
             try:
                 with failures_as_bad_clip(str(path)):
-                    table = kept_table(path, self.cache_dir)
+                    table = cached_table(path, self.cache_dir)
                     if table is None:
                         table = made_apart(path, str(path))
                         made += 1
@@ -645,14 +647,14 @@ class NavsimReader:
         if ref.log_id not in self._logs:
             path = self._path_of(ref)
             data = bytes_of(path)
-            log = frames_of(load_plain(data, str(path)), path)
-            table = table_of(log)
+            log = parse_frames(load_plain(data, str(path)), path)
+            table = frame_table(log)
             opened = OpenLog(log, table, _digest(data, map_file(self.maps, table.location)))
             self._logs = dict([*self._logs.items(), (ref.log_id, opened)][-(CACHED_LOGS + self.traversals) :])
         return self._logs[ref.log_id]
 
     def _table(self, path: Path) -> FrameTable:
-        return kept_table(path, self.cache_dir) or make_table(path, self.cache_dir)
+        return cached_table(path, self.cache_dir) or read_and_cache_table(path, self.cache_dir)
 
     def _log_digest(self, log_id: str) -> str:
         path = self.logs()[log_id]
@@ -690,9 +692,9 @@ class NavsimReader:
             inside = np.flatnonzero((steps >= other.start) & (steps < other.stop))
             inside = inside[stretch[inside] == stretch[inside[0]]]
             frames = opened.log.frames[inside[0] : inside[-1] + 1]
-            blobs = blobs_of(frames, self.sensors)
+            blobs = sensor_files(frames, self.sensors)
             if blobs.images or blobs.sweeps:
-                cameras = rig_of(frames[len(frames) // 2], blobs.images, opened.log.file)
+                cameras = cameras_with_pictures(frames[len(frames) // 2], blobs.images, opened.log.file)
                 others.append(OtherDrive(other.log_id, stretch_agents(frames), cameras, blobs.images, blobs.sweeps))
         return with_other_drives(block, others) if others else block
 
@@ -701,7 +703,7 @@ class NavsimReader:
         assert self.sensors is not None
         first, stop = _block_frames(opened.table, start)
         frames = opened.log.frames[first:stop]
-        blobs = blobs_of(frames, self.sensors)
+        blobs = sensor_files(frames, self.sensors)
         start_s = float(opened.table.start_ms[first]) / 1000
         return Block(start_s, stretch_agents(frames), blobs.images, blobs.sweeps)
 

@@ -20,14 +20,14 @@ import numpy as np
 from factory.datasets.navsim.import_rows import (
     HISTORY_FRAMES,
     SCENE_FRAMES,
-    Entry,
-    Origin,
-    logged_label,
-    pictures,
-    scene_of,
+    ImportEntry,
+    SceneOrigin,
+    logged_label_columns,
+    picture_columns,
+    scene_of_frames,
     world_columns,
 )
-from factory.datasets.navsim.log import bytes_of, frames_of
+from factory.datasets.navsim.log import bytes_of, parse_frames
 from factory.datasets.navsim.pickles import METRICS, RewardFile
 from factory.datasets.navsim.window import RoadAhead, ego_states, road_around
 from factory.files import folders_in, matching, matching_below
@@ -59,7 +59,7 @@ PROGRESS = "ego_progress"
 NOMINAL_M = 256.0
 
 
-def vocabulary_labels(rewards: Mapping[str, Array], vocabulary: str, k: int) -> VocabularyLabels:
+def labels_of_rewards(rewards: Mapping[str, Array], vocabulary: str, k: int) -> VocabularyLabels:
     """Of metrics (K,) by their names; vocabulary: the digest of its K trajectories.
 
     Raises ValueError naming the metric that is missing, or holds what the public code does not write.
@@ -95,7 +95,7 @@ FRAME_US, SLACK_US = 500_000, 50_000
 
 
 @dataclass(frozen=True)
-class Part:
+class SimscaleFolder:
     """The samples of one expert and round, or human ones."""
 
     name: str
@@ -127,7 +127,7 @@ class Part:
         return ImageSource.PHOTO if self.number is None else ImageSource.RENDER
 
 
-def parts_of(root: Path, only: Collection[str] = ()) -> list[Part]:
+def simscale_folders(root: Path, only: Collection[str] = ()) -> list[SimscaleFolder]:
     """What lies under the root: as moved into NAVSIM's folders (tools/move.sh), or as unpacked.
 
     Raises ValueError where there is none, none of that name, or two of one expert and round.
@@ -135,9 +135,9 @@ def parts_of(root: Path, only: Collection[str] = ()) -> list[Part]:
     found = []
     for name, logs, blobs in _folders(root):
         if (named := FOLDER.fullmatch(name)) is not None:
-            found.append(Part(name, logs, blobs, named["who"], int(named["round"])))
+            found.append(SimscaleFolder(name, logs, blobs, named["who"], int(named["round"])))
         elif (named := HUMAN_FOLDER.fullmatch(name)) is not None:
-            found.append(Part(name, logs, blobs, named["who"], None))
+            found.append(SimscaleFolder(name, logs, blobs, named["who"], None))
     if not found:
         names = "synthetic_reaction_<expert>_v1.0-<k> or navtrain_human"
         expected = f"navsim_logs/<name> with sensor_blobs/<name>, or <name>/meta_datas, <name> being {names}"
@@ -145,7 +145,7 @@ def parts_of(root: Path, only: Collection[str] = ()) -> list[Part]:
     there = {part.name for part in found}
     if unknown := sorted(set(only) - there):
         raise ValueError(f"only={unknown[0]}: not under {root}; there are {', '.join(sorted(there))}")
-    chosen: dict[tuple[str, int], Part] = {}
+    chosen: dict[tuple[str, int], SimscaleFolder] = {}
     for part in sorted(found, key=lambda part: (part.name, part.logs)):
         if not only or part.name in only:
             twin = chosen.setdefault((part.expert, part.round), part)
@@ -165,7 +165,7 @@ def _folders(root: Path) -> Iterator[tuple[str, Path, Path]]:
                 yield folder.name, logs, folder / "sensor_blobs_hist"
 
 
-class Rewards:
+class RewardFiles:
     """The reward files of a folder, or one of them, by expert; each is opened when the first token of it is wanted."""
 
     def __init__(self, path: Path, vocabulary: Vocabulary) -> None:
@@ -183,7 +183,7 @@ class Rewards:
             )
         self._open: dict[Path, RewardFile] = {}
 
-    def columns(self, part: Part, token: str) -> dict[str, object]:
+    def columns(self, part: SimscaleFolder, token: str) -> dict[str, object]:
         """The label columns of a token; none where no file of its expert has it. Raises BadClip.
 
         The file of the part's own round is asked first, then later ones: the release's may be of one round or of all.
@@ -195,38 +195,38 @@ class Rewards:
             if token in self._open[path]:
                 found, vocabulary = self._open[path][token], self.vocabulary
                 try:
-                    return label_columns(vocabulary_labels(found, vocabulary.digest, len(vocabulary)))
+                    return label_columns(labels_of_rewards(found, vocabulary.digest, len(vocabulary)))
                 except ValueError as error:
                     raise BadClip(str(path), f"[{token!r}]", str(error)) from error
         return {}
 
 
 @dataclass(frozen=True)
-class Import:
+class SimscaleImport:
     """What is made of every log."""
 
     maps: Path | None = None  # nuPlan's; None: rows without a map
     pictures: bool = True
-    rewards: Rewards | None = None
+    rewards: RewardFiles | None = None
 
-    def entries(self, parts: Sequence[Part]) -> list[Entry]:
+    def entries(self, parts: Sequence[SimscaleFolder]) -> list[ImportEntry]:
         """Every log of the parts, by the names of their files alone."""
         return [self._entry(part, path) for part in parts for path in matching(part.logs, "*.pkl")]
 
-    def _entry(self, part: Part, path: Path) -> Entry:
+    def _entry(self, part: SimscaleFolder, path: Path) -> ImportEntry:
         named = re.fullmatch(LOG + part.suffix, path.stem)
         log, seed = (named["log"], named["seed"]) if named else (path.stem, "")
         clip_id = sha256("\x1f".join((DATASET, log, seed)).encode()).hexdigest()[:16]
         make = partial(self.row, part, path, clip_id)
-        return Entry(clip_id, DATASET, log, part.expert, part.round, part.candidate, make)
+        return ImportEntry(clip_id, DATASET, log, part.expert, part.round, part.candidate, make)
 
-    def row(self, part: Part, path: Path, clip_id: str) -> dict[str, object]:
+    def row(self, part: SimscaleFolder, path: Path, clip_id: str) -> dict[str, object]:
         """The columns of one log's row. Raises BadClip."""
         named = re.fullmatch(LOG + part.suffix, path.stem)
         if named is None:
             raise BadClip(str(path), "name", f"expected <log>-<token>{part.suffix}.pkl, as the logs of {part.name} are")
         data = bytes_of(path)
-        frames = frames_of(load_plain(data, str(path)), path).frames
+        frames = parse_frames(load_plain(data, str(path)), path).frames
         if len(frames) != SCENE_FRAMES:
             raise BadClip(str(path), "frames", f"{len(frames)}, expected {SCENE_FRAMES}: 4 of history and 8 to come")
         for i, (before, frame) in enumerate(pairwise(frames), 1):
@@ -243,7 +243,7 @@ class Import:
             )
         # A and B: a simulated log begins at B and is named after A; a human one begins at A, and its last frame is B
         tokens = (named["seed"], token["frame"]) if part.suffix else (token["frame"], end.token)
-        origin = Origin(
+        origin = SceneOrigin(
             file=str(path),
             clip_id=clip_id,
             dataset=DATASET,
@@ -258,9 +258,9 @@ class Import:
             road = RoadAhead(RoadMap({}, (), location=now.map_location), route, np.zeros((0, 3)))
         else:
             road = road_around(self.maps, now, ego_states(frames)[:, :2], now.pose, str(path), at)
-        scene = scene_of(frames, road, origin)
+        scene = scene_of_frames(frames, road, origin)
         seen: dict[str, object] = dict(NO_IMAGES)
         if self.pictures:
-            seen = pictures(frames[:HISTORY_FRAMES], part.blobs, part.source, str(path))
+            seen = picture_columns(frames[:HISTORY_FRAMES], part.blobs, part.source, str(path))
         labels = {} if self.rewards is None else self.rewards.columns(part, now.token)
-        return {**world_columns(scene, now.command), **logged_label(scene), **seen, **labels}
+        return {**world_columns(scene, now.command), **logged_label_columns(scene), **seen, **labels}

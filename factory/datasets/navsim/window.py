@@ -88,7 +88,7 @@ def world_from_ego(frames: Sequence[Frame]) -> Array:
     return poses
 
 
-def lights(frames: Sequence[Frame], lane_ids: Sequence[str]) -> TrafficLights:
+def traffic_lights(frames: Sequence[Frame], lane_ids: Sequence[str]) -> TrafficLights:
     """The lights (S, L) of those `lane_ids` that any frame names; unknown in frames that do not name them."""
     wanted = frozenset(lane_ids)
     named = sorted({lane_id for frame in frames for lane_id, _ in frame.lights if lane_id in wanted})
@@ -271,7 +271,7 @@ class Blobs:
     sweeps: tuple[SensorFile, ...]
 
 
-def blobs_of(frames: Sequence[Frame], folder: Path) -> Blobs:
+def sensor_files(frames: Sequence[Frame], folder: Path) -> Blobs:
     """The pictures and sweeps below `folder` of frames 0.5 s apart, times from the first. Raises BadClip."""
     images: list[SensorFile] = []
     sweeps: list[SensorFile] = []
@@ -287,7 +287,7 @@ def blobs_of(frames: Sequence[Frame], folder: Path) -> Blobs:
     return Blobs(tuple(images), tuple(sweeps))
 
 
-def rig_of(frame: Frame, images: Sequence[SensorFile], file: str) -> tuple[Camera, ...]:
+def cameras_with_pictures(frame: Frame, images: Sequence[SensorFile], file: str) -> tuple[Camera, ...]:
     """The cameras of a frame that took any of the `images`, whose first tells their size. Raises BadClip."""
     first: dict[str, str] = {}
     for image in images:

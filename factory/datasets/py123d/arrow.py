@@ -35,7 +35,7 @@ class ArrowFile:
 
     def column(self, name: str) -> pa.Array:
         """A column of the modality that the file is named after, without nulls. Raises BadClip."""
-        return whole(self.path, self.table, f"{self.path.stem}.{name}")
+        return column_without_nulls(self.path, self.table, f"{self.path.stem}.{name}")
 
     def stamps_ns(self) -> Ints:
         """(n,) nanoseconds. Raises BadClip."""
@@ -46,7 +46,7 @@ class ArrowFile:
 
     def rows(self, name: str, width: int) -> Array:
         """(n, width) of a column of lists of `width` numbers. Raises BadClip."""
-        return numbers(self.path, name, self.column(name), width)
+        return number_lists(self.path, name, self.column(name), width)
 
     def lists(self, name: str) -> tuple[Indices, pa.Array]:
         """(m,) the row of each of the m items that a column of lists holds, and the items. Raises BadClip."""
@@ -90,7 +90,7 @@ def open_file(path: Path, rows: bool = True) -> ArrowFile:
     packed = (table.schema.metadata or {}).get(b"metadata")
     if packed is None:
         raise BadClip(str(path), "metadata", "missing from the schema: not a file of py123d")
-    return ArrowFile(path, table, unpacked(path, "metadata", packed))
+    return ArrowFile(path, table, unpack_msgpack(path, "metadata", packed))
 
 
 def check_version(file: ArrowFile) -> None:
@@ -103,7 +103,7 @@ def check_version(file: ArrowFile) -> None:
         )
 
 
-def whole(path: Path, table: pa.Table, name: str) -> pa.Array:
+def column_without_nulls(path: Path, table: pa.Table, name: str) -> pa.Array:
     """A column without nulls. Raises BadClip."""
     if name not in table.column_names:
         raise BadClip(str(path), name, f"column is missing; there are {', '.join(table.column_names)}")
@@ -113,7 +113,7 @@ def whole(path: Path, table: pa.Table, name: str) -> pa.Array:
     return column
 
 
-def numbers(path: Path, name: str, lists: pa.Array, width: int) -> Array:
+def number_lists(path: Path, name: str, lists: pa.Array, width: int) -> Array:
     """(n, width) of n lists of `width` finite numbers. Raises BadClip."""
     if not pa.types.is_fixed_size_list(lists.type) or lists.type.list_size != width or lists.null_count:
         raise BadClip(str(path), name, f"expected lists of {width} numbers, found {lists.type}")
@@ -126,7 +126,7 @@ def numbers(path: Path, name: str, lists: pa.Array, width: int) -> Array:
     return out
 
 
-def unpacked(path: Path, field: str, data: bytes) -> dict[str, Any]:
+def unpack_msgpack(path: Path, field: str, data: bytes) -> dict[str, Any]:
     """A msgpack dictionary; arrays of floats in it as arrays of float64. Raises BadClip."""
     try:
         content = msgpack.unpackb(data, object_hook=_array, raw=False)

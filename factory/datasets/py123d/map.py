@@ -15,7 +15,14 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon
 
-from factory.datasets.py123d.arrow import ArrowFile, ConvertedSet, check_version, open_file, unpacked, whole
+from factory.datasets.py123d.arrow import (
+    ArrowFile,
+    ConvertedSet,
+    check_version,
+    column_without_nulls,
+    open_file,
+    unpack_msgpack,
+)
 from factory.datasets.scenarionet.map import (
     RawLane,
     closed_ring,
@@ -60,7 +67,7 @@ class MapObjects:
 
     def content(self, row: int) -> dict[str, Any]:
         """What the row says besides its polygon. Raises BadClip."""
-        return unpacked(self.file.path, f"features of {self.where(row)}", self.features[row].as_py())
+        return unpack_msgpack(self.file.path, f"features of {self.where(row)}", self.features[row].as_py())
 
     def where(self, row: int) -> str:
         """Names the row in errors."""
@@ -117,7 +124,9 @@ def _objects(path: Path, drive: Array) -> MapObjects:
     """What the map holds; of a city's, what is near the drive. Raises BadClip."""
     file = open_file(path)
     check_version(file)
-    ids, layers, packed, wkb = (whole(path, file.table, name) for name in ("object_id", "map_layer", "features", "wkb"))
+    ids, layers, packed, wkb = (
+        column_without_nulls(path, file.table, name) for name in ("object_id", "map_layer", "features", "wkb")
+    )
     try:
         shapes = np.asarray(shapely.from_wkb(wkb.to_pylist()), object)
         numbers = np.asarray(layers, np.int64)

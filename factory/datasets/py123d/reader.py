@@ -39,7 +39,7 @@ from factory.datasets.py123d.arrow import (
     ArrowFile,
     ConvertedSet,
     check_version,
-    numbers,
+    number_lists,
     open_file,
 )
 from factory.datasets.py123d.map import read_map
@@ -115,16 +115,16 @@ def read_motion(folder: Path) -> LogMotion:
     )
 
 
-def drive_of(motion: LogMotion) -> LoggedDrive:
+def logged_drive(motion: LogMotion) -> LoggedDrive:
     """Ego and agents every 0.1 s; a segment ends where poses or frames are missing. Raises BadClip."""
     times_s = step_times(0, motion.n_steps)
-    states = ego_states_of(motion, times_s)
+    states = resampled_ego_states(motion, times_s)
     here = np.isfinite(states).all(axis=1) & observed_at(motion, times_s)
     begins = here & ~np.concatenate([[False], here[:-1]])
     return LoggedDrive(states, agents_at(motion, times_s), np.where(here, np.cumsum(begins) - 1, -1))
 
 
-def ego_states_of(motion: LogMotion, times_s: Array) -> Array:
+def resampled_ego_states(motion: LogMotion, times_s: Array) -> Array:
     """Ego states (S, 11) at the log's steps; NaN where poses are missing."""
     states = np.full((len(times_s), EGO_STATE_SIZE), np.nan)
     usual_s = float(np.median(np.diff(motion.pose_times_s))) if len(motion.pose_times_s) > 1 else np.inf
@@ -147,7 +147,7 @@ def ego_states_of(motion: LogMotion, times_s: Array) -> Array:
     return states
 
 
-def lights_of(motion: LogMotion, road_map: RoadMap, times_s: Array) -> TrafficLights:
+def lights_at(motion: LogMotion, road_map: RoadMap, times_s: Array) -> TrafficLights:
     """Phases at times (S,) of the lanes on the map: of the latest frame, where one is at most 0.55 s old.
 
     Two lights of one lane count as the more restrictive. No lanes where the log has no lights. Raises BadClip.
@@ -176,7 +176,7 @@ def lights_of(motion: LogMotion, road_map: RoadMap, times_s: Array) -> TrafficLi
     return TrafficLights(lane_ids, states[np.where(fresh, latest, -1)])
 
 
-def matrices(path: Path, poses: Array) -> Array:
+def pose_matrices(path: Path, poses: Array) -> Array:
     """(n, 4, 4) of poses (n, 7) x, y, z, qw, qx, qy, qz. Raises BadClip for a quaternion that is no rotation."""
     out = np.tile(np.eye(4), (len(poses), 1, 1))
     if len(poses):
@@ -198,7 +198,7 @@ def _tracks(boxes: ArrowFile, row: Indices, values: pa.Array, boxed: Indices, ti
     (id_row, ids), (kind_row, labels) = boxes.lists("track_token"), boxes.lists("label")
     if not (np.array_equal(row, id_row) and np.array_equal(row, kind_row)) or ids.null_count or labels.null_count:
         raise BadClip(str(path), "track_token label", "not one of each for every box")
-    box = numbers(path, "bounding_box_se3", values, 10)[boxed]
+    box = number_lists(path, "bounding_box_se3", values, 10)[boxed]
     if (box[:, 7:] <= 0.0).any():
         raise BadClip(str(path), "bounding_box_se3", "a box has a size that is not positive")
     named = [id_text(token) for token in ids.to_pylist()]
@@ -243,7 +243,7 @@ CAMERAS, LIDAR, SWEEP_SUFFIX = "camera.*.arrow", "lidar.lidar_merged.arrow", ".f
 def read_rig(folder: Path) -> dict[Path, Camera]:
     """Table -> pinhole camera; fisheyes are left out. Raises BadClip."""
     mount = open_file(folder / EGO, rows=False).vector("rear_axle_to_imu_se3", 7)
-    rear_from_imu = np.linalg.inv(matrices(folder / EGO, mount[None])[0])
+    rear_from_imu = np.linalg.inv(pose_matrices(folder / EGO, mount[None])[0])
     files = {path: open_file(path, rows=False) for path in matching(folder, CAMERAS)}
     return {
         path: _camera(file, rear_from_imu)
@@ -287,7 +287,7 @@ def _camera(file: ArrowFile, rear_from_imu: Array) -> Camera:
         raise BadClip(str(file.path), "metadata.intrinsics", f"skew of {skew}, only cameras without are read")
     flat = file.value("is_undistorted", bool) or file.metadata.get("distortion") is None
     distortion = np.zeros(5) if flat else file.vector("distortion", 5)
-    mount = rear_from_imu @ matrices(file.path, file.vector("camera_to_imu_se3", 7)[None])[0]
+    mount = rear_from_imu @ pose_matrices(file.path, file.vector("camera_to_imu_se3", 7)[None])[0]
     intrinsics = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     size = file.value("width", int), file.value("height", int)
     try:
@@ -309,7 +309,7 @@ def _poses(file: ArrowFile, camera: Camera, motion: LogMotion, times_s: Array) -
     column = file.table[f"{file.path.stem}.camera_to_global_se3"].combine_chunks()
     posed = np.flatnonzero(np.asarray(column.is_valid()))
     if len(posed):
-        own = matrices(file.path, numbers(file.path, "camera_to_global_se3", column.drop_null(), 7))
+        own = pose_matrices(file.path, number_lists(file.path, "camera_to_global_se3", column.drop_null(), 7))
         poses[posed] = own @ np.linalg.inv(camera.ego_from_camera)
     return poses
 
@@ -373,22 +373,22 @@ class Py123dReader(LogReader[Py123dLog]):
 
     def drive(self, path: Path) -> LoggedDrive | str:
         """Ego and agents of the log in this folder; or what it lacks. Raises BadClip."""
-        header = open_header(path)
-        source_of(header)
+        header = read_header(path)
+        converted_set_of(header)
         for name in (EGO, BOXES):
             if not (path / name).is_file():
                 return f"no {name}"
         if header.metadata.get("map_metadata") is None:
             return "converted without a map"
         self._map_file(header)
-        return drive_of(read_motion(path))
+        return logged_drive(read_motion(path))
 
     def load(self, path: Path) -> Py123dLog:
         """The log in this folder, resampled to 0.1 s. Raises BadClip."""
-        header = open_header(path)
-        source, map_path = source_of(header), self._map_file(header)
+        header = read_header(path)
+        source, map_path = converted_set_of(header), self._map_file(header)
         motion = read_motion(path)
-        drive = drive_of(motion)
+        drive = logged_drive(motion)
         driven = drive.ego_states[drive.segment >= 0, :3]
         if not len(driven):
             raise BadClip(str(path / EGO), "imu_se3", "no continuous drive")
@@ -401,7 +401,7 @@ class Py123dReader(LogReader[Py123dLog]):
             agents=drive.agents,
             road_map=road_map,
             route=route_of_drive(road_map, driven, str(map_path), "lanes"),
-            lights=lights_of(motion, road_map, step_times(0, motion.n_steps)),
+            lights=lights_at(motion, road_map, step_times(0, motion.n_steps)),
             cameras=tuple(rig.values()),
             images=recorded_photos(motion, rig, self.sensor_root) if self.sensor_root else (),
             sweeps=recorded_sweeps(motion, self.sensor_root) if self.sensor_root else (),
@@ -416,12 +416,12 @@ class Py123dReader(LogReader[Py123dLog]):
 
     def log_digest(self, path: Path) -> str:
         """sha256 of the log in this folder, but for pixels and points. Raises BadClip."""
-        header = open_header(path)
+        header = read_header(path)
         return content_digest(header, self._map_file(header))
 
     def world(self, path: Path) -> str | None:
         """The map that the log shares with others; None where it has one of its own. Raises BadClip."""
-        header = open_header(path)
+        header = read_header(path)
         shares = not header.metadata["map_metadata"].get("map_is_per_log")
         return self._map_file(header).stem if shares else None
 
@@ -482,14 +482,14 @@ def log_folders(root: Path) -> dict[str, Path]:
     return dict(sorted(folders.items()))
 
 
-def open_header(folder: Path) -> ArrowFile:
+def read_header(folder: Path) -> ArrowFile:
     """What the log says of itself, its version checked. Raises BadClip."""
     header = open_file(folder / SYNC, rows=False)
     check_version(header)
     return header
 
 
-def source_of(header: ArrowFile) -> ConvertedSet:
+def converted_set_of(header: ArrowFile) -> ConvertedSet:
     """The data set that was converted. Raises BadClip for one that is not read."""
     name = header.value("dataset", str)
     if name not in SOURCES:

@@ -12,7 +12,7 @@ import numpy as np
 
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.navsim.log import read_frames, read_scene_pickle
-from factory.datasets.navsim.reader import read_selection, table_of
+from factory.datasets.navsim.reader import frame_table, read_selection
 from factory.datasets.py123d.reader import Py123dReader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.datasets.town.reader import SyntheticReader
@@ -118,7 +118,7 @@ def _scenario(folder: Path) -> Readable:
 
 def _log(folder: Path) -> Readable:
     (path,) = folder.glob(f"**/{NAME}.pkl")
-    return Readable(path, lambda: table_of(read_frames(path)), mutant=of_pickle)
+    return Readable(path, lambda: frame_table(read_frames(path)), mutant=of_pickle)
 
 
 def _scene_pickle(folder: Path) -> Readable:

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from factory.datasets.navsim.maps import cache_file, kept_tables
-from factory.datasets.navsim.reader import kept_table, make_table
+from factory.datasets.navsim.maps import cache_file, cached_tables
+from factory.datasets.navsim.reader import cached_table, read_and_cache_table
 from factory.datasets.town.reader import SensedReader, SyntheticReader, SyntheticTownsReader
 from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import SUMS
@@ -84,27 +84,27 @@ def test_a_city_s_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     write_root(tmp_path, "us-ma-boston", stub_rows())
     map_file = next(tmp_path.glob("us-ma-boston/*/map.gpkg"))
-    kept_tables(map_file)
+    cached_tables(map_file)
     path = cache_file(map_file)
     whole = path.read_bytes()
     for content in damaged(whole, every=len(whole) // 6):
         path.write_bytes(content)
-        kept_tables(map_file)
+        cached_tables(map_file)
         (line,) = lines()
         assert line.startswith(f"{path}: damaged") and path.read_bytes() == whole
 
 
 def test_the_table_of_a_log(tmp_path: Path, lines: Lines) -> None:
     log = write_frames(tmp_path, "mini", NAME, [frame(k) for k in range(3)])
-    make_table(log, tmp_path / "kept")
+    read_and_cache_table(log, tmp_path / "kept")
     (path,) = (tmp_path / "kept").iterdir()
     whole = path.read_bytes()
     for content in damaged(whole):
         path.write_bytes(content)
-        assert kept_table(log, tmp_path / "kept") is None
+        assert cached_table(log, tmp_path / "kept") is None
         (line,) = lines()
         assert line.startswith(f"{path}: it") and line.endswith(f"made again of {log}")
-    make_table(log, tmp_path / "kept")
+    read_and_cache_table(log, tmp_path / "kept")
     assert path.read_bytes() == whole
 
 
@@ -201,12 +201,12 @@ def prepared_clips(folder: Path) -> Kept:
 def city_tables(folder: Path) -> Kept:
     write_root(folder, "us-ma-boston", stub_rows(scale=2.0))
     maps = [next(folder.glob(f"{city}/*/map.gpkg")) for city in ("us-ma-boston", "sg-one-north")]
-    return [cache_file(path) for path in maps], lambda i: kept_tables(maps[i])["lanes_polygons"].xy.tobytes()
+    return [cache_file(path) for path in maps], lambda i: cached_tables(maps[i])["lanes_polygons"].xy.tobytes()
 
 
 def log_tables(folder: Path) -> Kept:
     logs = [write_frames(folder, split, NAME, [frame(k) for k in range(n)]) for split, n in (("mini", 3), ("test", 4))]
-    load = lambda i: len(kept_table(logs[i], folder / "kept") or make_table(logs[i], folder / "kept"))  # noqa: E731
+    load = lambda i: len(cached_table(logs[i], folder / "kept") or read_and_cache_table(logs[i], folder / "kept"))  # noqa: E731
     found = []
     for i in range(2):
         load(i)

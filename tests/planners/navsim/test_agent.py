@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from planners.navsim import agent
-from planners.navsim.agent import LENGTH, RemotePlanner, receive, send, shown
-from planners.navsim.serve import FRONT, Pilot, seen_of
+from planners.navsim.agent import LENGTH, RemotePlanner, agent_input_arrays, receive, send
+from planners.navsim.serve import FRONT, AgentPlanner, observation_of
 from tests.planners.navsim.agent_inputs import agent_input
 from tests.planners.navsim.trained import made, saved
 
@@ -46,9 +46,9 @@ def test_a_process_of_its_own_plans_the_same_and_ends_with_its_owner(tmp_path: P
     folder, given = saved(made("ltf_small"), tmp_path), agent_input(FRONT)
     remote = RemotePlanner(folder, sys.executable)
     assert remote.cameras == FRONT
-    here = Pilot(folder)
+    here = AgentPlanner(folder)
     for n_poses in (8, 40):
-        expected = here.plan(seen_of(shown(given, FRONT), FRONT), n_poses)
+        expected = here.plan(observation_of(agent_input_arrays(given, FRONT), FRONT), n_poses)
         plan = remote.plan(given, n_poses)
         np.testing.assert_allclose(plan, expected, atol=1e-5)  # it has other threads than this process
         assert plan.shape == (n_poses, 3) and plan.dtype == np.float32

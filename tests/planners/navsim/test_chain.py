@@ -25,8 +25,8 @@ from factory.run import main as run
 from factory.stages.sensors import decode_image, encode_jpeg
 from factory.store.reader import SampleTable, decode_stored_image
 from planners.evaluation.planning import plan_samples
-from planners.navsim.agent import RemotePlanner, shown
-from planners.navsim.serve import FRONT, Pilot, seen_of
+from planners.navsim.agent import RemotePlanner, agent_input_arrays
+from planners.navsim.serve import FRONT, AgentPlanner, observation_of
 from planners.training.checkpoint import load_planner, newest_checkpoint
 from planners.training.train import main as train
 from tasks.trajectories import score_trajectories
@@ -228,8 +228,8 @@ def test_a_planner_of_one_step_drives_as_an_agent_in_the_exported_logs_and_is_sc
     remote.close()
     for row, of_row in zip(rows, expected):  # pictures are other JPEGs, decoded smaller
         np.testing.assert_allclose(plans[row["expert"], row["round"]], of_row, atol=0.3)
-    still = Pilot("constant_velocity")
-    steady = still.plan(seen_of(shown(agent_input(scenes["human", 0]), ()), ()), 8)
+    still = AgentPlanner("constant_velocity")
+    steady = still.plan(observation_of(agent_input_arrays(agent_input(scenes["human", 0]), ()), ()), 8)
     speed = rows[0]["ego_status"][0]
     straight = np.array([[0.5 * speed * k, 0.0, 0.0] for k in range(1, 9)])
     np.testing.assert_allclose(steady, straight, atol=0.1)

@@ -13,9 +13,9 @@ from factory.datasets.navsim.reader import read_selection
 from factory.exits import BAD_CONFIG, COMPLETE
 from factory.readers.pickles import Record, load_records
 from planners.__main__ import main as planners
-from planners.navsim.agent import shown
-from planners.navsim.serve import FRONT, Pilot, seen_of
-from planners.navsim.submit import scenes_of, submission_bytes
+from planners.navsim.agent import agent_input_arrays
+from planners.navsim.serve import FRONT, AgentPlanner, observation_of
+from planners.navsim.submit import split_scenes, submission_bytes
 from tests.factory.datasets.navsim import scene_pickles
 from tests.factory.datasets.navsim.openscene_writer import write_frames
 from tests.planners.navsim import agent_inputs
@@ -109,11 +109,14 @@ def test_constant_velocity_is_the_public_agent_s_closed_form_in_both_stages(file
 
 def test_what_is_seen_of_a_scene_is_what_the_agent_is_shown(files: Path) -> None:
     folders = files / "navsim_logs/test", files / "sensor_blobs/test", files / "navhard_two_stage"
-    scenes = scenes_of(read_selection(str(files / "split.yaml")), *folders)
+    scenes = split_scenes(read_selection(str(files / "split.yaml")), *folders)
     found = {scene.token: scene for scene in (*scenes.first_stage(), *filter(None, scenes.second_stage()))}
     frames = log_frames()
     for token, k in (*((frames[k]["token"], k) for k in STAGE_ONE), *zip(TOKENS, STAGE_TWO)):
-        seen, wanted = found[token].sighting(FRONT), seen_of(shown(agent_input(frames, k), FRONT), FRONT)
+        seen, wanted = (
+            found[token].observation(FRONT),
+            observation_of(agent_input_arrays(agent_input(frames, k), FRONT), FRONT),
+        )
         np.testing.assert_allclose(seen.history, wanted.history, atol=2e-7)
         np.testing.assert_array_equal(seen.status, wanted.status)
         for view, other in zip(seen.views, wanted.views, strict=True):
@@ -129,9 +132,9 @@ def test_a_trained_planner_s_plans_are_those_it_makes_as_an_agent(files: Path) -
     folder = saved(made("ltf_small"), files / "training")
     assert submit(files, folder, f"sensors={files / 'sensor_blobs/test'}") == COMPLETE
     first, second = stages_of(files / "submission.pkl")
-    frames, pilot = log_frames(), Pilot(folder)
+    frames, pilot = log_frames(), AgentPlanner(folder)
     for token, k in (*((frames[k]["token"], k) for k in STAGE_ONE), *zip(TOKENS, STAGE_TWO)):
-        given = seen_of(shown(agent_input(frames, k), FRONT), FRONT)
+        given = observation_of(agent_input_arrays(agent_input(frames, k), FRONT), FRONT)
         np.testing.assert_allclose((first | second)[token], pilot.plan(given, 8), atol=2e-6, err_msg=token)
     plans = [*first.values(), *second.values()]
     assert all(np.abs(one - other).max() > 1e-3 for i, one in enumerate(plans) for other in plans[:i])

@@ -21,7 +21,7 @@ from torch import Tensor
 from factory.config.compose import ConfigError
 from factory.exits import Stopped
 from planners.data.batch import Batch
-from planners.published.import_planner import imported
+from planners.published.import_planner import import_weights
 from planners.training.fit import LOSSES, Loop, fit, step_seed
 from planners.training.optim import FACTOR, TrainingSettings, build_optimiser
 from planners.training.processes import TrainingProcess
@@ -128,7 +128,7 @@ def learned(lesson: Lesson, names: Mapping[str, list[int]], first: int, out: Pat
     planner_like = preset(lesson.case, lesson.picture)
     mode: AbstractContextManager[Any] = Doubled() if lesson.double else nullcontext()
     with mode:
-        found = imported(planner_like, formula_weights(names, given, first_weight), f"the public {lesson.case}")
+        found = import_weights(planner_like, formula_weights(names, given, first_weight), f"the public {lesson.case}")
         batches = _Batches(lesson, first)
         if lesson.double:
             found.planner.double()

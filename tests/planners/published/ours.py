@@ -16,7 +16,7 @@ from planners.models.diffusiondrive import DiffusionDrive, EncodedScene
 from planners.models.gtrs_dense import IMITATION, WEIGHTINGS, GtrsDense, weighted_total
 from planners.models.ltf import Ltf
 from planners.models.planner import Planner, PlannerChoice, evaluating
-from planners.published.import_planner import SCORES, Imported, imported
+from planners.published.import_planner import SCORES, ImportedPlanner, import_weights
 from planners.training.train import PlannerEntry
 from tasks.world.arrays import Array
 from tests.planners.published.formula import CELLS, FROZEN, SEED, inputs, weight
@@ -87,11 +87,11 @@ def preset(case: str, picture: tuple[int, int], *changed: str) -> PlannerChoice:
     return PlannerChoice(entry.name, entry.settings)
 
 
-def planner_of(recorded: PublicRecord, public: Mapping[str, Tensor] | None = None) -> Imported:
+def planner_of(recorded: PublicRecord, public: Mapping[str, Tensor] | None = None) -> ImportedPlanner:
     """Our planner with the weights of a recorded model; public: those of a file, else the formula's."""
     if public is None:
         public = formula_weights(recorded.names, inputs(*recorded.picture))
-    return imported(preset(recorded.case, recorded.picture), public, f"the recorded {recorded.case}")
+    return import_weights(preset(recorded.case, recorded.picture), public, f"the recorded {recorded.case}")
 
 
 def batch_of(arrays: Mapping[str, Any]) -> Batch:
@@ -148,7 +148,7 @@ def _scored(planner: GtrsDense, batch: Batch) -> dict[str, Tensor]:
     return {"trajectory": planner.plan(batch), "imi": logits[IMITATION], "scores": scores, **named}
 
 
-def trained(found: Imported, batch: Batch) -> tuple[dict[str, float], dict[tuple[str, ...], float]]:
+def trained(found: ImportedPlanner, batch: Batch) -> tuple[dict[str, float], dict[tuple[str, ...], float]]:
     """The loss and its terms by public names, and norms of gradients by the public matrices that they belong to."""
     torch.manual_seed(SEED)
     losses, norms = _stepped_back(found, batch)
@@ -169,12 +169,12 @@ def without_dropout(planner: Planner) -> Planner:
     return planner
 
 
-def gradient_norms(found: Imported, batch: Batch) -> dict[tuple[str, ...], float]:
+def gradient_norms(found: ImportedPlanner, batch: Batch) -> dict[tuple[str, ...], float]:
     """Norms of gradients by the public matrices that they belong to; the gradients stay."""
     return _stepped_back(found, batch)[1]
 
 
-def _stepped_back(found: Imported, batch: Batch) -> tuple[dict[str, float], dict[tuple[str, ...], float]]:
+def _stepped_back(found: ImportedPlanner, batch: Batch) -> tuple[dict[str, float], dict[tuple[str, ...], float]]:
     planner = without_dropout(found.planner).train()
     losses = planner.losses(batch)
     torch.stack(list(losses.values())).sum().backward()
@@ -202,7 +202,7 @@ class Difference:
         return self.largest <= tolerance * self.rounding
 
 
-def differences(recorded: PublicRecord, found: Imported) -> list[Difference]:
+def differences(recorded: PublicRecord, found: ImportedPlanner) -> list[Difference]:
     """Everything recorded against ours. Raises ConfigError where one side has what the other lacks."""
     batch, theirs = batch_of(inputs(*recorded.picture)), recorded.results
     rows = []
@@ -215,7 +215,7 @@ def differences(recorded: PublicRecord, found: Imported) -> list[Difference]:
     return rows + (_differences_in_training(recorded, found, batch) if recorded.gradients else [])
 
 
-def _differences_in_training(recorded: PublicRecord, found: Imported, batch: Batch) -> list[Difference]:
+def _differences_in_training(recorded: PublicRecord, found: ImportedPlanner, batch: Batch) -> list[Difference]:
     rows, theirs = [], recorded.results
     losses, gradients = trained(found, batch)
     for name, value in losses.items():

@@ -15,7 +15,7 @@ from torch import Tensor
 from factory.config.compose import ConfigError
 from planners.data.batch import BevLayout
 from planners.models.planner import PlannerChoice
-from planners.published.import_planner import imported
+from planners.published.import_planner import import_weights
 from tests.planners.published.formula import FROZEN, inputs
 from tests.planners.published.ours import (
     CASES,
@@ -95,7 +95,7 @@ def test_without_what_the_public_code_does_plans_are_others(case: str, changed: 
 def test_every_number_of_the_public_model_is_ours_or_named(case: str) -> None:
     one = recorded(case)
     with torch.device("meta"):
-        found = imported(preset(case, one.picture), on_meta(one), case)
+        found = import_weights(preset(case, one.picture), on_meta(one), case)
     moved = {name for names in found.came_from.values() for name in names}
     assert moved | set(found.aside) == set(one.names) and not moved & set(found.aside)
     ours = sum(parameter.numel() for parameter in found.planner.parameters())
@@ -126,7 +126,7 @@ def test_a_weight_too_few_or_too_many_or_of_another_shape_is_refused_by_name(cas
         (other, r"is \(3, 3\), not \("),
     ):
         with torch.device("meta"), pytest.raises(ConfigError, match=said):
-            imported(choice, changed, "it")
+            import_weights(choice, changed, "it")
 
 
 def test_another_planner_s_checkpoint_is_told_by_its_weights() -> None:
@@ -135,9 +135,9 @@ def test_another_planner_s_checkpoint_is_told_by_its_weights() -> None:
     for case, asked in wrong.items():
         one = recorded(case)
         with torch.device("meta"), pytest.raises(ConfigError, match=f"its weights look like planner={case}_public$"):
-            imported(preset(asked, one.picture), on_meta(one), "it")
+            import_weights(preset(asked, one.picture), on_meta(one), "it")
 
 
 def test_planners_without_public_checkpoints_are_refused() -> None:
     with pytest.raises(ConfigError, match="only ltf, diffusiondrive, gtrs_dense have public checkpoints"):
-        imported(PlannerChoice("ego_mlp"), {}, "it")
+        import_weights(PlannerChoice("ego_mlp"), {}, "it")

@@ -12,7 +12,7 @@ from torch import nn
 from factory.config.compose import ConfigError
 from planners.models.diffusiondrive import sinusoids
 from planners.models.layers import Decoder
-from planners.published.import_planner import Moves, _points_reordered, model_weights, read_public
+from planners.published.import_planner import WeightMoves, _points_reordered, read_public_weights, unwrapped_weights
 
 
 def lightning(path: Path, **more: Any) -> Path:
@@ -26,7 +26,7 @@ def lightning(path: Path, **more: Any) -> Path:
 
 
 def test_a_lightning_checkpoint_gives_the_model_s_own_names(tmp_path: Path) -> None:
-    assert set(read_public(lightning(tmp_path / "a.ckpt"))) == {"_status_encoding.weight", "a.bias"}
+    assert set(read_public_weights(lightning(tmp_path / "a.ckpt"))) == {"_status_encoding.weight", "a.bias"}
 
 
 def test_nothing_of_a_file_runs(tmp_path: Path) -> None:
@@ -36,17 +36,17 @@ def test_nothing_of_a_file_runs(tmp_path: Path) -> None:
 
     path = lightning(tmp_path / "a.ckpt", hyper_parameters=Code())
     with pytest.raises(ConfigError, match="cannot be read as a checkpoint of tensors and plain values"):
-        read_public(path)
+        read_public_weights(path)
     assert not (tmp_path / "ran").exists()
 
 
 def test_what_is_no_checkpoint_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "a.ckpt").write_bytes(b"not a file of torch's")
     with pytest.raises(ConfigError, match="cannot be read") as caught:
-        read_public(tmp_path / "a.ckpt")
+        read_public_weights(tmp_path / "a.ckpt")
     assert "\n" not in str(caught.value)
     with pytest.raises(ConfigError, match="No such file"):
-        read_public(tmp_path / "absent.ckpt")
+        read_public_weights(tmp_path / "absent.ckpt")
     for content, said in (
         ({"state_dict": {"a": 1}}, "holds no state_dict of tensors"),
         ([1], "holds no state_dict of tensors"),
@@ -57,7 +57,7 @@ def test_what_is_no_checkpoint_is_refused_in_one_line(tmp_path: Path) -> None:
         ),
     ):
         with pytest.raises(ConfigError, match=said):
-            model_weights(content, "it")
+            unwrapped_weights(content, "it")
 
 
 def test_a_decoder_of_torch_s_layers_moves_to_ours() -> None:
@@ -65,26 +65,29 @@ def test_a_decoder_of_torch_s_layers_moves_to_ours() -> None:
     theirs = nn.TransformerDecoder(nn.TransformerDecoderLayer(16, 2, 32, 0.0, batch_first=True), 2)
     for parameter in theirs.parameters():
         nn.init.normal_(parameter, std=0.3)
-    moves, ours = Moves({f"it.{name}": value for name, value in theirs.state_dict().items()}), Decoder(16, 2, 32, 2)
-    moves.decoder("it", "here")
-    moves.done()
+    moves, ours = (
+        WeightMoves({f"it.{name}": value for name, value in theirs.state_dict().items()}),
+        Decoder(16, 2, 32, 2),
+    )
+    moves.move_decoder("it", "here")
+    moves.check_complete()
     ours.load_state_dict({name.removeprefix("here."): value for name, value in moves.ours.items()})
     queries, memory = torch.randn(3, 5, 16), torch.randn(3, 7, 16)
     torch.testing.assert_close(ours(queries, memory), theirs(queries, memory), rtol=1e-5, atol=1e-5)
 
 
 def test_what_nobody_moved_is_named_and_what_is_left_is_kept_apart() -> None:
-    moves = Moves({"a.x": torch.ones(1), "b": torch.ones(2), "c": torch.ones(3)}, "it")
-    moves.leave("a.")
-    moves.one("b", "ours.b", lambda x: 2 * x)
+    moves = WeightMoves({"a.x": torch.ones(1), "b": torch.ones(2), "c": torch.ones(3)}, "it")
+    moves.set_aside("a.")
+    moves.move("b", "ours.b", lambda x: 2 * x)
     with pytest.raises(ConfigError, match=r"^it holds c, of which"):
-        moves.done()
+        moves.check_complete()
     with pytest.raises(ConfigError, match=r"^it lacks b:"):
-        moves.one("b", "twice")
+        moves.move("b", "twice")
     with pytest.raises(ConfigError, match=r"^it lacks a\.\.\.\.:"):
-        moves.leave("a.")
-    assert torch.equal(moves.kept("c"), torch.ones(3)) and set(moves.aside) == {"a.x", "c"}
-    moves.done()
+        moves.set_aside("a.")
+    assert torch.equal(moves.take_frozen("c"), torch.ones(3)) and set(moves.aside) == {"a.x", "c"}
+    moves.check_complete()
     assert moves.came_from == {"ours.b": ("b",)} and moves.ours["ours.b"].tolist() == [2.0, 2.0]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from factory.datasets.navsim.log import CAMERA_NAMES, frame_of, frames_of, read_frames
+from factory.datasets.navsim.log import CAMERA_NAMES, parse_frame, parse_frames, read_frames
 from factory.readers.base import BadClip
 from tasks.world.clip import AgentKind
 from tests.factory.datasets.navsim.logs import NAME, SPEED_MPS, frame
@@ -38,8 +38,8 @@ def test_a_frame_holds_what_its_keys_say(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("key", ["frame_idx", "occ_gt_final_path", "log_token", "vehicle_name"])
 def test_keys_that_navsim_does_not_read_are_not_looked_at(key: str) -> None:
-    plain = frame_of(frame(0), "f", "")
-    assert frame_of(frame(0, **{key: object()}), "f", "").token == plain.token
+    plain = parse_frame(frame(0), "f", "")
+    assert parse_frame(frame(0, **{key: object()}), "f", "").token == plain.token
 
 
 def test_other_spellings_of_the_same_values_are_read(tmp_path: Path) -> None:
@@ -69,20 +69,20 @@ def test_other_spellings_of_the_same_values_are_read(tmp_path: Path) -> None:
 def test_a_test_set_s_log_has_no_boxes() -> None:
     without = frame(0)
     del without["anns"]
-    assert frame_of(without, "f", "").boxes is None
+    assert parse_frame(without, "f", "").boxes is None
 
 
 def test_the_heading_is_the_public_reader_s() -> None:
     """pyquaternion's yaw_pitch_roll: R = Rx(roll) Ry(pitch) Rz(yaw)."""
     x, y, z, w = Rotation.from_euler("XYZ", [0.03, -0.05, 2.1]).as_quat()
-    read = frame_of(frame(0, ego2global_rotation=[w, x, y, z]), "f", "")
+    read = parse_frame(frame(0, ego2global_rotation=[w, x, y, z]), "f", "")
     assert read.pose[2] == pytest.approx(2.1, abs=1e-12)
     ground = np.arctan2(*read.world_from_ego[[1, 0], 0])
     assert abs(ground - 2.1) > 5e-4
 
 
 def test_velocities_are_rounded_as_the_public_reader_rounds_them() -> None:
-    read = frame_of(frame(0, ego_dynamic_state=[0.1, 0.2, 0.3, 0.4]), "f", "")
+    read = parse_frame(frame(0, ego_dynamic_state=[0.1, 0.2, 0.3, 0.4]), "f", "")
     assert read.dynamic_state.tolist() == [float(np.float32(v)) for v in (0.1, 0.2, 0.3, 0.4)]
 
 
@@ -139,7 +139,7 @@ def test_a_missing_key_is_named(key: str) -> None:
     item = frame(0)
     del item[key]
     with pytest.raises(BadClip) as refused:
-        frames_of([item], Path(f"{NAME}.pkl"))
+        parse_frames([item], Path(f"{NAME}.pkl"))
     assert refused.value.field == f"frames[0].{key}" and refused.value.problem == "missing"
 
 
@@ -164,6 +164,6 @@ def test_what_is_no_log_is_refused(tmp_path: Path, damage: Callable[[bytes], byt
 def test_a_token_or_a_place_that_changes_within_a_log_is_refused() -> None:
     path = Path(f"{NAME}.pkl")
     with pytest.raises(BadClip, match=r"token: .* stands twice"):
-        frames_of([frame(0), frame(1, token=frame(0)["token"])], path)
+        parse_frames([frame(0), frame(1, token=frame(0)["token"])], path)
     with pytest.raises(BadClip, match="map_location: changes"):
-        frames_of([frame(0), frame(1, map_location="sg-one-north")], path)
+        parse_frames([frame(0), frame(1, map_location="sg-one-north")], path)

@@ -19,10 +19,10 @@ from factory.datasets.navsim.frames import (
     ExportSettings,
     connector_number,
     derivatives,
-    in_space,
-    log_frames,
+    openscene_frames,
+    poses_in_space,
     sample_names,
-    shown,
+    sample_pictures,
 )
 from factory.datasets.navsim.pickles import dumps
 from tasks.world.frames import to_local, to_world
@@ -39,7 +39,7 @@ def frames_of(expert: str, **columns: Any) -> tuple[Any, Frames]:
     """A row, and its log as read back."""
     row = exported(1, expert, **columns)
     names = sample_names(row)
-    return row, pickle.loads(dumps(log_frames(row, names, shown(row, names, ANY).cams, ANY)))
+    return row, pickle.loads(dumps(openscene_frames(row, names, sample_pictures(row, names, ANY).cams, ANY)))
 
 
 def yaw_of(wxyz: Any) -> float:
@@ -199,7 +199,7 @@ def test_on_any_slope_the_public_code_reads_the_heading_and_the_road_s_normal_st
     cp, sp, cr, sr = np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll)
     known = np.eye(4)
     known[:3, :3] = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]) @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    matrices, quaternions = in_space(np.array([[5.0, -2.0, heading]]), known[None])
+    matrices, quaternions = poses_in_space(np.array([[5.0, -2.0, heading]]), known[None])
     assert yaw_of(quaternions[0]) == pytest.approx(heading, abs=1e-12)
     np.testing.assert_allclose(matrices[0, :3, 2], known[:3, 2], atol=1e-12)
     w, *v = quaternions[0]
@@ -262,8 +262,8 @@ def test_a_place_that_the_public_code_does_not_know_is_refused_until_it_is_named
     row = exported(0, "human", map_location="PIT_city_47896")
     names = sample_names(row)
     with pytest.raises(CannotExport, match=r"its map is of PIT_city_47896.*give map_location="):
-        log_frames(row, names, ({},) * 12, ANY)
-    named = log_frames(row, names, ({},) * 12, ExportSettings(map_location="us-ma-boston"))
+        openscene_frames(row, names, ({},) * 12, ANY)
+    named = openscene_frames(row, names, ({},) * 12, ExportSettings(map_location="us-ma-boston"))
     assert {frame["map_location"] for frame in named} == {"us-ma-boston"}
     with pytest.raises(ValueError, match="map_location=town"):
         ExportSettings(map_location="town")

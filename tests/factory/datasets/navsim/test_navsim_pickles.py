@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.datasets.navsim.frames import hex16, source_log
-from factory.datasets.navsim.pickles import dumps, write_dict
+from factory.datasets.navsim.frames import hex16, source_log_name
+from factory.datasets.navsim.pickles import dumps, write_pickled_dict
 
 
 @pytest.mark.parametrize(
@@ -20,8 +20,8 @@ from factory.datasets.navsim.pickles import dumps, write_dict
     ],
 )
 def test_a_source_log_s_name_has_one_dash(log_id: str, name: str) -> None:
-    assert source_log("av2", log_id) == name.format(hex16("av2", log_id)[:8])
-    assert source_log("av2", log_id).count("-") == 1
+    assert source_log_name("av2", log_id) == name.format(hex16("av2", log_id)[:8])
+    assert source_log_name("av2", log_id).count("-") == 1
 
 
 def test_a_dictionary_of_any_size_is_pickled_entry_by_entry(tmp_path: Path) -> None:
@@ -31,7 +31,7 @@ def test_a_dictionary_of_any_size_is_pickled_entry_by_entry(tmp_path: Path) -> N
     second = {"c": shared, "a2": {"x": np.float16([1, 2])}}
     for name, entries, after in (("1", first, None), ("2", second, tmp_path / "1")):
         with (tmp_path / name).open("w+b") as file:
-            write_dict(file, entries.items(), after)
+            write_pickled_dict(file, entries.items(), after)
     np.testing.assert_equal(pickle.loads((tmp_path / "1").read_bytes()), first)
     np.testing.assert_equal(pickle.loads((tmp_path / "2").read_bytes()), first | second)
     assert list(pickle.loads((tmp_path / "2").read_bytes())) == ["a", "b", "c", "a2"]

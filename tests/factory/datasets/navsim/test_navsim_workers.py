@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from factory.commands.table import COMMANDS
-from factory.datasets.navsim.export import RowGroup, write_group
+from factory.datasets.navsim.export import RowGroup, write_row_group
 from factory.datasets.navsim.frames import CannotExport, ExportSettings
 from factory.store.samples import Store
 from tests.factory.datasets.navsim.navsim_samples import exported, quiet, tree
@@ -96,4 +96,4 @@ def test_a_worker_that_does_not_see_the_run_says_so(street_run: Path, tmp_path: 
     elsewhere = replace(Store(street_run).samples.location, uri=str(tmp_path / "not_mounted"))
     group = RowGroup("round=0/part.parquet", {}, 0, (0,))
     with pytest.raises(CannotExport, match=r"not_mounted/round=0/part.parquet: not there for .*: every worker"):
-        write_group(elsewhere, tmp_path, ExportSettings(), group)
+        write_row_group(elsewhere, tmp_path, ExportSettings(), group)

@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 from factory.datasets.av2.reader import read_map
-from factory.datasets.navsim.maps import City, cache_file, kept_tables, open_city
+from factory.datasets.navsim.maps import City, cache_file, cached_tables, open_city
 from factory.datasets.town.town import _vector_map, plan_log
 from factory.readers.base import BadClip
 from tasks.world.road_map import MapLayer, RoadMap
@@ -107,7 +107,7 @@ def test_a_road_map_holds_what_lies_within_the_radius_of_any_point(root: Path) -
 
 def test_kept_tables_are_the_file_s_and_damage_is_mended(root: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = next((root / CITY).glob("*/map.gpkg"))
-    fresh, kept = kept_tables(path), kept_tables(path)
+    fresh, kept = cached_tables(path), cached_tables(path)
     assert not caplog.records
     for layer, table in fresh.items():
         np.testing.assert_array_equal(table.fid, kept[layer].fid)
@@ -117,7 +117,7 @@ def test_kept_tables_are_the_file_s_and_damage_is_mended(root: Path, caplog: pyt
     file = cache_file(path)
     whole_bytes = file.read_bytes()
     file.write_bytes(whole_bytes[: len(whole_bytes) // 2])
-    assert kept_tables(path).keys() == fresh.keys()
+    assert cached_tables(path).keys() == fresh.keys()
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert len(file.read_bytes()) == len(whole_bytes)
 

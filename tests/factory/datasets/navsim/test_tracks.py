@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factory.datasets.navsim.log import Frame, frame_of
-from factory.datasets.navsim.window import ego_states, lights, stretch_agents, window_agents, world_from_ego
+from factory.datasets.navsim.log import Frame, parse_frame
+from factory.datasets.navsim.window import ego_states, stretch_agents, traffic_lights, window_agents, world_from_ego
 from tasks.world.clip import NOW, AgentKind, AgentTracks
 from tasks.world.road_map import LightState
 from tests.factory.datasets.navsim.logs import frame
@@ -25,7 +25,7 @@ def _frame(k: int, rows: dict[str, list[float]], kinds: dict[str, str], **other:
         "instance_tokens": list(rows),
         "track_tokens": list(rows),
     }
-    return frame_of(frame(k, anns=anns, **other), "f", "")
+    return parse_frame(frame(k, anns=anns, **other), "f", "")
 
 
 def _random_frames(seed: int) -> list[Frame]:
@@ -120,7 +120,7 @@ def test_a_stretch_shows_each_track_from_its_first_to_its_last_frame() -> None:
 
 
 def test_the_ego_is_linear_between_frames_in_pose_velocity_and_acceleration() -> None:
-    frames = [frame_of(frame(k, ego_dynamic_state=[8.0 + k, 0.5, 0.25 * k, 0.0]), "f", "") for k in range(20)]
+    frames = [parse_frame(frame(k, ego_dynamic_state=[8.0 + k, 0.5, 0.25 * k, 0.0]), "f", "") for k in range(20)]
     states, poses = ego_states(frames), world_from_ego(frames)
     at = np.arange(96) / 5
     assert np.allclose(states[:, 0], 331_000.0 + 4.0 * at, atol=1e-9) and (states[:, 1] == 4_690_000.0).all()
@@ -133,7 +133,7 @@ def test_an_ego_that_turns_through_pi_takes_the_short_way() -> None:
     frames = []
     for k, heading in enumerate((3.1, -3.1)):
         quaternion = [np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2)]
-        frames.append(frame_of(frame(k, ego2global_rotation=quaternion), "f", ""))
+        frames.append(parse_frame(frame(k, ego2global_rotation=quaternion), "f", ""))
     turned = ego_states(frames)[:, 2]
     assert (np.abs(turned) > 3.09).all() and turned[0] > 0 > turned[-1]
     forward = world_from_ego(frames)[:, :2, 0]
@@ -142,8 +142,8 @@ def test_an_ego_that_turns_through_pi_takes_the_short_way() -> None:
 
 def test_a_light_holds_until_the_next_frame_and_red_wins_where_it_is_named_twice() -> None:
     named = [[("21", False)], [("21", True), ("21", False), ("77", True)], []]
-    frames = [frame_of(frame(k, traffic_lights=lights_), "f", "") for k, lights_ in enumerate(named)]
-    read = lights(frames, ["21", "22"])
+    frames = [parse_frame(frame(k, traffic_lights=lights_), "f", "") for k, lights_ in enumerate(named)]
+    read = traffic_lights(frames, ["21", "22"])
     assert read.lane_ids == ("21",)
     green, red, unknown = LightState.GREEN, LightState.RED, LightState.UNKNOWN
     assert read.states[:, 0].tolist() == [green] * 5 + [red] * 5 + [unknown]

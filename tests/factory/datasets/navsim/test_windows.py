@@ -16,19 +16,19 @@ from factory.datasets.navsim.reader import (
     SHORT_FUTURE,
     SHORT_HISTORY,
     STANDING,
-    Choice,
     FrameTable,
     SceneFilter,
-    keep_table,
-    kept_table,
-    make_table,
-    usable,
+    WindowChoice,
+    cache_table,
+    cached_table,
+    read_and_cache_table,
+    usable_windows,
     wanted_windows,
 )
 from tests.factory.datasets.navsim.logs import NAME, frame
 from tests.factory.datasets.navsim.openscene_writer import write_frames
 
-EVERY = Choice(stride_frames=1, first_frame=0, min_top_speed_mps=0.5)
+EVERY = WindowChoice(stride_frames=1, first_frame=0, min_top_speed_mps=0.5)
 
 
 def table(n: int, **other: np.ndarray) -> FrameTable:
@@ -48,7 +48,7 @@ def table(n: int, **other: np.ndarray) -> FrameTable:
     )
 
 
-def scenes(**fields: object) -> Choice:
+def scenes(**fields: object) -> WindowChoice:
     return replace(EVERY, scene_filter=SceneFilter(frame_interval=1, **fields))  # type: ignore[arg-type]
 
 
@@ -78,10 +78,10 @@ def test_a_window_that_cannot_be_a_clip_is_counted_by_its_reason() -> None:
         annotated=np.arange(60) != 29,
         speeds=np.where(np.arange(60) < 28, 0.1, 8.0).astype(np.float32),
     )
-    kept, dropped = usable(frames, [2, 3, 6, 9, 12, 13, 30, 43, 44], EVERY)
+    kept, dropped = usable_windows(frames, [2, 3, 6, 9, 12, 13, 30, 43, 44], EVERY)
     assert kept == [12, 43]
     assert dropped == {SHORT_HISTORY: 1, STANDING: 2, NO_ROUTE: 1, NO_BOXES: 1, GAP: 1, SHORT_FUTURE: 1}
-    kept, _ = usable(frames, [3], scenes())
+    kept, _ = usable_windows(frames, [3], scenes())
     assert kept == [3], "a filter's scene may stand"
 
 
@@ -95,19 +95,19 @@ def test_clips_are_named_by_milliseconds_that_go_on_by_500_and_jump_at_gaps() ->
 
 def test_a_log_s_table_is_kept_until_its_file_changes(tmp_path: Path) -> None:
     log = write_frames(tmp_path, "mini", NAME, [frame(k) for k in range(3)])
-    assert kept_table(log, tmp_path / "kept") is None
-    made = make_table(log, tmp_path / "kept")
-    kept = kept_table(log, tmp_path / "kept")
+    assert cached_table(log, tmp_path / "kept") is None
+    made = read_and_cache_table(log, tmp_path / "kept")
+    kept = cached_table(log, tmp_path / "kept")
     assert kept is not None
     for column, value in vars(made).items():
         assert (getattr(kept, column) == value).all()
     assert made.tokens.tolist() == [frame(k)["token"] for k in range(3)]
     (file,) = (tmp_path / "kept").iterdir()
     file.write_bytes(file.read_bytes()[:50])
-    assert kept_table(log, tmp_path / "kept") is None, "what is cut off is made again"
-    make_table(log, tmp_path / "kept")
+    assert cached_table(log, tmp_path / "kept") is None, "what is cut off is made again"
+    read_and_cache_table(log, tmp_path / "kept")
     write_frames(tmp_path, "mini", NAME, [frame(k) for k in range(4)])
-    assert kept_table(log, tmp_path / "kept") is None
+    assert cached_table(log, tmp_path / "kept") is None
 
 
 PLAN = """
@@ -137,7 +137,7 @@ def test_navtrain_s_token_list_plans_in_seconds(tmp_path: Path) -> None:
         name = f"2021.06.14.18.00.00_veh-51_{i:05d}_{i + 1:05d}"
         (tmp_path / "logs" / f"{name}.pkl").write_bytes(b"never opened")
         made = table(600, tokens=np.array([f"{i:06x}{k:010x}" for k in range(600)]))
-        keep_table(made, tmp_path / "logs" / f"{name}.pkl", tmp_path / "kept")
+        cache_table(made, tmp_path / "logs" / f"{name}.pkl", tmp_path / "kept")
         names.append(name)
         wanted += made.tokens[np.sort(rng.choice(np.arange(3, 580), 87 if i < 776 else 86, replace=False))].tolist()
     assert len(wanted) == 103_288
