@@ -159,14 +159,11 @@ class ConvertedSet:
     own_centerlines: bool = True  # else 123D made them from the boundaries, as we do
 
 
-AV2 = "CC BY-NC-SA 4.0 (Argoverse 2 via 123D)"
-WAYMO = "Waymo Open Dataset licence, non-commercial (via 123D)"
 SOURCES = {  # by the data set's name in a log's metadata
-    "av2-sensor": ConvertedSet(AV2, own_centerlines=False),
+    "av2-sensor": ConvertedSet("CC BY-NC-SA 4.0 (Argoverse 2 via 123D)", own_centerlines=False),
     "nuplan": ConvertedSet("CC BY-NC-SA 4.0 (nuPlan via 123D)", own_roadblocks=True, own_intersections=True),
     "nuscenes": ConvertedSet("CC BY-NC-SA 4.0 (nuScenes via 123D)", own_intersections=True),
-    "wod-perception": ConvertedSet(WAYMO),
-    "wod-motion": ConvertedSet(WAYMO),
+    "wod-perception": ConvertedSet("Waymo Open Dataset licence, non-commercial (via 123D)"),
 }
 
 _CAR, _WALKER, _BICYCLE, _THING = AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.BICYCLE, AgentKind.GENERIC_OBJECT
@@ -191,5 +188,4 @@ KINDS_OF_LABELS: dict[str, tuple[AgentKind, ...]] = {
         *(_THING,) * 4,  # pushable, debris, bicycle rack, animal
     ),
     "WODPerceptionBoxDetectionLabel": (_THING, _CAR, _WALKER, AgentKind.CZONE_SIGN, _BICYCLE),
-    "WODMotionBoxDetectionLabel": (_THING, _CAR, _WALKER, _BICYCLE, _THING),
 }

@@ -232,12 +232,12 @@ def _filled_s(boxes: ArrowFile, frames_s: Array) -> float:
     return 0.0 if usual_s <= DENSE_S else FILLED_SPACINGS * usual_s
 
 
-# Cameras of a log of 123D, and where its photos and sweeps lie.
+# Cameras of a log of 123D, and where its photos lie.
 #
 # 123D keeps photos by their path under the data set's own sensor root, or packed into its tables. Only files are
-# taken: photos where `sensor_root` says where they are, sweeps where they are Argoverse 2's feathers.
+# taken, where `sensor_root` says where they are.
 
-CAMERAS, LIDAR, SWEEP_SUFFIX = "camera.*.arrow", "lidar.lidar_merged.arrow", ".feather"
+CAMERAS = "camera.*.arrow"
 
 
 def read_rig(folder: Path) -> dict[Path, Camera]:
@@ -245,11 +245,8 @@ def read_rig(folder: Path) -> dict[Path, Camera]:
     mount = open_file(folder / EGO, rows=False).vector("rear_axle_to_imu_se3", 7)
     rear_from_imu = np.linalg.inv(pose_matrices(folder / EGO, mount[None])[0])
     files = {path: open_file(path, rows=False) for path in matching(folder, CAMERAS)}
-    return {
-        path: _camera(file, rear_from_imu)
-        for path, file in files.items()
-        if file.value("camera_model", str) == "pinhole"
-    }
+    pinholes = {path: file for path, file in files.items() if file.value("camera_model", str) == "pinhole"}
+    return {path: _camera(file, rear_from_imu) for path, file in pinholes.items()}
 
 
 def has_photos(folder: Path) -> bool:
@@ -258,27 +255,23 @@ def has_photos(folder: Path) -> bool:
 
 
 def recorded_photos(motion: LogMotion, rig: dict[Path, Camera], sensor_root: Path) -> tuple[SensorFile, ...]:
-    """The log's photos, seconds since its first annotated frame, posed as their tables say. Raises BadClip."""
+    """The log's photos, seconds since its first annotated frame, posed as their tables say.
+
+    Raises BadClip, also for a path that leads out of the root.
+    """
     out: list[SensorFile] = []
     for path, camera in rig.items():
         file = open_file(path)
-        if pa.types.is_string(_data_type(file)) and file.table.num_rows:
-            times_s = seconds_since(motion.start_ns, file.stamps_ns())
-            out += _files(file, camera.name, sensor_root, times_s, _poses(file, camera, motion, times_s))
+        if not pa.types.is_string(_data_type(file)) or not file.table.num_rows:
+            continue
+        names, times_s = file.column("data").to_pylist(), seconds_since(motion.start_ns, file.stamps_ns())
+        for name in names:
+            if Path(name).is_absolute() or ".." in Path(name).parts:
+                raise BadClip(str(path), "data", f"{shown(name)} is no path under the sensor root")
+        poses = _poses(file, camera, motion, times_s)
+        for i in np.argsort(times_s, kind="stable"):
+            out.append(SensorFile(camera.name, str(sensor_root / names[i]), float(times_s[i]), poses[i]))
     return tuple(out)
-
-
-def recorded_sweeps(motion: LogMotion, sensor_root: Path) -> tuple[SensorFile, ...]:
-    """The log's sweeps where they are Argoverse 2's files, seconds since its first annotated frame. Raises BadClip."""
-    path = motion.folder / LIDAR
-    if not path.exists():
-        return ()
-    file = open_file(path)
-    if not pa.types.is_string(_data_type(file)) or not file.table.num_rows:
-        return ()
-    times_s = seconds_since(motion.start_ns, file.stamps_ns())
-    sweeps = _files(file, "lidar", sensor_root, times_s, world_from_ego_at(motion, times_s))
-    return tuple(sweep for sweep in sweeps if sweep.uri.endswith(SWEEP_SUFFIX))
 
 
 def _camera(file: ArrowFile, rear_from_imu: Array) -> Camera:
@@ -314,27 +307,16 @@ def _poses(file: ArrowFile, camera: Camera, motion: LogMotion, times_s: Array) -
     return poses
 
 
-def _files(file: ArrowFile, sensor: str, root: Path, times_s: Array, poses: Array) -> list[SensorFile]:
-    """Files in time order. Raises BadClip for a path that leads out of the root."""
-    names = file.column("data").to_pylist()
-    for name in names:
-        if Path(name).is_absolute() or ".." in Path(name).parts:
-            raise BadClip(str(file.path), "data", f"{shown(name)} is no path under the sensor root")
-    order = np.argsort(times_s, kind="stable")
-    return [SensorFile(sensor, str(root / names[i]), float(times_s[i]), poses[i]) for i in order]
-
-
 SYNC, MAP = "sync.arrow", "map.arrow"
 
 
 @dataclass(frozen=True)
 class Py123dLog(WholeLog):
-    """One log, whole, with its rig and where its photos and sweeps lie; their times count from its first step."""
+    """One log, whole, with its rig and where its photos lie; their times count from its first step."""
 
     motion: LogMotion
     cameras: tuple[Camera, ...]
     images: tuple[SensorFile, ...]
-    sweeps: tuple[SensorFile, ...]
 
 
 class Py123dReader(LogReader[Py123dLog]):
@@ -352,7 +334,7 @@ class Py123dReader(LogReader[Py123dLog]):
         sensor_root: str | Path | None = Py123dClips.sensor_root,
         **windows: Any,
     ) -> None:
-        """maps_root: None: `maps` beside `logs`; sensor_root: of the data set itself, None: no photos and sweeps.
+        """maps_root: None: `maps` beside `logs`; sensor_root: of the data set itself, None: no photos.
 
         windows: as of LogReader. Raises ValueError.
         """
@@ -404,7 +386,6 @@ class Py123dReader(LogReader[Py123dLog]):
             lights=lights_at(motion, road_map, step_times(0, motion.n_steps)),
             cameras=tuple(rig.values()),
             images=recorded_photos(motion, rig, self.sensor_root) if self.sensor_root else (),
-            sweeps=recorded_sweeps(motion, self.sensor_root) if self.sensor_root else (),
             licence=source.licence,
             content_digest=content_digest(header, map_path),
             split=split if split in SPLITS else None,
@@ -438,11 +419,13 @@ class Py123dReader(LogReader[Py123dLog]):
         return f"{ref.log_id}@{first * STEP_S:g}s"
 
     def recorded(self, log: Py123dLog, start: int, stop: int) -> Recorded:
-        """Poses, rig, photos and sweeps of a window, and the block that it is rendered from."""
+        """Poses, rig and photos of a window, and the block that it is rendered from."""
         poses = world_from_ego_at(log.motion, step_times(start, stop))
         sensed = files_within(log.images, start, stop), files_within(log.sweeps, start, stop)
         block = block_of_log(log, log.images, log.sweeps, self.block_steps(start)) if log.images else None
         return Recorded(poses, log.cameras, *sensed, block)
+        if not log.images:
+            return Recorded(poses, log.cameras)
 
     def _map_file(self, header: ArrowFile) -> Path:
         """The log's map, in its folder or among the maps of its data set. Raises BadClip where it is not there."""

@@ -73,7 +73,6 @@ def convert(log: Path, root: Path, made: Made | None = None, objects: Sequence[M
     _write_motion(folder, log, made)
     _write_lights(folder, log)
     _write_cameras(folder, log)
-    _write_lidar(folder, log)
     told = made.map_metadata(log.name)
     header: dict[str, Any] = {
         "dataset": made.dataset,
@@ -299,20 +298,6 @@ def write_camera(
         f"{key}.exposure_factor": pa.nulls(n, pa.float32()),
     }
     write(folder / f"{key}.arrow", columns, told | changed)
-
-
-def _write_lidar(folder: Path, log: Path) -> None:
-    sweeps, key = sorted((log / "sensors" / "lidar").glob("*.feather")), "lidar.lidar_merged"
-    if not sweeps:
-        return
-    stamps = np.array([int(sweep.stem) // 1000 for sweep in sweeps])
-    columns = {
-        f"{key}.timestamp_us": pa.array(stamps),
-        f"{key}.end_timestamp_us": pa.array(stamps + 100_000),
-        f"{key}.data": pa.array([str(sweep.relative_to(log.parent.parent)) for sweep in sweeps], pa.string()),
-        f"{key}.kwargs": pa.nulls(len(sweeps), pa.string()),
-    }
-    write(folder / f"{key}.arrow", columns, {})
 
 
 def _columns(path: Path) -> dict[str, Any]:
