@@ -35,16 +35,14 @@ class Footers:
         self._footers: OrderedDict[str, pq.FileMetaData] = OrderedDict()
         self._lock = Lock()
 
-    def of(self, path: str) -> pq.FileMetaData | None:
-    def get(self, path: str) -> Footer | None:
+    def get(self, path: str) -> pq.FileMetaData | None:
         """The footer of a file; None where it must be read."""
         with self._lock:
             if path in self._footers:
                 self._footers.move_to_end(path)
             return self._footers.get(path)
 
-    def keep(self, path: str, footer: pq.FileMetaData) -> None:
-    def put(self, path: str, footer: Footer) -> None:
+    def put(self, path: str, footer: pq.FileMetaData) -> None:
         """Keep one footer more, and drop those that were not asked for the longest as far as need be."""
         with self._lock:
             if path not in self._footers:
@@ -108,8 +106,7 @@ def files_of(table: str | os.PathLike[str], storage_options: Mapping[str, str] |
     ]
 
 
-def leaves(file: pq.ParquetFile, columns: Sequence[str]) -> list[str]:
-def leaf_paths(file: StoredFile, columns: Sequence[str]) -> list[str]:
+def leaf_paths(file: pq.ParquetFile, columns: Sequence[str]) -> list[str]:
     """The paths of the leaves under columns and members (`label_2hz`, `images.jpeg`) of a file, for reading.
 
     Raises ValueError naming those it has not.

@@ -46,7 +46,6 @@ from planners.drive.work import (
     DrivingPlanner,
     FailedDrive,
     RowCommitter,
-    is_town_reader,
     open_drives,
 )
 from planners.evaluation.planner_names import find_planners
@@ -112,7 +111,6 @@ def _requested_drives(settings: DriveSettings) -> RequestedDrives:
     planners = _planners(settings)
     reader, index = open_reader(settings.clips)
     if any("truth" in kinds for _, kinds in planners) and painter_of(reader) is None:
-    if any("truth" in kinds for _, kinds in planners) and not is_town_reader(reader):
         raise ConfigError("pictures=truth is the painter's of the synthetic town: give pictures=engine for these clips")
     if any("engine" in kinds for _, kinds in planners):
         try:

@@ -205,7 +205,6 @@ class DriveWork:
         clip, n_steps = read_clip(self.reader, item.ref), self.settings.loop.clip_steps(last)
         painter = painter_of(self.reader)
         return extend_clip(clip, n_steps, None if painter is None else painter.lights(clip, n_steps))
-        return extend_clip(clip, n_steps, town_lights(clip, n_steps) if is_town_reader(self.reader) else None)
 
     def _starts(self, clip: Clip, wanted: set[int]) -> dict[int, DriveStart]:
         found = [logged_start(clip)] if LOGGED in wanted else []

@@ -19,8 +19,8 @@ from factory.config.compose import ConfigError
 from planners.data.batch import COMMANDS, Batch, ImageLayout, Needs
 from planners.data.decode import BatchBuffer, StoredRows
 from planners.data.images import chosen_cameras, stitch_pixels
-from planners.evaluation.planner_names import needs_of, planner_of
-from planners.evaluation.planning import check_plan, plans_for
+from planners.evaluation.planner_names import find_planner, needs_of
+from planners.evaluation.planning import check_plan, plan_batch
 from planners.navsim.agent import CAMERAS, HISTORY, receive, send
 from tasks.render.views import undistorted
 from tasks.trajectories import at_ten_hz
@@ -70,7 +70,7 @@ class AgentPlanner:
 
         Raises ConfigError for a planner that wants what NAVSIM shows no agent, and for cameras that it has not.
         """
-        who = planner_of(planner)
+        who = find_planner(planner)
         if who.load is None:
             raise ConfigError(f"planner={planner} plans from the log itself, which NAVSIM shows no agent")
         made = who.load()
@@ -88,7 +88,7 @@ class AgentPlanner:
     def plan(self, seen: AgentObservation, n_poses: int) -> Array:
         """(8 or 40, 3) float32 poses, 4 s. Raises ValueError where a plan is none, or the cameras look elsewhere."""
         batch = self.batch_of(seen).to(self._device)
-        plan = plans_for(self._made, batch)[0]
+        plan = plan_batch(self._made, batch)[0]
         check_plan(plan, "NAVSIM")
         if len(plan) != n_poses:
             plan = at_ten_hz(plan[None])[0] if n_poses == HORIZON_STEPS else plan[4::5]

@@ -109,8 +109,7 @@ def newest_checkpoint(path: Path) -> Path:
 def read_record(path: Path) -> dict[str, Any]:
     """What a checkpoint says of itself. Raises ConfigError."""
     try:
-        record = parse_json_with_checksum((newest(path) / RECORD).read_bytes())
-        record = unsealed_json((newest_checkpoint(path) / RECORD).read_bytes())
+        record = parse_json_with_checksum((newest_checkpoint(path) / RECORD).read_bytes())
         record["planner"]["name"], record["planner"]["settings"], record["step"], record[FILES]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{path}: its {RECORD} cannot be read ({error}): restore the checkpoint") from error

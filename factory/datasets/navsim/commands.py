@@ -17,9 +17,9 @@ from factory.config.words import ConfigError
 from factory.datasets.navsim.benchmarks import NavsimFolders, import_navhard, import_navtest
 from factory.datasets.navsim.export import Each, ExportSummary, export
 from factory.datasets.navsim.frames import ExportSettings
-from factory.datasets.navsim.import_rows import identity_of, import_rows
+from factory.datasets.navsim.import_rows import import_identity, import_rows
 from factory.datasets.navsim.reader import Selection, read_selection
-from factory.datasets.navsim.simscale import Import, Rewards, parts_of
+from factory.datasets.navsim.simscale import RewardFiles, SimscaleImport, simscale_folders
 from factory.exits import INTERRUPTED, Stopped
 from factory.files import matching, why_unusable
 from factory.graph.execute import RunSummary
@@ -34,10 +34,10 @@ from tasks.world.arrays import Array
 def import_simscale(request: Any, store: Store) -> tuple[RunSummary, str]:
     """The rows of released folders, or exported ones. Raises Refused."""
 
-    parts = parts_of(Path(request.root), request.only)
+    parts = simscale_folders(Path(request.root), request.only)
     rewards = None
     if request.rewards is not None and request.vocabulary is not None:
-        rewards = Rewards(Path(request.rewards), load_vocabulary(request.vocabulary))
+        rewards = RewardFiles(Path(request.rewards), load_vocabulary(request.vocabulary))
     settings = {
         "maps": request.maps is not None,
         "pictures": request.pictures,
@@ -46,8 +46,8 @@ def import_simscale(request: Any, store: Store) -> tuple[RunSummary, str]:
     maps = _folder(request.maps)
     if maps is not None and not maps.is_dir():
         raise Refused(f"maps={request.maps}: no such folder")
-    wanted = Import(maps, request.pictures, rewards)
-    return import_rows(store, identity_of(request.source, settings), wanted.entries(parts)), ""
+    wanted = SimscaleImport(maps, request.pictures, rewards)
+    return import_rows(store, import_identity(request.source, settings), wanted.entries(parts)), ""
 
 
 def import_two_stages(request: Any, store: Store) -> tuple[RunSummary, str]:

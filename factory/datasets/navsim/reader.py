@@ -327,8 +327,8 @@ def cached_table(path: Path, cache_dir: Path) -> FrameTable | None:
 def cached_or_read_table(path: Path) -> FrameTable:
     """The table of the log at `path`; one that was not kept is made in another process. Raises BadClip."""
     cache_dir = user_cache() / "navsim"
-    return kept_table(path, cache_dir) or OtherProcess(partial(make_table, cache_dir=cache_dir))(path, str(path))
-    return cached_table(path, cache_dir) or Apart(partial(read_and_cache_table, cache_dir=cache_dir))(path, str(path))
+    made_apart = OtherProcess(partial(read_and_cache_table, cache_dir=cache_dir))
+    return cached_table(path, cache_dir) or made_apart(path, str(path))
 
 
 def read_and_cache_table(path: Path, cache_dir: Path) -> FrameTable:
@@ -608,8 +608,7 @@ class NavsimReader:
     def _tables(self, logs: Mapping[str, Path]) -> Iterable[tuple[str, FrameTable | BadClip]]:
         """The table of each log, or what is wrong with it; what takes long is told on stderr."""
         began, made, told = time.monotonic(), 0, 0.0
-        made_apart = OtherProcess(partial(make_table, cache_dir=self.cache_dir))
-        made_apart = Apart(partial(read_and_cache_table, cache_dir=self.cache_dir))
+        made_apart = OtherProcess(partial(read_and_cache_table, cache_dir=self.cache_dir))
         for i, (log_id, path) in enumerate(logs.items(), start=1):
             try:
                 with failures_as_bad_clip(str(path)):

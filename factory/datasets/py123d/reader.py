@@ -421,11 +421,10 @@ class Py123dReader(LogReader[Py123dLog]):
     def recorded(self, log: Py123dLog, start: int, stop: int) -> Recorded:
         """Poses, rig and photos of a window, and the block that it is rendered from."""
         poses = world_from_ego_at(log.motion, step_times(start, stop))
-        sensed = files_within(log.images, start, stop), files_within(log.sweeps, start, stop)
-        block = block_of_log(log, log.images, log.sweeps, self.block_steps(start)) if log.images else None
-        return Recorded(poses, log.cameras, *sensed, block)
         if not log.images:
             return Recorded(poses, log.cameras)
+        block = block_of_log(log, log.images, (), self.block_steps(start))
+        return Recorded(poses, log.cameras, files_within(log.images, start, stop), (), block)
 
     def _map_file(self, header: ArrowFile) -> Path:
         """The log's map, in its folder or among the maps of its data set. Raises BadClip where it is not there."""

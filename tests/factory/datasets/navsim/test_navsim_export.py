@@ -207,8 +207,7 @@ def test_absent_pictures_are_refused_black_or_named(tmp_path: Path, columns: dic
 def test_a_rig_without_navsim_s_names_is_paired_by_direction() -> None:
     yaws = {"front": 0, "front_left": 60, "rear_left": 120, "rear": 180, "rear_right": -120, "front_right": -60}
     ring = [pinhole(name, yaw, 70.0) for name, yaw in yaws.items()]
-    paired = slots(ring)
-    paired = match_cameras(RIGS["ring_six"])
+    paired = match_cameras(ring)
     ours = {slot: camera.name for slot, camera in paired.items()}
     assert ours == {
         "CAM_F0": "front",
@@ -218,7 +217,7 @@ def test_a_rig_without_navsim_s_names_is_paired_by_direction() -> None:
         "CAM_R1": "rear_right",
         "CAM_B0": "rear",
     }
-    assert list(match_cameras(list(reversed(RIGS["ring_six"])))) == list(ours), "whatever their order"
+    assert list(match_cameras(list(reversed(ring)))) == list(ours), "whatever their order"
     assert match_cameras([]) == {}
 
 
