@@ -262,7 +262,7 @@ def _agent_faults(clip: Clip) -> Iterator[Fault]:
     if len(agents.kinds) != n:
         yield "agents.kinds", "not one kind per track"
     if strange := sorted({shown(kind) for kind in agents.kinds if not isinstance(kind, AgentKind)}):
-        yield "agents.kinds", f"{', '.join(strange)}: expected tasks.world.agents.AgentKind"
+        yield "agents.kinds", f"{', '.join(strange)}: expected tasks.world.clip.AgentKind"
     if len(set(agents.track_ids)) != n:
         yield "agents.track_ids", "a track id stands twice"
     for name in ("boxes", "velocities", "center_z"):
@@ -287,7 +287,7 @@ def _map_faults(road_map: RoadMap) -> Iterator[Fault]:
     for name in ("drivable_areas", "intersections"):
         for i, area in enumerate(getattr(road_map, name) or ()):
             if not isinstance(area.layer, MapLayer):
-                yield f"road_map.{name}[{i}].layer", f"{shown(area.layer)}: expected tasks.world.lanes.MapLayer"
+                yield f"road_map.{name}[{i}].layer", f"{shown(area.layer)}: expected tasks.world.road_map.MapLayer"
             for ring in (area.ring, *area.holes):
                 yield from _ring(f"road_map.{name}[{i}]", ring)
     for i, ring in enumerate(road_map.crossings):
@@ -298,7 +298,7 @@ def _map_faults(road_map: RoadMap) -> Iterator[Fault]:
 
 def _lane_faults(field: str, lane_id: str, lane: Any) -> Iterator[Fault]:
     if not isinstance(lane, Lane):
-        yield field, f"is a {type(lane).__name__}, expected tasks.world.lanes.Lane"
+        yield field, f"is a {type(lane).__name__}, expected tasks.world.road_map.Lane"
     if lane.lane_id != lane_id:
         yield field, f"its lane_id is {shown(lane.lane_id)}"
     yield from _ring(f"{field}.ring", lane.ring)
@@ -316,7 +316,7 @@ def _route_faults(clip: Clip) -> Iterator[Fault]:
         if unknown := sorted(set(getattr(route, name)) - set(clip.road_map.lanes)):
             yield f"route.{name}", f"not on the map: {_some(unknown)}"
     if without := sorted(set(route.lane_ids) - set(blocks)):
-        how = "fill it with tasks.world.route.roadblocks_of(lanes)"
+        how = "fill it with tasks.world.road_map.roadblocks_of(lanes)"
         yield "road_map.roadblock_of", f"has no roadblock of on-route {_some(without)}: {how}"
     if beside := sorted({blocks[lane_id] for lane_id in route.lane_ids} - set(route.roadblock_ids)):
         yield "route.roadblock_ids", f"lacks the roadblocks of on-route lanes: {_some(beside)}"
@@ -328,12 +328,12 @@ def _light_faults(clip: Clip) -> Iterator[Fault]:
         return
     yield from _shape("lights.states", lights.states, (CLIP_STEPS, len(lights.lane_ids)))
     if strange := sorted(set(np.unique(lights.states).tolist()) - {int(state) for state in LightState}):
-        yield "lights.states", f"{_some(strange)}: expected tasks.world.lanes.LightState"
+        yield "lights.states", f"{_some(strange)}: expected tasks.world.road_map.LightState"
 
 
 def _sensor_faults(clip: Clip) -> Iterator[Fault]:
     if any(not isinstance(camera, Camera) for camera in clip.cameras):
-        yield "cameras", "expected tasks.world.camera.Camera"
+        yield "cameras", "expected tasks.world.clip.Camera"
     names = [camera.name for camera in clip.cameras]
     if len(set(names)) != len(names):
         yield "cameras", "a name stands twice"

@@ -56,8 +56,7 @@ def make_validation(
 
     Raises ValueError where the tables are not what the planner needs.
     """
-    where = {name: getattr(data, name) for name in ("storage_options", "copy", "pictures", "pictures_gb")}
-    where = {name: getattr(data, name) for name in ("storage_options", "format", "pictures", "pictures_gb")}
+    where = {name: getattr(data, name) for name in ("storage_options", "pictures", "pictures_gb")}
     dataset = open_data(DataSettings(real=data.tables("val"), **where))
     needs = replace(planner.needs, labels=None)
     size = max(n for n in range(1, LARGEST_BATCH + 1) if len(dataset) % n == 0)  # no sample is left out

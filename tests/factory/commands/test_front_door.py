@@ -328,7 +328,7 @@ def test_completion_knows_those_of_planners_too() -> None:
     assert "clips.root=" in completions(["drive", "clips=av2"], "", "planners")
     assert "traffic@two_stage_traffic=idm" in completions(["evaluate"], "traffic@two_stage_traffic=", "planners")
     assert "planner=ltf" not in completions(["evaluate"], "planner=", "planners")
-    assert {"split=", "fine="} <= set(completions(["submit"], "", "planners"))
+    assert {"split=", "authors="} <= set(completions(["submit"], "", "planners"))
 
 
 @pytest.mark.parametrize(

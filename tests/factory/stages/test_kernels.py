@@ -108,7 +108,7 @@ print(sum(squared.stats.cache_hits.values()), sum(squared.stats.cache_misses.val
 
 def copy_with_one_kernel(folder: Path) -> Path:
     """The project's decorator and one kernel, as a job's upload would lie in a folder of its own."""
-    for name in ("__init__", "caches", "sealed", "kernels/__init__", "kernels/compiled"):
+    for name in ("__init__", "caches", "kernels/__init__", "kernels/compiled"):
         target = folder / "tasks" / f"{name}.py"
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(REPOSITORY / "tasks" / f"{name}.py", target)
