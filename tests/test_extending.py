@@ -59,7 +59,7 @@ def test_the_reader_and_the_expert_make_samples_of_a_map_of_one_s_own(made: Path
 
 def test_the_planner_trains_on_them(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own = "planner=custom planner.name=examples.linear_planner:LinearPlanner +planner.settings.history=true"
-    small = "planner.training.batch_size=2 steps=3 workers=0 device=cpu"
+    small = "planner.training.batch_size=2 steps=3 workers=1 device=cpu"
     data = [f"data.real=[{made / 'out'}]", f"data.sim=[{made / 'out'}]", f"out={made / 'linear'}"]
     assert train_main([*own.split(), *small.split(), *data]) == 0, capsys.readouterr().err
     assert type(load_planner(made / "linear")) is LinearPlanner  # as planners.evaluation.evaluate loads it

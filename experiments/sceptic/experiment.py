@@ -20,9 +20,9 @@ from planners.study.arms import (
     HeldAgainst,
     against_bounds,
     arm_differences,
+    comparison_tables,
     drive_arms,
     read_arm_drives,
-    text_of,
     write_arms,
 )
 from planners.study.setups import Comparison, Setup
@@ -205,4 +205,4 @@ def report_drives(settings: ExperimentSettings, arms: Sequence[Training], wanted
         first = next(iter(settings.parts))
         held = against_bounds(report, [one.setup for one in wanted if one.part == first], settings.seeds)
         write_arms(report, driven, found, held)
-        print(text_of(driven, found, held))
+        print(comparison_tables(driven, found, held))

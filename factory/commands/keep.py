@@ -210,9 +210,8 @@ def compact(request: FolderRequest) -> None:
     """`python -m factory compact out=<folder or URL>`: merge the small shards of a run into larger ones.
 
     Of each round and expert, files below 64 MB are merged into files of up to 128 MB, one transaction a table. No
-    sample changes: readers, trainings and their order are the same before and after. MCAP shards
-    (store.episodes=all) follow, and those that the samples lack are written. What was merged is left for readers
-    that are open; `python -m factory clean` removes it. While a run writes here the command is refused.
+    sample changes: readers, trainings and their order are the same before and after. What was merged is left for
+    readers that are open; `python -m factory clean` removes it. While a run writes here the command is refused.
     """
     from factory.store.location import BadLocation, DamagedFile
     from factory.store.table import AnotherWriter

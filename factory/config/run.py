@@ -20,7 +20,7 @@ from tasks.settings import ExpertGate, PdmSettings, PerturbSettings, RecoverySet
 from tasks.stages import FRAMES, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
-RECOVERY = "factory.setup.settings.recovery"
+RECOVERY = "factory.setup.settings.recovery_expert"
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from factory.stages.sensors import choose_cameras, masks_digest, refuse_unknown_
 from factory.store.schema import UNLISTED, RunIdentity, canonical_json
 from tasks.caches import user_cache, verify_checksum
 from tasks.experts.protocol import Expert, drives_once_per_clip
-from tasks.experts.recovery import Recovery, RecoverySettings, RecoveryTable
+from tasks.experts.recovery import RecoveryExpert, RecoverySettings, RecoveryTable
 from tasks.render.scene import engine
 from tasks.render.settings import RenderMode
 from tasks.render.splatting.gsplat_backend import BackendMissing
@@ -278,18 +278,18 @@ def cache_folder(out: str) -> str:
 log = logging.getLogger(__name__)
 
 
-def recovery(run: RunContext, **settings: Any) -> Recovery:
+def recovery_expert(run: RunContext, **settings: Any) -> RecoveryExpert:
     """Of conf/expert/recovery.yaml. Raises ConfigError."""
     where = f"expert.{run.name}"
     sources = fill(RecoverySources, settings, where)
     chosen = RecoverySettings(sources.smooth, sources.weights, sources.feasible)
     if sources.table is None:
-        return Recovery(_recovery_table(run, sources.vocabularies), chosen)
+        return RecoveryExpert(_recovery_table(run, sources.vocabularies), chosen)
     if not Path(sources.table).is_file():
         raise ConfigError(f"{where}.table={sources.table}: there is no such file")
     if sources.vocabularies:
         raise ConfigError(f"{where}: give table or vocabularies; a finished table takes no more trajectories")
-    return Recovery(load_recovery_table(sources.table), chosen)
+    return RecoveryExpert(load_recovery_table(sources.table), chosen)
 
 
 def _recovery_table(run: RunContext, vocabularies: Sequence[str]) -> RecoveryTable:

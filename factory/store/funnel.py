@@ -197,7 +197,7 @@ class BalanceSheet:
 
 def balance_sheet(plans: pa.Table, attempts: Attempts, lists: pa.Table) -> BalanceSheet:
     """Of tables in hand; lists: rows of `candidates` with BALANCE_COLUMNS."""
-    clips, rounds = planned_rounds(plans)
+    clips, rounds = wanted_rounds_by_expert(plans)
     if not len(clips):
         return BalanceSheet()
     ours = np.array(attempts.clip_ids, object)
@@ -243,7 +243,7 @@ def _of_attempts(attempts: Attempts, expert: str, at: Ints, pending: int) -> lis
     return found
 
 
-def planned_rounds(plans: pa.Table) -> tuple[NDArray[np.object_], dict[str, Ints]]:
+def wanted_rounds_by_expert(plans: pa.Table) -> tuple[NDArray[np.object_], dict[str, Ints]]:
     """(C,) clip_ids in order, and for each expert (C,) the rounds wanted of each: the most of all plans."""
     rows = plans.to_pylist()
     clips = np.array(sorted({clip for row in rows for clip in row["clip_ids"]}), object)

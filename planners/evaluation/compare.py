@@ -119,7 +119,7 @@ def compare_tables(a: Sequence[str], b: Sequence[str], settings: CompareSettings
     return found | {name: {"clip": one} for name, one in summaries.items()}
 
 
-def text_of(found: Mapping[Measure, ByLevel], confidence: float, of_tables: bool = False) -> str:
+def comparison_text(found: Mapping[Measure, ByLevel], confidence: float, of_tables: bool = False) -> str:
     """A table to be printed; of_tables: of `compare_tables`."""
     percent = f"{100 * confidence:g} %"
     levels = [level for level in LEVELS if any(level in by_level for by_level in found.values())]
@@ -189,6 +189,6 @@ def main(argv: Sequence[str]) -> None:
         a, b = (read_runs(side) for side in sides)
         check_same_rules([*sides[0], *sides[1]])
         found = compare(a, b, settings)
-    print(text_of(found, settings.confidence, of_tables))
+    print(comparison_text(found, settings.confidence, of_tables))
     if settings.out is not None:
         write_csv(Path(settings.out), found)

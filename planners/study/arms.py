@@ -192,10 +192,10 @@ def write_arms(
     write_csv(report / "driving_differences.csv", differences)
     if held:
         write_csv(report / "bounds_held.csv", held)
-    (report / "arms.md").write_text(text_of(found, differences, held) + "\n", encoding="utf-8")
+    (report / "arms.md").write_text(comparison_tables(found, differences, held) + "\n", encoding="utf-8")
 
 
-def text_of(
+def comparison_tables(
     found: Sequence[ArmDrives], differences: Sequence[Mapping[str, Any]], held: Sequence[Mapping[str, Any]]
 ) -> str:
     """Tables to be read: means of each arm and bound, then what is held against what."""

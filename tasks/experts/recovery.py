@@ -237,7 +237,7 @@ class RecoveryTable:
 
 
 @dataclass(frozen=True)
-class Recovery:
+class RecoveryExpert:
     """Drives back to the log the way some human once did."""
 
     table: RecoveryTable

@@ -382,7 +382,7 @@ def check_drive_pictures(
         affines = [asset.affine_of(camera.name, step * STEP_S) for camera in cameras]
         views = render(scene, eyes, backend=backend, affines=affines)
         own = [asset.own_body(camera.name) for camera in cameras]
-        looked_at = measure_views(scene, eyes, views, pose, backend, own)
+        looked_at = measure_rendered_views(scene, eyes, views, pose, backend, own)
         for camera, eye, view, found in zip(rig, eyes, views, looked_at, strict=True):
             inside = _tracks_around(eye.world_from_camera[:3, 3], there)
             fault = ("lens_covered", f"inside track {inside[0]}") if inside else picture_fault(found, settings)
@@ -459,7 +459,7 @@ def compose_near(asset: RenderAsset, there: Vehicles, place: Array, reach_m: flo
     return replace(asset, background=scene, nodes={})
 
 
-def measure_views(
+def measure_rendered_views(
     scene: RenderAsset,
     eyes: Sequence[Pinhole],
     views: Sequence[View],
@@ -476,11 +476,11 @@ def measure_views(
             road &= ~body.in_front(eye.width, eye.height)
         close = _on_the_lens(scene.background, eye.world_from_camera[:3, 3] - scene.origin)
         lens = render(replace(scene, background=close), [eye], backend=backend)[0].alpha if len(close) else None
-        out.append(measure_view(seen, road, lens))
+        out.append(measure_rendered_view(seen, road, lens))
     return out
 
 
-def measure_view(seen: View, road: Bools, lens: F32 | None = None) -> PictureMeasures:
+def measure_rendered_view(seen: View, road: Bools, lens: F32 | None = None) -> PictureMeasures:
     """Of one picture; `road` (H, W) pixels that are not to show sky, `lens` (H, W) alpha of what is on the lens."""
     grey = seen.rgb @ GREY
     contrast = float(grey.std())

@@ -315,7 +315,7 @@ def _follow(ego: Array, starts: Array, poses: Array, local: bool, wheel_base: fl
         fit_curvatures(n_plans, plans)
         _start(ego, wheel_base, n_plans, motions)
         for t in range(HORIZON_STEPS):
-            _steer(plans, t, n_plans, wheel_base, motions)
+            _apply_commands(plans, t, n_plans, wheel_base, motions)
             _move(t, n_plans, wheel_base, motions)
         _write(ego, motions, states[first : first + n_plans])
     return True
@@ -381,7 +381,7 @@ def _start(ego: Array, wheel_base: float, n_plans: int, motions: Motions) -> Non
 
 
 @inlined
-def _steer(plans: Plans, t: int, n_plans: int, wheel_base: float, motions: Motions) -> None:
+def _apply_commands(plans: Plans, t: int, n_plans: int, wheel_base: float, motions: Motions) -> None:
     """Speed, acceleration and steering at t + 1, by the LQR's commands at t."""
     ahead = min(t + TRACKING_STEPS, HORIZON_STEPS - 1)
     for b in range(n_plans):

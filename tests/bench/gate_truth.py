@@ -26,7 +26,7 @@ from tasks.render.gate import (
     large_vehicles,
     likeness_to_nearest_photo,
     masked_mean,
-    measure_views,
+    measure_rendered_views,
     picture_fault,
     ssim_map,
     to_box_frame,
@@ -133,7 +133,7 @@ def verdicts(
     there = vehicles_at(drive.agents, shown.step * STEP_S, pose[:2, 3], settings.reach_m)
     scene = compose_near(asset, there, pose[:3, 3], settings.reach_m)
     views = render(scene, [shown.eye], affines=[asset.affine_of(shown.camera, shown.step * STEP_S)])
-    fault = picture_fault(measure_views(scene, [shown.eye], views, pose)[0], settings)
+    fault = picture_fault(measure_rendered_views(scene, [shown.eye], views, pose)[0], settings)
     least, beside = NOTHING_LARGE, NOTHING_LARGE
     for j, _ in large_vehicles(there, shown.eye, views[0], settings.vehicle_share):
         track_id, box = there.track_ids[j], there.boxes[j]

@@ -74,7 +74,7 @@ def test_a_reader_an_expert_and_a_planner_work_by_name(
     install(site, "somebody")
     assert run_main([*run_arguments(tmp_path), "executor=local"]) == 0, capsys.readouterr().err
     assert experts_of(tmp_path) == {"mine", "human"}
-    small = "planner=mine planner.settings.history=true planner.training.batch_size=2 steps=1 workers=0 device=cpu"
+    small = "planner=mine planner.settings.history=true planner.training.batch_size=2 steps=1 workers=1 device=cpu"
     data = [f"data.real=[{tmp_path / 'out'}]", f"data.sim=[{tmp_path / 'out'}]", f"out={tmp_path / 'linear'}"]
     assert train_main([*small.split(), *data]) == 0, capsys.readouterr().err
     loaded = find_planner(str(tmp_path / "linear")).load

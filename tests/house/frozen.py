@@ -32,7 +32,7 @@ RUNS = {
     "av2": ["clips=av2", "clips.root={shared}/data/av2/sensor", "clips.split=train", "limit=3", "rounds=2"],
     "nuscenes": ["clips=scenarionet", "clips.root={shared}/data/scenarionet/nuscenes", "clips.split=train", "limit=5"],
 }
-TRAINING = ["planner=ego_mlp_small", "planner.training.batch_size=8", "steps=40", "log_every=1", "workers=0"]
+TRAINING = ["planner=ego_mlp_small", "planner.training.batch_size=8", "steps=40", "log_every=1", "workers=1"]
 
 
 def digest_of(column: pa.ChunkedArray) -> str:

@@ -10,14 +10,14 @@ import pytest
 @contextmanager
 def interrupted_after_one(command: ModuleType) -> Iterator[None]:
     """Inside, the command is interrupted once it has its first item."""
-    each = command.each
+    each = command.parallel_map
 
     def first_alone(function, items, *arguments) -> Iterator[object]:  # type: ignore[no-untyped-def]
         yield from each(function, list(items)[:1], *arguments)
         raise command.TaskStopped
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(command, "each", first_alone)
+        patch.setattr(command, "parallel_map", first_alone)
         yield
 
 

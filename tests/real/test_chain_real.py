@@ -11,7 +11,7 @@ from factory.datasets.av2.reader import AV2Reader
 from tasks.attempt import ExpertGate, Judged, attempt, perturbed_scene
 from tasks.experts.pdm_closed import PdmClosed, PdmSettings, plan_for
 from tasks.experts.protocol import Expert
-from tasks.experts.recovery import Recovery, RecoveryTable
+from tasks.experts.recovery import RecoveryExpert, RecoveryTable
 from tasks.perturb import Perturbation, PerturbSettings, gate_failures, grid_cells, perturb
 from tasks.reward.epdms import prepare_scene, score
 from tasks.rollout.lqr import track
@@ -40,7 +40,7 @@ def clip(shared_root: Path) -> Clip:
 
 @pytest.fixture(scope="module")
 def experts(human: NDArray[np.float64]) -> tuple[Expert, ...]:
-    return PdmClosed(PDM), Recovery(RecoveryTable(human))
+    return PdmClosed(PDM), RecoveryExpert(RecoveryTable(human))
 
 
 def listed(clip: Clip, human: NDArray[np.float64]) -> Perturbation:

@@ -12,7 +12,7 @@ from factory.readers.base import ClipReader
 from tasks.attempt import ExpertGate, Judged, attempt, drive_as_human, end_verdict, perturbed_scene
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Human
-from tasks.experts.recovery import Recovery, RecoveryTable
+from tasks.experts.recovery import RecoveryExpert, RecoveryTable
 from tasks.perturb import Perturbation, PerturbSettings, perturb
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic
 from tasks.stages import Rejected
@@ -55,7 +55,7 @@ def driven(clip: Clip, shared_root: Path) -> list[tuple[Judged, Rejected | None,
     rng, traffic = random_stream(0, clip.clip_id, "perturb"), TrafficSettings()
     found = perturb(clip, Vocabulary(human), PerturbSettings(), traffic, PDM, rng)
     assert isinstance(found, Perturbation)
-    expert, out = Recovery(RecoveryTable(human)), []
+    expert, out = RecoveryExpert(RecoveryTable(human)), []
     for candidate in found.candidates:
         scene = perturbed_scene(clip, candidate.rollout)
         pair = [attempt(scene, expert, gate, traffic, PDM, RNG) for gate in (PUBLISHED, ExpertGate())]

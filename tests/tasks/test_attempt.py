@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tasks.attempt import ExpertGate, Judged, attempt, drive_as_human, perturbed_scene, verdict
 from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.experts.protocol import Expert, Human, Plan
-from tasks.experts.recovery import Recovery, RecoveryTable
+from tasks.experts.recovery import RecoveryExpert, RecoveryTable
 from tasks.reward.epdms import Scores
 from tasks.reward.labels import BRAKING_MPS2, hit_after_s
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
@@ -128,7 +128,7 @@ def test_the_second_rollout_continues_ego_and_traffic_without_a_jump(scene: Scen
 
 
 def test_both_experts_recover_from_beside_the_lane_s_middle(scene: Scene, table: RecoveryTable) -> None:
-    for expert in (PdmClosed(), Recovery(table)):
+    for expert in (PdmClosed(), RecoveryExpert(table)):
         judged, rejected = tried(scene, expert)
         assert rejected is None, f"{expert.name}: {rejected}"
         assert all(getattr(judged.scores, name)[1] == 1.0 for name in GATE.full)
@@ -210,7 +210,7 @@ def test_sub_scores_come_before_ends_and_the_route_before_the_second_after(scene
 def test_what_an_end_leads_to_changes_neither_drive_nor_scores(scene: Scene, table: RecoveryTable) -> None:
     """Traffic that went on for a second is asked beside the rollout, which stays as it was to the last bit."""
     without = replace(GATE, off_route=False, after=False)
-    for expert in (PdmClosed(), Recovery(table)):
+    for expert in (PdmClosed(), RecoveryExpert(table)):
         (a, _), (b, _) = (
             attempt(scene, expert, gate, TrafficSettings(), PdmSettings(), RNG)  # type: ignore[misc]
             for gate in (GATE, without)
@@ -254,7 +254,7 @@ def test_around_the_human_everybody_does_what_the_log_says() -> None:
 def test_moving_the_world_moves_a_whole_attempt_along(table: RecoveryTable, origin: tuple[float, ...]) -> None:
     here, frame = street_clip(), np.array(origin)
     there = moved(here, frame)
-    for expert in (PdmClosed(), Recovery(table)):
+    for expert in (PdmClosed(), RecoveryExpert(table)):
         (a, rejected_a), (b, rejected_b) = (
             tried(perturbed_scene(clip, first_stage(clip)), expert) for clip in (here, there)
         )

@@ -155,7 +155,7 @@ NEAREST_M = 0.3  # to a camera
 GONE_LOGIT = -8.0  # of its opacity
 
 
-def clear_floaters(problem: FitProblem, state: FitState) -> int:
+def fade_floaters(problem: FitProblem, state: FitState) -> int:
     """Makes floaters transparent, in place, for `relocate_and_grow` to move them. Returns how many there were."""
     rows = find_floaters(problem, state)
     state.learned["logits"].values[rows] = GONE_LOGIT
@@ -275,7 +275,7 @@ def run_iterations(
         relocates = at <= REFINE_UNTIL * settings.iterations
         if due and (relocates or problem.tracks.driving.any()):
             drawing.store(held, state)
-            clear_floaters(problem, state)
+            fade_floaters(problem, state)
             if relocates:
                 relocate_and_grow(state, settings)
             held = drawing.load(state)

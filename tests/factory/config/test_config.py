@@ -166,7 +166,7 @@ def test_render_settings_out_of_range_are_refused(name: str, values: tuple[float
 
 
 PDM = "+expert.mine._target_=tasks.experts.pdm_closed.PdmClosed.of_run"
-RECOVERY = "+expert.mine._target_=factory.setup.settings.recovery"
+RECOVERY = "+expert.mine._target_=factory.setup.settings.recovery_expert"
 
 
 def built(*overrides: str) -> object:

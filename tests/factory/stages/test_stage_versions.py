@@ -20,9 +20,9 @@ from factory.store.schema import SCHEMA
 from tasks.attempt import Judged, perturbed_scene
 from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.experts.protocol import Human, Plan
-from tasks.experts.recovery import Recovery, RecoveryTable
+from tasks.experts.recovery import RecoveryExpert, RecoveryTable
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
-from tasks.render.gate import compose_near, likeness_to_photo, measure_views
+from tasks.render.gate import compose_near, likeness_to_photo, measure_rendered_views
 from tasks.render.scene.build import AssetSettings, build_asset
 from tasks.render.scene.engine import NOBODY, render
 from tasks.render.views import draw_map_views, pinhole, render_views
@@ -137,7 +137,7 @@ def plans() -> dict[str, object]:
     """The stage `expert`."""
     scene, table = scene_aside(), RecoveryTable(kinematic_trajectories(300, 1))
     out: dict[str, object] = {}
-    for expert in (PdmClosed(), Recovery(table), Human()):
+    for expert in (PdmClosed(), RecoveryExpert(table), Human()):
         plan = expert.plan(scene, RNG)
         assert isinstance(plan, Plan), expert.name
         out[expert.name] = plan.poses
@@ -181,7 +181,7 @@ def pictures() -> dict[str, object]:
     drawn = draw_map_views(clip.road_map, [pinhole("front", 0.0, 70.0)], pose, clip.agents, [NOW], 128, 72)
     eye = Pinhole(front.intrinsics, aside[0] @ front.ego_from_camera, street.WIDTH, street.HEIGHT)
     near = compose_near(asset, NOBODY, aside[0, :3, 3], 30.0)
-    (found,) = measure_views(near, [eye], render(near, [eye]), aside[0])
+    (found,) = measure_rendered_views(near, [eye], render(near, [eye]), aside[0])
     alike = likeness_to_photo(asset, photos[2], street.tracks(), ["car"])
     return {"rendered": blocks(seen), "drawn": blocks(drawn), "gate": astuple(found), "likeness": [alike["car"]]}
 

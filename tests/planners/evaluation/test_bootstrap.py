@@ -14,7 +14,14 @@ from planners.evaluation.aggregation import (
     total_score,
 )
 from planners.evaluation.bootstrap import paired_interval
-from planners.evaluation.compare import CompareSettings, compare, difference_columns, is_clear, is_clear_row, text_of
+from planners.evaluation.compare import (
+    CompareSettings,
+    compare,
+    comparison_text,
+    difference_columns,
+    is_clear,
+    is_clear_row,
+)
 from planners.evaluation.score_rows import FrameRow
 from tests.planners.made_rows import clip_rows
 
@@ -173,7 +180,7 @@ def test_runs_are_compared_in_every_stage() -> None:
         expected = 0.0 if name[0] == "stage_one" else 0.25
         for interval in by_level.values():
             np.testing.assert_allclose([interval.difference, interval.low, interval.high], expected, atol=1e-12)
-    assert "unfiltered compares with the paper's tables" in text_of(found, 0.95)
+    assert "unfiltered compares with the paper's tables" in comparison_text(found, 0.95)
 
 
 def test_means_over_clips_are_those_of_the_table() -> None:
@@ -195,7 +202,7 @@ def test_runs_are_compared_over_clips_logs_and_towns() -> None:
     of_one_town = compare([run(n_clips=4)], [run(0.1, n_clips=4)], SETTINGS)
     assert np.isnan(of_one_town["final", "unfiltered"]["town"].low)
     assert not is_clear(of_one_town["final", "unfiltered"])
-    assert "only one" in text_of(of_one_town, 0.95)
+    assert "only one" in comparison_text(of_one_town, 0.95)
     row = difference_columns(of_one_town["final", "unfiltered"])
     of_one_log = difference_columns(compare([run(n_clips=2)], [run(0.1, n_clips=2)], SETTINGS)["final", "unfiltered"])
     assert is_clear_row(row) and float(of_one_log["low"]) > 0.0 and not is_clear_row(of_one_log)
@@ -206,7 +213,7 @@ def test_runs_of_unknown_logs_are_compared_over_clips_and_it_is_said() -> None:
     unknown = [[replace(clip, log_id="") for clip in run()]]
     found = compare(unknown, unknown, SETTINGS)
     assert {tuple(by_level) for by_level in found.values()} == {("clip",)}
-    assert "do not say which log" in text_of(found, 0.95)
+    assert "do not say which log" in comparison_text(found, 0.95)
 
 
 def test_other_clips_are_not_compared() -> None:

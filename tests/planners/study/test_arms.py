@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from planners.study import arms as module
-from planners.study.arms import ArmDrives, HeldAgainst, arm_differences, clean_route, read_arm_drives, text_of
+from planners.study.arms import ArmDrives, HeldAgainst, arm_differences, clean_route, comparison_tables, read_arm_drives
 from planners.training.many import Training
 from tests.planners.drive.test_summary import row
 
@@ -47,7 +47,7 @@ def test_arms_are_held_against_each_other_where_all_have_driven(monkeypatch: pyt
     more = apart[ARMS[1], ARMS[0], "clean_route"]
     assert [more[name] for name in ("difference", "low", "high")] == pytest.approx([10.0, 10.0, 10.0])
     assert apart[ARMS[0], "constant_velocity", "route_completed"]["difference"] == pytest.approx(30.0)
-    assert "**+10.0** [+10.0, +10.0]" in text_of([found], list(apart.values()), [])
+    assert "**+10.0** [+10.0, +10.0]" in comparison_tables([found], list(apart.values()), [])
 
 
 def test_towns_are_drawn_whole_and_failures_count_by_the_kilometre(

@@ -13,8 +13,8 @@ from tasks.render.gate import (
     PictureMeasures,
     check_drive_pictures,
     compose_near,
-    measure_view,
-    measure_views,
+    measure_rendered_view,
+    measure_rendered_views,
     meets_road,
     picture_fault,
 )
@@ -47,7 +47,7 @@ def turned(x: float, y: float, degrees: float) -> np.ndarray:
 def measured_at(asset: RenderAsset, pose: np.ndarray) -> PictureMeasures:
     eye = Pinhole(FRONT.intrinsics, pose @ FRONT.ego_from_camera, *SIZE)
     scene = compose_near(asset, NOBODY, pose[:3, 3], SETTINGS.reach_m)
-    return measure_views(scene, [eye], render(scene, [eye]), pose)[0]
+    return measure_rendered_views(scene, [eye], render(scene, [eye]), pose)[0]
 
 
 def blob(x: float, y: float, z: float, sigma_m: float) -> Gaussians:
@@ -114,9 +114,9 @@ def test_a_blurred_picture_is_told_from_a_sharp_one() -> None:
     rgb = street.photo(3.0, 0.0, 0.8).rgb.astype(np.float32) / 255.0
     solid = np.ones(rgb.shape[:2], np.float32)
     road = np.ones(rgb.shape[:2], bool)
-    assert picture_fault(measure_view(View(rgb, solid, solid), road), SETTINGS) is None
+    assert picture_fault(measure_rendered_view(View(rgb, solid, solid), road), SETTINGS) is None
     soft = gaussian_filter(rgb, (2.0, 2.0, 0.0))
-    found = picture_fault(measure_view(View(soft, solid, solid), road), SETTINGS)
+    found = picture_fault(measure_rendered_view(View(soft, solid, solid), road), SETTINGS)
     assert found is not None and found[0] == "blurred"
 
 

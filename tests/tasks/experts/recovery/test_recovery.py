@@ -9,7 +9,7 @@ import pytest
 from tasks.experts.protocol import Plan
 from tasks.experts.recovery import (
     FeasibleSettings,
-    Recovery,
+    RecoveryExpert,
     RecoverySettings,
     RecoveryTable,
     make_feasible,
@@ -80,14 +80,14 @@ def test_the_ego_s_velocity_is_matched_forward_with_forward_and_sideways_with_si
     scene = replace(scene, ego_history=states)
     goal = to_local(scene.ego_state[: HEADING + 1], scene.clip.ego_states[NOW + 40, : HEADING + 1])
     rows = np.stack([ending_at(velocity, goal) for velocity in ((1.5, 10.0), (10.0, 1.5), (10.0, -1.5))])
-    assert Recovery(RecoveryTable(rows)).retrieve(scene) == 1
+    assert RecoveryExpert(RecoveryTable(rows)).retrieve(scene) == 1
 
 
 def test_the_goal_is_the_log_s_pose_at_four_seconds_not_a_step_before_or_after(road: Road) -> None:
     scene = road(speed=10.0)
     ends = to_local(scene.ego_state[: HEADING + 1], scene.clip.ego_states[NOW + 39 : NOW + 42, : HEADING + 1])
     rows = np.stack([ending_at((10.0, 0.0), end) for end in ends])
-    assert Recovery(RecoveryTable(rows)).retrieve(scene) == 1
+    assert RecoveryExpert(RecoveryTable(rows)).retrieve(scene) == 1
 
 
 def test_end_headings_are_compared_around_the_circle() -> None:
@@ -121,7 +121,7 @@ def test_the_goal_is_the_logged_pose_four_seconds_later_seen_from_the_perturbed_
     wanted[:, 1] = -1.2 * (T / 4.0) ** 2 * (3.0 - 2.0 * T / 4.0)  # 1.2 m to the right, where the log is
     table = RecoveryTable(np.stack([straight(10.0), wanted * [1, -1, 1], wanted, straight(4.0)]))
     scene = road(speed=10.0, y=1.2)
-    raw = Recovery(table, RecoverySettings(smooth=False))
+    raw = RecoveryExpert(table, RecoverySettings(smooth=False))
     assert raw.retrieve(scene) == 2
     plan = raw.plan(scene, RNG)
     assert isinstance(plan, Plan)
@@ -131,7 +131,7 @@ def test_the_goal_is_the_logged_pose_four_seconds_later_seen_from_the_perturbed_
 
 def test_a_clip_that_ends_before_the_goal_is_refused(road: Road) -> None:
     with pytest.raises(ValueError, match="needs the log at step 96; the clip has 96"):
-        Recovery(RecoveryTable(straight(5.0)[None])).retrieve(replace(road(), step=56))
+        RecoveryExpert(RecoveryTable(straight(5.0)[None])).retrieve(replace(road(), step=56))
 
 
 def test_a_drivable_trajectory_stays_as_it_is() -> None:
@@ -180,7 +180,7 @@ def test_the_same_problem_gives_the_same_bits() -> None:
 
 def test_a_solver_that_does_not_converge_is_a_rejection_and_never_the_raw_trajectory(road: Road) -> None:
     hurried = RecoverySettings(feasible=FeasibleSettings(max_iterations=1, tolerance=1e-12))
-    result = Recovery(RecoveryTable(kinematic_trajectories(50, 2)), hurried).plan(road(), RNG)
+    result = RecoveryExpert(RecoveryTable(kinematic_trajectories(50, 2)), hurried).plan(road(), RNG)
     assert isinstance(result, Rejected)
     assert (result.stage, result.reason) == ("expert", "no_plan")
     assert "longitudinal QP" in result.detail
@@ -189,10 +189,10 @@ def test_a_solver_that_does_not_converge_is_a_rejection_and_never_the_raw_trajec
 def test_the_digest_knows_the_table_and_the_settings() -> None:
     table, other = RecoveryTable(kinematic_trajectories(5, 0)), RecoveryTable(kinematic_trajectories(5, 1))
     digests = {
-        Recovery(table).digest(),
-        Recovery(other).digest(),
-        Recovery(table, RecoverySettings(smooth=False)).digest(),
-        Recovery(table, RecoverySettings(weights=(2.0, 1.0, 1.0, 1.0, 1.0, 1.0))).digest(),
+        RecoveryExpert(table).digest(),
+        RecoveryExpert(other).digest(),
+        RecoveryExpert(table, RecoverySettings(smooth=False)).digest(),
+        RecoveryExpert(table, RecoverySettings(weights=(2.0, 1.0, 1.0, 1.0, 1.0, 1.0))).digest(),
     }
     assert len(digests) == 4
-    assert Recovery(table).digest() == Recovery(RecoveryTable(kinematic_trajectories(5, 0))).digest()
+    assert RecoveryExpert(table).digest() == RecoveryExpert(RecoveryTable(kinematic_trajectories(5, 0))).digest()

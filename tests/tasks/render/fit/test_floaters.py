@@ -18,7 +18,7 @@ from tasks.render.fit.reconstruct import (
     NEAREST_M,
     REFINE_UNTIL,
     SHOWN_BY,
-    clear_floaters,
+    fade_floaters,
     find_floaters,
     run_iterations,
 )
@@ -213,7 +213,7 @@ def test_floaters_become_transparent_and_forget_how_they_were_moved(prepared: Pr
     for name in ("first", "second"):
         getattr(state.learned["logits"], name)[:] = 1.0
     state.add_to_average()
-    assert clear_floaters(problem, state) == 1
+    assert fade_floaters(problem, state) == 1
     logits = state.learned["logits"]
     assert state.averages["logits"][0] == GONE_LOGIT
     assert logits.values[0] == GONE_LOGIT and logits.first[0] == logits.second[0] == 0.0
