@@ -97,7 +97,7 @@ def test_a_block_is_built_by_one_process_at_a_time_where_the_file_system_has_no_
 COUNTED = """
 import os, sys
 from pathlib import Path
-from factory.stages.assets import only_builder
+from factory.stages.assets import builder_lock
 
 block, counter = map(Path, sys.argv[1:])
 counter.write_text("0")
@@ -107,7 +107,7 @@ for _ in range(4):
         children.append(child)
         continue
     for _ in range(25):
-        with only_builder(block):
+        with builder_lock(block):
             counter.write_text(str(int(counter.read_text()) + 1))
     os._exit(0)
 assert not any(os.waitpid(child, 0)[1] for child in children)

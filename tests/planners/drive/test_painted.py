@@ -63,7 +63,7 @@ def test_where_the_log_drives_the_painter_shows_the_log_s_photos(photographed: C
 @pytest.mark.slow
 def test_it_paints_what_the_simulation_has(photographed: Clip) -> None:
     """From a metre further to the left, and without anybody, other pictures."""
-    scene, cameras = logged_start(photographed).scene, PaintedCameras(photographed, SMALL)
+    scene, cameras = logged_start(photographed).scene, PaintedCameras(photographed, SMALL, TownPainter())
     here = unit(front(cameras.images(scene, 0)))
     beside = scene.ego_history.copy()
     heading = beside[-1, 2]

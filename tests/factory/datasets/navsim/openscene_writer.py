@@ -188,14 +188,14 @@ def sensed_by_town(log: AV2Log) -> Sensed:
         for camera in log.cameras
     }
     images, sweeps = {}, {}
-    for camera, path, time_s in log.images:
-        k, between = divmod(round(time_s / STEP_S), FRAME_STEPS)
+    for photo in log.images:
+        k, between = divmod(round(photo.time_s / STEP_S), FRAME_STEPS)
         if not between:
-            images[TOWN_CAMERAS[camera], k] = path.read_bytes()
-    for _, path, time_s in log.sweeps:
-        k, between = divmod(round(time_s / STEP_S), FRAME_STEPS)
+            images[TOWN_CAMERAS[photo.sensor], k] = Path(photo.uri).read_bytes()
+    for sweep in log.sweeps:
+        k, between = divmod(round(sweep.time_s / STEP_S), FRAME_STEPS)
         if not between:
-            table = pyarrow.feather.read_table(path)
+            table = pyarrow.feather.read_table(sweep.uri)
             sweeps[k] = np.stack([table[c].to_numpy().astype(np.float32) for c in ("x", "y", "z", "intensity")], axis=1)
     return Sensed(tuple(cameras[name] for name in CAMERA_NAMES if name in cameras), images, sweeps)
 

@@ -4,11 +4,12 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.stages.scene_file import read_scene, write_scene
-from factory.stages.sensors import encode_jpeg, load_photos, resized_mask
+from factory.stages.sensors import load_photos, resized_mask
 from factory.store.location import ClipCache, Location
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
@@ -59,7 +60,9 @@ def test_a_pinhole_would_have_taken_the_same() -> None:
 def test_a_sidecar_says_so_and_photos_and_masks_come_out_straight(tmp_path: Path) -> None:
     log = town.save(town.nuscenes(), tmp_path / "logs", "sd_nuscenes_v1.0-mini_scene-0001.pkl")
     (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "0.jpg").write_bytes(encode_jpeg(as_taken(), 98, "444"))
+    whole_colours = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    options = [cv2.IMWRITE_JPEG_QUALITY, 98, *whole_colours]
+    assert cv2.imwrite(str(tmp_path / "photos" / "0.jpg"), as_taken()[:, :, ::-1], options)
     camera = {"K": K.tolist(), "width": SIZE[0], "height": SIZE[1], "cam_to_ego": MOUNT.tolist(),
               "fisheye": TERMS.tolist()}  # fmt: skip
     frames = [{"t_s": 0.5 * k, "file": "0.jpg"} for k in range(24)]
