@@ -61,7 +61,7 @@ test: install
 
 unit: install
 	$(PY) -m factory warm
-	$(PY) -m pytest -n 2 --dist loadfile --ignore tests/real --ignore tests/chaos -m "not ray and not slow"
+	$(PY) -m pytest -n 2 --dist loadfile --ignore tests/real --ignore tests/chaos -m "not ray and not slow and not chaos"
 
 lint: install
 	$(PY) -m ruff check .
@@ -73,14 +73,15 @@ format: install
 	$(PY) -m ruff check --fix .
 
 # Every kind of file with 5,000 mutants each (half an hour), one flipped bit at a time in what a run keeps, processes
-# killed at any moment and at every step of a commit (Linux, a C compiler), little space in every place (root), clips
-# that do harm, a run under kills for HOURS (2).
+# killed at any moment and at every step of a commit (Linux, a C compiler), little space in every place (root), buckets
+# that break requests, clips that do harm, a run under kills for HOURS (2).
 # N=<mutants of each kind>, KINDS="ply spz".
 chaos: install
 	$(PY) -m tests.chaos.damaged_files.fuzz $(or $(N),5000) $(KINDS)
 	$(PY) -m experiments.chaos.flips
 	$(PY) -m experiments.chaos.kills
 	$(PY) -m tests.chaos.commit_steps
+	$(PY) -m pytest -m chaos
 	$(PY) -m experiments.chaos.full_disks
 	$(PY) -m experiments.chaos.poison
 	$(PY) -m experiments.chaos.long_run hours=$(or $(HOURS),2)

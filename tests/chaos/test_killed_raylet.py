@@ -225,6 +225,7 @@ def test_a_signal_to_the_command_reaches_its_run(tmp_path: Path, number: signal.
 
 @pytest.mark.ray
 @pytest.mark.slow
+@pytest.mark.chaos
 def test_a_cluster_that_dies_while_it_is_started_is_one_that_died() -> None:
     """Ray itself waits half a minute and raises an Exception of no narrower class."""
     words = [sys.executable, "-c", START]

@@ -70,7 +70,7 @@ def clip(drive: PhotoDrive, tmp_path_factory: pytest.TempPathFactory) -> Clip:
     log = _log_on_the_road(root / "maps", np.stack(steps))
     write_openscene(root, "mini", LOG, log, Place(CITY, np.zeros(3)), sensed, np.stack(steps))
     blobs = root / "sensor_blobs" / "mini"
-    reader = NavsimReader(root / "navsim_logs" / "mini", root / "maps", blobs, cache_dir=root / "kept")
+    reader = NavsimReader(root / "navsim_logs" / "mini", root / "maps", sensors=str(blobs), cache_dir=root / "kept")
     (ref,) = reader.index().refs
     return reader.read(ref)
 
