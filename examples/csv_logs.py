@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from factory.readers.base import BadClip
-from factory.readers.logs import LoggedDrive, LogReader, Recorded, WholeLog, route_of_drive
+from factory.readers.logs import LoggedDrive, LogReader, WholeLog, WindowSensors, route_of_drive
 from tasks.world.clip import STEP_S, AgentKind, AgentTracks
 from tasks.world.frames import AX, EGO_STATE_SIZE, HEADING, VX, YAW_RATE, X, Y
 from tasks.world.road_map import (
@@ -72,14 +72,14 @@ class CsvReader(LogReader[WholeLog]):
             content_digest=hashlib.sha256(read).hexdigest(),
         )
 
-    def recorded(self, log: WholeLog, start: int, stop: int) -> Recorded:
+    def recorded(self, log: WholeLog, start: int, stop: int) -> WindowSensors:
         """The ego's pose in space: level ground, no cameras."""
         x, y, heading = log.ego_states[start:stop, : HEADING + 1].T
         poses = np.tile(np.eye(4), (stop - start, 1, 1))
         poses[:, 0, 0] = poses[:, 1, 1] = np.cos(heading)
         poses[:, 1, 0], poses[:, 0, 1] = np.sin(heading), -np.sin(heading)
         poses[:, 0, 3], poses[:, 1, 3] = x, y
-        return Recorded(poses)
+        return WindowSensors(poses)
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:

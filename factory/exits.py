@@ -77,7 +77,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise _Interrupt
 
 
-def become_worker() -> None:
+def ignore_terminal_signals() -> None:
     """In a process begun in `terminal_signals_blocked`: only the program that started it ends it."""
     for number in TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
@@ -87,7 +87,7 @@ def become_worker() -> None:
 
 @contextmanager
 def terminal_signals_blocked(*signals: signal.Signals) -> Iterator[None]:
-    """Processes begun inside do not receive these signals, all of TERMINAL_SIGNALS by default, before `become_worker`.
+    """Processes begun inside do not receive these signals before `ignore_terminal_signals`; all of TERMINAL_SIGNALS.
 
     This process heeds them at the end of it, when who began others knows them and can end them.
     """

@@ -60,7 +60,7 @@ def matching_below(folder: Path, pattern: str) -> list[Path]:
             entered.add((of.st_dev, of.st_ino))
             entries = [entry for entry in os.scandir(here) if is_data(entry.name)]
         except OSError as error:
-            _pass_over(here, error.strerror or str(error))
+            _warn_skipped_once(here, error.strerror or str(error))
             continue
         for entry in entries:
             if matches := fnmatchcase(entry.name, pattern):
@@ -86,12 +86,12 @@ def _leads_to_folder(entry: os.DirEntry[str], warn: bool = True) -> bool:
     if not entry.is_symlink() or os.path.isdir(entry):
         return entry.is_symlink()
     if warn and not os.path.exists(entry):
-        _pass_over(entry.path, f"the link leads to {os.readlink(entry)}, which is not there")
+        _warn_skipped_once(entry.path, f"the link leads to {os.readlink(entry)}, which is not there")
     return False
 
 
 @cache
-def _pass_over(path: str | Path, why: str) -> None:
+def _warn_skipped_once(path: str | Path, why: str) -> None:
     """Once a process: a folder is looked at several times."""
     log.warning("%s is passed over: %s", path, why)
 
@@ -265,7 +265,7 @@ def machine_fault_of(error: BaseException) -> str:
     """What the machine said, where its illness is behind the error; else nothing."""
     seen: BaseException | None = error
     while seen is not None:
-        if isinstance(seen, MemoryError) and _memory_left() < SHORT_OF_MEMORY:
+        if isinstance(seen, MemoryError) and _free_memory_share() < SHORT_OF_MEMORY:
             return f"out of memory: {seen}"
         if isinstance(seen, PlaceRefused | DiskFull | NotWritable | ConnectionError | TimeoutError) or _is_of_machine(
             seen
@@ -284,7 +284,7 @@ def _is_of_machine(error: BaseException) -> bool:
     return _number_of(error) in MACHINE_ERRNOS or (error.errno is None and STORE_FAULT.search(str(error)) is not None)
 
 
-def _memory_left() -> float:
+def _free_memory_share() -> float:
     """Share of this machine's memory that is free or can be freed; 1 where it does not say."""
     try:
         rows = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())

@@ -27,7 +27,7 @@ from factory.stages.imaging import Imaging, scene_cache_counts
 from factory.stages.rows import label_columns, sample_row
 from factory.store.samples import CandidateRow
 from factory.store.schema import UNLISTED, RunIdentity
-from tasks.attempt import ExpertGate, Judged, Timed, attempt, drive_as_human, has_route, perturbed_scene
+from tasks.attempt import ExpertGate, Judged, Timed, attempt, drive_under_log_replay, has_route, perturbed_scene
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Expert, Human, drives_once_per_clip
 from tasks.hard_scenes import BEFORE_STEPS, BenchmarkClip, drive_follow_up, frame_digest, seen_half_a_second_earlier
@@ -221,7 +221,7 @@ class FactoryWork:
         payload, driver = perturbed_clip_of(prepared), self.experts[expert]
         rng = random_stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
         if drives_once_per_clip(driver):
-            judged = drive_as_human(scene_of_clip(payload.clip), driver, self.pdm, rng, timed)
+            judged = drive_under_log_replay(scene_of_clip(payload.clip), driver, self.pdm, rng, timed)
             return Drive(payload.ref, None, judged, None)
         chosen = payload.candidates[candidate]
         self._refuse_another_policy()
@@ -470,8 +470,10 @@ class BenchmarkWork(FactoryWork):
         if expert == HUMAN_BEFORE:
             assert prepared.scenes is not None, "prepared by a run without frames"
             rng = random_stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
-            judged = drive_as_human(scene_of_clip(prepared.scenes.before), Human(), self.pdm, rng, timed)
-            return Drive(_earlier_ref(payload.ref), None, judged, None, row_overrides=_earlier_lineage(payload.clip))
+            judged = drive_under_log_replay(scene_of_clip(prepared.scenes.before), Human(), self.pdm, rng, timed)
+            return Drive(
+                _earlier_ref(payload.ref), None, judged, None, row_overrides=_lineage_of_earlier_row(payload.clip)
+            )
         chosen = payload.candidates[candidate]
         led_to = drive_follow_up(payload.clip, chosen.rollout, self.traffic, self.pdm, timed)
         if isinstance(led_to, Rejected):
@@ -481,7 +483,7 @@ class BenchmarkWork(FactoryWork):
         return Drive(payload.ref, chosen, led_to, None, shared=(now - BEFORE_STEPS, now), sampled_instead=shown)
 
 
-def _earlier_lineage(clip: Clip) -> dict[str, object]:
+def _lineage_of_earlier_row(clip: Clip) -> dict[str, object]:
     """What the row of the log 0.5 s before T says about its clip, instead of the earlier window it was read from."""
     return {
         "clip_id": clip.clip_id,

@@ -59,7 +59,7 @@ def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:
     return "\n".join([f"{'stage':<12}{'tasks':>8}{'seconds':>10}{'each':>10}", *lines])
 
 
-def run_kernel_parts(config: RunConfig) -> list[str]:
+def needed_kernel_parts(config: RunConfig) -> list[str]:
     """The parts of factory.stages.warm that the run will ask for."""
     from factory.setup.settings import simulates
     from factory.stages.warm import kernel_parts
@@ -130,7 +130,7 @@ def _run(
     from factory.graph.driver import EpisodeSettings
     from factory.graph.execute import Execution, execute, rerun_on_new_clusters
     from factory.graph.local import Claims, Limits
-    from factory.setup.calibrate import calibrate, plan_text
+    from factory.setup.calibrate import estimate_run_size, plan_text
     from factory.setup.settings import assemble
     from factory.stages.benchmark import NEEDED, write_benchmark
     from factory.stages.warm import compiling_ahead
@@ -148,12 +148,12 @@ def _run(
     except (BadLocation, DamagedLog, OtherSchema) as error:
         raise ConfigError(str(error)) from error
     elsewhere = config.executor == "ray" and "RAY_ADDRESS" in os.environ  # a cluster's nodes compile for themselves
-    with nullcontext() if elsewhere else compiling_ahead(run_kernel_parts(config)):
+    with nullcontext() if elsewhere else compiling_ahead(needed_kernel_parts(config)):
         assembled = assemble(config)
         refs = interleave_by_log(assembled.refs, config.workers or os.cpu_count() or 1)
         print(plan_text(assembled, refs), flush=True)
         if only_plan:
-            print(calibrate(assembled, refs))
+            print(estimate_run_size(assembled, refs))
             return 0
         since = time.monotonic() if began is None else began
         summary = rerun_on_new_clusters(

@@ -127,7 +127,7 @@ def attempt(
         return judged, verdict(judged.scores, gate) or end_verdict(judged, ready, gate)
 
 
-def drive_as_human(
+def drive_under_log_replay(
     scene: Scene, expert: Expert, planner: PdmSettings, rng: np.random.Generator, timed: Timed = nullcontext
 ) -> Judged:
     """The drive from the log at T, scored under log replay and never filtered."""

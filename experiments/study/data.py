@@ -16,7 +16,7 @@ from threading import Event
 from experiments.study.settings import settings_of
 from factory.config.arguments import INPUT_ERRORS, run_command
 from factory.exits import INTERRUPTED, Failed, Stopped, calling_on_stop_signal
-from planners.training.many import SweepResources, exit_code
+from planners.training.many import SweepResources, run_process
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def factory(*words: str) -> None:
     print("python -m factory", *words, file=sys.stderr)
     stop = Event()
     with calling_on_stop_signal(stop.set):
-        code = exit_code([sys.executable, "-m", "factory", *words], stop.is_set)
+        code = run_process([sys.executable, "-m", "factory", *words], stop.is_set)
     if code == INTERRUPTED or stop.is_set():
         raise Stopped("the same command goes on")
     if code:

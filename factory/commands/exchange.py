@@ -91,13 +91,13 @@ def export(request: ExportRequest) -> int:
     What is written: docs/navsim_format.md.
     """
     if request.format == "navsim":
-        return _export_all(request)
-    for path in _export_some(request):
+        return _export_navsim(request)
+    for path in _export_sample_files(request):
         print(path.resolve())
     return COMPLETE
 
 
-def _export_some(request: ExportRequest) -> Iterator[Path]:
+def _export_sample_files(request: ExportRequest) -> Iterator[Path]:
     """Write the files; their paths as they are written. Raises Refused where there is nothing, or no file can be."""
     store, target = open_store(request.out), Path(request.to)
     table = open_samples(store)
@@ -119,7 +119,7 @@ def _export_some(request: ExportRequest) -> Iterator[Path]:
         raise Refused(f"{store.location.uri}: {error}") from error
 
 
-def _export_all(request: ExportRequest) -> int:
+def _export_navsim(request: ExportRequest) -> int:
     """All samples in SimScale's layout; the exit code. Raises Refused."""
     from factory.config.compose import need_run_extra
     from factory.graph.parallel import WorkerDied, parallel_map
@@ -134,7 +134,7 @@ def _export_all(request: ExportRequest) -> int:
         target = Location.parse(request.to, setting="to")
         dealt = partial(parallel_map, executor=request.executor, workers=request.workers, to=target)
         table = sample_table(store.location.uri, store.location.options)
-        trajectories = _label_trajectories(store, request.vocabulary)
+        trajectories = _label_vocabulary(store, request.vocabulary)
         done = find_function("EXPORTS", request.format)(request, table, Path(target.uri), trajectories, dealt)
     except (OSError, ValueError, WorkerDied) as error:  # no folder, a full disk, what cannot be written as asked
         raise Refused(str(error)) from error
@@ -148,7 +148,7 @@ def _export_all(request: ExportRequest) -> int:
     return COMPLETE
 
 
-def _label_trajectories(store: "Store", file: str | None) -> "Array | None":
+def _label_vocabulary(store: "Store", file: str | None) -> "Array | None":
     """(K, 40, 3) that the samples' labels are of; None where there are none, or of a file that was not named."""
     from factory.store.reader import SampleTable
     from factory.store.schema import LABEL_COLUMNS
@@ -248,7 +248,7 @@ def import_(request: ImportRequest) -> int:
     The same command again goes on, and tries what failed once more. What is kept and what is lost: docs/navsim.md.
     """
     if request.source == CAMERAS:
-        return _cameras(request)
+        return _import_nuscenes_cameras(request)
     from deltalake.exceptions import DeltaError
 
     from factory.files import why_unusable
@@ -272,7 +272,7 @@ def import_(request: ImportRequest) -> int:
     return summary.exit_code
 
 
-def _cameras(request: ImportRequest) -> int:
+def _import_nuscenes_cameras(request: ImportRequest) -> int:
     """Write the sidecars and say what each holds. Raises Refused."""
     from factory.readers.base import BadClip
 

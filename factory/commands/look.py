@@ -17,8 +17,8 @@ from factory.views.sample_text import (
     label_lines,
     labelled_trajectories,
     logged_drive,
-    number_lines,
     open_samples,
+    sample_fact_lines,
 )
 from factory.views.sample_text import lineage as lineage_parts
 from factory.views.status import failed_lines, open_store, status_lines
@@ -109,11 +109,11 @@ def show(request: ShowRequest) -> None:
     """
     store = open_store(request.out)
     table, which = open_samples(store), request.sample
-    for line in table.attempt_ids if which is None else sample_lines(store, table, which, request):
+    for line in table.attempt_ids if which is None else draw_and_describe_sample(store, table, which, request):
         print(line, flush=True)
 
 
-def sample_lines(store: "Store", table: "SampleTable", which: str, request: ShowRequest) -> Iterator[str]:
+def draw_and_describe_sample(store: "Store", table: "SampleTable", which: str, request: ShowRequest) -> Iterator[str]:
     """One sample's numbers; writes its picture and says where it is."""
     from factory.views.pictures import encode_image, sample_sheet
     from factory.views.rendered_again import (
@@ -128,7 +128,7 @@ def sample_lines(store: "Store", table: "SampleTable", which: str, request: Show
     row = table[attempt_id]
     path = _picture_path(attempt_id, request.to)
     drawn = labelled_trajectories(row, request.vocabulary)
-    yield from number_lines(row)
+    yield from sample_fact_lines(row)
     yield from label_lines(row, drawn is not None)
     logged = logged_drive(store, row["clip_id"], row["settings_hash"])
     sheets = [sample_sheet(row, logged, vocabulary=drawn)]

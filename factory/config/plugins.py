@@ -53,20 +53,20 @@ class Plugin:
 def plugins_by_name(kind: str) -> dict[str, list[Plugin]]:
     """Name -> what installed packages offer under it; kind: a key of GROUPS."""
     found: dict[str, list[Plugin]] = {}
-    for entry in _declared(_installed_since()).select(group=GROUPS[kind]):
+    for entry in _entry_points(_package_folder_times()).select(group=GROUPS[kind]):
         package = "an unnamed package" if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"
         found.setdefault(entry.name, []).append(Plugin(entry.name, entry.module, entry.attr, package))
     return {name: sorted(found[name], key=lambda plugin: plugin.package) for name in sorted(found)}
 
 
-def _installed_since() -> tuple[tuple[str, int], ...]:
+def _package_folder_times() -> tuple[tuple[str, int], ...]:
     """The folders that are searched for packages, and when each was last written."""
     folders = [Path(folder) for folder in sys.path]
     return tuple((str(folder), folder.stat().st_mtime_ns) for folder in folders if folder.is_dir())
 
 
 @lru_cache(maxsize=1)
-def _declared(installed_since: tuple[tuple[str, int], ...]) -> Any:
+def _entry_points(installed_since: tuple[tuple[str, int], ...]) -> Any:
     """All entry points of these folders: hundreds of files, which one command line asks for four times."""
     return entry_points()
 

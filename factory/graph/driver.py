@@ -49,7 +49,7 @@ from factory.graph.steps import (
     PrepareReport,
 )
 from factory.readers.base import ClipRef
-from factory.store.episodes import EPISODES_FOLDER, episode_name, has_episode
+from factory.store.episodes import EPISODES_FOLDER, episode_name, wants_episode
 from factory.store.location import Shard
 from factory.store.samples import ClipCandidates, ErrorKind, Kind, Outcome, PastAttempt, Store
 from factory.store.schema import RunIdentity, Stamp, attempt_id
@@ -75,7 +75,7 @@ class EpisodeSettings:
     make: MakeEpisode  # a function that workers can import
 
 
-class Episodes:
+class EpisodeScheduler:
     """Keeps the episodes of a run in step with its table: says what is missing and has tasks write it."""
 
     def __init__(self, store: Store, wanted: EpisodeSettings, refs: Iterable[ClipRef]) -> None:
@@ -136,7 +136,7 @@ class Episodes:
         missing: dict[str, ClipRef] = {}
         for row in self._store.samples.read_file(path, partition, ROWS).to_pylist():
             name = episode_name(row)
-            chosen = has_episode(row["attempt_id"], self._wanted.every)
+            chosen = wants_episode(row["attempt_id"], self._wanted.every)
             if chosen and name not in self._there and row["clip_id"] in self._refs:
                 missing[row["attempt_id"]] = self._refs[row["clip_id"]]
                 self._there.add(name)  # asked for once
@@ -167,7 +167,7 @@ class BlockBuild:
     ref: ClipRef
 
 
-class BlockQueue:
+class ClipQueue:
     """The clips of a plan, handed out one by one."""
 
     def __init__(self, clips: Sequence[ClipPlan], block_of: BlockOf, workers: int) -> None:
@@ -420,7 +420,9 @@ class RunDriver:
     def interrupted(self) -> bool:
         return self._stopping.is_set()
 
-    def loop(self, graph: Graph, commits: CommitQueue, metrics: RunMetrics, episodes: Episodes | None = None) -> None:
+    def loop(
+        self, graph: Graph, commits: CommitQueue, metrics: RunMetrics, episodes: EpisodeScheduler | None = None
+    ) -> None:
         """Until nothing is left, or stopped and drained. Raises DiskFull once a disk is full, and MachineFailure."""
         self._graph, self._commits, self._metrics, self._episodes = graph, commits, metrics, episodes
         commits.on_commit = self._on_commit
@@ -431,7 +433,7 @@ class RunDriver:
             self.notes.append(f"{what}; a later run that needs them prepares them again")
 
     def _work_through(self, graph: Graph, commits: CommitQueue, progress: ProgressLine) -> None:
-        self._queue = BlockQueue(self._plan.todo, self._block_of, graph.parallelism)
+        self._queue = ClipQueue(self._plan.todo, self._block_of, graph.parallelism)
         self._forecast.blocks.left = self._queue.n_blocks
         while True:
             wanted = len(self._walks_left) + len(self._preparing) < CLIPS_PER_WORKER * graph.parallelism

@@ -22,7 +22,7 @@ from factory.graph.driver import (
     SHARD_BYTES,
     SHARD_SECONDS,
     CommitQueue,
-    Episodes,
+    EpisodeScheduler,
     EpisodeSettings,
     RunDriver,
     WriteFailed,
@@ -39,7 +39,7 @@ from factory.graph.local import (
     notes_folder,
 )
 from factory.graph.own_process import AGAIN, NEW_CLUSTERS, new_cluster_text
-from factory.graph.plan import RunPlan, RunRecords, Try, count_crash, make_plan, read_crash, retry_policy
+from factory.graph.plan import RunPlan, RunRecords, Try, make_plan, plan_after_crash, read_crash, retry_policy
 from factory.graph.progress import RunMetrics, RunTotals
 from factory.graph.steps import NotReady, Work
 from factory.readers.base import ClipRef
@@ -136,7 +136,7 @@ class _Run:
             self._on_change: OnChange = "keep" if kept else self._how.on_change
             plan = self._planned(not self._store.starts_over(self._records))
             wanted = self._how.episodes
-            self._episodes = Episodes(self._store, wanted, self._refs) if wanted else None
+            self._episodes = EpisodeScheduler(self._store, wanted, self._refs) if wanted else None
         except ChangedRun as error:
             return RunSummary(BAD_CONFIG, str(error))
         except (OSError, DeltaError) as error:
@@ -146,7 +146,7 @@ class _Run:
             return RunSummary(BAD_CONFIG, f"{error}; {damaged}")
         self._notes = notes_folder(self._store.location)
         records = RunRecords(self._identity, self._digests)
-        plan, self._died = count_crash(read_crash(self._notes), plan, records, self._policy)
+        plan, self._died = plan_after_crash(read_crash(self._notes), plan, records, self._policy)
         self._use_plan(plan)
         if plan.frozen:
             kept_clips = f"{len(plan.frozen)} clips kept as they are"

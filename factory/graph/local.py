@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from factory.exits import become_worker, terminal_signals_blocked
+from factory.exits import ignore_terminal_signals, terminal_signals_blocked
 from factory.files import DiskFull
 from factory.graph import steps
 from factory.graph.guard import OVER, WORK, WatchedProcess, read_note
@@ -54,7 +54,7 @@ class Limits:
         return sum(seconds) or None, max(known) if known and len(known) == len(memory) else None
 
 
-class Costs:
+class TaskDurations:
     """How long tasks have taken in this run, and so what the next may take."""
 
     def __init__(self, limits: Limits) -> None:
@@ -89,7 +89,7 @@ def notes_folder(out: Location) -> Path:
     return Path(tempfile.gettempdir()) / f"driving-data-factory-{os.getuid()}" / name
 
 
-def clear_notes(folder: Path) -> str:
+def start_run_notes(folder: Path) -> str:
     """A new run's name in the notes of its guards; those of earlier runs go, but for what was in hand at a crash."""
     for path in (*folder.glob(f"*{OVER}"), *folder.glob(f"*{WORK}")):
         path.unlink(missing_ok=True)
@@ -329,9 +329,9 @@ class IsolatedGraph(Graph):
         self._context = multiprocessing.get_context("spawn")
         with terminal_signals_blocked():  # what keeps its semaphores is a process, too
             self._stop = self._context.Event()
-        self._costs, self._notes = Costs(limits), notes_folder(out)
+        self._costs, self._notes = TaskDurations(limits), notes_folder(out)
         self._waiting: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
-        self._numbers, self._run = count(), clear_notes(self._notes)
+        self._numbers, self._run = count(), start_run_notes(self._notes)
         self._in_hand: tuple[Ticket, str, tuple[Any, ...]] | None = None
         self._deaths = 0  # at what is in hand
         self._begin()
@@ -424,7 +424,7 @@ class IsolatedGraph(Graph):
 
 def _serve_tasks(pipe: Connection, work: Work, out: Location, stop: Any, notes: Path) -> None:
     """The other process: a task at a time, until there is none or the run is gone."""
-    become_worker()
+    ignore_terminal_signals()
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the run decides
     supplied = {"work": work, "out": out, "stopped": stop.is_set}
     kept: OrderedDict[int, Any] = OrderedDict()

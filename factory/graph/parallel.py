@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from itertools import islice
 from typing import Literal, ParamSpec, TypeVar
 
-from factory.exits import become_worker, calling_on_stop_signal, terminal_signals_blocked
+from factory.exits import calling_on_stop_signal, ignore_terminal_signals, terminal_signals_blocked
 from factory.graph.steps import TaskStopped
 from factory.store.location import Location
 
@@ -102,7 +102,7 @@ class _Processes(ProcessPoolExecutor):
 
 def _detach_worker() -> None:
     """A worker process out of reach of what is sent to all of a terminal, that ends when its driver was killed."""
-    become_worker()
+    ignore_terminal_signals()
     os.setpgrp()
     driver = multiprocessing.parent_process()
     assert driver is not None

@@ -398,7 +398,7 @@ def read_crash(folder: Path) -> Mapping[str, Any]:
     return read_note(folder / CRASHED) or {}
 
 
-def count_crash(
+def plan_after_crash(
     crash: Mapping[str, Any], plan: RunPlan, records: RunRecords, may_retry: Callable[[PastAttempt], bool]
 ) -> tuple[RunPlan, list[Outcome]]:
     """The plan that knows of a crash, and the outcome to be stored before anything is begun."""

@@ -66,7 +66,7 @@ class Bar:
 
 
 @dataclass
-class Counter(Bar):
+class RateBar(Bar):
     """The rate and the time left by it; those done before this run are not in the rate."""
 
     def show(self, done: int, note: str = "") -> None:

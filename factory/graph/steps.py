@@ -21,7 +21,7 @@ from factory.store.episodes import EPISODES_FOLDER, episode_name
 from factory.store.location import BadCacheFile, ClipCache, Location, SceneFiles, Shard, write_shard
 from factory.store.reader import read_samples
 from factory.store.samples import CandidateRow, ErrorKind
-from factory.store.schema import SAMPLES, RunIdentity, Stamp, sample_row_to_table
+from factory.store.schema import SAMPLES, RunIdentity, Stamp, sample_rows_to_table
 from factory.wording import one_line
 from tasks.stages import ATTEMPT, Rejected
 
@@ -346,12 +346,12 @@ def prepare(
     if result.clip_id != ref.clip_id:
         raise ValueError(f"prepare({ref.clip_id}) returned clip {result.clip_id}")
     _refuse_changed(ref, result.content_digest, wanted_content)
-    uncached = _why_uncached(cache, key, result)
+    uncached = _cache_clip(cache, key, result)
     _keep_scenes(out, result)
     return PrepareReport(replace(result, payload=None, scenes=None), False, note, uncached, result.seconds), result
 
 
-def _why_uncached(cache: ClipCache, key: str, clip: PreparedClip) -> str:
+def _cache_clip(cache: ClipCache, key: str, clip: PreparedClip) -> str:
     """Keep a prepared clip; what stopped that, if anything did: a result that could not be cached is still a result."""
     try:
         cache.store(key, clip)
@@ -392,7 +392,7 @@ def attempt(
         if isinstance(result, RejectedAttempt):
             subscores, at_hand = dict(result.subscores), result.scene_at_hand
             return AttemptReport(result.rejected, subscores=subscores, seconds=seconds, scene_at_hand=at_hand), None
-        row = sample_row_to_table([{**result.row, **vars(stamp)}])
+        row = sample_rows_to_table([{**result.row, **vars(stamp)}])
         (psnr_db,) = row["psnr"].to_pylist()
         report = AttemptReport(
             None,

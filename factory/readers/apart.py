@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection
 from threading import Lock
 from typing import Any, Generic, TypeVar
 
-from factory.exits import become_worker
+from factory.exits import ignore_terminal_signals
 from factory.readers.base import BadClip
 
 LIMIT_S = 300.0  # for one file; the longest logs take seconds
@@ -63,7 +63,7 @@ _lock = Lock()
 _running: list[ReaderProcess] = []
 
 
-class OtherProcess(Generic[A, R]):
+class ProcessFunction(Generic[A, R]):
     """A function, answered in the other process; it is sent there once for all arguments that follow each other."""
 
     def __init__(self, function: Callable[[A], R]) -> None:
@@ -136,5 +136,5 @@ def _answer_all(pipe: "Connection[Any, Any]") -> None:
 
 
 if __name__ == "__main__":
-    become_worker()
+    ignore_terminal_signals()
     _answer_all(Connection(int(sys.argv[1])))

@@ -37,7 +37,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from factory.readers.apart import OtherProcess
+from factory.readers.apart import ProcessFunction
 from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, failures_as_bad_clip, split_of, validate_clip
 from factory.readers.settings import LogClips, WindowSettings, check_traversals
 from tasks.world.arrays import Array, Ints
@@ -54,7 +54,7 @@ from tasks.world.clip import (
     SensorFile,
 )
 from tasks.world.frames import VX, VY, X, Y
-from tasks.world.road_map import NoRoute, RoadMap, Route, RouteFinder, TrafficLights, route_of_log
+from tasks.world.road_map import CenterlineFinder, NoRoute, RoadMap, Route, TrafficLights, route_of_log
 
 # Several logs of one place: which other drives lead through a block, and the block with what they saw.
 #
@@ -229,13 +229,13 @@ class WholeLog:
     split: str | None = field(default=None, kw_only=True)  # the data set's own; None: by the hash of the log's id
 
     @cached_property
-    def finder(self) -> RouteFinder:
+    def finder(self) -> CenterlineFinder:
         """Of the centrelines ahead."""
-        return RouteFinder(self.road_map, self.route)
+        return CenterlineFinder(self.road_map, self.route)
 
 
 @dataclass(frozen=True)
-class Recorded:
+class WindowSensors:
     """What one window has besides states: the ego's pose in space, and what it is rendered from."""
 
     world_from_ego: Array  # (96, 4, 4) rear axle
@@ -310,7 +310,7 @@ class LogReader(ABC, Generic[Log]):
         """The whole log, with the same steps as `drive`. Raises BadClip."""
 
     @abstractmethod
-    def recorded(self, log: Log, start: int, stop: int) -> Recorded:
+    def recorded(self, log: Log, start: int, stop: int) -> WindowSensors:
         """What steps start..stop-1 of the log have besides states. Raises BadClip."""
 
     def world(self, path: Path) -> str | None:
@@ -335,7 +335,7 @@ class LogReader(ABC, Generic[Log]):
         if self.traversals:
             self._driven  # noqa: B018 - found once, before workers get the reader
         importable = type(self).__module__ != "__main__"  # else no other process knows the class
-        elsewhere = OtherProcess(self.windows_of) if self.untrusted and importable else None
+        elsewhere = ProcessFunction(self.windows_of) if self.untrusted and importable else None
         for log_id, path in chosen.items():
             try:
                 with failures_as_bad_clip(str(path)):

@@ -376,11 +376,11 @@ class _Array(np.ndarray):
         super().__setstate__(checked)
 
 
-def _hashed(value: object, left: int) -> int:
+def _left_after_hashing(value: object, left: int) -> int:
     """What is left of `left` values once those that hashing a tuple goes through are taken; below 0: too many."""
     left -= 1
     for item in value if isinstance(value, tuple) and left >= 0 else ():
-        left = _hashed(item, left)
+        left = _left_after_hashing(item, left)
         if left < 0:
             break
     return left
@@ -436,7 +436,7 @@ def _stand_ins(file: str, budget: int, classes: frozenset[str]) -> dict[tuple[st
     def copied(kind: Callable[[Iterable[object]], Any]) -> Callable[..., Any]:
         def build(items: list[object] | tuple[object, ...] | str = ()) -> Any:
             spend(64 * len(items))
-            if kind in (set, frozenset) and any(_hashed(item, MAX_HASHED) < 0 for item in items):
+            if kind in (set, frozenset) and any(_left_after_hashing(item, MAX_HASHED) < 0 for item in items):
                 raise BadClip(file, "pickle", "a member of a set is a tuple of too many")
             return kind(items)
 

@@ -25,7 +25,7 @@ def read_pcd(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     """The named fields (N,), N >= 1, in the types they have in the file. Raises BadClip."""
     file, data = str(path), bytes_of(path)
     header, start = _header(data, file)
-    record, n_points = _record(header, file)
+    record, n_points = _record_layout(header, file)
     if record.names is None or (missing := [name for name in columns if name not in record.names]):
         raise BadClip(file, "FIELDS", f"no {', '.join(missing)}; there are {', '.join(record.names or ())}")
     if n_points < 1:
@@ -67,7 +67,7 @@ def _header(data: bytes, file: str) -> tuple[dict[str, list[str]], int]:
     return found, at
 
 
-def _record(header: dict[str, list[str]], file: str) -> tuple[np.dtype[Any], int]:
+def _record_layout(header: dict[str, list[str]], file: str) -> tuple[np.dtype[Any], int]:
     """The type of one record, and how many there are. Raises BadClip."""
     if header["DATA"] != ["binary"]:
         raise BadClip(file, "DATA", f"is {' '.join(header['DATA'])}, only binary is read")

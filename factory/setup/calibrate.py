@@ -14,7 +14,7 @@ from factory.graph.plan import candidate_order
 from factory.graph.steps import Columns, run_attempt
 from factory.readers.base import ClipRef
 from factory.setup.settings import Run
-from factory.store.schema import BOOKKEEPING, sample_row_to_table
+from factory.store.schema import BOOKKEEPING, sample_rows_to_table
 from tasks.render.settings import RenderMode
 from tasks.stages import TASKS, Rejected
 from tasks.world.vocabulary import Vocabulary
@@ -55,7 +55,7 @@ def plan_text(run: Run, refs: Sequence[ClipRef]) -> str:
         n_clips = sum(ref.clip_id in starts for ref in refs)
         lines.append(f"starts: {sum(map(len, starts.values()))}; {n_clips} of the {len(refs)} clips have some")
     lines.append(f"experts: {', '.join(config.experts)}; rounds: {config.rounds}; out: {config.out}")
-    lines.append(setup_text(config, vocabulary))
+    lines.append(paper_deviations_line(config, vocabulary))
     return "\n".join(lines)
 
 
@@ -99,14 +99,14 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
                 if isinstance(result, Columns):
                     sums.accepted += 1
                     blank: dict[str, object] = dict.fromkeys(BOOKKEEPING, "") | {"round": 0, "candidate_index": 0}
-                    sums.row_bytes += int(sample_row_to_table([{**blank, **result.row}]).nbytes)
+                    sums.row_bytes += int(sample_rows_to_table([{**blank, **result.row}]).nbytes)
                     wanted -= 1
                 if wanted == 0:
                     break
     return sums
 
 
-def calibrate(run: Run, refs: Sequence[ClipRef]) -> str:
+def estimate_run_size(run: Run, refs: Sequence[ClipRef]) -> str:
     """The expected size of the whole run as a text."""
     sums = measure(run, refs)
     if sums.clips == 0:
@@ -134,13 +134,13 @@ def calibrate(run: Run, refs: Sequence[ClipRef]) -> str:
     return "\n".join(lines)
 
 
-def setup_text(config: RunConfig, vocabulary: Vocabulary) -> str:
+def paper_deviations_line(config: RunConfig, vocabulary: Vocabulary) -> str:
     """One line: settings that are not preset=paper's, with those in brackets, and what no preset makes the paper's."""
-    found = [*differences_from_paper(config, vocabulary), *fixed_differences_from_paper(config)]
+    found = [*differences_from_paper(config, vocabulary), *differences_in_every_preset(config)]
     return f"set-up: not the paper's (in brackets; preset=paper comes nearest): {', '.join(found)}"
 
 
-def fixed_differences_from_paper(config: RunConfig) -> list[str]:
+def differences_in_every_preset(config: RunConfig) -> list[str]:
     """What of this set-up is not as the paper's text (3.2, supplement) or the public code has it, in any preset."""
     found = ["walks that go on to the next candidate until one is accepted (the rates fit one draw a round)"]
     if config.traffic.mode == "idm":

@@ -18,10 +18,10 @@ from factory.files import machine_fault_of
 from factory.pipeline import BenchmarkWork, FactoryWork
 from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef, read_clip
 from factory.setup.vocabulary import (
-    StartStates,
+    StartTrajectories,
     build_recovery_table,
     load_recovery_table,
-    load_start_states,
+    load_start_trajectories,
     load_vocabulary,
     save_recovery_table,
     train_windows,
@@ -117,7 +117,7 @@ def assemble(config: RunConfig) -> Run:
         vocabulary = choose_vocabulary(config.vocabulary)
         labels_of = choose_labels_of(config, vocabulary)
         traffic_record(config.traffic)  # whether there is its policy
-        starts = None if config.perturb.starts is None else load_start_states(config.perturb.starts)
+        starts = None if config.perturb.starts is None else load_start_trajectories(config.perturb.starts)
         experts = {
             name: build_expert(RunContext(config, name, opened)) for name in config.experts if name not in FRAMES
         }
@@ -226,7 +226,7 @@ def _must_have(plugged: object, members: Sequence[str], where: str, what: str) -
 
 
 def run_identity(
-    config: RunConfig, vocabulary: Vocabulary, labels_of: Vocabulary | None, starts: StartStates | None = None
+    config: RunConfig, vocabulary: Vocabulary, labels_of: Vocabulary | None, starts: StartTrajectories | None = None
 ) -> RunIdentity:
     """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it.
 

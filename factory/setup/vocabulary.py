@@ -106,7 +106,7 @@ def load_vocabulary(path: str | Path, first: int | None = None) -> Vocabulary:
 
 
 @dataclass(frozen=True)
-class StartStates:
+class StartTrajectories:
     """Trajectories that lead single clips into states of somebody's choice, such as where a planner drove itself."""
 
     of_clip: Mapping[str, Array]  # clip_id -> (S, 40, 3) ego frame at T, 0.1 .. 4.0 s, in the order of the file
@@ -118,7 +118,7 @@ class StartStates:
             raise ValueError(f"perturb.starts: none of its {len(self.of_clip)} clips is among those of clips=")
 
 
-def load_start_states(path: str) -> StartStates:
+def load_start_trajectories(path: str) -> StartTrajectories:
     """Those of a Parquet file: a row each, of clip_id and trajectory (40, 3). Raises ValueError that names the file."""
     where = f"perturb.starts={path}"
     try:
@@ -139,7 +139,7 @@ def load_start_states(path: str) -> StartStates:
         of_clip.setdefault(clip_id, []).append(trajectory)
     found = {clip_id: np.array(of_clip[clip_id]) for clip_id in sorted(of_clip)}
     named = "\x1f".join(f"{clip_id} {trajectories_digest(starts)}" for clip_id, starts in found.items())
-    return StartStates(found, hashlib.sha256(named.encode()).hexdigest()[:16])
+    return StartTrajectories(found, hashlib.sha256(named.encode()).hexdigest()[:16])
 
 
 def load_recovery_table(path: str | Path) -> RecoveryTable:

@@ -96,7 +96,7 @@ class CorrectedRig:
         return lift_tracks(agents, times - first_s, rises)
 
 
-def is_rig_corrected(block: Block, settings: RigSettings) -> bool:
+def needs_rig_correction(block: Block, settings: RigSettings) -> bool:
     """Whether the block's rig is to be corrected."""
     return bool(block.images) and (
         settings.adjust is Adjust.ON or (settings.adjust is Adjust.AUTO and not block.sweeps)
@@ -319,10 +319,10 @@ def block_sensing(clip: Clip, settings: RenderSettings) -> Sensing:
     photos = files_of_cameras(cameras, block.images)
     if block.sweeps and photos:
         return Sensing.PHOTOS
-    return Sensing.PHOTOS_ONLY if photos and _with_parallax(photos) >= PARALLAX_SHARE else Sensing.NOTHING
+    return Sensing.PHOTOS_ONLY if photos and _parallax_share(photos) >= PARALLAX_SHARE else Sensing.NOTHING
 
 
-def _with_parallax(photos: Sequence[SensorFile]) -> float:
+def _parallax_share(photos: Sequence[SensorFile]) -> float:
     """Share of the photos that another of the same camera lies at a useful distance from for depth by comparison."""
     places: dict[str, list[Array]] = {}
     for file in photos:
@@ -355,11 +355,11 @@ def load_or_build_scene(
             except BadScene as error:
                 log.warning("%s; it is built again", error)
             else:
-                if is_rig_corrected(block, settings.rig) and path.with_suffix(RIG_SUFFIX).exists():
+                if needs_rig_correction(block, settings.rig) and path.with_suffix(RIG_SUFFIX).exists():
                     read_or_correct_rig(path, block, cameras, masks)  # written again where it is damaged
                 return kept
         agents, taken, found = block.agents, tuple[PhotoPose, ...](), None
-        if is_rig_corrected(block, settings.rig):
+        if needs_rig_correction(block, settings.rig):
             given = block.images
             block, cameras, found = correct_block_rig(path, block, cameras, masks)
             taken = photo_poses(given, block.images) if found is not None else ()
@@ -383,7 +383,7 @@ def load_or_correct_rig(clip: Clip, settings: RenderSettings, cache_dir: str | P
     Raises BadClip and ValueError as `load_or_build_scene` does.
     """
     block, rig = block_of(clip), choose_cameras(clip.cameras, settings.cameras)
-    if block_sensing(clip, settings) is Sensing.NOTHING or not is_rig_corrected(block, settings.rig):
+    if block_sensing(clip, settings) is Sensing.NOTHING or not needs_rig_correction(block, settings.rig):
         return None
     cameras = block_cameras(block, rig)
     path, masks = scene_path(clip, settings, cache_dir), block_masks(cameras, read_masks(settings.own_body, rig))
@@ -446,7 +446,7 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
     if settings.scene is SceneFrom.FIT and settings.backend.on_gpu:
         made["backend"] = Backend.GSPLAT  # another fit to the last bits, so that a run on CPUs never meets it
     how: list[object] = [settings.width, settings.height, sorted(settings.cameras), made]
-    if is_rig_corrected(block, settings.rig):
+    if needs_rig_correction(block, settings.rig):
         how.append(asdict(settings.rig))
     if settings.own_body:
         how.append(["own_body", masks_digest(settings.own_body)])

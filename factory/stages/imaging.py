@@ -32,13 +32,13 @@ from tasks.render.gate import (
     VehiclePhotos,
     block_fault,
     check_drive_pictures,
-    checked_size,
     estimate_fading,
     find_sightings,
+    gate_picture_size,
     likeness_to_photo,
 )
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import vehicles_at
+from tasks.render.scene.engine import agents_at_time
 from tasks.render.scene.sensed import Photo
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
 from tasks.render.views import MAP_RIG, draw_map_views, render_views
@@ -336,7 +336,7 @@ def _cached_rig(block: _BlockKey) -> CorrectedRig | None:
     return load_or_correct_rig(block.clip, block.settings, Path(block.cache_dir))
 
 
-def open_vehicle_photos(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> VehiclePhotos:
+def lazy_vehicle_photos(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> VehiclePhotos:
     """The photos of a clip's block; one is opened when a vehicle is first held against it. Raises BadClip then."""
     block, cameras = block_of(clip), asset.as_corrected(choose_cameras(clip.cameras, settings.cameras))
     files = asset.photos_of(block.images)
@@ -346,7 +346,7 @@ def open_vehicle_photos(clip: Clip, asset: RenderAsset, settings: RenderSettings
     for track_id, seen in shown.items():
         for row in seen.photos:
             tracks.setdefault(int(row), []).append(track_id)
-    size = checked_size((settings.width, settings.height), settings.gate)
+    size = gate_picture_size((settings.width, settings.height), settings.gate)
     known: dict[int, dict[str, float]] = {}
 
     @cache
@@ -359,7 +359,7 @@ def open_vehicle_photos(clip: Clip, asset: RenderAsset, settings: RenderSettings
         return known[row][track_id]
 
     def taken(track_id: str, row: int) -> VehiclePhoto:
-        there = vehicles_at(agents, photo(row).time_s)
+        there = agents_at_time(agents, photo(row).time_s)
         own = there.track_ids.index(track_id)
         return VehiclePhoto(photo(row), there.boxes[own], np.delete(there.boxes, own, axis=0))
 
@@ -370,4 +370,4 @@ def open_vehicle_photos(clip: Clip, asset: RenderAsset, settings: RenderSettings
 
 @lru_cache(maxsize=2)
 def _cached_vehicle_photos(block: _BlockKey) -> VehiclePhotos:
-    return open_vehicle_photos(block.clip, _scene_of_block(block.clip, block.settings, block.cache_dir), block.settings)
+    return lazy_vehicle_photos(block.clip, _scene_of_block(block.clip, block.settings, block.cache_dir), block.settings)

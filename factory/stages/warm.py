@@ -15,7 +15,7 @@ from threading import Event, Lock, Thread
 
 import numpy as np
 
-from factory.exits import become_worker, terminal_signals_blocked
+from factory.exits import ignore_terminal_signals, terminal_signals_blocked
 from factory.files import locked
 from factory.graph.steps import NotReady
 from tasks.attempt import drive_and_judge
@@ -175,7 +175,7 @@ def _wait_for_part(part: "subprocess.Popen[str]", enough: Event) -> str:
 
 def _compile_and_mark(name: str) -> int:
     """One part, in this process; the exit code."""
-    become_worker()
+    ignore_terminal_signals()
     gc.disable()  # a process that ends soon: some 220 MB more for a sixth of its time
     PARTS[name]()
     listed = "\n".join(sorted(path.relative_to(cache_dir()).as_posix() for path in USED))

@@ -34,7 +34,7 @@ class Message:
     content: Any  # a message of protobuf, or a mapping
 
 
-def has_episode(attempt_id: str, every: int) -> bool:
+def wants_episode(attempt_id: str, every: int) -> bool:
     """One sample in `every`, by its id alone; 1: all, 0: none."""
     return every > 0 and zlib.crc32(attempt_id.encode()) % every == 0
 

@@ -82,7 +82,7 @@ def attempts_from_tables(samples: pa.Table, outcomes: pa.Table, runs: Sequence[M
     why, whys, task = _reasons(outcomes)
     why = np.concatenate([why, np.zeros(samples.num_rows, np.int32)])
     task = np.concatenate([task, np.full(samples.num_rows, len(ATTEMPT), np.int32)])
-    age = 2 * (_ages(rows, runs) + 1)  # -1: of no record
+    age = 2 * (_run_numbers(rows, runs) + 1)  # -1: of no record
     age[n_outcomes:] += 1
     sizes = len(clip_ids), int(candidate.max(initial=-1)) + 2, n_ages
     newest = _last_of_each(_ordered(expert, list(zip(sizes, (clip, candidate + 1, age)))), n_ages)
@@ -119,11 +119,11 @@ def _reasons(outcomes: pa.Table) -> tuple[Codes, tuple[str, ...], Codes]:
     found, at = distinct_texts(outcomes, ("kind", "stage", "reason", "error_kind"))
     words = [_reason(*row) for row in found]
     known = list(dict.fromkeys([ACCEPTED, EXHAUSTED, *words]))
-    tasks = np.array([_task(stage) for _, stage, _, _ in found], np.int32)
+    tasks = np.array([_task_index(stage) for _, stage, _, _ in found], np.int32)
     return np.array([known.index(word) for word in words], np.int32)[at], tuple(known), tasks[at]
 
 
-def _task(stage: str) -> int:
+def _task_index(stage: str) -> int:
     """Place in ATTEMPT of the task of that stage or name; of one that was not told the first."""
     return next((i for i, name in enumerate(ATTEMPT) if stage == name or stage in STAGES_OF[name]), 0)
 
@@ -134,7 +134,7 @@ def _reason(kind: str, stage: str, reason: str, error_kind: str) -> str:
     return f"failed.{error_kind}" if kind == Kind.FAILED else f"{stage}.{reason}"
 
 
-def _ages(rows: pa.Table, runs: Sequence[Mapping[str, Any]]) -> Codes:
+def _run_numbers(rows: pa.Table, runs: Sequence[Mapping[str, Any]]) -> Codes:
     """The number of the run that each row is of (factory.store.samples.run_number_lookup)."""
     names = [name for name in MADE_UNDER if name != "attempt_id"]
     found, at = distinct_texts(rows, names)

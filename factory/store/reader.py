@@ -129,7 +129,7 @@ class SampleTable:
         _check_columns(columns)
         for path in sorted(self._partitions):
             with raising_damaged_file(f"{self._table.location.uri}/{path}"):
-                groups = len(group_rows(self._file(path)))
+                groups = len(row_group_sizes(self._file(path)))
             for group in range(groups):
                 with raising_damaged_file(f"{self._table.location.uri}/{path}"):
                     rows = read_rows(self._file(path), group, self._partitions[path], columns)
@@ -147,7 +147,7 @@ def read_samples(
             yield from read_rows(file, group, partition, None, slice(i, i + 1))
 
 
-def group_rows(file: pq.ParquetFile) -> Ints:
+def row_group_sizes(file: pq.ParquetFile) -> Ints:
     """(groups,) rows of each row group of a file."""
     metadata = file.metadata
     return np.array([metadata.row_group(g).num_rows for g in range(metadata.num_row_groups)], np.int64)
@@ -156,7 +156,7 @@ def group_rows(file: pq.ParquetFile) -> Ints:
 def find_row_group(file: pq.ParquetFile, row: int) -> tuple[int, int]:
     """The row group that a file's row stands in, and its place there."""
     group = 0
-    for n in group_rows(file).tolist():
+    for n in row_group_sizes(file).tolist():
         if row < n:
             break
         group, row = group + 1, row - n

@@ -453,7 +453,7 @@ def why_other_schema(uri: str, version: object) -> str:
     )
 
 
-def sample_row_to_table(rows: Sequence[Mapping[str, object]]) -> pa.Table:
+def sample_rows_to_table(rows: Sequence[Mapping[str, object]]) -> pa.Table:
     """Rows (column -> value) as a table of SCHEMA.
 
     A nullable column may be left out. Raises BadRow naming a column that is missing, unknown, misshapen or not finite.

@@ -323,7 +323,7 @@ def compact(store: Store) -> Iterator[CompactedTable]:
         facts = table.file_facts()
         drop: list[str] = []
         add: list[tuple[Shard, int]] = []
-        for group in _merge_groups(table):
+        for group in _files_to_merge(table):
             rows = pa.concat_tables([table.read_file(path, facts[path].partition) for path in group])
             shard = write_shard(table.location, table.spec, rows)
             add.append((shard, max(facts[path].written_ms for path in group)))
@@ -333,7 +333,7 @@ def compact(store: Store) -> Iterator[CompactedTable]:
         yield CompactedTable(table.spec.name, len(facts), len(table.file_facts()))
 
 
-def _merge_groups(table: KeyedTable) -> list[list[str]]:
+def _files_to_merge(table: KeyedTable) -> list[list[str]]:
     """Files to be merged into one, two or more each; of a partition, in the order of their names."""
     partitions: dict[tuple[str, ...], list[tuple[str, int]]] = defaultdict(list)
     for path, file in sorted(table.file_facts().items()):

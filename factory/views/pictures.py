@@ -362,7 +362,7 @@ def images_at_now(row: Row) -> list[dict[str, Any]]:
     return list(nearest.values())
 
 
-def earlier_images(row: Row, camera: str) -> list[dict[str, Any]]:
+def images_up_to_now(row: Row, camera: str) -> list[dict[str, Any]]:
     """What one camera saw up to now, in order of time."""
     taken = [image for image in row["images"] or () if image["camera"] == camera and image["time_s"] < 0.1]
     return sorted(taken, key=lambda image: float(image["time_s"]))

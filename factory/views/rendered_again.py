@@ -30,7 +30,7 @@ from factory.views.pictures import (
 from factory.views.status import rows_where
 from tasks.caches import user_cache
 from tasks.render.scene.asset import RenderAsset, psnr
-from tasks.render.scene.engine import render, vehicles_at
+from tasks.render.scene.engine import agents_at_time, render
 from tasks.render.settings import ImageSource
 from tasks.render.views import VISIBLE_M
 from tasks.world.arrays import Array, Image
@@ -234,7 +234,7 @@ def render_cameras(
     The scene's time is that of the agents.
     """
     agents_s = time_s + NOW_INDEX * STEP_S
-    there = vehicles_at(agents, agents_s, world_from_ego[:2, 3], VISIBLE_M)
+    there = agents_at_time(agents, agents_s, world_from_ego[:2, 3], VISIBLE_M)
     eyes = [
         Pinhole(
             np.reshape(camera["intrinsics"], (3, 3)),

@@ -125,7 +125,7 @@ def sample_facts(row: Mapping[str, Any]) -> dict[str, str]:
     return facts
 
 
-def number_lines(row: dict[str, Any]) -> Iterable[str]:
+def sample_fact_lines(row: dict[str, Any]) -> Iterable[str]:
     """A sample's lineage, facts and scores."""
     from tasks.subscores import SUBSCORES
 
@@ -158,7 +158,7 @@ def lineage(store: "Store", which: str) -> list[Part]:
     records = store.runs()
     number = run_number_lookup(records)(row)
     record = records[number] if number >= 0 else {}
-    clip = _clip(store, row)
+    clip = _candidates_row(store, row)
     parts = [("run", _run_facts(store, record, number, row)), ("clip", _clip_facts(store, row, clip))]
     if row["candidate_index"] >= 0:
         parts.append(("candidate", _candidate_facts(row, clip, record)))
@@ -198,7 +198,7 @@ def _file_and_row(table: "KeyedTable", key: str, columns: Sequence[str]) -> tupl
     return path, rows.filter(pc.equal(rows[table.spec.key], key)).to_pylist()[0]
 
 
-def _clip(store: "Store", row: Row) -> Row:
+def _candidates_row(store: "Store", row: Row) -> Row:
     """The clip's row of candidates with its file, empty where it has none."""
     if row["clip_id"] not in store.candidates:
         return {}

@@ -107,7 +107,7 @@ def _as_public(sample: Mapping[str, Any], layout: BevLayout, step: int) -> Bytes
     return np.ascontiguousarray(drawn.T)
 
 
-def nearest_agents(sample: Mapping[str, Any], layout: BevLayout, n: int) -> tuple[F32, Bools]:
+def nearest_vehicles(sample: Mapping[str, Any], layout: BevLayout, n: int) -> tuple[F32, Bools]:
     """Vehicles at now whose centre is inside the layout, nearest first: boxes (n, 5) float32 and whether there is one.
 
     In a public layout those behind too, as far as ahead.

@@ -115,10 +115,10 @@ class BatchBuffer:
         if needs.bev is not None:
             arrays["bev"][i] = stored.raster(row, needs.bev)
             if needs.n_agents:
-                from planners.data.bev import nearest_agents
+                from planners.data.bev import nearest_vehicles
 
                 seen = stored.values(AGENT_COLUMNS, row)
-                arrays["agents"][i], arrays["agents_valid"][i] = nearest_agents(seen, needs.bev, needs.n_agents)
+                arrays["agents"][i], arrays["agents_valid"][i] = nearest_vehicles(seen, needs.bev, needs.n_agents)
         if needs.labels is not None:
             labels = labels_of(stored.values(LABEL_COLUMNS, row), needs.labels)
             for name in LABELLED:

@@ -19,12 +19,12 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from factory.store.location import Location, raising_damaged_file
-from factory.store.reader import TIME_TOLERANCE_S, group_rows
+from factory.store.reader import TIME_TOLERANCE_S, row_group_sizes
 from factory.store.schema import LABEL_COLUMNS
 from planners.data.batch import ImageLayout, Needs, TrainingData
 from planners.data.files import SampleFile, files_of, group_bytes, leaf_paths, read_all
 from planners.data.images import chosen_cameras
-from planners.data.mix import MixSettings, Samples, check_sides
+from planners.data.mix import MixSettings, OrderInputs, check_sides
 from tasks.settings import constant
 from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
 
@@ -144,7 +144,7 @@ class Dataset:
             with raising_damaged_file(self.files[number].where):
                 parquet = self.files[number].open()
                 stored = parquet.read(columns=leaf_paths(parquet, ["label_2hz"]))["label_2hz"].combine_chunks()
-                starts = np.concatenate([[0], np.cumsum(group_rows(parquet))])
+                starts = np.concatenate([[0], np.cumsum(row_group_sizes(parquet))])
                 values = stored.flatten().flatten().to_numpy().reshape(-1, 8, 3)
                 labels[here] = values[starts[self.rows.group[here]] + self.rows.place[here]]
         return labels
@@ -211,7 +211,7 @@ def _rows_of(file: SampleFile, number: int) -> SampleRows:
 
 
 def _index_of(file: SampleFile, number: int, parquet: pq.ParquetFile, table: pa.Table) -> SampleRows:
-    counts, n = group_rows(parquet), table.num_rows
+    counts, n = row_group_sizes(parquet), table.num_rows
 
     def text(name: str) -> NDArray[np.str_]:
         return np.array(pc.fill_null(table[name], "").to_pylist(), dtype=np.str_)
@@ -343,11 +343,11 @@ def make_feed(dataset: Dataset, needs: Needs) -> Feed:
     return Feed(dataset, needs, columns, tuple(cameras), size)
 
 
-def mixed_samples(feed: Feed) -> Samples:
+def order_inputs(feed: Feed) -> OrderInputs:
     """What the order of a feed's samples depends on."""
     rows = feed.dataset.rows
     group = np.unique(np.stack([rows.file, rows.group]), axis=1, return_inverse=True)[1].reshape(-1)
-    return Samples(rows.simulated, group, feed.size)
+    return OrderInputs(rows.simulated, group, feed.size)
 
 
 def _check_index(dataset: Dataset, needs: Needs) -> None:
@@ -381,7 +381,7 @@ def _file_part(
     """Of one file the places in the dataset of its samples, their cameras and their sizes."""
     here = np.flatnonzero(dataset.rows.file == number)
     parquet = dataset.files[number].open()
-    rows, groups = group_rows(parquet), dataset.rows.group[here]
+    rows, groups = row_group_sizes(parquet), dataset.rows.group[here]
     kept = np.ones((len(rows), len(columns)))  # share of a column's bytes
     cameras: list[tuple[str, ...]] = [()] * len(here)
     if needs.image is not None:

@@ -30,7 +30,7 @@ from planners.data.batch import Batch, Needs
 from planners.data.decode import BatchBuffer, StoredRows, count_labels
 from planners.data.files import leaf_paths, read_group
 from planners.data.images import GB, PictureCache, stitch
-from planners.data.index import Dataset, Feed, make_feed, mixed_samples
+from planners.data.index import Dataset, Feed, make_feed, order_inputs
 from planners.data.mix import EpochOrder, MixSettings, Side, WindowKey, make_order
 from tasks.world.arrays import Ints
 
@@ -40,7 +40,7 @@ Place = tuple[StoredRows, int]  # a row group in memory, a row of it
 
 
 @dataclass(frozen=True, eq=False)
-class Window:
+class ShuffleWindow:
     """What is wanted of one window."""
 
     key: WindowKey
@@ -92,7 +92,7 @@ class WindowMemory:
         lasting = ("_feed", "_staying", "pictures", "_checked")
         return {name: self.__dict__[name] for name in lasting} | {"_stay": {}}
 
-    def start_epoch(self, windows: Sequence[Window], executor: Executor) -> None:
+    def start_epoch(self, windows: Sequence[ShuffleWindow], executor: Executor) -> None:
         """Start to read for an epoch; what an earlier one left is dropped, but what stays."""
         self._executor = executor
         self._to_come = [window for window in windows if window.key[0] not in self._staying]
@@ -198,11 +198,11 @@ class Loader:
         self.mix, self.batch_size, self.rank, self.world, self.seed = mix, batch_size, rank, world, seed
         self._needs, self._workers, self._pinned = needs, workers, pinned
         self._feed = make_feed(dataset, needs)
-        samples = mixed_samples(self._feed)
+        samples = order_inputs(self._feed)
         self._order = make_order(samples, mix, batch_size, seed)
         staying = {side.number: side.rows for side in self._order.sides if side.fits}
         self._memory = WindowMemory(self._feed, staying)
-        self._pictures_bytes = _kept_pictures(self._order.sides, needs, mix)
+        self._pictures_bytes = _kept_picture_bytes(self._order.sides, needs, mix)
         sha = sha256(dataset.digest.encode())
         if len(staying) < len(self._order.sides):  # windows depend on where samples stand
             sha.update(samples.group.tobytes() + samples.size.tobytes())
@@ -348,7 +348,7 @@ class Loader:
         return buffer.batch(rows.attempt_id[samples].tolist(), simulated, imitate[self.mix.imitation])
 
 
-def _kept_pictures(sides: Sequence[Side], needs: Needs, mix: MixSettings) -> int:
+def _kept_picture_bytes(sides: Sequence[Side], needs: Needs, mix: MixSettings) -> int:
     """Bytes of the decoded pictures of all samples where they fit into mix.shuffle_mb beside the samples, else 0."""
     if needs.image is None or not all(side.fits for side in sides):
         return 0
@@ -357,12 +357,14 @@ def _kept_pictures(sides: Sequence[Side], needs: Needs, mix: MixSettings) -> int
     return pictures if samples + pictures <= mix.shuffle_mb * 2**20 else 0
 
 
-def _windows(order: EpochOrder, rows: Ints, windows: Ints, first: int) -> list[Window]:
+def _windows(order: EpochOrder, rows: Ints, windows: Ints, first: int) -> list[ShuffleWindow]:
     """What is wanted of the windows from batch `first` on, in the order in which it is."""
     found = []
     batches = np.broadcast_to(np.arange(len(rows))[:, None], rows.shape)[first:]
     for number in np.unique(windows[first:]).tolist():
         inside = windows[first:] == number
         used = batches[inside]
-        found.append((int(used.min()), Window(order.keys[number], np.unique(rows[first:][inside]), int(used.max()))))
+        found.append(
+            (int(used.min()), ShuffleWindow(order.keys[number], np.unique(rows[first:][inside]), int(used.max())))
+        )
     return [window for _, window in sorted(found, key=lambda item: item[0])]

@@ -47,7 +47,7 @@ class MixSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class OrderInputs:
     """What the order depends on, of n samples in the order of their ids."""
 
     simulated: Bools  # (n,)
@@ -177,7 +177,7 @@ def check_sides(mix: MixSettings, simulated: Bools) -> None:
             )
 
 
-def make_order(samples: Samples, mix: MixSettings, batch_size: int, seed: int) -> Order:
+def make_order(samples: OrderInputs, mix: MixSettings, batch_size: int, seed: int) -> Order:
     """Raises ValueError where there are fewer samples than one batch takes, or a side that the ratio needs is empty."""
     check_sides(mix, samples.simulated)
     half = mix.shuffle_mb * 2**20 / 2  # a window is read while the one before it is used

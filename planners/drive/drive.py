@@ -28,7 +28,7 @@ from factory.config.compose import ConfigError, need_run_extra
 from factory.exits import Failed, Stopped
 from factory.files import why_unusable
 from factory.graph.parallel import WorkerDied, parallel_map
-from factory.graph.progress import Counter
+from factory.graph.progress import RateBar
 from factory.graph.steps import TaskStopped
 from factory.readers.base import ClipRef, painter_of
 from factory.setup.settings import choose_vocabulary, open_reader
@@ -37,7 +37,7 @@ from factory.store.table import AnotherWriter, KeyedTable
 from planners.drive.drivers import make_driver
 from planners.drive.settings import DriveSettings, Pictures, settings_of
 from planners.drive.starts import LOGGED
-from planners.drive.summary import Row, picture_differences, summarise_drives, summary_text, write_summary
+from planners.drive.summary import Row, picture_source_effects, summarise_drives, summary_text, write_summary
 from planners.drive.work import (
     FACTS,
     DriveItem,
@@ -156,7 +156,7 @@ def _drive(work: DriveWork, items: Sequence[DriveItem], table: KeyedTable) -> li
     n_done = total - sum(len(item.keys) for item in waiting)
     try:
         with (
-            Counter("drives", total, before=n_done) as progress,
+            RateBar("drives", total, before=n_done) as progress,
             closing(parallel_map(work, waiting, settings.executor, settings.workers, work.out)) as results,
         ):
             for made in results:
@@ -178,7 +178,7 @@ def main(argv: Sequence[str]) -> None:
         need_run_extra("ray")
     rows, failed = drive_all(settings)
     if rows:
-        lines, apart = summarise_drives(rows, settings.confidence), picture_differences(rows, settings.confidence)
+        lines, apart = summarise_drives(rows, settings.confidence), picture_source_effects(rows, settings.confidence)
         print(summary_text(lines, apart, settings.confidence))
         if work_folder := local_folder(settings.out):
             write_summary(work_folder, lines, apart)

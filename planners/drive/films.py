@@ -24,7 +24,7 @@ from factory.views.pictures import (
     write_mp4,
     write_text,
 )
-from planners.drive.loop import PLAN_STEPS, ClosedLoop, measure_drive
+from planners.drive.loop import PLAN_STEPS, ClosedLoopDrive, measure_drive
 from tasks.world.arrays import Image
 from tasks.world.clip import STEP_S
 from tasks.world.frames import HEADING, VX
@@ -36,7 +36,7 @@ HOLD = 10  # pictures that the end is shown for
 Rig = Sequence[Mapping[str, Any]] | None  # the column `cameras`
 
 
-def write_film(out: Location, drive_id: str, made: ClosedLoop, rig: Rig, title: str) -> str:
+def write_film(out: Location, drive_id: str, made: ClosedLoopDrive, rig: Rig, title: str) -> str:
     """The film's file under `out`, written whole."""
     with TemporaryDirectory() as folder:
         path = Path(folder, "drive.mp4")
@@ -45,7 +45,7 @@ def write_film(out: Location, drive_id: str, made: ClosedLoop, rig: Rig, title: 
     return f"{FILMS}/{drive_id}.mp4"
 
 
-def film_frames(made: ClosedLoop, rig: Rig, title: str) -> Iterator[Image]:
+def film_frames(made: ClosedLoopDrive, rig: Rig, title: str) -> Iterator[Image]:
     """RGB pictures (560, 1280, 3), one each 0.1 s, the last several times."""
     sheet = None
     for step in range(made.n_steps + 1):
@@ -55,7 +55,7 @@ def film_frames(made: ClosedLoop, rig: Rig, title: str) -> Iterator[Image]:
         yield from [sheet] * HOLD
 
 
-def _sheet(made: ClosedLoop, rig: Rig, title: str, step: int) -> Image:
+def _sheet(made: ClosedLoopDrive, rig: Rig, title: str, step: int) -> Image:
     clip, pose = made.start.scene.clip, made.ego_states[step, : HEADING + 1]
     ways = [
         DrawnPath(clip.ego_states[made.start.scene.step :, : HEADING + 1], LOGGED, "logged", dashed=True),
@@ -79,7 +79,7 @@ def _sheet(made: ClosedLoop, rig: Rig, title: str, step: int) -> Image:
     return sheet
 
 
-def _lines(made: ClosedLoop, front: str | None, step: int, planned: int) -> list[str]:
+def _lines(made: ClosedLoopDrive, front: str | None, step: int, planned: int) -> list[str]:
     seen = "sees no pictures" if front is None else f"camera {front} at {planned * PLAN_STEPS * STEP_S:.1f} s"
     along = made.along_m[step] - made.along_m[0]
     told = [seen, f"{made.ego_states[step, VX]:.1f} m/s  {along:.0f} of {made.road.length_m:.0f} m of the route"]

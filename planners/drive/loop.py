@@ -21,7 +21,7 @@ from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentTracks, Rollout
 from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y
 from tasks.world.geometry import ego_boxes, touching
-from tasks.world.road_map import RouteFinder, arc_lengths
+from tasks.world.road_map import CenterlineFinder, arc_lengths
 
 # The road ahead of a drive: how far along it a place lies, and where it ends.
 
@@ -120,7 +120,7 @@ class Hit:
 
 
 @dataclass(frozen=True)
-class ClosedLoop:
+class ClosedLoopDrive:
     """A drive. S + 1 instants 0.1 s apart, the first of them the start's; P plans, the first made at the start."""
 
     start: DriveStart
@@ -142,7 +142,7 @@ class ClosedLoop:
 
 def drive(
     start: DriveStart, driver: Driver, settings: LoopSettings | None = None, cameras: DriveCameras | None = None
-) -> ClosedLoop:
+) -> ClosedLoopDrive:
     """Drive on from the start until something ends it.
 
     cameras: of a driver that looks; None: there are none. Raises ValueError where the clip has too few steps
@@ -151,8 +151,8 @@ def drive(
     settings, seen, scene = settings or LoopSettings(), cameras or NoCameras(), start.scene
     if scene.clip.agents.n_steps < settings.clip_steps(scene.step):
         raise ValueError(f"the clip must have {settings.clip_steps(scene.step)} steps, not {scene.clip.agents.n_steps}")
-    finder = RouteFinder(scene.clip.road_map, scene.clip.route)
-    course, observer = _Course(start, settings), Observer(seen)
+    finder = CenterlineFinder(scene.clip.road_map, scene.clip.route)
+    course, observer = _DriveSoFar(start, settings), Observer(seen)
     plans: list[Array] = []
     images: list[Images] = []
     while course.ended is None:
@@ -169,7 +169,7 @@ def drive(
         ahead = finder.centerline_from(tracked[steps, : HEADING + 1])
         scene = next_scene(scene, rollout, ahead, steps)
     first, n = start.scene.step, len(course.states)
-    return ClosedLoop(
+    return ClosedLoopDrive(
         start=start,
         road=course.road,
         ego_states=np.stack(course.states),
@@ -183,7 +183,7 @@ def drive(
     )
 
 
-class _Course:
+class _DriveSoFar:
     """A drive as far as it has come."""
 
     def __init__(self, start: DriveStart, settings: LoopSettings) -> None:
@@ -264,7 +264,7 @@ class DriveMeasures:
         return self.off_road_events + self.at_fault_collision
 
 
-def measure_drive(drive: ClosedLoop) -> DriveMeasures:
+def measure_drive(drive: ClosedLoopDrive) -> DriveMeasures:
     """Comfort is judged with the start's own history, since its filters are as long as 1.5 s."""
     states, off = drive.ego_states, drive.off_road
     steps_m = np.hypot(*np.diff(states[:, [X, Y]], axis=0).T)

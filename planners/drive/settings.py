@@ -73,12 +73,12 @@ class DriveSettings:
 
 def settings_of(argv: Sequence[str]) -> DriveSettings:
     """The settings of a command line. Raises ConfigError."""
-    settings = fill(DriveSettings, compose_with_planner("drive", argv, DriveSettings, with_clips), "")
+    settings = fill(DriveSettings, compose_with_planner("drive", argv, DriveSettings, with_reader_defaults), "")
     refuse_missing_root(settings.clips)
     return settings
 
 
-def with_clips(values: dict[str, Any]) -> dict[str, Any]:
+def with_reader_defaults(values: dict[str, Any]) -> dict[str, Any]:
     """With the defaults of the reader's settings, held against their types where it is a built-in one."""
     clips = values["clips"]
     shape = reader_settings(clips)

@@ -61,7 +61,7 @@ def summarise_drives(rows: Sequence[Row], confidence: float = 0.95) -> list[Driv
 
 
 def _line(planner: str, pictures: str, start: str, rows: Sequence[Row], confidence: float) -> DriveLine:
-    level, clusters = highest_level(rows)
+    level, clusters = coarsest_clusters(rows)
     km = np.maximum([row["distance_m"] / M_PER_KM for row in rows], 1e-9)  # a drive that stands weighs nothing
     failed = np.array([row["off_road_events"] + row["at_fault_collision"] for row in rows], dtype=float)
 
@@ -93,7 +93,7 @@ def _mean(values: Array, clusters: Sequence[str], confidence: float, weights: Ar
     )
 
 
-def highest_level(rows: Sequence[Row]) -> tuple[str, Sequence[str]]:
+def coarsest_clusters(rows: Sequence[Row]) -> tuple[str, Sequence[str]]:
     """Of clips that share a log or a town, whole ones are taken: no independent draws else (planners.evaluation)."""
     known = clusters_of([row["clip_id"] for row in rows], [row["log_id"] for row in rows])
     several = [level for level in LEVELS if level in known and len(set(known[level])) > 1]
@@ -102,7 +102,7 @@ def highest_level(rows: Sequence[Row]) -> tuple[str, Sequence[str]]:
 
 
 @dataclass(frozen=True)
-class PicturesDifference:
+class PictureSourceEffect:
     """What one planner's drives change where it sees the engine's pictures in place of the painter's."""
 
     planner: str
@@ -112,7 +112,7 @@ class PicturesDifference:
     shares: Mapping[str, Interval]  # b (engine) - a (truth)
 
 
-def picture_differences(rows: Sequence[Row], confidence: float = 0.95) -> list[PicturesDifference]:
+def picture_source_effects(rows: Sequence[Row], confidence: float = 0.95) -> list[PictureSourceEffect]:
     """Over the starts that were driven with both. None where there are none."""
     both: dict[tuple[str, str], dict[tuple[str, int], dict[str, Row]]] = {}
     for row in rows:
@@ -123,7 +123,7 @@ def picture_differences(rows: Sequence[Row], confidence: float = 0.95) -> list[P
         twice = [pair for pair in pairs.values() if {"truth", "engine"} <= pair.keys()]
         if not twice:
             continue
-        level, clusters = highest_level([pair["truth"] for pair in twice])
+        level, clusters = coarsest_clusters([pair["truth"] for pair in twice])
         shares = {
             name: paired_interval(
                 np.array([[share(pair["truth"]) for pair in twice]]),
@@ -133,11 +133,11 @@ def picture_differences(rows: Sequence[Row], confidence: float = 0.95) -> list[P
             )
             for name, share in SHARES.items()
         }
-        found.append(PicturesDifference(planner, start, len(twice), level, shares))
+        found.append(PictureSourceEffect(planner, start, len(twice), level, shares))
     return found
 
 
-def summary_text(lines: Sequence[DriveLine], differences: Sequence[PicturesDifference], confidence: float) -> str:
+def summary_text(lines: Sequence[DriveLine], differences: Sequence[PictureSourceEffect], confidence: float) -> str:
     """Tables to be printed, in percent."""
     head = ["planner", "pictures", "start", "drives", *(f"{name} %" for name in SHARES), "km", "failures", "m between"]
     rows = [head]
@@ -174,7 +174,7 @@ def _table(rows: Sequence[Sequence[str]]) -> list[str]:
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
 
 
-def write_summary(folder: Path, lines: Sequence[DriveLine], differences: Iterable[PicturesDifference]) -> None:
+def write_summary(folder: Path, lines: Sequence[DriveLine], differences: Iterable[PictureSourceEffect]) -> None:
     """`summary.csv`, and `differences.csv` where there are any."""
     rows: list[dict[str, object]] = []
     for line in lines:

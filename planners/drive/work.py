@@ -19,7 +19,7 @@ from factory.store.table import KeyedTable
 from planners.drive.cameras import DriveCameras, NoCameras, PaintedCameras, RenderedCameras, open_rendered_cameras
 from planners.drive.drivers import Driver, make_driver
 from planners.drive.films import write_film
-from planners.drive.loop import DRIVE_VERSION, ClosedLoop, DriveMeasures, drive, measure_drive
+from planners.drive.loop import DRIVE_VERSION, ClosedLoopDrive, DriveMeasures, drive, measure_drive
 from planners.drive.settings import DriveSettings, Pictures
 from planners.drive.starts import LOGGED, DriveStart, extend_clip, logged_start, perturbed_starts
 from planners.evaluation.planner_names import find_planner
@@ -232,7 +232,7 @@ class DriveWork:
     def _driver(self, who: DrivingPlanner) -> Driver:
         return cached_driver(who, canonical_json(self.settings.settings), self.settings.pdm, self.settings.device)
 
-    def _film(self, who: DrivingPlanner, key: DriveKey, made: ClosedLoop, cameras: DriveCameras) -> str:
+    def _film(self, who: DrivingPlanner, key: DriveKey, made: ClosedLoopDrive, cameras: DriveCameras) -> str:
         """One drive in so many has one, chosen by its id."""
         one_in = self.settings.one_film_in
         if one_in == 0 or int(key.drive_id, 16) % one_in:
@@ -240,7 +240,7 @@ class DriveWork:
         start = "log" if key.start == LOGGED else f"start {key.start}"
         return write_film(self.out, key.drive_id, made, cameras.rig, f"{who.label}, {key.pictures}, {start}")
 
-    def _row(self, who: DrivingPlanner, key: DriveKey, made: ClosedLoop, cameras: DriveCameras) -> DriveRow:
+    def _row(self, who: DrivingPlanner, key: DriveKey, made: ClosedLoopDrive, cameras: DriveCameras) -> DriveRow:
         clip, hit = made.start.scene.clip, made.hit
         return DriveRow(
             **vars(measure_drive(made)),

@@ -83,13 +83,13 @@ def paired_interval(
     differences = np.empty(draws)
     for start in range(0, draws, DRAWS_AT_ONCE):
         size = min(DRAWS_AT_ONCE, draws - start)
-        clips = _drawn(rng, size, n_clusters)[:, cluster_of_clip]
-        of_a = _drawn(rng, size, len(a))
-        of_b = of_a if paired else _drawn(rng, size, len(b))
+        clips = _draw_counts(rng, size, n_clusters)[:, cluster_of_clip]
+        of_a = _draw_counts(rng, size, len(a))
+        of_b = of_a if paired else _draw_counts(rng, size, len(b))
         differences[start : start + size] = _means(b, counts[1], of_b, clips) - _means(a, counts[0], of_a, clips)
     low, high = np.quantile(differences, [(1.0 - confidence) / 2.0, (1.0 + confidence) / 2.0])
     if clusters is not None:
-        errors = _errors(b, counts[1], cluster_of_clip) - _errors(a, counts[0], cluster_of_clip)
+        errors = _cluster_influences(b, counts[1], cluster_of_clip) - _cluster_influences(a, counts[0], cluster_of_clip)
         error = np.sqrt(n_clusters / (n_clusters - 1) * (errors**2).sum())
         half = stdtrit(n_clusters - 1, (1.0 + confidence) / 2.0) * error
         low = min(low, max(mean_b - mean_a - half, b.min() - a.max()))  # no mean leaves the range of its scores
@@ -97,7 +97,7 @@ def paired_interval(
     return Interval(mean_b - mean_a, float(low), float(high), mean_a, mean_b)
 
 
-def _errors(scores: Array, weights: Array, cluster_of_clip: Indices) -> Array:
+def _cluster_influences(scores: Array, weights: Array, cluster_of_clip: Indices) -> Array:
     """(G,) by how much the scores of each cluster move the weighted mean."""
     off = weights * (scores - (scores * weights).sum() / weights.sum())
     return np.bincount(cluster_of_clip, off.sum(axis=0)) / weights.sum()
@@ -111,7 +111,7 @@ def _indices(clusters: Sequence[Hashable], n_clips: int) -> tuple[Indices, int]:
     return np.array([place[cluster] for cluster in clusters]), len(place)
 
 
-def _drawn(rng: np.random.Generator, size: int, n: int) -> Array:
+def _draw_counts(rng: np.random.Generator, size: int, n: int) -> Array:
     """How often each of n is drawn in `size` draws of n with replacement: (size, n)."""
     return rng.multinomial(n, np.full(n, 1.0 / n), size=size).astype(np.float64)
 

@@ -115,7 +115,7 @@ def compare_tables(a: Sequence[str], b: Sequence[str], settings: CompareSettings
     of_a, of_b = (navsim.table_scores(side, settings.column) for side in runs)
     navsim.check_same_tokens(of_a, of_b)
     found: dict[Measure, ByLevel] = dict(intervals(of_a, of_b, settings))
-    summaries = navsim.summaries(*runs, settings.column)
+    summaries = navsim.published_mean_differences(*runs, settings.column)
     return found | {name: {"clip": one} for name, one in summaries.items()}
 
 

@@ -38,7 +38,7 @@ from factory.config.arguments import command
 from factory.config.compose import ConfigError, fill
 from factory.config.datasets import find_function, words_of
 from factory.config.shapes import to_plain
-from factory.graph.progress import Counter
+from factory.graph.progress import RateBar
 from planners.evaluation.aggregation import SummaryLine, summarise, summary_lines, table_text, write_table
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.frames import Benchmark, FrameKey
@@ -176,7 +176,7 @@ def _score_clips(
     tags = {key: tuple(sample["tags"]) for key, sample in benchmark.stream(["tags"])}
     driven: dict[tuple[str, str | None], Array] = {}  # of the clip before
     spent = 0.0
-    with Counter("clips scored", len(clips)) as progress:
+    with RateBar("clips scored", len(clips)) as progress:
         for done, clip_id in enumerate(clips, start=1):
             prepared = _prepared(benchmark, clip_id, rules)
             began = time.perf_counter()

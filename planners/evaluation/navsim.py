@@ -266,7 +266,7 @@ def check_same_tokens(first: Mapping[Measure, RunScores], second: Mapping[Measur
             raise ConfigError(f"{name[0]}: {len(other)} tokens stand on one side alone, such as {min(other)}")
 
 
-def summaries(
+def published_mean_differences(
     a: Sequence[Sequence[PublicTable]], b: Sequence[Sequence[PublicTable]], column: str
 ) -> dict[Measure, Interval]:
     """(stage, filter) -> difference of the published means of two stages, without an interval."""

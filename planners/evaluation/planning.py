@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from factory.config.compose import ConfigError
-from factory.graph.progress import Counter
+from factory.graph.progress import RateBar
 from factory.store.reader import Sample
 from factory.store.schema import LABEL_COLUMNS, NOW_INDEX, SCHEMA
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
@@ -37,7 +37,7 @@ LATER_ZERO = ("agent_valid", "light_states")
 EGO_COLUMNS = ("attempt_id", "expert", "command", "ego_status", "ego_history_2hz")
 
 
-def as_shown(sample: Mapping[str, Any]) -> Sample:
+def without_future(sample: Mapping[str, Any]) -> Sample:
     """A copy of a sample, or of some of its columns, without what comes after now.
 
     label_*, proposal_10hz                      zeros (the drive that followed)
@@ -61,7 +61,7 @@ def as_shown(sample: Mapping[str, Any]) -> Sample:
     return shown
 
 
-def columns_shown(needs: Needs | None) -> list[str]:
+def columns_to_read(needs: Needs | None) -> list[str]:
     """The columns that have to be read of a sample for a batch with these needs; None: all that may be shown."""
     if needs is None:
         return [name for name in SCHEMA.names if not name.startswith(SCORES)]
@@ -146,13 +146,13 @@ def _planned(
     made = {one.label: _loaded(one, device) for one in who}
     needs = {label: needs_of(planner) for label, planner in made.items()}
     kinds = list(dict.fromkeys(needs.values()))
-    columns = dict.fromkeys(name for kind in kinds for name in columns_shown(kind))
+    columns = dict.fromkeys(name for kind in kinds for name in columns_to_read(kind))
     wanted = set(keys)
     frames = (frame for frame in benchmark.stream(list(columns)) if frame[0] in wanted)
     plans: dict[str, dict[FrameKey, Array]] = {label: {} for label in made}
     name = who[0].label if len(who) == 1 else f"{len(who)} planners"
     done = 0
-    with Counter(f"{name}: frames planned", len(keys)) as progress:
+    with RateBar(f"{name}: frames planned", len(keys)) as progress:
         while part := list(islice(frames, batch_size)):
             samples = [sample for _, sample in part]
             for kind in kinds:
@@ -175,7 +175,7 @@ def _loaded(one: EvaluatedPlanner, device: str) -> Any:
 
 
 def _shown_to(needs: Needs | None, samples: Samples, device: str) -> Batch | Samples:
-    shown = [as_shown(sample) for sample in samples]
+    shown = [without_future(sample) for sample in samples]
     return shown if needs is None else batch_samples(shown, needs).to(device)
 
 

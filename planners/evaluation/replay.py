@@ -22,8 +22,8 @@ from factory.views.pictures import (
     Boxes,
     DrawnPath,
     draw_bev,
-    earlier_images,
     front_camera,
+    images_up_to_now,
     letterboxed,
     map_shapes,
     write_mp4,
@@ -76,7 +76,7 @@ def film_frames(shown: ReplayStage, logged: Array | None) -> Iterator[Image]:
     frame = shown.pair.now
     scene, drive = frame.scene, shown.rollout
     camera = front_camera(shown.sample)
-    pictures = earlier_images(shown.sample, camera) if camera else []
+    pictures = images_up_to_now(shown.sample, camera) if camera else []
     ways = [DrawnPath(drive.ego_states, PERTURBED, "drive"), DrawnPath(shown.plan, EXPERT, "plan", dashed=True)]
     ways += [] if logged is None else [DrawnPath(logged, LOGGED, "logged", dashed=True)]
     for row in range(-HISTORY_STEPS, HORIZON_STEPS + 1):

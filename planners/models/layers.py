@@ -378,7 +378,7 @@ def initialise_as_public(model: nn.Module) -> None:
         elif isinstance(module, BasicBlock):
             nn.init.zeros_(module.bn2.weight)
         elif isinstance(module, Attention):
-            _as_torch_s_attention(module)
+            _init_as_torch_attention(module)
     for module in model.modules():
         if isinstance(module, Decoder):
             copy_first_layer(module.layers)
@@ -397,7 +397,7 @@ def _as_gpt(exchange: TokenExchange) -> None:
             nn.init.zeros_(module.bias)
 
 
-def _as_torch_s_attention(attention: Attention) -> None:
+def _init_as_torch_attention(attention: Attention) -> None:
     """Query, key and value as parts of one matrix; without biases it is lucidrains', whose maps are plain."""
     for projection in (attention.query, attention.key, attention.value):
         if attention.query.bias is None:

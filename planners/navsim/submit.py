@@ -26,7 +26,7 @@ from factory.datasets.navsim.reader import (
     scene_frames,
 )
 from factory.datasets.navsim.window import cameras_with_pictures, sensor_files
-from factory.graph.progress import Counter
+from factory.graph.progress import RateBar
 from factory.readers.base import BadClip
 from factory.stages.sensors import decode_image
 from factory.wording import one_line
@@ -113,7 +113,7 @@ class SplitScenes:
             yield None if left_out else ObservedScene(scene.token, scene.frames, blobs, str(path))
 
 
-def split_scenes(selection: Selection, logs: Path, sensors: Path | None, root: Path | None) -> SplitScenes:
+def scenes_of_split(selection: Selection, logs: Path, sensors: Path | None, root: Path | None) -> SplitScenes:
     """The scenes of a split among these folders; root: of the second stage, as import navhard takes it.
 
     What an agent is asked to plan, as the public loader chooses it: rules of navsim/common/dataloader.py:19-173
@@ -240,8 +240,8 @@ def main(request: Request) -> None:
         pilot = AgentPlanner(request.planner, request.cameras, request.undistort, request.device)
         if pilot.cameras and request.sensors is None:
             raise Refused(f"sensors=... is missing: planner={request.planner} looks at {', '.join(pilot.cameras)}")
-        scenes = split_scenes(read_selection(request.split), logs, sensors, root)
-        with Counter("scenes planned", len(scenes)) as progress:
+        scenes = scenes_of_split(read_selection(request.split), logs, sensors, root)
+        with RateBar("scenes planned", len(scenes)) as progress:
             first = _planned(scenes.first_stage(), pilot, progress, 0)
             second = _planned(scenes.second_stage(), pilot, progress, len(first))
         team = {name: getattr(request, name) for name in ("team_name", "authors", "email", "institution")}
@@ -255,7 +255,7 @@ def main(request: Request) -> None:
 
 
 def _planned(
-    stage: Iterable[ObservedScene | None], pilot: AgentPlanner, progress: Counter, before: int
+    stage: Iterable[ObservedScene | None], pilot: AgentPlanner, progress: RateBar, before: int
 ) -> dict[str, Array]:
     """Token -> plan. Raises BadClip."""
     plans: dict[str, Array] = {}

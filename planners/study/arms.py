@@ -15,7 +15,7 @@ import numpy as np
 from factory.exits import Failed, Stopped
 from planners.drive.drive import drive_all, read_drives
 from planners.drive.settings import DriveSettings, settings_of
-from planners.drive.summary import M_PER_KM, SHARES, highest_level, start_kind
+from planners.drive.summary import M_PER_KM, SHARES, coarsest_clusters, start_kind
 from planners.evaluation.aggregation import BOUNDS, score_column, scores_in_percent, write_csv
 from planners.evaluation.bootstrap import Interval, paired_interval
 from planners.evaluation.compare import CompareSettings, compare, difference_columns
@@ -32,7 +32,7 @@ DRIVES = "drives"
 RULES = CompareSettings(a="", b="")  # draws, confidence and seed as `python -m planners compare` has them
 
 
-def clean_route(row: Row) -> float:
+def route_without_failure(row: Row) -> float:
     """Route completed where nothing went wrong: 0 of a drive with a collision at fault, or off the road."""
     failed = row["at_fault_collision"] or row["off_road_events"] > 0
     return 0.0 if failed else float(row["route_completed"])
@@ -43,7 +43,7 @@ def failures(row: Row) -> float:
     return float(row["off_road_events"] + row["at_fault_collision"])
 
 
-IN_PERCENT: Mapping[str, Callable[[Row], float]] = {"clean_route": clean_route, **SHARES}
+IN_PERCENT: Mapping[str, Callable[[Row], float]] = {"clean_route": route_without_failure, **SHARES}
 PER_KM = "failures_per_km"
 DRIVEN = (*IN_PERCENT, PER_KM)  # measures, the first of them the one that arms are judged by
 
@@ -134,7 +134,7 @@ def _paired(kind: str, by_label: Mapping[str, Mapping[Start, Row]], labels: Sequ
     starts = sorted(set.intersection(*(set(one) for one in every))) if whole else []
     if not starts:
         return None
-    level, clusters = highest_level([every[0][start] for start in starts])
+    level, clusters = coarsest_clusters([every[0][start] for start in starts])
     return ArmDrives(
         kind, {name: [[one[s] for s in starts] for one in side] for name, side in sides.items()}, level, clusters
     )

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.exits import Failed, Stopped
-from factory.graph.progress import Counter
+from factory.graph.progress import RateBar
 from planners.evaluation.aggregation import BOUNDS, PAPER, HumanFilter
 from planners.evaluation.planner_names import find_planner
 from planners.evaluation.score_rows import RECORD
@@ -125,7 +125,7 @@ def evaluate_all(
     done = 0
     with (
         stop_event(resources.left_s) as stop,
-        Counter("evaluations", len(everyone)) as counter,
+        RateBar("evaluations", len(everyone)) as counter,
         ThreadPoolExecutor(resources.at_once) as pool,
     ):
         shares = shares_of(everyone, resources.at_once)

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from factory.exits import Stopped, calling_on_stop_signal
-from factory.graph.progress import Counter
+from factory.graph.progress import RateBar
 from planners.data.batch import Batch
 from planners.models.planner import Planner
 from planners.training.checkpoint import (
@@ -114,7 +114,7 @@ class Batches(Protocol):
 
 
 @dataclass(frozen=True)
-class Loop:
+class FitSettings:
     """How a training runs, beside what it computes."""
 
     seed: int
@@ -136,7 +136,7 @@ def fit(
     planner: Planner,
     batches: Batches,
     training: TrainingSettings,
-    loop: Loop,
+    loop: FitSettings,
     process: TrainingProcess,
     out: Path,
     record: Mapping[str, Any],
@@ -198,9 +198,9 @@ def fit(
         return measured
 
     asked = Event()
-    with calling_on_stop_signal(asked.set), Counter("steps", loop.steps, first, quiet=not process.writes) as counter:
+    with calling_on_stop_signal(asked.set), RateBar("steps", loop.steps, first, quiet=not process.writes) as counter:
         step, shown = first, "-"  # until the losses are looked at
-        for batch in _endless(batches, loop.steps - first):
+        for batch in _next_batches(batches, loop.steps - first):
             torch.manual_seed(step_seed(loop.seed, step, process.rank))
             rate = learning_rate(training, step, loop.steps, epoch_steps)
             terms, scaling = _step(model, optimiser, scaler, batch, rate, training.gradient_clip, loop, process)
@@ -237,7 +237,7 @@ def _step(
     batch: Batch,
     rate: float,
     clip: float | None,
-    loop: Loop,
+    loop: FitSettings,
     process: TrainingProcess,
 ) -> tuple[dict[str, Tensor], list[Tensor]]:
     """One optimiser step; the terms of the loss, detached, and SCALING where there is some, without a wait for it."""
@@ -277,7 +277,7 @@ def _is_best(out: Path, measure: str, measured: Mapping[str, float]) -> bool:
     return before is None or measured[measure] < read_record(before)["validation"][measure]
 
 
-def _endless(batches: Batches, n: int) -> Iterator[Batch]:
+def _next_batches(batches: Batches, n: int) -> Iterator[Batch]:
     """The next n batches, epoch after epoch, from the loader's position on."""
     epochs = (batches.epoch(epoch) for epoch in count(int(batches.state()["epoch"])))
     return islice(chain.from_iterable(epochs), n)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, ClassVar, TextIO
 
 from factory.exits import INTERRUPTED, Failed, Stopped, calling_on_stop_signal
-from factory.graph.progress import Counter
+from factory.graph.progress import RateBar
 
 TRAININGS, DONE, LOG = "trainings", "sweep.json", "train.log"
 LOOK_EVERY_S = 0.5
@@ -91,7 +91,7 @@ def train_all(trainings: Sequence[Training], out: Path, resources: SweepResource
     left = [training for training in trainings if not is_done(out, training)]
     done, failed = len(trainings) - len(left), list[str]()
     with (
-        Counter("trainings", len(trainings), done) as counter,
+        RateBar("trainings", len(trainings), done) as counter,
         stop_event(resources.left_s) as stop,
         ThreadPoolExecutor(resources.at_once) as pool,
     ):
@@ -117,7 +117,7 @@ def train_one(training: Training, out: Path, stop: Callable[[], bool] = lambda: 
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "planners", "train", *training.overrides, f"out={folder}"]
     with (folder / LOG).open("w") as log:
-        code = exit_code(command, stop, log, ONE_THREAD | os.environ)
+        code = run_process(command, stop, log, ONE_THREAD | os.environ)
     if stop() and code == -signal.SIGTERM:  # it had not begun yet
         return INTERRUPTED
     if code == 0:
@@ -125,7 +125,7 @@ def train_one(training: Training, out: Path, stop: Callable[[], bool] = lambda: 
     return code
 
 
-def exit_code(
+def run_process(
     command: Sequence[str],
     stop: Callable[[], bool],
     log: TextIO | None = None,

@@ -18,7 +18,7 @@ from ray.train import RunConfig, ScalingConfig, WorkerGroupError
 from ray.train.torch import TorchConfig, TorchTrainer, get_device
 
 from factory.exits import terminal_signals_blocked
-from planners.training.processes import RaySettings, TrainingProcess, join_processes
+from planners.training.processes import RaySettings, TrainingProcess, join_process_group
 
 
 def train_on_ray(train: Callable[[TrainingProcess], None], settings: RaySettings, out: str) -> None:
@@ -44,7 +44,7 @@ def train_on_ray(train: Callable[[TrainingProcess], None], settings: RaySettings
 
 
 def _part(settings: dict[str, Any]) -> None:
-    with join_processes("auto", get_device()) as process:
+    with join_process_group("auto", get_device()) as process:
         settings["train"](process)
 
 

@@ -55,7 +55,7 @@ class TrainingProcess:
 
 
 @contextmanager
-def join_processes(device: str, place: torch.device | None = None) -> Iterator[TrainingProcess]:
+def join_process_group(device: str, place: torch.device | None = None) -> Iterator[TrainingProcess]:
     """What this process was started as: alone, by torchrun, or in a group that stands already (Ray Train).
 
     device: auto | cpu | cuda; place: the device itself, where that is known. Raises ValueError for cuda where there is

@@ -41,9 +41,9 @@ from planners.training.checkpoint import (
     read_record,
     settings_record,
 )
-from planners.training.fit import Loop, Precision, fit, total_steps
+from planners.training.fit import FitSettings, Precision, fit, total_steps
 from planners.training.optim import TrainingSettings
-from planners.training.processes import RaySettings, TrainingProcess, join_processes
+from planners.training.processes import RaySettings, TrainingProcess, join_process_group
 
 LARGEST_BATCH = 32
 FURTHER = frozenset({"steps", "processes", "accumulate"})  # what may be another with resume=further
@@ -139,7 +139,7 @@ def main(argv: Sequence[str]) -> None:
 
         train_on_ray(partial(train, config), config.ray, config.out)
     else:
-        with join_processes(config.device) as process:
+        with join_process_group(config.device) as process:
             train(config, process)
 
 
@@ -190,7 +190,7 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
     identity = _identity(config, dataset, steps, process)
     resume_from = _checkpoint_to_resume(out, config, identity)
     before = {} if resume_from is None else read_record(resume_from)
-    backbones = _first_weights(planner, config) if resume_from is None else before["backbones"]
+    backbones = _load_first_weights(planner, config) if resume_from is None else before["backbones"]
     record = {
         "trained": identity,
         **_earlier_settings(before, identity),
@@ -203,7 +203,7 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
             why = f"a batch of {asked} takes more samples than there are"
             print(f"note: planner.training.batch_size={asked} -> {training.batch_size}: {why}")
         print(_plan_text(config, record, loader, resume_from), flush=True)
-    loop = Loop(
+    loop = FitSettings(
         seed=config.seed,
         steps=steps,
         accumulate=config.accumulate,
@@ -249,7 +249,7 @@ def _planner(config: TrainConfig, settings: Any, dataset: Dataset) -> Planner:
     return build_planner(config.planner, arrays)
 
 
-def _first_weights(planner: Planner, config: TrainConfig) -> dict[str, str]:
+def _load_first_weights(planner: Planner, config: TrainConfig) -> dict[str, str]:
     """Fills in the weights that a training begins with; backbone -> where its weights are from."""
     if config.init_from is None:
         return load_pretrained(planner)

@@ -113,7 +113,7 @@ _DIGEST = sources_digest()
 USED: set[Path] = set()  # files of compiled functions that this process has loaded or written
 
 
-def _use(path: Path) -> None:
+def _mark_used(path: Path) -> None:
     """Into USED; the process's first marks the folder as used now."""
     if not USED:
         with suppress(OSError):  # another user's, to read only
@@ -156,7 +156,7 @@ class KernelCache:
         except Damaged as error:
             log.warning("%s: %s; compiled again", path, error)
             return None
-        _use(path)
+        _mark_used(path)
         return CompileResult._rebuild(target, *pickle.loads(kept))  # noqa: S301 -- machine code, written below
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
@@ -170,7 +170,7 @@ class KernelCache:
         except OSError as error:
             warnings.warn(cache_write_error(error), RuntimeWarning, stacklevel=1)
             return
-        _use(path)
+        _mark_used(path)
 
     def _path(self, signature: Any) -> Path:
         takes = f"{signature} {processor_key()} {self._enclosed}"
@@ -233,7 +233,7 @@ def inlined(function: F) -> F:
     return _compiled(function, forceinline=True, error_model="numpy", no_cpython_wrapper=True)
 
 
-def drawing_kernel(function: F) -> F:
+def numpy_division_kernel(function: F) -> F:
     """As `kernel`, but dividing as numpy does.
 
     Without Python's ZeroDivisionError behind every division the synthetic town's shading compiles in half the time.

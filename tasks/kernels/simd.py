@@ -143,7 +143,7 @@ def sqrt(typing_context: Any, values: Any) -> Any:
     return lanes(lanes), lambda context, builder, sig, arguments: _call_llvm(builder, "llvm.sqrt.v16f32", arguments)
 
 
-def _first_where(comparison: str) -> Any:
+def _select_where(comparison: str) -> Any:
     """An intrinsic of a and b: a in the lanes where the comparison of them holds, b in the others."""
 
     @intrinsic
@@ -156,7 +156,7 @@ def _first_where(comparison: str) -> Any:
     return chosen
 
 
-smaller, larger = _first_where("<"), _first_where(">")  # b where a is NaN
+smaller, larger = _select_where("<"), _select_where(">")  # b where a is NaN
 
 
 def _value_where(comparison: str) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 from tasks.render.scene.asset import OwnBody, RenderAsset, camera_psnr_db, compose_gaussians
-from tasks.render.scene.engine import Backend, Vehicles, render, vehicles_at
+from tasks.render.scene.engine import Backend, PlacedAgents, agents_at_time, render
 from tasks.render.scene.movers import BEYOND_M, behind_boxes, boxes_at, world_from_boxes
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky import pixel_directions
@@ -152,7 +152,7 @@ def estimate_fading(
     return {n: max(FADING, float((loss + usual * OTHERS_WAY) / (way + OTHERS_WAY))) for n, (loss, way) in sums.items()}
 
 
-def large_vehicles(there: Vehicles, eye: Pinhole, view: View, share: float) -> Iterator[tuple[int, float]]:
+def large_vehicles(there: PlacedAgents, eye: Pinhole, view: View, share: float) -> Iterator[tuple[int, float]]:
     """Rows of the vehicles that cover at least a share of a picture, each with its share, the nearest first.
 
     `view` of the scene with them: what is behind a nearer vehicle or behind what the scene has there is not covered.
@@ -171,7 +171,7 @@ def large_vehicles(there: Vehicles, eye: Pinhole, view: View, share: float) -> I
     for j in sorted(np.flatnonzero(possible), key=lambda j: nearest[j]):
         if rays is None:
             rays = pixel_directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
-        outline = box_outline(there.boxes[j], eye, rays)
+        outline = box_mask(there.boxes[j], eye, rays)
         hidden = (view.depth < nearest[j] - HIDDEN_M) & (view.alpha > 0.5)
         covered = float((outline & free & ~hidden).mean())
         free &= ~outline
@@ -179,7 +179,7 @@ def large_vehicles(there: Vehicles, eye: Pinhole, view: View, share: float) -> I
             yield int(j), covered
 
 
-def box_outline(box: Array, eye: Pinhole, rays: Array | None = None) -> Bools:
+def box_mask(box: Array, eye: Pinhole, rays: Array | None = None) -> Bools:
     """(H, W) the pixels that look at a box (7,) in the world; `rays` (H * W, 3) where they are known."""
     if rays is None:
         rays = pixel_directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
@@ -197,12 +197,12 @@ def likeness_to_photo(
     """
     height, width = photo.rgb.shape[:2]
     eye = Pinhole(photo.intrinsics, photo.world_from_camera, width, height)
-    there = vehicles_at(agents, photo.time_s)
+    there = agents_at_time(agents, photo.time_s)
     seen = render(asset, [eye], there, backend, affines=[asset.affine_of(photo.camera, photo.time_s)])[0].rgb
     similar = ssim_map(seen, photo.rgb.astype(np.float32) / np.float32(255.0))
     out = {}
     for track_id in track_ids:
-        inside = box_outline(there.boxes[there.track_ids.index(track_id)], eye)
+        inside = box_mask(there.boxes[there.track_ids.index(track_id)], eye)
         out[track_id] = masked_mean(similar, inside)
     return out
 
@@ -373,10 +373,10 @@ def check_drive_pictures(
     0, `size` width, height [px] of the pictures to be stored, whose shape the small ones have. Of the `stored` steps
     alone vehicles are held against the photos of an `album`: what is torn elsewhere nobody learns from.
     """
-    width, height = checked_size(size, settings)
+    width, height = gate_picture_size(size, settings)
     rig = [camera.resized(width, height) for camera in cameras]
     for pose, step in zip(world_from_ego, steps, strict=True):
-        there = vehicles_at(agents, step * STEP_S, pose[:2, 3], settings.reach_m)
+        there = agents_at_time(agents, step * STEP_S, pose[:2, 3], settings.reach_m)
         eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, c.width, c.height) for c in rig]
         scene = compose_near(asset, there, pose[:3, 3], settings.reach_m)
         affines = [asset.affine_of(camera.name, step * STEP_S) for camera in cameras]
@@ -384,7 +384,7 @@ def check_drive_pictures(
         own = [asset.own_body(camera.name) for camera in cameras]
         looked_at = measure_rendered_views(scene, eyes, views, pose, backend, own)
         for camera, eye, view, found in zip(rig, eyes, views, looked_at, strict=True):
-            inside = _tracks_around(eye.world_from_camera[:3, 3], there)
+            inside = _tracks_containing(eye.world_from_camera[:3, 3], there)
             fault = ("lens_covered", f"inside track {inside[0]}") if inside else picture_fault(found, settings)
             if fault is None and album is not None and step in stored:
                 fault = vehicle_fault(album, there, eye, view, settings)
@@ -393,14 +393,14 @@ def check_drive_pictures(
     return None
 
 
-def checked_size(size: tuple[int, int], settings: GateSettings) -> tuple[int, int]:
+def gate_picture_size(size: tuple[int, int], settings: GateSettings) -> tuple[int, int]:
     """Width and height [px] of the pictures that are looked at, for those of `size` to be stored."""
     width = min(settings.width, size[0])
     return width, max(1, round(width * size[1] / size[0]))
 
 
 def vehicle_fault(
-    album: VehiclePhotos, there: Vehicles, eye: Pinhole, view: View, settings: GateSettings
+    album: VehiclePhotos, there: PlacedAgents, eye: Pinhole, view: View, settings: GateSettings
 ) -> tuple[str, str] | None:
     """(reason, detail) of the nearest large vehicle that cannot be expected to look like its photos."""
     if settings.vehicle_min == 0.0:
@@ -419,7 +419,7 @@ def vehicle_fault(
     return None
 
 
-def likeness_to_nearest_photo(album: VehiclePhotos, there: Vehicles, j: int, eye: Pinhole, view: View) -> float:
+def likeness_to_nearest_photo(album: VehiclePhotos, there: PlacedAgents, j: int, eye: Pinhole, view: View) -> float:
     """How like the photo that was taken from nearest to here the j-th vehicle in a picture is, 0 to 1; 1 where no photo
     was taken near enough to say."""
     track_id, box = there.track_ids[j], there.boxes[j]
@@ -449,7 +449,7 @@ def picture_fault(found: PictureMeasures, settings: GateSettings) -> tuple[str, 
     return None
 
 
-def compose_near(asset: RenderAsset, there: Vehicles, place: Array, reach_m: float) -> RenderAsset:
+def compose_near(asset: RenderAsset, there: PlacedAgents, place: Array, reach_m: float) -> RenderAsset:
     """The scene with who is there as its background, without what is farther than reach_m from a place (3,) in the
     world, seen from above."""
     east, north = (asset.background.means[:, k] - np.float32(place[k] - asset.origin[k]) for k in (0, 1))
@@ -522,7 +522,7 @@ def _on_the_lens(scene: Gaussians, eye: Array) -> Gaussians:
     return replace(close, means=means, log_scales=close.log_scales + np.float32(math.log(MAGNIFIED)))
 
 
-def _tracks_around(eye: Array, there: Vehicles) -> list[str]:
+def _tracks_containing(eye: Array, there: PlacedAgents) -> list[str]:
     """Tracks whose box has the eye (3,) inside."""
     local = np.einsum("nij,ni->nj", world_from_boxes(there.boxes)[:, :3, :3], eye - there.boxes[:, :3])
     inside = (np.abs(local) < there.boxes[:, 4:7] / 2.0).all(axis=1)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import Backend, render, vehicles_at
+from tasks.render.scene.engine import Backend, agents_at_time, render
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Camera, Fisheye, Pinhole
 from tasks.world.frames import box_corners
@@ -39,7 +39,7 @@ def render_views(
     rig = [camera.resized(width, height) for camera in cameras]
     for f, step in enumerate(steps):
         affines = [asset.affine_of(camera.name, step * STEP_S) for camera in cameras]
-        there = vehicles_at(agents, step * STEP_S, world_from_ego[f, :2, 3], VISIBLE_M)
+        there = agents_at_time(agents, step * STEP_S, world_from_ego[f, :2, 3], VISIBLE_M)
         eyes = [Pinhole(c.intrinsics, world_from_ego[f] @ c.ego_from_camera, width, height) for c in rig]
         for c, view in enumerate(render(asset, eyes, there, backend, affines=affines)):
             out[f, c] = np.rint(view.rgb * 255.0).astype(np.uint8)

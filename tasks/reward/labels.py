@@ -38,7 +38,7 @@ from tasks.world.frames import (
     Y,
 )
 from tasks.world.geometry import ego_boxes, touching
-from tasks.world.road_map import RoadMap, Route, RouteFinder
+from tasks.world.road_map import CenterlineFinder, RoadMap, Route
 from tasks.world.vocabulary import Vocabulary
 
 TRAJECTORIES_AT_ONCE = 4096  # 15 MB of states
@@ -77,7 +77,7 @@ def route_ahead_m(road_map: RoadMap, route: Route, pose: Array) -> float | None:
     from its polygon, or turned against its centreline by more than NEAR_RAD. Raises NoRoute where the map has none of
     the route's lanes.
     """
-    metres = RouteFinder(road_map, route).metres_ahead(pose, NEAR_M, NEAR_RAD, ONWARD_M)
+    metres = CenterlineFinder(road_map, route).metres_ahead(pose, NEAR_M, NEAR_RAD, ONWARD_M)
     return metres if metres is None or metres < ONWARD_M else math.inf
 
 

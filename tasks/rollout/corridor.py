@@ -344,11 +344,11 @@ def boxes_overlap(a: Box, b: Box) -> bool:
     if not dx * dx + dy * dy <= reach * reach:  # also where a box is absent (NaN)
         return False
     c, s = abs(math.cos(b[2] - a[2])), abs(math.sin(b[2] - a[2]))
-    return not (_is_beside(a, b, dx, dy, c, s) or _is_beside(b, a, dx, dy, c, s))
+    return not (_axis_separates(a, b, dx, dy, c, s) or _axis_separates(b, a, dx, dy, c, s))
 
 
 @inner_kernel
-def _is_beside(box: Box, other: Box, dx: float, dy: float, c: float, s: float) -> bool:
+def _axis_separates(box: Box, other: Box, dx: float, dy: float, c: float, s: float) -> bool:
     """Does an axis of `box` separate it from one whose centre is at +-(dx, dy), turned by |cos| = c, |sin| = s?"""
     along = dx * math.cos(box[2]) + dy * math.sin(box[2])
     across = -dx * math.sin(box[2]) + dy * math.cos(box[2])

@@ -297,7 +297,7 @@ def road_acceleration(paths: Paths, driver: IdmDriver, t: int, m: int, s: float,
 
 
 @inner_kernel
-def hardest_acceleration(
+def acceleration_for_others(
     paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int, way: Way, speed: float,
     accel: float, yielding: Yielding | None,
 ) -> float:  # fmt: skip

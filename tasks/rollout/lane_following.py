@@ -156,7 +156,7 @@ def _distances(poses: Array, points: Array, first: Ints, discs: Array, lanes: In
     return distance, difference
 
 
-def lane_costs(index: LaneIndex, poses: Array, lanes: Sequence[int] | None = None) -> tuple[Array, Array]:
+def lane_distances_and_turns(index: LaneIndex, poses: Array, lanes: Sequence[int] | None = None) -> tuple[Array, Array]:
     """(distance [m], |heading difference| [rad]) of poses (K, 3) to lanes, (K, L); inf beyond COST_CAP_M.
 
     lanes: which; None: all.
@@ -207,12 +207,12 @@ def find_path(index: LaneIndex, pose: Array, log_poses: Array, ahead_m: float) -
 
     log_poses (K, 3): where its log is over the whole clip, before and after.
     """
-    distance, difference = lane_costs(index, pose[None])
+    distance, difference = lane_distances_and_turns(index, pose[None])
     starts: list[int] = np.flatnonzero(on_a_lane(distance[0], difference[0])).tolist()
     if not starts:
         return None
     starts = _with_neighbors(index, starts, distance[0], difference[0])
-    ahead = {k: _left_of_lane(index, k, pose) for k in starts}
+    ahead = {k: _lane_length_ahead(index, k, pose) for k in starts}
     # To be told apart ways must go as far as the log gets from here.
     reach = float(np.hypot(*(log_poses[:, :2] - pose[:2]).T).max(initial=0.0)) * 1.2 + 10.0
     ways = _ways(index, ahead, reach)
@@ -295,7 +295,7 @@ def _with_neighbors(index: LaneIndex, starts: list[int], distance: Array, differ
     return list(dict.fromkeys(starts + beside))
 
 
-def _left_of_lane(index: LaneIndex, lane: int, pose: Array) -> float:
+def _lane_length_ahead(index: LaneIndex, lane: int, pose: Array) -> float:
     """Length of the lane still ahead of a pose."""
     xy = index.points[index.first[lane] : index.first[lane + 1], :2]
     return index.length_from(lane, int(((xy - pose[:2]) ** 2).sum(axis=1).argmin()))
@@ -322,7 +322,7 @@ def _ways(index: LaneIndex, starts: Mapping[int, float], reach: float) -> list[l
 def _log_costs(index: LaneIndex, ways: list[list[int]], log_poses: Array) -> Array:
     """(W,) mean cost of a log's poses (K, 3) to the nearest lane of each way."""
     lanes = sorted(set().union(*ways))
-    costs = _point_costs(*lane_costs(index, log_poses, lanes))
+    costs = _point_costs(*lane_distances_and_turns(index, log_poses, lanes))
     place = {lane: k for k, lane in enumerate(lanes)}
     nearest = [costs[:, [place[lane] for lane in way]].min(axis=1) for way in ways]
     mean: Array = np.array(nearest).mean(axis=1)
@@ -481,7 +481,7 @@ def join_steps(index: LaneIndex, scene: Scene) -> Ints:
     start = scene.step
     out = np.full(len(scene.agents), NEVER)
     here = np.flatnonzero(scene.agents.valid[start])
-    on = on_a_lane(*lane_costs(index, scene.agents.boxes[start, here, :3])).any(axis=1)
+    on = on_a_lane(*lane_distances_and_turns(index, scene.agents.boxes[start, here, :3])).any(axis=1)
     out[here[on]] = start
     return out
 
@@ -490,7 +490,7 @@ def first_later_step_on_lane(index: LaneIndex, scene: Scene, i: int) -> int:
     """First later step at which agent i is on a lane; NEVER if it never is."""
     log, start = scene.clip.agents, scene.step
     steps = start + 1 + np.flatnonzero(log.valid[start + 1 : start + HORIZON_STEPS + 1, i])
-    on = on_a_lane(*lane_costs(index, log.boxes[steps, i, :3])).any(axis=1)
+    on = on_a_lane(*lane_distances_and_turns(index, log.boxes[steps, i, :3])).any(axis=1)
     return int(steps[on.argmax()]) if on.any() else NEVER
 
 

@@ -338,7 +338,7 @@ def roll_out_navsim(
             boxes[t, i] = *agent.pose, agent.about.length, agent.about.width
             velocities[t, i] = agent.speed * np.cos(heading), agent.speed * np.sin(heading)
             valid[t, i] = True
-        stay = staying[_stay(agents, moving)]
+        stay = staying[_staying_present(agents, moving)]
         boxes[t, stay], velocities[t, stay], valid[t, stay] = window.boxes[0, stay], window.velocities[0, stay], True
     center_z = np.where(vehicle, np.where(valid, window.center_z[0], np.nan), window.center_z)
     driven = np.zeros(len(window), dtype=bool)
@@ -346,7 +346,7 @@ def roll_out_navsim(
     return replace(window, boxes=boxes, velocities=velocities, valid=valid, center_z=center_z), driven
 
 
-def _stay(agents: NavsimAgents, moving: dict[int, _Agent]) -> Bools:
+def _staying_present(agents: NavsimAgents, moving: dict[int, _Agent]) -> Bools:
     """(F,) which of the staying are there: in nobody that moves, and in none of the staying before them."""
     stays: Bools = np.zeros(len(agents.staying), dtype=bool)
     for i, body in enumerate(agents.staying_bodies):

@@ -164,7 +164,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     moving_kind = np.array([kind in MOVING_KINDS for kind in now.kinds], dtype=bool)
     standing = is_vehicle & stands_always(log) & ~(moved & now.valid[start])
     index = _indexed_lanes(scene.clip.road_map)
-    ahead_m = _path_length(scene, settings)
+    ahead_m = _needed_path_length(scene, settings)
 
     join, hold = join_steps(index, scene), np.zeros(n, dtype=np.int64)
     clock = log_steps(scene)
@@ -234,7 +234,7 @@ def roll_out_longer(traffic: TrafficScene, ego_states: Array) -> AgentTracks:
 def _answer(traffic: TrafficScene, ego_states: Array, steps: int) -> tuple[AgentTracks, Bools]:
     """The tracks of T rows around an ego with states (T, 11), and who was driven in the first `steps` (N,)."""
     start, n_rows = traffic.scene.step, len(ego_states)
-    window = _lasting(traffic.scene.agents, start + n_rows).window(start, start + n_rows)
+    window = _extend_tracks(traffic.scene.agents, start + n_rows).window(start, start + n_rows)
     if traffic.navsim is not None:
         return roll_out_navsim(traffic.navsim, traffic.settings, window, ego_states)
     if traffic.roles is None or traffic.paths is None or len(window) == 0:
@@ -242,7 +242,7 @@ def _answer(traffic: TrafficScene, ego_states: Array, steps: int) -> tuple[Agent
     n, policy = len(window), traffic.settings.policy
     if policy is None:
         yielding = None if traffic.yielding is None else Yielding(*_writable(traffic.yielding))
-        rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states), yielding)
+        rows, motion = drive(*_kernel_inputs(traffic, window), *_ego_boxes(ego_states), yielding)
     else:
         rows, motion = _drive_by_policy(policy_named(policy), traffic, window, ego_states)
     return replace(window, **{name: getattr(rows, name)[:, :n].copy() for name in PER_STEP}), motion.was_driven[steps]
@@ -253,7 +253,7 @@ def _drive_by_policy(
 ) -> tuple[RolloutRows, Motion]:
     """As `traffic.drive`, by a policy. Raises BadPolicy where it answers no states."""
     scene = traffic.scene
-    start, log, now, roles, paths, driver = _script(traffic, window)
+    start, log, now, roles, paths, driver = _kernel_inputs(traffic, window)
     rows, motion = initial_rows(now, roles, *_ego_boxes(ego_states))
     past = _agent_states(scene.agents.window(start - SEEN_ROWS + 1, start + 1))
     boxes, velocities = (
@@ -296,7 +296,7 @@ def _checked(policy: TrafficPolicy, answer: Array, asked: Bools) -> Array:
     return answer
 
 
-def _lasting(agents: AgentTracks, n_steps: int) -> AgentTracks:
+def _extend_tracks(agents: AgentTracks, n_steps: int) -> AgentTracks:
     """Tracks over at least so many steps: who is there at the last one goes straight on as fast as there."""
     more = n_steps - agents.n_steps
     if more <= 0:
@@ -314,7 +314,7 @@ def _check_states(ego_states: Array, n_rows: int) -> None:
         raise ValueError(f"ego_states are not finite or above {LARGEST:g}: leave the ego out")
 
 
-def _script(
+def _kernel_inputs(
     traffic: TrafficScene, window: AgentTracks
 ) -> tuple[int, AgentStates, AgentStates, Roles, Paths, IdmDriver]:
     """All that the kernels need to know but the ego, and who gives way."""
@@ -328,7 +328,7 @@ def _script(
         driver = driver._replace(headway_s=min(driver.headway_s, SHORTEST_HEADWAY_S))
     return (
         start,
-        _agent_states(_lasting(traffic.scene.clip.agents, start + window.n_steps)),
+        _agent_states(_extend_tracks(traffic.scene.clip.agents, start + window.n_steps)),
         _agent_states(window.window(0, 1)),
         Roles(*_writable(traffic.roles)),
         Paths(*_writable(paths)),
@@ -370,7 +370,7 @@ def _writable(arrays: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
     return (np.require(a, requirements=["C", "W"]) for a in arrays)
 
 
-def _path_length(scene: Scene, settings: TrafficSettings) -> float:
+def _needed_path_length(scene: Scene, settings: TrafficSettings) -> float:
     """Metres of path any vehicle can need: what the fastest covers in H, and its view beyond."""
     speeds = np.hypot(*np.moveaxis(scene.agents.velocities, -1, 0))
     limits = [lane.speed_limit_mps or 0.0 for lane in scene.clip.road_map.lanes.values()]

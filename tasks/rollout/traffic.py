@@ -24,11 +24,11 @@ from tasks.rollout.idm import (
     Roles,
     RolloutRows,
     Yielding,
+    acceleration_for_others,
     advance,
     empty_motion,
     empty_rows,
     far_from_ego,
-    hardest_acceleration,
     is_clear,
     must_brake,
     nearest_point_index,
@@ -194,7 +194,7 @@ def _drive_on(
             nose = s + 0.5 * rows.boxes[t, i, 3]
             accel = intended_acceleration(yielding, paths, driver, m, s, speed, start, t, nose)
         way = way_along(rows, t, i, m, s, travelled, motion.offset[t, i], motion.turn[t, i])
-        accel = hardest_acceleration(paths, driver, rows, t, i, way, speed, accel, yielding)
+        accel = acceleration_for_others(paths, driver, rows, t, i, way, speed, accel, yielding)
         if yielding is not None:
             accel = yielding_acceleration(yielding, driver, start, t, i, m, s, speed, rows, mode, motion, accel)
         motion.was_driven[t + 1, i] = True

@@ -343,7 +343,7 @@ def driven_lanes(road_map: RoadMap, poses: Array) -> tuple[str, ...]:
     return tuple(reversed(backwards))
 
 
-class RouteFinder:
+class CenterlineFinder:
     """The centreline ahead of many poses on one route: prepared once, then well under a millisecond per pose."""
 
     def __init__(self, road_map: RoadMap, route: Route) -> None:
@@ -437,8 +437,8 @@ class RouteFinder:
 
 
 def centerline_from(road_map: RoadMap, route: Route, pose: Array) -> Array:
-    """(P, 3) centreline of the route ahead of one rear-axle pose (3,); for many poses keep a RouteFinder."""
-    return RouteFinder(road_map, route).centerline_from(pose)
+    """(P, 3) centreline of the route ahead of one rear-axle pose (3,); for many poses keep a CenterlineFinder."""
+    return CenterlineFinder(road_map, route).centerline_from(pose)
 
 
 def _refuse_without_roadblock(road_map: RoadMap, lane_ids: Iterable[str]) -> None:

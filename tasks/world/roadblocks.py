@@ -14,7 +14,7 @@ import numpy as np
 
 from tasks.world.arrays import Array
 from tasks.world.frames import PACIFICA, wrap_angle
-from tasks.world.road_map import MapLayer, NoRoute, RoadMap, Route, RouteFinder
+from tasks.world.road_map import CenterlineFinder, MapLayer, NoRoute, RoadMap, Route
 
 SEARCH_M = 1.0  # half side of the square in which roadblocks are candidates
 MAX_HEADING_ERROR_RAD, MAX_DISPLACEMENT_M = np.pi / 4, 3.0
@@ -126,7 +126,7 @@ def route_of_roadblocks(
     if not lane_ids:
         raise NoRoute(f"none of the route's roadblocks {list(roadblock_ids)[:5]} is on the map around the ego")
     route = Route((), tuple(passed), frozenset(lane_ids))
-    finder = RouteFinder(road_map, route)
+    finder = CenterlineFinder(road_map, route)
     start = starting_lane(road_map, lane_ids, pose)
     return Route(tuple(finder.lane_path_from(start)), route.roadblock_ids, route.lane_ids)
 

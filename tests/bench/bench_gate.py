@@ -24,9 +24,9 @@ from factory.graph.steps import PreparedClip
 from factory.pipeline import FactoryWork
 from factory.setup.settings import assemble
 from factory.stages.assets import load_or_build_scene
-from factory.stages.imaging import open_vehicle_photos, scene_in_clip_time
+from factory.stages.imaging import lazy_vehicle_photos, scene_in_clip_time
 from factory.stages.sensors import choose_cameras
-from tasks.render.gate import GateSettings, VehiclePhotos, check_drive_pictures, checked_size
+from tasks.render.gate import GateSettings, VehiclePhotos, check_drive_pictures, gate_picture_size
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.settings import STEPS_OF, Frames
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip
@@ -73,10 +73,10 @@ def labelled(seed: int, clips: int, most: int, every: int, share_min: float, out
         clip = work.reader.read(ref)
         asset = load_or_build_scene(clip, work.render, work.cache_dir, threads=2)
         assert asset is not None, "a town has photos"
-        album, town = open_vehicle_photos(clip, asset, work.render), Painted(seed, ref.log_id)
-        timed_album = open_vehicle_photos(clip, asset, work.render)  # whose photos are opened while the clock runs
+        album, town = lazy_vehicle_photos(clip, asset, work.render), Painted(seed, ref.log_id)
+        timed_album = lazy_vehicle_photos(clip, asset, work.render)  # whose photos are opened while the clock runs
         asset = scene_in_clip_time(clip, asset)
-        size = checked_size((work.render.width, work.render.height), settings)
+        size = gate_picture_size((work.render.width, work.render.height), settings)
         rig = [camera.resized(*size) for camera in choose_cameras(clip.cameras, work.render.cameras)]
         for drive in drives(work, prepared, EXPERTS, most):
             name = f"{clip.clip_id}/{drive.expert}/{drive.candidate}"

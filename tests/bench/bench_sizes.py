@@ -18,7 +18,7 @@ from factory.stages.sensors import encode_jpeg, load_photos
 from tasks.render.fit.reconstruct import finish_scene, run_iterations
 from tasks.render.fit.start import prepare_fit
 from tasks.render.scene.asset import psnr
-from tasks.render.scene.engine import Vehicles, render
+from tasks.render.scene.engine import PlacedAgents, render
 from tasks.render.settings import FitSettings
 from tasks.world.clip import Pinhole
 from tests.bench.bench_rig import HELD_OUT, read_block
@@ -55,7 +55,7 @@ def one(size: str, root: Path, options: dict[str, str]) -> None:
     each = (time.process_time() - started) / n
     asset, photo = finish_scene(replace(problem, held_out=()), state, threads), photos[0]
     eye = Pinhole(photo.intrinsics, photo.world_from_camera, width, height)
-    nobody = Vehicles((), (), problem.tracks.at(0.0)[0])
+    nobody = PlacedAgents((), (), problem.tracks.at(0.0)[0])
     render(asset, [eye], nobody, threads=threads)
     started = time.process_time()
     picture = render(asset, [eye], nobody, threads=threads)[0].rgb

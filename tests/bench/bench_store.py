@@ -32,7 +32,7 @@ from factory.graph.plan import make_plan, retry_policy
 from factory.readers.base import ClipRef
 from factory.store.location import Shard, write_shard
 from factory.store.samples import CANDIDATES, OUTCOMES, Store
-from factory.store.schema import SAMPLES, RunIdentity, TableSpec, attempt_id, sample_row_to_table
+from factory.store.schema import SAMPLES, RunIdentity, TableSpec, attempt_id, sample_rows_to_table
 from tests.factory.toy import ToyWork, row_of, stream
 
 EXPERTS = ("pdm_closed", "recovery")
@@ -90,7 +90,7 @@ def write(out: Path, attempts: int, commits: int) -> None:
     digests = {expert: WORK.expert_digest(expert) for expert in EXPERTS}
     store.begin_run(store.checked_records(identity, digests, "stop"))
     store.record_plan(dict.fromkeys(EXPERTS, ROUNDS), [ref.clip_id for ref in refs])
-    sample = sample_row_to_table([_row()])
+    sample = sample_rows_to_table([_row()])
     for part in np.array_split(np.arange(len(refs)), commits):
         store.candidates.commit([_shard(store, CANDIDATES, _lists([refs[i] for i in part], identity))])
         shards, fell = [], []

@@ -29,7 +29,7 @@ from tasks.render.fit.reconstruct import LEAST_PIXELS as LEAST_OF_CLASS
 from tasks.render.fit.reconstruct import finish_scene, run_iterations
 from tasks.render.fit.start import prepare_fit
 from tasks.render.scene.build import held_out_rows
-from tasks.render.scene.engine import vehicles_at
+from tasks.render.scene.engine import agents_at_time
 from tasks.render.scene.sensed import Photo
 from tasks.render.settings import FitSettings
 from tasks.world.clip import Camera, Pinhole
@@ -177,7 +177,7 @@ def main() -> None:
     looks = [
         Look(p.camera, p.time_s, Pinhole(p.intrinsics, p.world_from_camera, width, height), p.rgb, there)
         for p in photos
-        for there in [vehicles_at(block.agents, p.time_s)]
+        for there in [agents_at_time(block.agents, p.time_s)]
     ]
     print(f"\n{storage_table(asset, looks, threads)}")
     took = f"{seconds:.0f} s on {threads} threads, CPU {cpu_s:.0f} s"

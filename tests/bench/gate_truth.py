@@ -20,7 +20,7 @@ from factory.stages.imaging import GATE_STRIDE
 from tasks.render.gate import (
     GateSettings,
     VehiclePhotos,
-    box_outline,
+    box_mask,
     compose_near,
     expected_likeness,
     large_vehicles,
@@ -32,7 +32,7 @@ from tasks.render.gate import (
     to_box_frame,
 )
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import Vehicles, render, vehicles_at
+from tasks.render.scene.engine import PlacedAgents, agents_at_time, render
 from tasks.render.views import VISIBLE_M
 from tasks.world.arrays import F32, Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentKind, AgentTracks, Camera, Clip, Pinhole
@@ -62,7 +62,7 @@ class Shown:
     step: int
     eye: Pinhole
     world_from_ego: Array
-    there: Vehicles
+    there: PlacedAgents
     picture: F32  # (H, W, 3) in [0, 1]
     truth: F32
 
@@ -72,7 +72,7 @@ class Shown:
         similar = ssim_map(self.picture, self.truth)
         worst = (NOTHING_LARGE, 0.0)
         for kind, box in zip(self.there.kinds, self.there.boxes, strict=True):
-            outline = box_outline(box, self.eye) if kind == AgentKind.VEHICLE else np.zeros(1, bool)
+            outline = box_mask(box, self.eye) if kind == AgentKind.VEHICLE else np.zeros(1, bool)
             if outline.mean() >= share:
                 worst = min(worst, (masked_mean(similar, outline), float(outline.mean())))
         return worst
@@ -116,7 +116,7 @@ class Painted:
         renderer = TownRenderer(town.scenery, played, town.sun_azimuth, town.sun_elevation, town.sky_seed)
         for pose, step in list(zip(drive.poses, drive.steps, strict=True))[::every]:
             scene = renderer.scene_at(first + step)
-            there = vehicles_at(drive.agents, step * STEP_S, pose[:2, 3], VISIBLE_M)
+            there = agents_at_time(drive.agents, step * STEP_S, pose[:2, 3], VISIBLE_M)
             eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, c.width, c.height) for c in rig]
             views = render(asset, eyes, there, affines=[asset.affine_of(c.name, step * STEP_S) for c in rig])
             for camera, eye, seen in zip(rig, eyes, views, strict=True):
@@ -130,7 +130,7 @@ def verdicts(
     """What the gate says of a picture: the fault without regard to photos, "" for none; the likeness expected of the
     large vehicle that is to be least like its photos; and that of the one that beside a photo is least like it."""
     pose = shown.world_from_ego
-    there = vehicles_at(drive.agents, shown.step * STEP_S, pose[:2, 3], settings.reach_m)
+    there = agents_at_time(drive.agents, shown.step * STEP_S, pose[:2, 3], settings.reach_m)
     scene = compose_near(asset, there, pose[:3, 3], settings.reach_m)
     views = render(scene, [shown.eye], affines=[asset.affine_of(shown.camera, shown.step * STEP_S)])
     fault = picture_fault(measure_rendered_views(scene, [shown.eye], views, pose)[0], settings)

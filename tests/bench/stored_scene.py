@@ -12,7 +12,7 @@ import numpy as np
 
 from factory.stages.scene_file import read_scene, write_scene
 from tasks.render.scene.asset import RenderAsset, psnr
-from tasks.render.scene.engine import NOBODY, Vehicles, render
+from tasks.render.scene.engine import NOBODY, PlacedAgents, render
 from tasks.render.settings import RenderSettings, SceneDtype
 from tasks.world.arrays import F32, Bytes
 from tasks.world.clip import Pinhole
@@ -29,7 +29,7 @@ class Look:
     time_s: float
     eye: Pinhole  # world
     photo: Bytes  # (H, W, 3)
-    there: Vehicles = NOBODY
+    there: PlacedAgents = NOBODY
 
 
 def kept(asset: RenderAsset) -> RenderAsset:

@@ -10,7 +10,7 @@ from tasks.render.fit.losses import photo_target, ssim
 from tasks.render.fit.reconstruct import pixel_classes
 from tasks.render.fit.state import Road
 from tasks.render.scene.asset import RenderAsset, psnr
-from tasks.render.scene.engine import Vehicles, render, vehicles_at
+from tasks.render.scene.engine import PlacedAgents, agents_at_time, render
 from tasks.render.scene.movers import behind_boxes
 from tasks.render.scene.sensed import Photo, shift_pose
 from tasks.render.scene.sky import pixel_directions
@@ -98,13 +98,13 @@ class Truth:
         """Of cameras where and when `photos` say (world); those inside somebody are left out."""
         out = []
         for photo in photos:
-            there = vehicles_at(self.agents, photo.time_s)
+            there = agents_at_time(self.agents, photo.time_s)
             if not _in_the_way(photo, there.boxes):
                 truth = _unit(self.painter(photo.time_s, photo))
                 out.append(Compared(truth, self._seen(photo, there), classes=self._classes(photo, there)))
         return out
 
-    def _classes(self, photo: Photo, there: Vehicles) -> Mapping[str, NDArray[np.bool_]]:
+    def _classes(self, photo: Photo, there: PlacedAgents) -> Mapping[str, NDArray[np.bool_]]:
         local = replace(photo, world_from_camera=shift_pose(photo.world_from_camera, -self.asset.origin))
         rows = [kind == AgentKind.VEHICLE for kind in there.kinds]
         boxes = there.boxes[np.array(rows, bool)] - np.concatenate([self.asset.origin, np.zeros(4)])
@@ -114,7 +114,7 @@ class Truth:
         """The same with moved vehicles, inside the boxes of those near; views that show little of them are left out."""
         out = []
         for photo in photos:
-            there = vehicles_at(self.agents, photo.time_s)
+            there = agents_at_time(self.agents, photo.time_s)
             boxes = moved_on(there.boxes, there.kinds)
             eye = photo.world_from_camera[:3, 3]
             vehicle = np.array([kind == AgentKind.VEHICLE for kind in there.kinds], bool)
@@ -129,7 +129,7 @@ class Truth:
                 out.append(Compared(truth, self._seen(photo, replace(there, boxes=boxes)), inside))
         return out
 
-    def _seen(self, photo: Photo, there: Vehicles) -> F32:
+    def _seen(self, photo: Photo, there: PlacedAgents) -> F32:
         height, width = photo.rgb.shape[:2]
         eye = Pinhole(photo.intrinsics, photo.world_from_camera, width, height)
         affine = self.asset.affine_of(photo.camera, photo.time_s)

@@ -14,7 +14,7 @@ from factory.stages.rows import label_columns
 from factory.store import location
 from factory.store.location import Location, write_shard
 from factory.store.samples import Store
-from factory.store.schema import sample_row_to_table
+from factory.store.schema import sample_rows_to_table
 from planners.data.batch import COMMANDS
 from tests.factory.toy import labels_of_stream, row_of, stream
 
@@ -116,7 +116,7 @@ def write_table(
     shards = []
     for same in places.values():
         for start in range(0, len(same), shard_rows):
-            content = sample_row_to_table(same[start : start + shard_rows])
+            content = sample_rows_to_table(same[start : start + shard_rows])
             body = content.drop_columns(["round", "expert"])
             group_bytes = int((group_rows + 0.5) * body.nbytes / body.num_rows)
             with patch.object(location, "ROW_GROUP_BYTES", group_bytes):

@@ -12,7 +12,7 @@ from factory.stages.benchmark import BENCHMARK_FILE
 from factory.stages.rows import sample_row
 from factory.store.location import Location, SceneFiles, write_shard
 from factory.store.samples import Store
-from factory.store.schema import COLUMNS, SAMPLES, sample_row_to_table
+from factory.store.schema import COLUMNS, SAMPLES, sample_rows_to_table
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair
 from tasks.attempt import drive_and_judge
 from tasks.experts.pdm_closed import PdmSettings
@@ -141,7 +141,7 @@ def write_benchmark_folder(out: Path, clip_ids: tuple[str, ...] = ("a", "b")) ->
         SceneFiles(location.child("scenes")).store(stored)
         clips.append({"clip_id": clip_id, "log_id": f"log-{clip_id}", "follow_ups": [i for i, _ in stored.follow_ups]})
         for key, scene in frames_of(clip_scenes(stored.clip)).items():
-            shards.append(write_shard(location.child("samples"), SAMPLES, sample_row_to_table([sample(key, scene)])))
+            shards.append(write_shard(location.child("samples"), SAMPLES, sample_rows_to_table([sample(key, scene)])))
     Store(location).samples.commit(shards)
     location.write(BENCHMARK_FILE, json.dumps({"format": 1, "clips": clips, "left_out": []}).encode())
     return out

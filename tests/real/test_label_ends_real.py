@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import ClipReader
-from tasks.attempt import ExpertGate, Judged, attempt, drive_as_human, end_verdict, perturbed_scene
+from tasks.attempt import ExpertGate, Judged, attempt, drive_under_log_replay, end_verdict, perturbed_scene
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Human
 from tasks.experts.recovery import RecoveryExpert, RecoveryTable
@@ -37,7 +37,7 @@ def test_no_human_drive_is_one_that_would_be_refused(
     refs = logs.index().refs
     assert len(refs) in (14, 61)
     for ref in refs:
-        judged = drive_as_human(scene_of_clip(logs.read(ref)), Human(), PDM, RNG)
+        judged = drive_under_log_replay(scene_of_clip(logs.read(ref)), Human(), PDM, RNG)
         replayed = prepare_traffic(judged.scene, TrafficSettings(mode="replay"))
         assert end_verdict(judged, replayed, ExpertGate()) is None, ref
 

@@ -10,7 +10,7 @@ from factory.stages.rows import label_columns
 from factory.store.location import write_shard
 from factory.store.reader import SampleTable, labels_of
 from factory.store.samples import Store
-from factory.store.schema import LABEL_COLUMNS, SAMPLES, Stamp, sample_row_to_table
+from factory.store.schema import LABEL_COLUMNS, SAMPLES, Stamp, sample_rows_to_table
 from tasks.reward.label_bytes import UNITS_PER_M, VocabularyLabels
 from tasks.subscores import JUDGED, RECORDS
 from tests.factory.toy import row_of, stream
@@ -31,7 +31,7 @@ def test_recorded_scores_come_back_from_the_table_and_take_few_bytes(
     labels = VocabularyLabels("reference", 0.0, **scores)
     row = row_of(stream(scene)) | label_columns(labels) | vars(Stamp("a", "human", "d", 0, -1, "v", "s", "{}"))
     store = Store(tmp_path)
-    shard = write_shard(store.samples.location, SAMPLES, sample_row_to_table([row]))
+    shard = write_shard(store.samples.location, SAMPLES, sample_rows_to_table([row]))
     store.samples.commit([shard])
 
     back = labels_of(SampleTable(tmp_path)[0])

@@ -19,7 +19,7 @@ from test_scoring_real import WHOLE, frame_of
 from factory.stages.benchmark import BENCHMARK_FILE
 from factory.store.location import Location, SceneFiles, write_shard
 from factory.store.samples import Store
-from factory.store.schema import SAMPLES, sample_row_to_table
+from factory.store.schema import SAMPLES, sample_rows_to_table
 from planners.evaluation.evaluate import main
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.navsim import LONG, read_table
@@ -56,7 +56,7 @@ def benchmark(shared_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
         SceneFiles(location.child("scenes")).store(OneStageClip(clip))
         clips.append({"clip_id": name, "log_id": name, "follow_ups": [], "tokens": [name], "before": None})
         row = sample(FrameKey.logged(name).now, scene_of_clip(clip))
-        shards.append(write_shard(location.child("samples"), SAMPLES, sample_row_to_table([row])))
+        shards.append(write_shard(location.child("samples"), SAMPLES, sample_rows_to_table([row])))
     Store(location).samples.commit(shards)
     document = {"format": 1, "stages": 1, "clips": clips, "left_out": []}
     location.write(BENCHMARK_FILE, json.dumps(document).encode())

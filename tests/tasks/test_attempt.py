@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.attempt import ExpertGate, Judged, attempt, drive_as_human, perturbed_scene, verdict
+from tasks.attempt import ExpertGate, Judged, attempt, drive_under_log_replay, perturbed_scene, verdict
 from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.experts.protocol import Expert, Human, Plan
 from tasks.experts.recovery import RecoveryExpert, RecoveryTable
@@ -235,7 +235,7 @@ class OffTheRoad:
 
 def test_a_human_drive_is_scored_and_never_filtered() -> None:
     clip = street_clip()
-    judged = drive_as_human(scene_of_clip(clip), OffTheRoad(), PdmSettings(), RNG)
+    judged = drive_under_log_replay(scene_of_clip(clip), OffTheRoad(), PdmSettings(), RNG)
     assert verdict(judged.scores, GATE) is not None
     assert judged.scores.dac[1] == 0.0
     assert judged.scene.step == NOW
@@ -243,7 +243,7 @@ def test_a_human_drive_is_scored_and_never_filtered() -> None:
 
 def test_around_the_human_everybody_does_what_the_log_says() -> None:
     clip = street_clip()
-    judged = drive_as_human(scene_of_clip(clip), Human(), PdmSettings(), RNG)
+    judged = drive_under_log_replay(scene_of_clip(clip), Human(), PdmSettings(), RNG)
     np.testing.assert_array_equal(judged.plan.poses, clip.ego_states[NOW + 1 : NOW + 41, :3])
     np.testing.assert_array_equal(judged.rollout.agents.boxes, clip.agents.boxes[NOW : NOW + 41])
     assert not judged.rollout.simulated.any()

@@ -24,8 +24,8 @@ from factory.readers.logs import (
     STEP_MS,
     LoggedDrive,
     LogReader,
-    Recorded,
     WholeLog,
+    WindowSensors,
     block_of_log,
     files_within,
     route_of_drive,
@@ -157,7 +157,7 @@ def read_motion(folder: Path) -> LogMotion:
     pose_stamps = stamps(pose_path, poses)
     if (np.diff(pose_stamps) < 0).any():
         raise BadClip(str(pose_path), "timestamp_ns", "time runs backwards")
-    keep = spaced(seconds_since(start_ns, pose_stamps))
+    keep = distinct_time_indices(seconds_since(start_ns, pose_stamps))
     pose_values = numbers(pose_path, poses, POSE_COLUMNS)[keep]
     pose_times = seconds_since(start_ns, pose_stamps[keep])
     frame_times = seconds_since(start_ns, np.unique(box_stamps))
@@ -240,7 +240,7 @@ def agents_at(motion: LogMotion, times_s: Array) -> AgentTracks:
     )
 
 
-def spaced(times_s: Array) -> Indices:
+def distinct_time_indices(times_s: Array) -> Indices:
     """Indices of the times kept when each must stand more than 1 ms after the last one kept."""
     keep = [0]
     for i in range(1, len(times_s)):
@@ -505,12 +505,12 @@ class AV2Reader(LogReader[AV2Log]):
     def _photographed(self) -> frozenset[str]:
         return frozenset(log_id for log_id, folder in self.logs().items() if (folder / "sensors" / "cameras").is_dir())
 
-    def recorded(self, log: AV2Log, start: int, stop: int) -> Recorded:
+    def recorded(self, log: AV2Log, start: int, stop: int) -> WindowSensors:
         """Poses, rig, photos and sweeps of a window, and the block that it is rendered from."""
         poses = world_from_ego_at(log.motion, step_times(start, stop))
         sensed = files_within(log.images, start, stop), files_within(log.sweeps, start, stop)
         block = block_of_log(log, log.images, log.sweeps, self.block_steps(start)) if log.images else None
-        return Recorded(poses, log.cameras, *sensed, block)
+        return WindowSensors(poses, log.cameras, *sensed, block)
 
 
 def read_log(folder: Path) -> AV2Log:

@@ -10,8 +10,8 @@ from factory.datasets.navsim.settings import NavsimClips
 READERS = {"NavsimReader": NavsimClips}
 IMPORTS = {
     "simscale": "factory.datasets.navsim.commands:import_simscale",
-    "navhard": "factory.datasets.navsim.commands:import_two_stages",
-    "navtest": "factory.datasets.navsim.commands:import_one_stage",
+    "navhard": "factory.datasets.navsim.commands:import_two_stage_benchmark",
+    "navtest": "factory.datasets.navsim.commands:import_one_stage_benchmark",
 }
 EXPORTS = {"navsim": "factory.datasets.navsim.commands:export_samples"}
-BENCHMARKS = dict.fromkeys(("navhard", "navtest"), "factory.datasets.navsim.commands:benchmark_by_name")
+BENCHMARKS = dict.fromkeys(("navhard", "navtest"), "factory.datasets.navsim.commands:find_or_make_benchmark")

@@ -104,7 +104,7 @@ def _clip_id(*names: str) -> str:
     return sha256("\x1f".join(names).encode()).hexdigest()[:16]
 
 
-class FrameReader:
+class FrameImporter:
     """Frames of logs and synthetic scenes as rows; their scenes are written beside. The last log stays open."""
 
     def __init__(self, dataset: str, places: NavsimFolders, store: Store) -> None:
@@ -185,7 +185,7 @@ def import_navhard(store: Store, selection: Selection, places: NavsimFolders) ->
 
     Raises ValueError and BadClip where nothing can begin, and what `import_rows` raises.
     """
-    groups, reader = scene_groups(selection, places.logs), FrameReader(NAVHARD, places, store)
+    groups, reader = scene_groups(selection, places.logs), FrameImporter(NAVHARD, places, store)
     entries = [
         ImportEntry(
             group.clip_id, NAVHARD, group.log_id, kind, 0, number, partial(reader.group_row, group, kind, number)
@@ -250,7 +250,7 @@ def import_navtest(store: Store, selection: Selection, places: NavsimFolders) ->
     clip. Raises ValueError and BadClip where nothing can begin, and what `import_rows` raises.
     """
     tokens, absent = one_stage_frames(selection, places.logs)
-    reader = FrameReader(NAVTEST, places, store)
+    reader = FrameImporter(NAVTEST, places, store)
     entries = [
         ImportEntry(one.clip_id, NAVTEST, one.log.stem, HUMAN, 0, NO_CANDIDATE, partial(reader.token_row, one))
         for one in tokens

@@ -50,7 +50,7 @@ def import_simscale(request: Any, store: Store) -> tuple[RunSummary, str]:
     return import_rows(store, import_identity(request.source, settings), wanted.entries(parts)), ""
 
 
-def import_two_stages(request: Any, store: Store) -> tuple[RunSummary, str]:
+def import_two_stage_benchmark(request: Any, store: Store) -> tuple[RunSummary, str]:
     """The rows of navhard, and what is said of them."""
 
     logs, maps = _folder(request.logs), _folder(request.maps)
@@ -59,7 +59,7 @@ def import_two_stages(request: Any, store: Store) -> tuple[RunSummary, str]:
     return import_navhard(store, read_selection(request.split), places)
 
 
-def import_one_stage(request: Any, store: Store) -> tuple[RunSummary, str]:
+def import_one_stage_benchmark(request: Any, store: Store) -> tuple[RunSummary, str]:
     """The rows of navtest, and what is said of them."""
 
     maps = _folder(request.maps)
@@ -85,7 +85,7 @@ IN_DEVKIT = "navsim/planning/script/config/common/train_test_split"
 MADE_FROM = "made_from.json"
 
 
-def benchmark_by_name(
+def find_or_make_benchmark(
     name: str, made: str, data: str | None, maps: str | None, split: str | None, pictures: bool
 ) -> str:
     """The folder of a benchmark of SPLITS, `<made>/<name>`, made first where it is not there whole.

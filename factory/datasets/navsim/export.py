@@ -298,7 +298,7 @@ def export(
     _write_logs(table, journal, settings, todo, each, say)
     logs = [journal.logs[key] for key in sorted(planned)]
     say("splits, rewards, checksums")
-    files = [*_split_files(to, settings, logs, splits)]
+    files = [*_write_split_files(to, settings, logs, splits)]
     rewards, without = _reward_files(table, to, splits)
     files += rewards
     if trajectories is not None:
@@ -447,7 +447,7 @@ def _tidy(journal: Journal, planned: Mapping[tuple[str, str], PlannedSample], sp
     return bool(stale)
 
 
-def _split_files(
+def _write_split_files(
     root: Path, settings: ExportSettings, logs: Sequence[WrittenLog], splits: Iterable[SplitNames]
 ) -> Iterator[WrittenFile]:
     """The YAML files of each split, of the logs that the public loader takes, and its black picture."""

@@ -34,13 +34,13 @@ from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, calling
 from factory.files import DiskFull
 from factory.graph.driver import SHARD_BYTES
 from factory.graph.execute import RunSummary, write_last_run
-from factory.graph.progress import Counter, RunTotals
+from factory.graph.progress import RateBar, RunTotals
 from factory.readers.base import BadClip, failures_as_bad_clip
 from factory.readers.pictures import BadPicture, check_size, without_exif
 from factory.stages.rows import scene_columns
 from factory.store.location import Shard, write_shard
 from factory.store.samples import IMPORTED, ChangedRun, ErrorKind, Kind, Outcome, Store
-from factory.store.schema import SAMPLES, UNLISTED, BadRow, RunIdentity, Stamp, attempt_id, sample_row_to_table
+from factory.store.schema import SAMPLES, UNLISTED, BadRow, RunIdentity, Stamp, attempt_id, sample_rows_to_table
 from tasks.render.settings import ImageSource
 from tasks.world.arrays import Array
 from tasks.world.clip import (
@@ -242,9 +242,9 @@ def import_rows(store: Store, identity: RunIdentity, entries: Sequence[ImportEnt
     try:
         store.begin_run(records)
         batch = _Batch(store)
-        with calling_on_stop_signal(lambda: stopped.append(True)), Counter("imported", len(waiting)) as progress:
+        with calling_on_stop_signal(lambda: stopped.append(True)), RateBar("imported", len(waiting)) as progress:
             for done, (entry, stamp) in enumerate(waiting, start=1):
-                failed = _try(batch, entry, stamp)
+                failed = _import_fails(batch, entry, stamp)
                 counts[Kind.FAILED if failed else Kind.ACCEPTED] += 1
                 progress.show(done, f"{counts[Kind.FAILED]} failed")
                 summary.executed.attempts += 1
@@ -296,12 +296,12 @@ class _Batch:
         self._failed, self._licences = [], set()
 
 
-def _try(batch: _Batch, entry: ImportEntry, stamp: Stamp) -> bool:
+def _import_fails(batch: _Batch, entry: ImportEntry, stamp: Stamp) -> bool:
     """Whether it failed, as an outcome of its own."""
     try:
         with failures_as_bad_clip(f"log {entry.log_id}"):
             row = entry.make()
-        batch.add(sample_row_to_table([{**row, **asdict(stamp)}]), (entry.round, entry.expert), str(row["licence"]))
+        batch.add(sample_rows_to_table([{**row, **asdict(stamp)}]), (entry.round, entry.expert), str(row["licence"]))
         return False
     except (BadClip, BadRow) as error:
         batch.fail(

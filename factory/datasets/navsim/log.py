@@ -406,7 +406,7 @@ def _frame(values: CheckedValues, about: CheckedValues, *, as_shown: bool) -> Fr
         lights=parse_lights(values),
         command=parse_command(ego),
         cameras=parse_cameras(
-            CheckedValues(_without_paths(values.get("camera_dict")), values.file, f"{values.place}camera_dict.")
+            CheckedValues(_paths_as_text(values.get("camera_dict")), values.file, f"{values.place}camera_dict.")
         ),
         lidar_path=None,
         boxes=None if as_shown else parse_boxes(values.inner("annotations"), ANNOTATIONS),
@@ -502,12 +502,12 @@ def _list(values: CheckedValues, key: str) -> list[Any]:
     return found
 
 
-def _without_paths(value: Any) -> Any:
+def _paths_as_text(value: Any) -> Any:
     """With pathlib's paths as text."""
     if isinstance(value, Record) and f"{value.module} {value.name}" in PATHS:
         return str(Path(*map(str, value.arguments)))
     if isinstance(value, dict):
-        return {key: _without_paths(item) for key, item in value.items()}
+        return {key: _paths_as_text(item) for key, item in value.items()}
     return value
 
 

@@ -233,7 +233,7 @@ def _parts(path: Path, layer: str, fids: Ints, shapes: NDArray[np.object_]) -> t
 FORMAT = 3  # raise by hand whenever a GeoPackage gives other tables, or they are kept otherwise
 
 
-def cache_file(path: Path) -> Path:
+def cached_tables_path(path: Path) -> Path:
     """Named by the GeoPackage's place, size and time of change, and by this format."""
     told = path.stat()
     name = f"{path.resolve()}|{told.st_size}|{told.st_mtime_ns}|{FORMAT}"
@@ -242,7 +242,7 @@ def cache_file(path: Path) -> Path:
 
 def cached_tables(path: Path) -> dict[str, LayerTable]:
     """The tables of a GeoPackage, from the cache where it is in order. Raises BadClip, ImportError."""
-    kept = cache_file(path)
+    kept = cached_tables_path(path)
     if kept.is_file():
         try:
             verify_checksum(kept, kept.name)

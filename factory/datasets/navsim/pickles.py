@@ -165,7 +165,7 @@ class RewardFile:
         self.type = ""
         try:
             with path.open("rb") as file:
-                _follow(file, self._add)
+                _for_each_entry(file, self._add)
         except OSError as error:
             raise BadClip(str(path), "file", f"cannot be read: {error.strerror}") from error
         except (ValueError, TypeError, LookupError, OverflowError) as error:  # of a broken or foreign stream
@@ -200,7 +200,7 @@ class RewardFile:
         self._places[token] = tuple(places)
 
 
-def _follow(file: BinaryIO, add: Any) -> None:
+def _for_each_entry(file: BinaryIO, add: Any) -> None:
     """Call `add(token, metrics)` for each entry of the pickled dictionary. Raises ValueError and what a stream may."""
     stack: list[Any] = []
     marks: list[int] = []

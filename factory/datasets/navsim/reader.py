@@ -37,7 +37,7 @@ from factory.datasets.navsim.window import (
     world_from_ego,
 )
 from factory.files import file_digest, matching
-from factory.readers.apart import OtherProcess
+from factory.readers.apart import ProcessFunction
 from factory.readers.base import (
     SPLITS,
     BadClip,
@@ -192,7 +192,7 @@ def _filter_name(content: Mapping[str, Any], path: Path) -> str:
 def _mapping(path: Path) -> dict[str, Any]:
     """What a YAML file holds, read as logs are, in another process. Raises ValueError."""
     try:
-        return OtherProcess(_read)(path, str(path))
+        return ProcessFunction(_read)(path, str(path))
     except BadClip as error:
         raise ValueError(str(error)) from error
 
@@ -327,7 +327,7 @@ def cached_table(path: Path, cache_dir: Path) -> FrameTable | None:
 def cached_or_read_table(path: Path) -> FrameTable:
     """The table of the log at `path`; one that was not kept is made in another process. Raises BadClip."""
     cache_dir = user_cache() / "navsim"
-    made_apart = OtherProcess(partial(read_and_cache_table, cache_dir=cache_dir))
+    made_apart = ProcessFunction(partial(read_and_cache_table, cache_dir=cache_dir))
     return cached_table(path, cache_dir) or made_apart(path, str(path))
 
 
@@ -608,7 +608,7 @@ class NavsimReader:
     def _tables(self, logs: Mapping[str, Path]) -> Iterable[tuple[str, FrameTable | BadClip]]:
         """The table of each log, or what is wrong with it; what takes long is told on stderr."""
         began, made, told = time.monotonic(), 0, 0.0
-        made_apart = OtherProcess(partial(read_and_cache_table, cache_dir=self.cache_dir))
+        made_apart = ProcessFunction(partial(read_and_cache_table, cache_dir=self.cache_dir))
         for i, (log_id, path) in enumerate(logs.items(), start=1):
             try:
                 with failures_as_bad_clip(str(path)):

@@ -37,7 +37,7 @@ from tasks.world.clip import (
 )
 from tasks.world.frames import AX, EGO_STATE_SIZE, HEADING, PACIFICA, VX, X, wrap_angle
 from tasks.world.geometry import ego_boxes, touching
-from tasks.world.road_map import LightState, NoRoute, RoadMap, Route, RouteFinder, TrafficLights
+from tasks.world.road_map import CenterlineFinder, LightState, NoRoute, RoadMap, Route, TrafficLights
 from tasks.world.roadblocks import corrected_roadblocks, route_of_roadblocks
 
 FRAMES_BEFORE = HISTORY_STEPS // FRAME_STEPS  # of T in a window
@@ -108,7 +108,7 @@ def window_agents(frames: Sequence[Frame]) -> AgentTracks:
     seen = _seen(frames, (*range(now, later + 1), *range(now), *range(later + 1, end)))  # T's horizon has the first say
     agents = _nowhere(seen, CLIP_STEPS)
     for first, last, judged in ((0, now, False), (later, end - 1, True), (now, later, True)):
-        _write(agents, seen, frames, first, last, judged)
+        _fill_agent_steps(agents, seen, frames, first, last, judged)
     return agents
 
 
@@ -116,7 +116,7 @@ def stretch_agents(frames: Sequence[Frame]) -> AgentTracks:
     """The objects of any number of frames, each from its first frame to its last."""
     seen = _seen(frames, range(len(frames)))
     agents = _nowhere(seen, n_steps(len(frames)))
-    _write(agents, seen, frames, 0, len(frames) - 1, False)
+    _fill_agent_steps(agents, seen, frames, 0, len(frames) - 1, False)
     return agents
 
 
@@ -183,7 +183,9 @@ def _nowhere(seen: SeenBoxes, steps: int) -> AgentTracks:
     )
 
 
-def _write(agents: AgentTracks, seen: SeenBoxes, frames: Sequence[Frame], first: int, last: int, judged: bool) -> None:
+def _fill_agent_steps(
+    agents: AgentTracks, seen: SeenBoxes, frames: Sequence[Frame], first: int, last: int, judged: bool
+) -> None:
     """Frames first..last into the steps from the one to the other, whatever stood there."""
     steps = slice(FRAME_STEPS * first, FRAME_STEPS * last + 1)
     at = np.arange(n_steps(last - first + 1))
@@ -246,7 +248,7 @@ def road_around(maps: Path, frame: Frame, along_xy: Array, pose: Array, file: st
         along = [lane_id for block in passed for lane_id in blocks.lanes_of.get(block, ())]
         road_map = city.road_map(along_xy, MAP_RADIUS_M, along)
         route = replace(route_of_roadblocks(road_map, frame.roadblock_ids, pose, blocks), lit_lane_ids=lit)
-        return RoadAhead(road_map, route, RouteFinder(road_map, route).centerline_from(pose))
+        return RoadAhead(road_map, route, CenterlineFinder(road_map, route).centerline_from(pose))
     except NoRoute as error:
         raise BadClip(file, f"frames[{number}].roadblock_ids", str(error)) from error
 

@@ -21,12 +21,12 @@ from factory.datasets.av2.reader import (
     BoxTrack,
     LogMotion,
     agents_at,
+    distinct_time_indices,
     ego_states_at,
     observed_at,
     rotations,
     seconds_since,
     seen_at,
-    spaced,
     step_times,
     tracks_of,
     world_from_ego_at,
@@ -50,8 +50,8 @@ from factory.readers.logs import (
     STEP_MS,
     LoggedDrive,
     LogReader,
-    Recorded,
     WholeLog,
+    WindowSensors,
     block_of_log,
     files_within,
     route_of_drive,
@@ -100,7 +100,7 @@ def read_motion(folder: Path) -> LogMotion:
     start_ns = int(frame_stamps[row[boxed[0]]])
     times_s = seconds_since(start_ns, frame_stamps)
     frames = np.unique(times_s[row[boxed[0]] : row[boxed[-1]] + 1])
-    keep = spaced(seconds_since(start_ns, pose_stamps))
+    keep = distinct_time_indices(seconds_since(start_ns, pose_stamps))
     world_from_rear, positions = _rear_axle(ego)
     return LogMotion(
         folder=folder,
@@ -111,7 +111,7 @@ def read_motion(folder: Path) -> LogMotion:
         rotations=world_from_rear[keep],
         yaws=np.unwrap(yaw_of(world_from_rear[keep])),
         tracks=_tracks(boxes, row, values, boxed, times_s),
-        fill_s=_filled_s(boxes, frames),
+        fill_s=_max_filled_gap_s(boxes, frames),
     )
 
 
@@ -222,7 +222,7 @@ def _kinds(boxes: ArrowFile, labels: Indices) -> list[AgentKind]:
     return [kinds[label] for label in labels.tolist()]
 
 
-def _filled_s(boxes: ArrowFile, frames_s: Array) -> float:
+def _max_filled_gap_s(boxes: ArrowFile, frames_s: Array) -> float:
     """The largest gap between two frames that is filled in; 0: none."""
     usual_s = float(np.median(np.diff(frames_s))) if len(frames_s) > 1 else 0.0
     if usual_s > MAX_GAP_S:
@@ -249,7 +249,7 @@ def read_rig(folder: Path) -> dict[Path, Camera]:
     return {path: _camera(file, rear_from_imu) for path, file in pinholes.items()}
 
 
-def has_photos(folder: Path) -> bool:
+def has_photo_files(folder: Path) -> bool:
     """Whether the log's photos are files."""
     return any(pa.types.is_string(_data_type(open_file(path, rows=False))) for path in matching(folder, CAMERAS))
 
@@ -413,18 +413,18 @@ class Py123dReader(LogReader[Py123dLog]):
 
     def block(self, ref: ClipRef) -> str | None:
         """Log and second at which the block begins that the clip is rendered from; None where there are no photos."""
-        if self.sensor_root is None or not has_photos(self.path_of(ref)):
+        if self.sensor_root is None or not has_photo_files(self.path_of(ref)):
             return None
         first, _ = self.block_steps(ref.start_ms // STEP_MS)
         return f"{ref.log_id}@{first * STEP_S:g}s"
 
-    def recorded(self, log: Py123dLog, start: int, stop: int) -> Recorded:
+    def recorded(self, log: Py123dLog, start: int, stop: int) -> WindowSensors:
         """Poses, rig and photos of a window, and the block that it is rendered from."""
         poses = world_from_ego_at(log.motion, step_times(start, stop))
         if not log.images:
-            return Recorded(poses, log.cameras)
+            return WindowSensors(poses, log.cameras)
         block = block_of_log(log, log.images, (), self.block_steps(start))
-        return Recorded(poses, log.cameras, files_within(log.images, start, stop), (), block)
+        return WindowSensors(poses, log.cameras, files_within(log.images, start, stop), (), block)
 
     def _map_file(self, header: ArrowFile) -> Path:
         """The log's map, in its folder or among the maps of its data set. Raises BadClip where it is not there."""

@@ -239,7 +239,7 @@ def _pose(
     return pose
 
 
-def first_step_with_photos(found: Photographs, first: int, n_steps: int) -> int:
+def start_step_nearest_photos(found: Photographs, first: int, n_steps: int) -> int:
     """The step of `first` .. `first` + 4 from which on instants every 0.5 s lie nearest to photos of all cameras.
 
     Samples show such instants, and windows begin at one.

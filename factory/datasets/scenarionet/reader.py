@@ -23,21 +23,21 @@ from factory.datasets.scenarionet.map import as_floats, road_map, traffic_lights
 from factory.datasets.scenarionet.photos import (
     NO_PHOTOGRAPHS,
     Photographs,
-    first_step_with_photos,
     load_sidecar,
     read_photographs,
     sidecars_of,
+    start_step_nearest_photos,
 )
 from factory.datasets.scenarionet.settings import ScenarioNetClips
 from factory.files import matching_below
-from factory.readers.apart import OtherProcess
+from factory.readers.apart import ProcessFunction
 from factory.readers.base import BadClip, ClipIndex, ClipRef, bytes_of, folder_split, nuscenes_split, waymo_split
 from factory.readers.logs import (
     STEP_MS,
     LoggedDrive,
     LogReader,
-    Recorded,
     WholeLog,
+    WindowSensors,
     block_of_log,
     files_within,
     route_of_drive,
@@ -173,7 +173,7 @@ class LoggedTrack:
     size: Array  # (3,) length, width, height, median over the valid frames; NaN where none is stored
 
 
-def sample_times(metadata: Mapping[str, Any], n_frames: int, file: str) -> Array:
+def frame_times(metadata: Mapping[str, Any], n_frames: int, file: str) -> Array:
     """(T,) seconds since the first frame. Raises BadClip for missing, non-monotonic or too sparse times."""
     if "ts" not in metadata:
         raise BadClip(file, "metadata.ts", "missing")
@@ -189,7 +189,7 @@ def sample_times(metadata: Mapping[str, Any], n_frames: int, file: str) -> Array
     return times - times[0]
 
 
-def frame_positions(times: Array) -> Array:
+def fractional_frame_indices(times: Array) -> Array:
     """(S,) fractional frame index of every 0.1 s step; whole numbers where the log runs at 10 Hz within 1 ms."""
     if np.abs(times - STEP_S * np.arange(len(times))).max() < 1e-3:
         return np.arange(len(times), dtype=np.float64)
@@ -267,7 +267,7 @@ def agent_tracks(
         track_ids=tuple(ids),
         kinds=tuple(kinds),
         boxes=boxes,
-        velocities=slope_velocities(boxes[..., :2], valid),
+        velocities=fitted_velocities(boxes[..., :2], valid),
         valid=valid,
         center_z=z,
         heights=np.array([track.size[2] for track in rows]),
@@ -285,7 +285,7 @@ def resampled(track: LoggedTrack, at: Array) -> tuple[Array, Array, Bools]:
     return position, wrap_angle(heading), track.valid[before] & track.valid[after]
 
 
-def slope_velocities(xy: Array, valid: Bools) -> Array:
+def fitted_velocities(xy: Array, valid: Bools) -> Array:
     """(S, N, 2) m/s: least-squares slope of the valid positions (S, N, 2) within five steps; NaN where not valid."""
     n_steps = len(xy)
     filled = np.where(valid[..., None], xy, 0.0)
@@ -464,7 +464,7 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
             return drive
         found = self._photographs(path, drive.ego_states)  # told here, once, what would fail each of its clips
         first = int(np.argmax(drive.segment >= 0))
-        return replace(drive, earliest=first_step_with_photos(found, first, len(drive.segment)))
+        return replace(drive, earliest=start_step_nearest_photos(found, first, len(drive.segment)))
 
     def load(self, path: Path) -> ScenarioLog:
         """The scenario in this file, with its photos. Raises BadClip."""
@@ -491,7 +491,7 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
         first = start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
         return first, first + BLOCK_STEPS
 
-    def recorded(self, log: ScenarioLog, start: int, stop: int) -> Recorded:
+    def recorded(self, log: ScenarioLog, start: int, stop: int) -> WindowSensors:
         """The ego's poses, photos and sweeps of a window. Raises BadClip where the ego's drive is broken."""
         ego_states = log.motion.ego_states[start:stop]
         if not np.isfinite(ego_states).all():
@@ -499,10 +499,10 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
         poses = planar_matrices(ego_states)  # the format's ego has no roll or pitch, its road is at z = 0
         found = log.photographs
         if not found.images:
-            return Recorded(poses)
+            return WindowSensors(poses)
         sensed = files_within(found.images, start, stop), files_within(found.sweeps, start, stop)
         block = block_of_log(log, found.images, found.sweeps, self.block_steps(start), GROUND_M)
-        return Recorded(poses, found.cameras, *sensed, block)
+        return WindowSensors(poses, found.cameras, *sensed, block)
 
     def _photographs(self, path: Path, ego_states: Array) -> Photographs:
         sidecar = self._sidecars[path]
@@ -539,8 +539,8 @@ def _listed(root: Path) -> list[Path]:
     """
     summary, mapped = root / SUMMARY, root / MAPPING
     try:
-        names = OtherProcess(_names)(summary, str(summary))
-        folders = OtherProcess(_folders)(mapped, str(mapped)) if mapped.is_file() else {}
+        names = ProcessFunction(_names)(summary, str(summary))
+        folders = ProcessFunction(_folders)(mapped, str(mapped)) if mapped.is_file() else {}
     except BadClip as error:
         raise ValueError(str(error)) from error
     return [root / folders.get(name, "") / name for name in names]
@@ -602,7 +602,7 @@ def read_motion(scenario: Mapping[str, Any], file: str) -> LoggedDrive:
     named = id_text(sdc_id)
     if named is None or sdc_id not in tracks:
         raise BadClip(file, "metadata.sdc_id", f"missing, or names no track: {shown(sdc_id)}")
-    at = frame_positions(sample_times(scenario["metadata"], n_frames, file))
+    at = fractional_frame_indices(frame_times(scenario["metadata"], n_frames, file))
     ego = read_track(tracks, sdc_id, n_frames, file)
     states, segment = ego_segments(ego, source, at)
     ground = ground_height(ego, at, file)
@@ -619,7 +619,7 @@ def read_log(path: Path) -> ScenarioLog:
     lights = traffic_lights(scenario["dynamic_map_states"], n_frames, file)
     lanes = road_map(scenario["map_features"], lights.lane_ids, name, id_text(metadata.get("map")) or "", file)
     route = route_of_drive(lanes, motion.ego_states[motion.segment >= 0, :3], file, "map_features")
-    frames = np.floor(frame_positions(sample_times(metadata, n_frames, file)) + 1e-9).astype(int)
+    frames = np.floor(fractional_frame_indices(frame_times(metadata, n_frames, file)) + 1e-9).astype(int)
     known = [column for column, lane_id in enumerate(lights.lane_ids) if lane_id in lanes.lanes]
     return ScenarioLog(
         file=file,

@@ -135,13 +135,13 @@ def follow_path(
         ahead = gaps > -1.0
         if ahead.any():
             nearest = int(np.argmin(np.where(ahead, gaps, np.inf)))
-            command = min(command, _follow(float(gaps[nearest]), v, float(along_speed[i, nearest]), style))
+            command = min(command, _idm_interaction(float(gaps[nearest]), v, float(along_speed[i, nearest]), style))
         for line, group in path.stops:
             state = RED if group < 0 else signals.state(group, float(time))
             distance = line - front
             can_stop = v * v / (2 * max(distance, 0.1)) < 2.6
             if distance > -1.0 and (state == RED or (state == YELLOW and can_stop)) and (distance > 0 or v < 1.0):
-                command = min(command, _follow(distance + style.gap_m - 0.6, v, 0.0, style))
+                command = min(command, _idm_interaction(distance + style.gap_m - 0.6, v, 0.0, style))
         a += float(np.clip(np.clip(command, -4.5, style.accel) - a, -style.jerk * STEP_S, style.jerk * STEP_S))
         if command < -2.5:
             a = min(a, command * 0.6)
@@ -153,7 +153,7 @@ def follow_path(
     return s_out, v_out
 
 
-def _follow(gap: float, v: float, lead_v: float, style: DrivingStyle) -> float:
+def _idm_interaction(gap: float, v: float, lead_v: float, style: DrivingStyle) -> float:
     """IDM's interaction term (Treiber et al. 2000)."""
     closing = v * (v - lead_v) / (2 * np.sqrt(style.accel * style.brake))
     wanted = style.gap_m + max(0.0, v * style.headway_s + closing)

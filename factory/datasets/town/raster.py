@@ -25,7 +25,7 @@ from factory.datasets.town.textures import (
     toned,
     visible,
 )
-from tasks.kernels.compiled import drawing_kernel
+from tasks.kernels.compiled import numpy_division_kernel
 from tasks.world.arrays import F32, Array, Ints, ShortInts
 
 NEAR_M = 0.15
@@ -49,7 +49,7 @@ class Mesh(NamedTuple):
         return self._replace(vertices=self.vertices @ turn + [pose[0], pose[1], 0.0], normals=self.normals @ turn)
 
 
-@drawing_kernel
+@numpy_division_kernel
 def rasterise(mesh: Mesh, view: Array, keys: F32, ids: ShortInts) -> Array:
     """Draws triangles into `keys` and `ids` (H, W), the visible one's number.
 
@@ -164,7 +164,7 @@ def cross(a: Array, b: Array) -> Array:
     return product
 
 
-def shades(percentages: str) -> Array:
+def parse_colours(percentages: str) -> Array:
     """(N, 3) colours, 0..1, from "red green blue, red green blue, ..." in percent."""
     return np.array([colour.split() for colour in percentages.split(",")], np.float64) / 100
 
@@ -289,14 +289,14 @@ class LitScene(NamedTuple):
     sky_seed: int
 
 
-@drawing_kernel
+@numpy_division_kernel
 def dashed(x: float, period: float, dash: float, footprint: float) -> float:
     """Share of a pixel at x that lies on dashes, one at the start of each period; a pattern too fine is its mean."""
     seen = visible(dash, footprint)
     return seen * inside(x % period, 0.0, dash, max(footprint, 0.01)) + (1 - seen) * (dash / period)
 
 
-@drawing_kernel
+@numpy_division_kernel
 def road_paint(u: float, d: float, marks: Array, fu: float, fd: float) -> tuple[float, float]:
     """(coverage, yellowness) of the paint at arc length u and offset d of a road.
 
@@ -318,7 +318,7 @@ def road_paint(u: float, d: float, marks: Array, fu: float, fd: float) -> tuple[
     return best, yellow
 
 
-@drawing_kernel
+@numpy_division_kernel
 def road_surface(x: float, y: float, u: float, d: float, marks: Array, fu: float, fd: float) -> RGB:
     """Asphalt with worn lane paint; the gutter beside the kerb is darker."""
     fp = max(fu, fd)
@@ -331,7 +331,7 @@ def road_surface(x: float, y: float, u: float, d: float, marks: Array, fu: float
     return colour
 
 
-@drawing_kernel
+@numpy_division_kernel
 def sky(dx: float, dy: float, dz: float, sun: Array, seed: int) -> RGB:
     """The sky in a direction: gradient, clouds on a high plane, a glow around the sun."""
     up = max(0.0, dz)
@@ -352,7 +352,7 @@ def sky(dx: float, dy: float, dz: float, sun: Array, seed: int) -> RGB:
     return min(1.0, r + glow), min(1.0, g + glow), min(1.0, b + glow * 0.8)
 
 
-@drawing_kernel
+@numpy_division_kernel
 def surface_colour(scene: LitScene, t: int, u: float, v: float, x: float, y: float, fu: float, fv: float) -> RGB:
     """Colour before light of triangle t at (u, v), world (x, y), in a pixel with the footprint (fu, fv)."""
     mesh = scene.mesh
@@ -425,7 +425,7 @@ def surface_colour(scene: LitScene, t: int, u: float, v: float, x: float, y: flo
     return toned(colour, tone)
 
 
-@drawing_kernel
+@numpy_division_kernel
 def lit_by_sun(x: float, y: float, z: float, scene: LitScene) -> float:
     """0 in shade .. 1 in the sun: four taps of the sun's depth map, blended; outside it: sun."""
     view, shadow = scene.sun.projection, scene.shadow
@@ -441,7 +441,7 @@ def lit_by_sun(x: float, y: float, z: float, scene: LitScene) -> float:
     return (1 - b) * top + b * low
 
 
-@drawing_kernel
+@numpy_division_kernel
 def lit(scene: LitScene, t: int, colour: RGB, x: float, y: float, z: float, dx: float, dy: float, dz: float) -> RGB:
     """The colour of triangle t at world (x, y, z) in the light there, seen along (dx, dy, dz)."""
     kind, sun = scene.mesh.material[t], scene.sun.direction
@@ -460,7 +460,7 @@ def lit(scene: LitScene, t: int, colour: RGB, x: float, y: float, z: float, dx: 
     return r * (ambient * 0.93 + 0.86 * direct), g * (ambient + 0.80 * direct), b * (ambient * 1.10 + 0.70 * direct)
 
 
-@drawing_kernel
+@numpy_division_kernel
 def shade(scene: LitScene, ids: ShortInts, planes: Array, origin: Array, rays: Array) -> F32:
     """(H, W, 3) RGB in [0, 255] of the triangles (2H, 2W) that a camera at `origin` (3,) in the world sees.
 

@@ -40,7 +40,7 @@ from tasks.world.road_map import TrafficLights
 _LOG = re.compile(r"town-(\d+)-(\d{4})-")  # log_name
 
 
-def town_log(log_id: str) -> tuple[int, int]:
+def parse_town_log_id(log_id: str) -> tuple[int, int]:
     """Seed and number of a town's log. Raises ValueError for the log of another data set."""
     found = _LOG.match(log_id)
     if found is None or log_name(int(found[1]), int(found[2])) != log_id:
@@ -57,7 +57,7 @@ class TownPainter:
 
     def lights(self, clip: Clip, n_steps: int) -> TrafficLights:
         """The clip's lights over `n_steps` steps from its first one, beyond the log too."""
-        town, drive = _planned(*town_log(clip.log_id))
+        town, drive = _planned(*parse_town_log_id(clip.log_id))
         times_s = _time_of(drive, clip, np.arange(n_steps))
         groups = [town.streets.lanes[int(lane_id)].light_group for lane_id in clip.lights.lane_ids]
         states = [[drive.signals.state(group, float(time_s)) for group in groups] for time_s in times_s]
@@ -67,7 +67,7 @@ class TownPainter:
         self, clip: Clip, cameras: Sequence[Camera], agents: AgentTracks, step: int, state: Array
     ) -> tuple[Array, list[Bytes]]:
         """The pose (4, 4) of an ego in a state (11,), and what each camera sees from there at a step of the clip."""
-        log = town_log(clip.log_id)
+        log = parse_town_log_id(clip.log_id)
         _, drive = _planned(*log)
         time_s = float(_time_of(drive, clip, np.array([step]))[0])
         lit = _renderer(*log).scene_among(_tracks(drive, agents), step, state[[X, Y]], time_s)
@@ -102,7 +102,7 @@ def _renderer(seed: int, number: int) -> TownRenderer:
 TOWN_VERSION = 3  # raise by hand whenever the same seed gives other bytes
 
 
-class SensedReader(AV2Reader):
+class TownLogReader(AV2Reader):
     """Towns' logs: a digest tells what the sensors record, too, pixels and points, which Argoverse's leaves out."""
 
     data_set = "synthetic"
@@ -126,7 +126,7 @@ class SensedReader(AV2Reader):
         return hashlib.sha256(f"{digest}{self.split or ''}{json.dumps(asdict(self.settings))}".encode()).hexdigest()
 
 
-class SyntheticReader(SensedReader):
+class SyntheticReader(TownLogReader):
     """Clips of a seed's town. It is test data and a first look, no replacement for real logs.
 
     The town is written on first use, into a folder named by everything that its bytes depend on, and moved there
@@ -173,7 +173,7 @@ def town_folder(cache_dir: str | Path | None, seed: int, logs: list[object], set
 # Several towns as one data set: a few logs of each seed's town, for studies that split their clips by town.
 
 
-class SyntheticTownsReader(SensedReader):
+class SyntheticTownsReader(TownLogReader):
     """Clips of the towns of several seeds; no seed's clips depend on which other seeds are read.
 
     A town has eighteen kinds of drives. Of each town the next `logs_per_town` are taken, so that a few towns hold every

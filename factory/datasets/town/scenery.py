@@ -10,7 +10,7 @@ import shapely
 from factory.datasets.town import curves
 from factory.datasets.town import textures as tx
 from factory.datasets.town.drive import GREEN, RED, YELLOW, TownTrack
-from factory.datasets.town.raster import WHITE, Mesh, MeshBuilder, lifted, shades
+from factory.datasets.town.raster import WHITE, Mesh, MeshBuilder, lifted, parse_colours
 from factory.datasets.town.streets import CROSSING_GAP_M, CROSSING_M, PAVEMENT_M, STOP_LINE_M, Streets, TownRoad
 from tasks.world.arrays import Array, Ints
 from tasks.world.road_map import arc_lengths
@@ -19,9 +19,9 @@ from tasks.world.road_map import arc_lengths
 
 KERB_M = 0.12  # height
 PLAIN_Z = -0.06  # the lawn around, below the road
-AWNINGS = shades("55 12 12, 14 32 24, 16 22 42, 78 70 52")
-CROWNS = shades("27 38 13, 22 33 14, 33 40 14, 40 36 13")
-TILES = shades("46 22 15, 28 27 29, 38 25 18")
+AWNINGS = parse_colours("55 12 12, 14 32 24, 16 22 42, 78 70 52")
+CROWNS = parse_colours("27 38 13, 22 33 14, 33 40 14, 40 36 13")
+TILES = parse_colours("46 22 15, 28 27 29, 38 25 18")
 CONCRETE, RAILING = (tx.ISLAND_STONE, (0.66, 0.64, 0.6)), (tx.DARK, (0.16, 0.16, 0.17))
 
 
@@ -315,7 +315,7 @@ def _furniture(b: MeshBuilder, streets: Streets, rng: np.random.Generator) -> No
             at = curves.pose_beside(line, s + float(rng.uniform(-5, 5)), road.half_width + 0.5)
             if kind < 0.5:
                 b.post(at, KERB_M, 2.75, 0.035, tx.METAL, (0.55, 0.55, 0.55), sides=5)
-                facing, seed = _facing(at), int(rng.integers(99))
+                facing, seed = _against_heading(at), int(rng.integers(99))
                 centre = np.array([*at[:2], 2.45]) + 0.05 * facing
                 b.disc(centre, facing, 0.32, tx.SIGN, WHITE, seed, sides=14, uv_scale=1 / 0.32)
             elif kind < 0.8:
@@ -324,7 +324,7 @@ def _furniture(b: MeshBuilder, streets: Streets, rng: np.random.Generator) -> No
                 b.box((*at[:2], 0.75), (0.5, 0.45, 1.25), tx.METAL, (0.62, 0.10, 0.09))
 
 
-def _facing(pose: Array) -> Array:
+def _against_heading(pose: Array) -> Array:
     """(3,) against the pose's heading: towards who comes."""
     return np.array([-np.cos(pose[2]), -np.sin(pose[2]), 0.0])
 
@@ -334,7 +334,7 @@ def _signal(b: MeshBuilder, pose: Array, width: float) -> Mesh:
     arm_length = width + 1.2
     b.post(pose, KERB_M, 6.1, 0.12, *MAST, sides=7)
     b.tube((*pose[:2], 5.9), (*curves.advance(pose, 0.0, arm_length)[:2], 6.1), 0.07, *MAST)
-    facing, lamps = _facing(pose), MeshBuilder()
+    facing, lamps = _against_heading(pose), MeshBuilder()
     one = np.array([-facing[1], facing[0], 0.0])
     for left, z in ((0.0, 3.0), *((arm_length - 0.7 - 3.4 * k, 5.7) for k in range(max(1, int(width / 3.4))))):
         middle = np.array([*curves.advance(pose, 0.0, left)[:2], z]) + 0.18 * facing
@@ -350,11 +350,13 @@ def _signal(b: MeshBuilder, pose: Array, width: float) -> Mesh:
 
 # Cars, trucks, buses, pedestrians and cyclists as meshes in their own frame: x forward, y left, z up from the road.
 
-CAR_PAINT = shades("62 64 66, 12 12 13, 85 85 84, 36 38 40, 50 8 9, 11 20 42, 18 30 24, 70 62 50, 74 72 70, 60 30 10")
-BUS_PAINT = shades("72 12 10, 10 30 55, 80 66 12")
-CLOTHES = shades("20 24 40, 55 12 14, 14 14 15, 66 64 58, 18 38 30, 75 55 18, 36 20 38, 30 45 62")
-SKIN = shades("80 62 50, 55 38 28, 70 52 40, 36 24 18")
-HAIR = shades("10 7 5, 30 20 10, 5 5 5, 50 42 30")
+CAR_PAINT = parse_colours(
+    "62 64 66, 12 12 13, 85 85 84, 36 38 40, 50 8 9, 11 20 42, 18 30 24, 70 62 50, 74 72 70, 60 30 10"
+)
+BUS_PAINT = parse_colours("72 12 10, 10 30 55, 80 66 12")
+CLOTHES = parse_colours("20 24 40, 55 12 14, 14 14 15, 66 64 58, 18 38 30, 75 55 18, 36 20 38, 30 45 62")
+SKIN = parse_colours("80 62 50, 55 38 28, 70 52 40, 36 24 18")
+HAIR = parse_colours("10 7 5, 30 20 10, 5 5 5, 50 42 30")
 HEAD_LIGHT, TAIL_LIGHT, PLATE = (0.95, 0.95, 0.88), (0.62, 0.05, 0.05), (0.86, 0.84, 0.70)
 WINDSCREEN = (0.14, 0.15, 0.17)
 GLASS_UV = [(0.08, 0.05), (0.44, 0.05), (0.44, 0.95), (0.08, 0.95)]
@@ -402,7 +404,9 @@ def _lamps(b: MeshBuilder, side: float, w: float, head: tuple[float, ...], tail:
         b.face(_panel((x, z), (x_high, z_high), (side * (w - inner), side * (w - outer))), tx.GLOW, light)
 
 
-def _ground(b: MeshBuilder, length: float, width: float, axles: tuple[float, ...], track: float, radius: float) -> None:
+def _underside_and_wheels(
+    b: MeshBuilder, length: float, width: float, axles: tuple[float, ...], track: float, radius: float
+) -> None:
     """The dark under a vehicle, where no sky reaches, and its wheels."""
     b.face(_level(-0.48 * length, 0.48 * length, 0.48 * width, 0.02), tx.DARK, (0.10, 0.10, 0.10))
     for x, side in itertools.product(axles, SIDES):
@@ -449,7 +453,7 @@ def _car(length: float, width: float, height: float, look: int) -> Mesh:
         b.face(_panel((x, 0.42), (x, 0.53), (-0.26, 0.26)), tx.GLOW, PLATE)
     b.face(_panel((f + 0.004, 0.57), (f - 0.04, 0.67), (-0.5, 0.5)), tx.DARK, (0.06, 0.06, 0.06))
     b.face(_level(r + 0.1, f - 0.1, w, 0.2), tx.DARK, (0.04, 0.04, 0.04))
-    _ground(b, length, width, (f - 0.85, r + 0.85), w, 0.33)
+    _underside_and_wheels(b, length, width, (f - 0.85, r + 0.85), w, 0.33)
     return b.mesh()
 
 
@@ -471,7 +475,7 @@ def _truck(length: float, width: float, height: float, look: int) -> Mesh:
         b.face(_panel((x, 0.85), (x, height), (-w, w)), tx.CARGO, paint, look)
     b.face(_level(r, box_f, w, height), tx.METAL, (0.8, 0.8, 0.8))
     b.box((0.0, 0.0, 0.68), (length * 0.94, width * 0.5, 0.36), tx.DARK, (0.07, 0.07, 0.07))
-    _ground(b, length, width, (f - 1.0, r + 1.3), w - 0.02, 0.45)
+    _underside_and_wheels(b, length, width, (f - 1.0, r + 1.3), w - 0.02, 0.45)
     return b.mesh()
 
 
@@ -484,7 +488,7 @@ def _bus(length: float, width: float, height: float, look: int) -> Mesh:
     b.face(_level(r, f, w, height), tx.METAL, (0.85, 0.85, 0.84))
     for side in SIDES:
         _lamps(b, side, w, *((x, 0.6, x, 0.85, 0.45, 0.12) for x in (f + 0.006, r - 0.006)))
-    _ground(b, length, width, (f - 2.4, r + 3.0), w, 0.48)
+    _underside_and_wheels(b, length, width, (f - 2.4, r + 3.0), w, 0.48)
     return b.mesh()
 
 

@@ -55,7 +55,7 @@ class TownSettings:
             raise ValueError(f"impossible lidar: {self.lidar_beams} beams, {self.lidar_azimuths} azimuths")
 
 
-class Sensed(ReaderSettings):
+class TownReaderSettings(ReaderSettings):
     """Settings with those of a town's sensors."""
 
     settings: TownSettings
@@ -71,7 +71,7 @@ class Sensed(ReaderSettings):
 
 
 @dataclass(frozen=True)
-class TownClips(Sensed):
+class TownClips(TownReaderSettings):
     """A seeded town: which of its clips."""
 
     cache_dir: str | None = None  # written there once; null: the user's cache ($XDG_CACHE_HOME or ~/.cache)
@@ -87,7 +87,7 @@ class TownClips(Sensed):
 
 
 @dataclass(frozen=True)
-class TownsClips(Sensed):
+class TownsClips(TownReaderSettings):
     """The towns of several seeds, a few logs of each."""
 
     seeds: tuple[int, ...] | None = None  # null: n_towns of them from first_seed on

@@ -6,7 +6,7 @@ alias and one place has one colour from near and far. Colours are (r, g, b) in 0
 
 import math
 
-from tasks.kernels.compiled import drawing_kernel
+from tasks.kernels.compiled import numpy_division_kernel
 
 # Materials
 ASPHALT, ROAD, PAVING, KERB, GRASS, FACADE, ROOF_TILES, FLAT_ROOF, BARK, LEAVES, PAINTED, CABIN = range(12)
@@ -21,20 +21,20 @@ WALLS = (  # colours: three of brick, four of plaster, concrete panels
 MORTAR, TRIM, SHUTTER = (0.62, 0.59, 0.55), (1.0, 0.97, 0.92), (0.85, 0.85, 0.82)
 
 
-@drawing_kernel
+@numpy_division_kernel
 def toned(colour: RGB, tone: float) -> RGB:
     """The colour, lighter or darker by a factor."""
     return colour[0] * tone, colour[1] * tone, colour[2] * tone
 
 
-@drawing_kernel
+@numpy_division_kernel
 def mixed(colour: RGB, other: RGB, share: float) -> RGB:
     """The colour with that share of the other."""
     r, g, b = colour
     return r + (other[0] - r) * share, g + (other[1] - g) * share, b + (other[2] - b) * share
 
 
-@drawing_kernel
+@numpy_division_kernel
 def chance(x: int, y: int, seed: int) -> float:
     """A fixed random number in [0, 1) of an integer cell."""
     h = (x * 374761393 + y * 668265263 + seed * 1442695041) & 0xFFFFFFFF
@@ -43,7 +43,7 @@ def chance(x: int, y: int, seed: int) -> float:
     return ((h ^ (h >> 16)) & 0xFFFFFF) / 16777216.0
 
 
-@drawing_kernel
+@numpy_division_kernel
 def noise(u: float, v: float, seed: int) -> float:
     """Value noise in [0, 1) with cells of size 1."""
     iu, iv = math.floor(u), math.floor(v)
@@ -55,13 +55,13 @@ def noise(u: float, v: float, seed: int) -> float:
     return top * (1 - b) + low * b
 
 
-@drawing_kernel
+@numpy_division_kernel
 def visible(size: float, footprint: float) -> float:
     """How much of a pattern of that size survives a pixel of that footprint (1 near, 0 far)."""
     return min(1.0, max(0.0, 1.6 * size / footprint - 0.8))
 
 
-@drawing_kernel
+@numpy_division_kernel
 def inside(x: float, low: float, high: float, footprint: float) -> float:
     """Share of a pixel of that footprint at x that lies in [low, high]."""
     return (
@@ -71,7 +71,7 @@ def inside(x: float, low: float, high: float, footprint: float) -> float:
     )
 
 
-@drawing_kernel
+@numpy_division_kernel
 def grain(u: float, v: float, seed: int, footprint: float) -> float:
     """Three octaves of fine noise around 0: stones of 6, 2 and 0.7 cm."""
     out = 0.0
@@ -85,7 +85,7 @@ def grain(u: float, v: float, seed: int, footprint: float) -> float:
     return out
 
 
-@drawing_kernel
+@numpy_division_kernel
 def asphalt(x: float, y: float, footprint: float) -> RGB:
     """Worn asphalt in world coordinates: broad tones, repairs, cracks, grain."""
     tone = 0.335 + 0.07 * (noise(x / 9.0, y / 9.0, 1) - 0.5) + 0.07 * (noise(x / 1.7, y / 1.7, 2) - 0.5)
@@ -104,7 +104,7 @@ def asphalt(x: float, y: float, footprint: float) -> RGB:
     return tone, tone * 1.005, tone * 1.02
 
 
-@drawing_kernel
+@numpy_division_kernel
 def paving(u: float, v: float, seed: int, footprint: float) -> RGB:
     """Concrete slabs of 60 x 40 cm."""
     row = math.floor(v / 0.4)
@@ -129,7 +129,7 @@ def paving(u: float, v: float, seed: int, footprint: float) -> RGB:
     return tone * 1.01, tone * 0.985, tone * 0.94
 
 
-@drawing_kernel
+@numpy_division_kernel
 def grass(x: float, y: float, footprint: float) -> RGB:
     """A lawn with tufts and bare spots."""
     broad = noise(x / 6.0, y / 6.0, 21)
@@ -141,7 +141,7 @@ def grass(x: float, y: float, footprint: float) -> RGB:
     return (0.27 + 0.12 * bare) * tone, (0.36 - 0.02 * bare) * tone, (0.15 + 0.07 * bare) * tone
 
 
-@drawing_kernel
+@numpy_division_kernel
 def wall(u: float, v: float, style: int, seed: int, footprint: float) -> RGB:
     """Brick, plaster or concrete panels, as in WALLS, stained from above."""
     stain = 1.0 + 0.16 * (noise(u / 1.3, v / 4.0, seed) - 0.5) + 0.10 * (noise(u / 0.4, v / 0.9, seed + 1) - 0.5)
@@ -158,7 +158,7 @@ def wall(u: float, v: float, style: int, seed: int, footprint: float) -> RGB:
     return toned(rough, 0.75) if style == 7 and (u % 3.0 < 0.03 or v % 1.6 < 0.03) and footprint < 0.3 else rough
 
 
-@drawing_kernel
+@numpy_division_kernel
 def pane(u: float, v: float, cell: int, seed: int) -> RGB:
     """Glass seen from the street: a dark room, a curtain, a bit of sky; u, v in 0..1 over the pane."""
     kind = chance(cell, 3, seed)
@@ -172,7 +172,7 @@ def pane(u: float, v: float, cell: int, seed: int) -> RGB:
     return 0.10 + sky * 0.8, 0.12 + sky * 0.95, 0.15 + sky * 1.1
 
 
-@drawing_kernel
+@numpy_division_kernel
 def facade(u: float, v: float, width: float, height: float, seed: int, fu: float, fv: float) -> RGB:
     """A house front: plinth, shops or doors at street level, floors of windows, cornice. Everything by `seed`."""
     ground = 3.3 + chance(seed, 2, 77) * 0.9
@@ -225,7 +225,7 @@ def facade(u: float, v: float, width: float, height: float, seed: int, fu: float
     return mixed(colour, cornice, inside(v, height - 0.45, height + 1.0, fv))
 
 
-@drawing_kernel
+@numpy_division_kernel
 def shopfront(u: float, v: float, ground: float, seed: int, fu: float, fv: float) -> RGB:
     """Shops of 4.6 m: sign with letters, window with goods, door, stall riser."""
     shop = math.floor(u / 4.6)
@@ -258,7 +258,7 @@ def shopfront(u: float, v: float, ground: float, seed: int, fu: float, fv: float
     return mixed((sign[0] * 0.6 + 0.1, sign[1] * 0.6 + 0.1, sign[2] * 0.6 + 0.1), window, glass)
 
 
-@drawing_kernel
+@numpy_division_kernel
 def leaf_here(u: float, v: float, seed: int) -> bool:
     """Is there a leaf at this place of a twig's card (in metres)?"""
     for k in range(2):
@@ -273,7 +273,7 @@ def leaf_here(u: float, v: float, seed: int) -> bool:
     return False
 
 
-@drawing_kernel
+@numpy_division_kernel
 def opaque_at(material: int, u: float, v: float, seed: int) -> bool:
     """The cut-out materials' masks."""
     if material == LEAVES:

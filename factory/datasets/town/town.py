@@ -40,7 +40,7 @@ from factory.datasets.town.drive import GREEN, RED, SCENARIOS, YELLOW, TownDrive
 from factory.datasets.town.scenery import Scenery, build_scenery
 from factory.datasets.town.settings import LOG_STEPS, LOGS_PER_TOWN, STEPS_PER_SWEEP, TownSettings
 from factory.datasets.town.streets import Streets, TownLane, build_streets
-from factory.exits import become_worker, terminal_signals_blocked
+from factory.exits import ignore_terminal_signals, terminal_signals_blocked
 from factory.files import matching_below
 from factory.wording import time_text
 from tasks.caches import Damaged, json_with_checksum, parse_json_with_checksum
@@ -61,10 +61,10 @@ Write = Callable[[Path], object]  # fills an empty folder
 def write_once(root: Path, write: Write) -> None:
     """The folder `root` with what `write` writes into it, unless it is there: whole or not at all."""
     if not root.is_dir():
-        fill_and_place(unfinished_folder(root), root, write)
+        fill_and_place(make_unfinished_folder(root), root, write)
 
 
-def unfinished_folder(root: Path) -> Path:
+def make_unfinished_folder(root: Path) -> Path:
     """A new empty folder beside `root`, or beside what a link of that name leads to, to become it."""
     root = root.resolve()
     root.parent.mkdir(parents=True, exist_ok=True)
@@ -91,7 +91,7 @@ def repair_folder(root: Path, write: Write) -> None:
     if not (wrong := _find_damage(root)):
         return
     log.warning("%s is damaged (%s); it is made again", root, wrong)
-    anew, old = unfinished_folder(root), unfinished_folder(root)
+    anew, old = make_unfinished_folder(root), make_unfinished_folder(root)
     try:
         _fill(anew, write, root.name)
         with suppress(FileNotFoundError):  # another worker is about to put the same there
@@ -482,7 +482,7 @@ def write_towns(towns: Sequence[TownFolder], settings: TownSettings) -> None:
         while waiting or painting:
             while waiting and len(painting) < at_once:
                 town = waiting.popleft()
-                begun.append(unfinished_folder(town.root))
+                begun.append(make_unfinished_folder(town.root))
                 with terminal_signals_blocked():
                     painting[_start_painter(town, begun[-1], settings, lifeline)] = town
             for child in [child for child in painting if child.poll() is not None]:
@@ -523,7 +523,7 @@ def _refusal_of(ended: "subprocess.Popen[bytes]") -> OSError | None:
 
 def main(told: str) -> None:
     """A painter's process: one town, on one core. Tells on standard output what it is refused."""
-    become_worker()
+    ignore_terminal_signals()
     threading.Thread(target=_end_with_input, daemon=True).start()
     town = json.loads(told)
     arguments = town["indices"], town["seed"], TownSettings(**town["settings"])

@@ -35,16 +35,16 @@ from factory.graph.local import (
     Claims,
     ClusterDied,
     ClusterLacks,
-    Costs,
     Graph,
     Limits,
     MachineFailure,
+    TaskDurations,
     Ticket,
     call_watched,
-    clear_notes,
     not_ready_error,
     notes_folder,
     remove_if_empty,
+    start_run_notes,
     task_cores,
     task_name,
     task_note,
@@ -76,7 +76,7 @@ def _can_read(out: Location, name: str, token: bytes) -> bool:
     return out.read(name) == token
 
 
-def connect(workers: int | None) -> bool:
+def join_or_start_cluster(workers: int | None) -> bool:
     """Join the cluster of RAY_ADDRESS, else start one in this machine (then True).
 
     Raises ConnectionError where nothing answers there; where nothing listens at once: Ray itself tries for minutes.
@@ -203,7 +203,7 @@ WARMING = {"key": "warm", "what": "compiling kernels", "run": "", "limited": Fal
 _HELD: dict[str, Any] = {}  # per worker process: the run's Work, fetched once
 
 
-def ray_metrics() -> Record:
+def ray_metric_recorder() -> Record:
     """By way of `ray.util.metrics`: each node's agent serves Prometheus.
 
     Measured: 4 us a value, about 50 us an attempt of 100 ms or more.
@@ -243,17 +243,17 @@ class RayGraph(Graph):
         DiskFull when there is no space for it.
         """
         self._connected = not ray.is_initialized()
-        self._is_ours = self._connected and connect(workers)
+        self._is_ours = self._connected and join_or_start_cluster(workers)
         self.parallelism = tasks_at_once(workers, self._is_ours)
         self.cores = min(self.parallelism, *(per_node("CPU") or [1]))  # none yet where a cluster grows from nothing
-        self.record_metric = ray_metrics()
+        self.record_metric = ray_metric_recorder()
         self._supplied: dict[str, Any] = {
             "work": [ray.put(work)],
             "out": out,
             "stopped": never_stop,
         }  # list: a reference
-        self._costs, self._notes = Costs(limits), notes_folder(out)
-        self._run = clear_notes(self._notes)
+        self._costs, self._notes = TaskDurations(limits), notes_folder(out)
+        self._run = start_run_notes(self._notes)
         self._tickets: dict[Any, Ticket] = {}
         self._ready: deque[Any] = deque()
         self._held_back: dict[bool, deque[tuple[Ticket, str, tuple[Any, ...]]]] = {False: deque(), True: deque()}
@@ -326,7 +326,7 @@ class RayGraph(Graph):
                 ticket, step, args = waiting.popleft()
                 supplied = [self._supplied[name] for name in STEPS[step][1]]
                 if ticket.step in self._after_drawing:
-                    args = tuple(FetchedResult(arg) if isinstance(arg, ray.ObjectRef) else arg for arg in args)
+                    args = tuple(ResultToFetch(arg) if isinstance(arg, ray.ObjectRef) else arg for arg in args)
                 gpu = self._gpu_share if draws else None
                 memory = self._claims.memory_bytes(ticket.step)
                 memory = memory if self._most_memory is None else min(memory, self._most_memory)
@@ -395,7 +395,7 @@ def _not_ready_error(error: RayError, said: str) -> Exception:
 
 
 @dataclass(frozen=True)
-class FetchedResult:
+class ResultToFetch:
     """A result that a task fetches itself: Ray sends a task to the node where most of what it is given lies.
 
     What follows a picture would go to the node that drew it, and take the cores that the next pictures wait for.
@@ -416,7 +416,7 @@ def _run(step: str, watch: tuple[Path, dict[str, Any]], n_supplied: int, *args: 
     a batch each sample's."""
     began = time.perf_counter()
     supplied = [_cached_work(arg) if isinstance(arg, list) else arg for arg in args[:n_supplied]]
-    given = [ray.get(arg.reference) if isinstance(arg, FetchedResult) else arg for arg in args[n_supplied:]]
+    given = [ray.get(arg.reference) if isinstance(arg, ResultToFetch) else arg for arg in args[n_supplied:]]
     if step == "attempts":
         report, *results = _attempt_batch(watch, *supplied, *given)
     else:
@@ -478,7 +478,7 @@ class RayPool(Executor):
         """
         self._connected = not ray.is_initialized()
         try:
-            is_ours = self._connected and connect(workers)
+            is_ours = self._connected and join_or_start_cluster(workers)
         except ClusterDied as error:
             raise ConnectionError(str(error)) from error
         self.parallelism = tasks_at_once(workers, is_ours)

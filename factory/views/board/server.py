@@ -151,7 +151,7 @@ class Board:
             case ["api", "overview"]:
                 return _json(overview(self.watch.snapshot(), self._store.location.uri, time.time()))
             case ["api", "samples"]:
-                page, size = _number(query, "page", 1), _number(query, "size", 12)
+                page, size = _pop_number(query, "page", 1), _pop_number(query, "size", 12)
                 order = query.pop("order", "newest")
                 return _json(gallery(self.watch.snapshot(), query, page, size, order))
             case ["api", "samples", attempt_id]:
@@ -159,7 +159,7 @@ class Board:
                 row = self._pictures.row(shot, _valid_id(attempt_id))
                 return _json(sample_page(shot, attempt_id, row, self._store.candidates))
             case ["api", "failed"]:
-                return _json(failures(self.watch.snapshot(), _number(query, "page", 1)))
+                return _json(failures(self.watch.snapshot(), _pop_number(query, "page", 1)))
             case ["api", "drives"]:
                 return _json(drives_as_json(self._drives.rows()))
             case ["film", name]:
@@ -181,7 +181,7 @@ class Board:
         if name == "front.jpg":
             data = self._pictures.front(shot, attempt_id)
         elif name == "bev.jpg":
-            data = self._pictures.bev(shot, attempt_id, _number(query, "size", 300), _number(query, "step", 15))
+            data = self._pictures.bev(shot, attempt_id, _pop_number(query, "size", 300), _pop_number(query, "step", 15))
         elif re.fullmatch(r"[0-9]{1,4}\.jpg", name):
             small = query.get("small") == "1"
             data = self._pictures.image(shot, attempt_id, int(name.removesuffix(".jpg")), small)
@@ -196,7 +196,7 @@ def _valid_id(attempt_id: str) -> str:
     return attempt_id
 
 
-def _number(query: dict[str, str], name: str, otherwise: int) -> int:
+def _pop_number(query: dict[str, str], name: str, otherwise: int) -> int:
     """Takes it out of the query."""
     text = query.pop(name, str(otherwise))
     if not (text.isascii() and text.isdecimal() and len(text) < 9):

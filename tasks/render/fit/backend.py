@@ -213,7 +213,7 @@ class CpuBackend:
             loss += through
         back = backward(seen, scene, d_rgb, d_alpha=d_alpha, threads=self.threads)
         cells, d_cells = backdrop_gradient(d_rgb, seen.view.alpha, sky)
-        rows, mine = _gradients_by_owner(back, parts)
+        rows, mine = _gradients_in_owner_frames(back, parts)
         tracks, boxes = _box_gradients(state, parts, rows, mine)
         score = psnr(np.clip(picture, 0.0, 1.0), compared.target.rgb)
         depths = seen.splats.projected[:, DEPTH]
@@ -246,7 +246,7 @@ def draw_with_sky(
     return forward(scene, photo.intrinsics, camera, width, height, behind, threads), sky
 
 
-def _gradients_by_owner(back: Gradients, parts: Sequence[OwnedGaussians]) -> tuple[Ints, Gradients]:
+def _gradients_in_owner_frames(back: Gradients, parts: Sequence[OwnedGaussians]) -> tuple[Ints, Gradients]:
     """The gradients in the frames that the Gaussians are learned in, and their rows in the state."""
     rows, pieces = [], []
     for part in parts:

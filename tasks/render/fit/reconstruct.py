@@ -22,7 +22,7 @@ from tasks.render.fit.start import FitPhoto, FitProblem
 from tasks.render.fit.state import BACKGROUND, FitState, Road, height_above_road, opacities_of, relocate_and_grow
 from tasks.render.scene.asset import ClassQuality, Exposure, RenderAsset, ViewQuality, mean_psnr_db, psnr
 from tasks.render.scene.body import BEFORE_M, bodies_near, nearest_box_along_rays
-from tasks.render.scene.engine import Vehicles, render
+from tasks.render.scene.engine import PlacedAgents, render
 from tasks.render.scene.movers import (
     SHIFT_SIZE,
     BoxShifts,
@@ -85,7 +85,7 @@ def draw_photo(
     samples are drawn, in the colours of its camera then, its tracks where photos say that they were."""
     boxes, valid = boxes_at_photo(asset, problem, photo)
     rows = np.flatnonzero(valid)
-    there = Vehicles(
+    there = PlacedAgents(
         tuple(problem.tracks.ids[j] for j in rows),
         tuple(problem.tracks.kinds[j] for j in rows),
         boxes[rows] + np.concatenate([problem.origin, np.zeros(4)]),

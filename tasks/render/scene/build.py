@@ -14,7 +14,7 @@ import numpy as np
 from tasks.render.scene.asset import RenderAsset, ViewQuality, compose_gaussians, mean_psnr_db, psnr
 from tasks.render.scene.body import with_body_depths
 from tasks.render.scene.depth import SHALLOW, PhotoDepth, estimate_photo_depth, label_confirmed
-from tasks.render.scene.engine import Vehicles, render
+from tasks.render.scene.engine import PlacedAgents, render
 from tasks.render.scene.features import NOTHING_KNOWN, KnownPoints, SurfacePoints, points_without_lidar
 from tasks.render.scene.movers import box_of_points, world_from_boxes
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse_sweeps, shift_pose
@@ -165,7 +165,7 @@ def _present_tracks(asset: RenderAsset, tracks: Tracks, time_s: float) -> tuple[
 def _picture(asset: RenderAsset, photo: Photo, tracks: Tracks) -> F32:
     """The rendering of a photo (pose local) as the scene was at its time."""
     rows, boxes = _present_tracks(asset, tracks, photo.time_s)
-    present = Vehicles(tuple(tracks.ids[j] for j in rows), tuple(tracks.kinds[j] for j in rows), boxes[rows])
+    present = PlacedAgents(tuple(tracks.ids[j] for j in rows), tuple(tracks.kinds[j] for j in rows), boxes[rows])
     height, width = photo.rgb.shape[:2]
     camera = Pinhole(photo.intrinsics, shift_pose(photo.world_from_camera, asset.origin), width, height)
     return render(asset, [camera], present)[0].rgb

@@ -25,7 +25,7 @@ from tasks.world.clip import AgentKind, AgentTracks, Pinhole
 
 
 @dataclass(frozen=True)
-class Vehicles:
+class PlacedAgents:
     """Who is in the scene, and where: vehicles, pedestrians and bicycles."""
 
     track_ids: tuple[str, ...]
@@ -33,22 +33,24 @@ class Vehicles:
     boxes: Array  # (N, 7) x, y, z of the centre, heading, length, width, height; world [m, rad]
 
 
-NOBODY = Vehicles((), (), np.zeros((0, 7)))
+NOBODY = PlacedAgents((), (), np.zeros((0, 7)))
 
 
-def vehicles_at(agents: AgentTracks, time_s: float, around: Array | None = None, reach_m: float = np.inf) -> Vehicles:
+def agents_at_time(
+    agents: AgentTracks, time_s: float, around: Array | None = None, reach_m: float = np.inf
+) -> PlacedAgents:
     """The tracks that are there at a time since their first step; given a place `around` (2,), those within reach."""
     boxes, valid = boxes_at(agents, time_s)
     if around is not None:
         valid = valid & (np.hypot(*(boxes[:, :2] - around).T) < reach_m)
     rows = np.flatnonzero(valid)
-    return Vehicles(tuple(agents.track_ids[j] for j in rows), tuple(agents.kinds[j] for j in rows), boxes[rows])
+    return PlacedAgents(tuple(agents.track_ids[j] for j in rows), tuple(agents.kinds[j] for j in rows), boxes[rows])
 
 
 def render(
     asset: RenderAsset,
     cameras: Sequence[Pinhole],
-    vehicles: Vehicles = NOBODY,
+    vehicles: PlacedAgents = NOBODY,
     backend: Backend = Backend.CPU,
     threads: int = 1,
     affines: Sequence[F32] | None = None,

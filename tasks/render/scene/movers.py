@@ -119,7 +119,7 @@ def world_from_boxes(boxes: Array) -> Array:
     return poses
 
 
-def is_driving(agents: AgentTracks) -> Bools:
+def ever_moves(agents: AgentTracks) -> Bools:
     """(N,) tracks that leave their place at some time; the others may be taken for part of the street."""
     first = np.argmax(agents.valid, axis=0)
     start = agents.boxes[first, np.arange(len(agents)), :2]

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from tasks.render.scene.asset import OwnBody, apply_affine
-from tasks.render.scene.movers import GROUND_CLEARANCE_M, KNOT_S, box_of_points, boxes_at, is_driving, world_from_boxes
+from tasks.render.scene.movers import GROUND_CLEARANCE_M, KNOT_S, box_of_points, boxes_at, ever_moves, world_from_boxes
 from tasks.world.arrays import F32, Array, Bools, Bytes, Indices
 from tasks.world.clip import MOVING_KINDS, STEP_S, AgentTracks
 from tasks.world.frames import PACIFICA
@@ -85,7 +85,7 @@ class Tracks:
         self._agents, self._origin = agents, origin
         self.ids = agents.track_ids if agents is not None else ()
         self.kinds = agents.kinds if agents is not None else ()
-        self.driving = is_driving(agents) if agents is not None else np.zeros(0, bool)
+        self.driving = ever_moves(agents) if agents is not None else np.zeros(0, bool)
         self._movable = np.array([kind in MOVING_KINDS for kind in self.kinds], bool)
 
     @property

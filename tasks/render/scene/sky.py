@@ -114,7 +114,7 @@ def sky_agrees(sky_cost: F32, cost: F32) -> Bools:
     return np.asarray(sky_cost < 1.3 * cost + 0.03)
 
 
-def smooth_around(rgb: F32, among: Bools) -> Bools:
+def is_smooth_around(rgb: F32, among: Bools) -> Bools:
     """Pixels (H, W) around which much of what is `among` (H, W) is smooth: sky and its clouds, but no boarded wall."""
     grey = rgb.mean(axis=-1)
     n = max(rgb.shape[1] // WINDOWS, 2) // 2 * 2 + 1

@@ -12,7 +12,7 @@ import numpy as np
 
 from tasks.kernels.compiled import kernel
 from tasks.render.scene.sensed import Photo
-from tasks.render.scene.sky import may_be_sky, sky_agrees, smooth_around
+from tasks.render.scene.sky import is_smooth_around, may_be_sky, sky_agrees
 from tasks.world.arrays import F32, Array, Bools
 
 FAR_M = 1.0e4  # stands for the sky
@@ -161,7 +161,7 @@ def wide_baseline_depth(
     _anchor(volume, anchors, float(inverse[0]), step)
     _stand_on(volume, np.ascontiguousarray(floor[::2, ::2]), float(inverse[0]), step, BELOW, SLACK)
     bright = may_be_sky(rgb) & (floor == 0.0)
-    smooth = bright & smooth_around(rgb, bright)
+    smooth = bright & is_smooth_around(rgb, bright)
     favour = BRIGHT_SKY * np.where(bright, 1.0, -1.0) + SMOOTH_SKY * smooth
     volume[-1] -= favour[::2, ::2][: shape[0], : shape[1]].astype(np.float32)
     guide = cv2.resize(rgb, shape[::-1], interpolation=cv2.INTER_AREA)

@@ -320,7 +320,7 @@ def _parts(content: object) -> dict[str, _StoredPart]:
     if content and all(
         isinstance(part, Mapping) and {"config", "state_dict"} <= set(part) for part in content.values()
     ):
-        return {name: _portable(name, part) for name, part in content.items()}
+        return {name: _worldengine_part(name, part) for name, part in content.items()}
     raise ValueError(
         "checkpoint: neither 'pipeline', as nerfstudio and MTGS have it, nor parts of 'config' and 'state_dict', as "
         "WorldEngine has them"
@@ -340,7 +340,7 @@ def _training_parts(pipeline: Mapping[str, Any]) -> dict[str, _StoredPart]:
     return {name: _part(name, state, {}) for name, state in states.items()}
 
 
-def _portable(name: str, part: Mapping[str, Any]) -> _StoredPart:
+def _worldengine_part(name: str, part: Mapping[str, Any]) -> _StoredPart:
     """Of WorldEngine's."""
     state, config = part["state_dict"], part["config"]
     if not isinstance(state, Mapping) or not isinstance(config, Mapping):

@@ -38,16 +38,16 @@ from tasks.render.splatting.project import (
     X,
     Y,
     Z,
-    area_of,
     axes_of,
+    covariance_determinant,
     dot,
     exponential,
     gather,
+    rotation_and_centre,
     scaled,
     seen_from,
     slope_on_picture,
     tangent_limits,
-    turned_by,
 )
 from tasks.render.splatting.raster import (
     ALL,
@@ -58,7 +58,7 @@ from tasks.render.splatting.raster import (
     TILES_CHUNK,
     ForwardPass,
     aligned_memory,
-    alpha_at,
+    alpha_from_exponent,
     exponent,
     fetch_ahead,
     pair_starts,
@@ -153,7 +153,7 @@ def blend_gradient(
                 q, q_y, q_yy = fill(NOTHING), fill(NOTHING), fill(NOTHING)
                 w_depth, w_red, w_green, w_blue = (fill(NOTHING), fill(NOTHING), fill(NOTHING), fill(NOTHING))
                 for _ in range(first, last):
-                    opaque = alpha_at(fma(fma(dy, steep, slope), dy, level))
+                    opaque = alpha_from_exponent(fma(fma(dy, steep, slope), dy, level))
                     light = load(buffer, at)
                     w = opaque * light
                     store(buffer, at, light - w)
@@ -184,7 +184,7 @@ def _row(tiles: Any, pair_start: Any, i: Any, tx: Any, ty: Any) -> Any:
 
 
 @kernel
-def add_pairs(pair_start: Any, rows: Any, first: int, last: int, out: Any) -> None:
+def sum_pairs(pair_start: Any, rows: Any, first: int, last: int, out: Any) -> None:
     """Adds up the rows (pairs, 16) of each Gaussian from `first` to `last` into `out` (M, 16) float32."""
     step = np.uint64(SUMS_SIZE)
     for i in range(first, last):
@@ -203,7 +203,7 @@ LEAST_AREA = np.float32(1e-20)  # [px4] of what is not on the picture
 
 
 @inlined
-def _conic_gradient(block: Any) -> Any:
+def _covariance_gradient(block: Any) -> Any:
     """Derivatives by the screen covariance xx, xy (both places), yy: -conic (d conic) conic."""
     cxx, cxy, cyy = load(block, CXX), load(block, CXY), load(block, CYY)
     half = fill(np.float32(-0.5))
@@ -225,7 +225,7 @@ def _where_between(value: Any, at: Any, least: Any, most: Any) -> Any:
 
 
 @inlined
-def _store_quaternions(block: Any, q: Any, shorten: Any, g: Any) -> None:
+def _store_quaternion_gradient(block: Any, q: Any, shorten: Any, g: Any) -> None:
     """From the derivatives `g` by the principal axes, three triples, to those by the quaternions as given."""
     w, x, y, z = q
     twist_x, twist_y, twist_z = g[1][2] - g[2][1], g[2][0] - g[0][2], g[0][1] - g[1][0]
@@ -254,13 +254,16 @@ def _pulled_back(block: Any, rows: Any, centre: Any, fx: Any, fy: Any, limits: A
     to_u, to_v = slope_on_picture(rows, rows[0], a, jx), slope_on_picture(rows, rows[1], b, jy)
     q, shorten, axes = axes_of(block)
     s = exponential(load(block, S0)), exponential(load(block, S1)), exponential(load(block, S2))
-    d_xx, d_xy, d_yy = _conic_gradient(block)
+    d_xx, d_xy, d_yy = _covariance_gradient(block)
 
     # By each half axis p = s * axis: du = to_u . p and dv = to_v . p make up the screen covariance.
     du = s[0] * dot(to_u, axes[0]), s[1] * dot(to_u, axes[1]), s[2] * dot(to_u, axes[2])
     dv = s[0] * dot(to_v, axes[0]), s[1] * dot(to_v, axes[1]), s[2] * dot(to_v, axes[2])
     xx, xy, yy = dot(du, du), dot(du, dv), dot(dv, dv)
-    by_peak, inverse = load(block, BY_PEAK), fill(np.float32(1.0)) / larger(area_of(du, dv), fill(LEAST_AREA))
+    by_peak, inverse = (
+        load(block, BY_PEAK),
+        fill(np.float32(1.0)) / larger(covariance_determinant(du, dv), fill(LEAST_AREA)),
+    )
     half = fill(np.float32(0.5)) * by_peak  # the peak has half the logarithm of the determinants' ratio
     d_xx = d_xx + half * (yy * inverse - load(block, CXX))
     d_xy = d_xy - by_peak * (xy * inverse + load(block, CXY))
@@ -277,7 +280,7 @@ def _pulled_back(block: Any, rows: Any, centre: Any, fx: Any, fy: Any, limits: A
         _weighted_sum(to_u, by_u[1], to_v, by_v[1]),
         _weighted_sum(to_u, by_u[2], to_v, by_v[2]),
     )
-    _store_quaternions(block, q, shorten, by_axes)
+    _store_quaternion_gradient(block, q, shorten, by_axes)
 
     # By to_u and to_v, turned into camera coordinates; from there by the Jacobian's entries and the rotation.
     pull_u, pull_v = _turned(rows, _mixed(axes, by_u)), _turned(rows, _mixed(axes, by_v))
@@ -344,7 +347,7 @@ def project_gradient(
     coordinates, v [m] before w [rad].
     """
     block, motion = np.zeros(BLOCK_SIZE, np.float32), np.empty(LANES, np.float32)
-    rows, centre = turned_by(camera_from_scene)
+    rows, centre = rotation_and_centre(camera_from_scene)
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
     limits = tangent_limits(fx, fy, cx, cy, width, height)
     for start in range(first, last, LANES):
@@ -418,7 +421,7 @@ def backward(
 
     def run(first: int, last: int) -> Array:
         camera = np.zeros(6)
-        add_pairs(pair_start, pairs, first, last, sums)
+        sum_pairs(pair_start, pairs, first, last, sums)
         project_gradient(*scene, splats.index, splats.projected, sums, first, last, *shapes, camera)
         return camera
 

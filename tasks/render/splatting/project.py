@@ -78,7 +78,7 @@ def gather(means: Any, quats: Any, log_scales: Any, i: Any, block: Any, k: Any) 
 
 
 @inlined
-def turned_by(camera: Any) -> Any:
+def rotation_and_centre(camera: Any) -> Any:
     """Rows (3) of the rotation, each a triple of Lanes, and the camera's centre, from `camera` (4, 4)."""
     rows = (
         (fill(camera[0, 0]), fill(camera[0, 1]), fill(camera[0, 2])),
@@ -123,7 +123,7 @@ def slope_on_picture(rows: Any, near: Any, a: Any, jx: Any) -> Any:
 
 
 @inlined
-def area_of(du: Any, dv: Any) -> Any:
+def covariance_determinant(du: Any, dv: Any) -> Any:
     """The determinant of a screen covariance, whose half axes are du and dv, triples of Lanes."""
     return _minor(du, dv, 0, 1) + _minor(du, dv, 0, 2) + _minor(du, dv, 1, 2)
 
@@ -150,7 +150,7 @@ def _ellipses(
     du = s[0] * dot(to_u, axes[0]), s[1] * dot(to_u, axes[1]), s[2] * dot(to_u, axes[2])
     dv = s[0] * dot(to_v, axes[0]), s[1] * dot(to_v, axes[1]), s[2] * dot(to_v, axes[2])
     xx, xy, yy = dot(du, du), dot(du, dv), dot(dv, dv)
-    area = area_of(du, dv)
+    area = covariance_determinant(du, dv)
     inverse = fill(np.float32(1.0)) / (area + dilation * (xx + yy + dilation))  # of the determinant
     xx, yy = xx + dilation, yy + dilation
     store(block, X, fma(fx, tx, cx))
@@ -202,7 +202,7 @@ def project(
     tiles = np.empty((last - first, 4), np.int32)
     count = 0
     block = np.zeros(BLOCK_SIZE, np.float32)
-    rows, centre = turned_by(camera_from_scene)
+    rows, centre = rotation_and_centre(camera_from_scene)
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
     limits = tangent_limits(fx, fy, cx, cy, width, height)
     middle_u, middle_v, dilation = width / 2.0, height / 2.0, fill(np.float32(dilation_px2))

@@ -163,7 +163,7 @@ def exponent(projected: Any, i: Any, x0: Any) -> Any:
 
 
 @inlined
-def alpha_at(x: Any) -> Any:
+def alpha_from_exponent(x: Any) -> Any:
     """Alpha where its logarithm is 8 x; 0 where that is below MIN_ALPHA."""
     e = fma(fma(fma(fma(fill(E4), x, fill(E3)), x, fill(E2)), x, fill(E1)), x, fill(E0))
     e = e * e
@@ -234,7 +234,7 @@ def blend(
                 dy = fill(np.float32(y0 + first) + np.float32(0.5) - projected[i, V])
                 at = np.uint64(first * 5 * TILE)
                 for _ in range(first, last):
-                    opaque = alpha_at(fma(fma(dy, steep, slope), dy, level))
+                    opaque = alpha_from_exponent(fma(fma(dy, steep, slope), dy, level))
                     light = load(buffer, at)
                     w = opaque * light
                     store(buffer, at, light - w)
@@ -287,7 +287,7 @@ def backproject_tiles(projected: Any, tile_start: Any, tile_splats: Any, image: 
                 at = np.uint64(first * 5 * TILE)
                 for _ in range(first, last):
                     light = load(buffer, at)
-                    w = light * alpha_at(fma(fma(dy, steep, slope), dy, level))
+                    w = light * alpha_from_exponent(fma(fma(dy, steep, slope), dy, level))
                     store(buffer, at, light - w)
                     w = w * larger(load(buffer, at + np.uint64(4 * TILE)), ignores_mask)
                     red = fma(w, load(buffer, at + np.uint64(TILE)), red)

@@ -15,7 +15,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from factory.readers.apart import OtherProcess
+from factory.readers.apart import ProcessFunction
 from factory.readers.base import BadClip, Unreadable
 from tests.chaos.damaged_files.fuzzed_kinds import KINDS, Readable, write_all
 from tests.chaos.damaged_files.mutants_of_files import rng_of
@@ -76,7 +76,7 @@ def _note(event: str, _arguments: object) -> None:
 
 def fuzzed(folder: Path, kind: str, numbers: range, say: Callable[[str], object] = print) -> Counter[str]:
     """How many mutants were accepted and refused; each finding is said, and counted by its first word."""
-    told, ask = Counter[str](), OtherProcess(answer)
+    told, ask = Counter[str](), ProcessFunction(answer)
     whole = KINDS[kind](folder).path.read_bytes()
     ask(Question(str(folder), kind, 0), kind)  # what a first read loads and compiles is no mutant's time
     for number in numbers:

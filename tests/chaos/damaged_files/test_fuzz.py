@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.readers.apart import OtherProcess
+from factory.readers.apart import ProcessFunction
 from tests.chaos.damaged_files.fuzz import Question, answer, fuzzed
 from tests.chaos.damaged_files.fuzzed_kinds import KINDS, write_all
 from tests.chaos.damaged_files.mutants_of_files import rng_of
@@ -45,7 +45,7 @@ FOUND = [
 
 @pytest.mark.parametrize(("kind", "number"), FOUND)
 def test_what_was_found_stays_found(folder: Path, kind: str, number: int) -> None:
-    assert OtherProcess(answer)(Question(str(folder), kind, number), kind) == "refused"
+    assert ProcessFunction(answer)(Question(str(folder), kind, number), kind) == "refused"
 
 
 def test_a_mutant_is_the_same_again_and_no_copy(folder: Path) -> None:

@@ -12,7 +12,7 @@ from factory.config.run import load_config
 from factory.graph.steps import Columns, PreparedClip, RejectedAttempt, run_attempt
 from factory.readers.base import BadClip
 from factory.setup.settings import Run, assemble
-from factory.store.schema import BOOKKEEPING, sample_row_to_table
+from factory.store.schema import BOOKKEEPING, sample_rows_to_table
 from tasks.stages import Rejected
 
 PLUGIN = '''
@@ -104,7 +104,7 @@ def test_my_reader_and_my_expert_make_samples(package: Path) -> None:
     assert rows, [result.rejected for result in results if isinstance(result, RejectedAttempt)]
     rows.append(run_attempt(run.work, prepared, -1, "human").row)  # type: ignore[union-attr]
     books = dict.fromkeys(BOOKKEEPING, "x") | {"round": 0, "candidate_index": 0}
-    table = sample_row_to_table([dict(row) | books for row in rows])
+    table = sample_rows_to_table([dict(row) | books for row in rows])
     assert set(table["dataset"].to_pylist()) == {"mine"}
     assert set(table["image_source"].to_pylist()) == {"none"}, "no cameras, no images, and it is said"
     # What the row calls the proposal is what my expert asked for.

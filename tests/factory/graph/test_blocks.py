@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
-from factory.graph.driver import BlockBuild, BlockQueue
+from factory.graph.driver import BlockBuild, ClipQueue
 from factory.graph.plan import ClipPlan
 from factory.readers.base import ClipRef
 from factory.store.samples import Store
@@ -19,7 +19,7 @@ def plans(logs: str) -> list[ClipPlan]:
     return [ClipPlan(ClipRef("toy", log, 1000 * i), (), None, None, frozenset(), 0, None) for i, log in enumerate(logs)]
 
 
-def handed_out(queue: BlockQueue, wanted: bool = True) -> list[str]:
+def handed_out(queue: ClipQueue, wanted: bool = True) -> list[str]:
     """What the queue gives until it has nothing for now: clips as log and second, blocks in brackets."""
     out = []
     while (what := queue.next(wanted)) is not None:
@@ -30,7 +30,7 @@ def handed_out(queue: BlockQueue, wanted: bool = True) -> list[str]:
 
 
 def test_clips_wait_for_their_block_while_those_of_built_ones_go_on() -> None:
-    queue = BlockQueue(plans("abaabc"), lambda ref: ref.log_id, workers=2)
+    queue = ClipQueue(plans("abaabc"), lambda ref: ref.log_id, workers=2)
     assert handed_out(queue) == ["[a]", "[b]"]
     queue.mark_built("b")
     assert handed_out(queue) == ["b1", "b4", "[c]"]
@@ -41,7 +41,7 @@ def test_clips_wait_for_their_block_while_those_of_built_ones_go_on() -> None:
 
 
 def test_clips_without_a_block_wait_for_nothing() -> None:
-    queue = BlockQueue(plans("aba"), lambda ref: None if ref.log_id == "a" else "b", workers=2)
+    queue = ClipQueue(plans("aba"), lambda ref: None if ref.log_id == "a" else "b", workers=2)
     assert handed_out(queue) == ["a0", "[b]", "a2"]
     queue.mark_built("b")
     assert handed_out(queue) == ["b1"] and not queue
@@ -49,7 +49,7 @@ def test_clips_without_a_block_wait_for_nothing() -> None:
 
 @pytest.mark.parametrize(("logs", "workers", "at_once"), [("aaa", 4, 1), ("abcd", 2, 2), ("aab", 8, 2)])
 def test_as_many_are_built_at_once_as_there_are_blocks_and_workers(logs: str, workers: int, at_once: int) -> None:
-    assert BlockQueue(plans(logs), lambda ref: ref.log_id, workers).at_once == at_once
+    assert ClipQueue(plans(logs), lambda ref: ref.log_id, workers).at_once == at_once
 
 
 def done(out: Path, work: ToyWork, rounds: int = 2, n: int = 4) -> int:

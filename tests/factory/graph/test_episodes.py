@@ -12,7 +12,7 @@ from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph import driver
 from factory.graph.driver import EpisodeSettings
 from factory.graph.execute import Execution, RunSummary
-from factory.store.episodes import EPISODES_FOLDER, episode_name, has_episode
+from factory.store.episodes import EPISODES_FOLDER, episode_name, wants_episode
 from factory.store.location import Location
 from factory.store.samples import Store
 from factory.store.verify import verify
@@ -36,7 +36,7 @@ def there(out: Path) -> dict[str, bytes]:
 
 def asked_for(out: Path, every: int = 1) -> set[str]:
     rows = Store(out).samples.read(["attempt_id", "settings_hash", "stage_versions"]).to_pylist()
-    return {episode_name(row) for row in rows if has_episode(row["attempt_id"], every)}
+    return {episode_name(row) for row in rows if wants_episode(row["attempt_id"], every)}
 
 
 def attempt_of(data: bytes) -> str:
@@ -67,8 +67,8 @@ def test_one_in_n_is_a_choice_of_the_ids_alone(whole: Path, tmp_path: Path) -> N
     run(tmp_path, every=3, rounds=2)
     assert there(tmp_path) == {name: data for name, data in there(whole).items() if name in asked_for(whole, 3)}
     many = [f"{i:016x}" for i in range(9000)]
-    assert 2800 < sum(has_episode(key, 3) for key in many) < 3200
-    assert set(filter(lambda key: has_episode(key, 6), many)) < set(filter(lambda key: has_episode(key, 3), many))
+    assert 2800 < sum(wants_episode(key, 3) for key in many) < 3200
+    assert set(filter(lambda key: wants_episode(key, 6), many)) < set(filter(lambda key: wants_episode(key, 3), many))
 
 
 @pytest.mark.slow
@@ -90,12 +90,12 @@ def test_a_run_killed_between_commit_and_episodes_ends_in_the_same_files(
     class Killed(BaseException):
         pass
 
-    def die(self: driver.Episodes, paths: object) -> None:
+    def die(self: driver.EpisodeScheduler, paths: object) -> None:
         if paths:
             raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(driver.Episodes, "on_commit", die)
+        patch.setattr(driver.EpisodeScheduler, "on_commit", die)
         with pytest.raises(Killed):
             run(tmp_path, shard_seconds=0.0)
     (tmp_path / EPISODES_FOLDER).mkdir()

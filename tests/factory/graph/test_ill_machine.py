@@ -118,7 +118,7 @@ def test_a_file_that_is_damaged_or_missing_is_no_illness(error: OSError) -> None
 
 def test_memory_is_the_machine_s_only_where_little_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """A clip that asks for terabytes says nothing of the machine."""
-    monkeypatch.setattr("factory.files._memory_left", lambda: 0.5)
+    monkeypatch.setattr("factory.files._free_memory_share", lambda: 0.5)
     assert failure_from_error(MemoryError("Unable to allocate 7.28 TiB")).kind is ErrorKind.SYSTEM
-    monkeypatch.setattr("factory.files._memory_left", lambda: 0.02)
+    monkeypatch.setattr("factory.files._free_memory_share", lambda: 0.02)
     assert failure_from_error(MemoryError("Unable to allocate 1.00 MiB")).kind is ErrorKind.MACHINE

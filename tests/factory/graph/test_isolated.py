@@ -15,7 +15,7 @@ import pytest
 from factory.config.run import load_config
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph.guard import CRASHED
-from factory.graph.local import MAX_RETRIES, Costs, Limits, notes_folder
+from factory.graph.local import MAX_RETRIES, Limits, TaskDurations, notes_folder
 from factory.run import needs_own_process
 from factory.store.samples import Store
 from factory.views.status import status_lines
@@ -142,7 +142,7 @@ def test_a_hanging_walk_is_seen_while_it_hangs_and_a_signal_ends_the_run(tmp_pat
 
 
 def test_what_tasks_took_so_far_says_what_the_next_may_take() -> None:
-    costs, given = Costs(Limits()), Costs(Limits(seconds={"perturb": 2000.0}))
+    costs, given = TaskDurations(Limits()), TaskDurations(Limits(seconds={"perturb": 2000.0}))
     assert costs.limits_for("drive+render+label") == {"seconds": 3000.0, "gb": 8.0}
     assert costs.limits_for("reconstruct") == {"seconds": 86_400.0, "gb": None}
     for _ in range(20):

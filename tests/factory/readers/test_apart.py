@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from factory.datasets.scenarionet.reader import ScenarioNetReader
-from factory.readers.apart import OtherProcess
+from factory.readers.apart import ProcessFunction
 from factory.readers.base import BadClip
 from tests.factory.datasets.scenarionet.scenarionet_scenarios import nuscenes, save
 
@@ -34,23 +34,23 @@ def hungry(n_bytes: int) -> int:
 
 
 def test_one_process_answers_all_and_another_follows_one_that_died() -> None:
-    first = OtherProcess(pid_of)(0, "a")
-    assert first != os.getpid() and [OtherProcess(doubled)(n, "a") for n in range(3)] == [0, 2, 4]
-    assert OtherProcess(pid_of)(0, "a") == first
+    first = ProcessFunction(pid_of)(0, "a")
+    assert first != os.getpid() and [ProcessFunction(doubled)(n, "a") for n in range(3)] == [0, 2, 4]
+    assert ProcessFunction(pid_of)(0, "a") == first
     for number in (signal.SIGSEGV, signal.SIGKILL):
         with pytest.raises(BadClip, match=f"b: file: its reader was killed by {number.name} over it"):
-            OtherProcess(killed)(number, "b")
-    assert OtherProcess(pid_of)(0, "a") not in (first, os.getpid())
+            ProcessFunction(killed)(number, "b")
+    assert ProcessFunction(pid_of)(0, "a") not in (first, os.getpid())
 
 
 def test_what_never_ends_is_given_up_and_what_is_raised_is_raised() -> None:
     with pytest.raises(BadClip, match=r"c: file: reading it was given up after 0\.2 s"):
-        OtherProcess(time.sleep)(60.0, "c", limit_s=0.2)
+        ProcessFunction(time.sleep)(60.0, "c", limit_s=0.2)
     with pytest.raises(BadClip, match="d: field: is wrong"):
-        OtherProcess(refused)("d", "d")
+        ProcessFunction(refused)("d", "d")
     with pytest.raises(BadClip, match="e: file: reading it takes more memory than there is for it"):
-        OtherProcess(hungry)(2**40, "e")
-    assert OtherProcess(doubled)(4, "a") == 8
+        ProcessFunction(hungry)(2**40, "e")
+    assert ProcessFunction(doubled)(4, "a") == 8
 
 
 class FatalReader(ScenarioNetReader):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from factory.readers.base import BadClip, ClipRef
-from factory.readers.logs import LoggedDrive, LogReader, Recorded, WholeLog, route_of_drive
+from factory.readers.logs import LoggedDrive, LogReader, WholeLog, WindowSensors, route_of_drive
 from tasks.world.clip import CLIP_STEPS, STEP_S, AgentTracks
 from tasks.world.frames import EGO_STATE_SIZE, VX, X
 from tasks.world.road_map import TrafficLights
@@ -63,10 +63,10 @@ class StreetReader(LogReader[WholeLog]):
             content_digest="0",
         )
 
-    def recorded(self, log: WholeLog, start: int, stop: int) -> Recorded:
+    def recorded(self, log: WholeLog, start: int, stop: int) -> WindowSensors:
         poses = np.tile(np.eye(4), (stop - start, 1, 1))
         poses[:, 0, 3] = log.ego_states[start:stop, X]
-        return Recorded(poses)
+        return WindowSensors(poses)
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 from factory.readers.base import BadClip, ClipIndex, ClipRef, read_clip
 from factory.readers.logs import route_of_drive
 from tasks.world.clip import Clip, SensorFile
-from tasks.world.road_map import NoRoute, RoadMap, RouteFinder, roadblocks_of
+from tasks.world.road_map import CenterlineFinder, NoRoute, RoadMap, roadblocks_of
 from tests.tasks.streets import street_clip
 
 REF = ClipRef("street", "street", 2000)
@@ -132,6 +132,6 @@ def test_a_map_without_roadblocks_has_no_route_and_says_what_fills_them() -> Non
     ):
         route_of_drive(bare, clip.ego_states[:, :3], "map.json", "lanes")
     with pytest.raises(NoRoute, match="roadblock_of"):
-        RouteFinder(bare, clip.route)
+        CenterlineFinder(bare, clip.route)
     filled = replace(bare, roadblock_of=roadblocks_of(bare.lanes))
     assert route_of_drive(filled, clip.ego_states[:, :3], "map.json", "lanes").lane_path == clip.route.lane_path

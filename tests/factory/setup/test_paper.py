@@ -7,7 +7,7 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import RunConfig, load_config
-from factory.setup.calibrate import differences_from_paper, fixed_differences_from_paper, setup_text
+from factory.setup.calibrate import differences_from_paper, differences_in_every_preset, paper_deviations_line
 from factory.setup.settings import choose_vocabulary
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
@@ -30,7 +30,7 @@ def test_the_preset_has_the_paper_s_settings(vocabulary: Vocabulary) -> None:
 
 
 def test_what_no_preset_makes_the_paper_s_is_said_in_a_line(vocabulary: Vocabulary) -> None:
-    assert setup_text(paper(), vocabulary) == (
+    assert paper_deviations_line(paper(), vocabulary) == (
         "set-up: not the paper's (in brackets; preset=paper comes nearest): walks that go on to the next candidate "
         "until one is accepted (the rates fit one draw a round), IDM along the lane graph (the public code's brakes "
         "for each lane's end: traffic=navsim), render.frames=history (all of T .. T+2H), no picture gate (unstable "
@@ -39,9 +39,9 @@ def test_what_no_preset_makes_the_paper_s_is_said_in_a_line(vocabulary: Vocabula
 
 
 def test_what_a_run_has_not_is_not_said_of_it() -> None:
-    (walks,) = fixed_differences_from_paper(paper("render=none", "traffic=navsim"))
+    (walks,) = differences_in_every_preset(paper("render=none", "traffic=navsim"))
     assert walks.startswith("walks that go on")
-    assert "the project's own picture gate (unstable" in fixed_differences_from_paper(load_config([]))[-1]
+    assert "the project's own picture gate (unstable" in differences_in_every_preset(load_config([]))[-1]
 
 
 def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:
@@ -58,7 +58,7 @@ def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:
         "render.camera_psnr_min=20.0 (0.0)",
         "render.gate.enabled=True (False)",
     ]
-    assert "\n" not in setup_text(config, choose_vocabulary(config.vocabulary))
+    assert "\n" not in paper_deviations_line(config, choose_vocabulary(config.vocabulary))
 
 
 def test_every_setting_of_the_paper_s_table_is_watched(vocabulary: Vocabulary) -> None:

@@ -14,7 +14,7 @@ from factory.datasets.town.reader import SyntheticReader
 from factory.datasets.town.settings import TownSettings
 from factory.exits import BAD_CONFIG, COMPLETE
 from factory.setup.settings import run_identity
-from factory.setup.vocabulary import StartStates, load_start_states
+from factory.setup.vocabulary import StartTrajectories, load_start_trajectories
 from factory.store.samples import Store
 from factory.views.sample_text import lineage
 from tasks.world.arrays import Array
@@ -32,11 +32,15 @@ def written(path: Path, rows: list[tuple[Any, Any]]) -> Path:
 def test_starts_come_back_by_clip_in_the_order_of_the_file(tmp_path: Path) -> None:
     """And the digest is of what leads where, not of the order of clips or of the file's name."""
     a, b, c = TRAJECTORIES[:3]
-    one = load_start_states(str(written(tmp_path / "one", [("y", a), ("x", b), ("y", c)])))
+    one = load_start_trajectories(str(written(tmp_path / "one", [("y", a), ("x", b), ("y", c)])))
     np.testing.assert_array_equal(one.of_clip["y"], [a, c])
     np.testing.assert_array_equal(one.of_clip["x"], [b])
-    assert load_start_states(str(written(tmp_path / "other", [("x", b), ("y", a), ("y", c)]))).digest == one.digest
-    assert load_start_states(str(written(tmp_path / "turned", [("x", b), ("y", c), ("y", a)]))).digest != one.digest
+    assert (
+        load_start_trajectories(str(written(tmp_path / "other", [("x", b), ("y", a), ("y", c)]))).digest == one.digest
+    )
+    assert (
+        load_start_trajectories(str(written(tmp_path / "turned", [("x", b), ("y", c), ("y", a)]))).digest != one.digest
+    )
 
 
 @pytest.mark.parametrize(
@@ -79,13 +83,13 @@ def test_with_starts_clips_are_prepared_anew_and_attempts_have_other_names() -> 
     """And without, nothing tells that there could be some; where the file lies is no matter."""
     config, vocabulary = load_config([]), Vocabulary(TRAJECTORIES)
 
-    def named(one: StartStates | None) -> tuple[str, str, str]:
+    def named(one: StartTrajectories | None) -> tuple[str, str, str]:
         made = run_identity(config, vocabulary, None, one)
         return made.prepare_digest, made.vocabulary_digest, made.settings_hash
 
     assert named(None)[1] == vocabulary.digest
     assert "perturb.starts" not in run_identity(config, vocabulary, None).settings
-    for a, b in ((None, StartStates({}, "0a")), (StartStates({}, "0a"), StartStates({}, "0b"))):
+    for a, b in ((None, StartTrajectories({}, "0a")), (StartTrajectories({}, "0a"), StartTrajectories({}, "0b"))):
         assert all(x != y for x, y in zip(named(a), named(b), strict=True))
 
 
@@ -144,7 +148,9 @@ def test_rows_follow_the_table_and_the_same_command_makes_none_again(
     }
     assert rows[own]["vocabulary_index"] == FIRST_START
     told = {name: str(value) for _, facts in lineage(store, rows[own]["attempt_id"]) for name, value in facts}
-    assert told["perturbed by"] == f"start 0 of the clip in perturb.starts {load_start_states(str(starts)).digest}"
+    assert (
+        told["perturbed by"] == f"start 0 of the clip in perturb.starts {load_start_trajectories(str(starts)).digest}"
+    )
     assert not set(store.samples.keys().tolist()) & set(plain.samples.keys().tolist())
 
     files = sorted(path.name for path in (tmp_path / "out" / "samples").rglob("*.parquet"))

@@ -11,7 +11,7 @@ import pytest
 from printed_street import CAMERAS, ROAD_M, WIDTH, photographed
 
 from factory.readers.base import BadClip
-from factory.stages.assets import RIG_SUFFIX, correct_block_rig, is_rig_corrected, read_or_correct_rig
+from factory.stages.assets import RIG_SUFFIX, correct_block_rig, needs_rig_correction, read_or_correct_rig
 from tasks.render.rig.adjust import motions_of_twists, twists_of
 from tasks.render.rig.correct import estimate_ground_height
 from tasks.render.scene.asset import PhotoPose, RenderAsset
@@ -93,11 +93,11 @@ def test_a_photo_of_another_size_than_its_camera_s_is_named(block: Block, tmp_pa
 def test_by_default_blocks_without_lidar_are_corrected(block: Block) -> None:
     sweep = SensorFile("lidar", "0.feather", 0.0, np.eye(4))
     with_lidar = replace(block, sweeps=(sweep,))
-    assert is_rig_corrected(block, RigSettings()) and not is_rig_corrected(with_lidar, RigSettings())
-    assert is_rig_corrected(with_lidar, RigSettings(adjust=Adjust.ON)) and not is_rig_corrected(
+    assert needs_rig_correction(block, RigSettings()) and not needs_rig_correction(with_lidar, RigSettings())
+    assert needs_rig_correction(with_lidar, RigSettings(adjust=Adjust.ON)) and not needs_rig_correction(
         block, RigSettings(adjust=Adjust.OFF)
     )
-    assert not is_rig_corrected(replace(block, images=()), RigSettings(adjust=Adjust.ON))
+    assert not needs_rig_correction(replace(block, images=()), RigSettings(adjust=Adjust.ON))
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from factory.stages.assets import RIG_SUFFIX, CorrectedRig, photo_poses, read_or
 from factory.stages.imaging import Imaging, height_columns
 from factory.stages.sensors import load_photos
 from factory.store.reader import decode_stored_image
-from tasks.attempt import Judged, drive_as_human
+from tasks.attempt import Judged, drive_under_log_replay
 from tasks.caches import parse_json_with_checksum
 from tasks.experts.protocol import Human
 from tasks.perturb import Candidate
@@ -41,7 +41,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
 
 @pytest.fixture(scope="module")
 def judged(clip: Clip) -> Judged:
-    return drive_as_human(scene_of_clip(clip), Human(), PdmSettings(), np.random.default_rng(0))
+    return drive_under_log_replay(scene_of_clip(clip), Human(), PdmSettings(), np.random.default_rng(0))
 
 
 def stored(camera: Camera, row: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:

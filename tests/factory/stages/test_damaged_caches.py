@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from factory.datasets.navsim.maps import cache_file, cached_tables
+from factory.datasets.navsim.maps import cached_tables, cached_tables_path
 from factory.datasets.navsim.reader import cached_table, read_and_cache_table
-from factory.datasets.town.reader import SensedReader, SyntheticReader, SyntheticTownsReader
+from factory.datasets.town.reader import SyntheticReader, SyntheticTownsReader, TownLogReader
 from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import SUMS
 from factory.graph.steps import PrepareReport, cache_key, prepare
@@ -85,7 +85,7 @@ def test_a_city_s_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines:
     write_root(tmp_path, "us-ma-boston", stub_rows())
     map_file = next(tmp_path.glob("us-ma-boston/*/map.gpkg"))
     cached_tables(map_file)
-    path = cache_file(map_file)
+    path = cached_tables_path(map_file)
     whole = path.read_bytes()
     for content in damaged(whole, every=len(whole) // 6):
         path.write_bytes(content)
@@ -201,7 +201,7 @@ def prepared_clips(folder: Path) -> Kept:
 def city_tables(folder: Path) -> Kept:
     write_root(folder, "us-ma-boston", stub_rows(scale=2.0))
     maps = [next(folder.glob(f"{city}/*/map.gpkg")) for city in ("us-ma-boston", "sg-one-north")]
-    return [cache_file(path) for path in maps], lambda i: cached_tables(maps[i])["lanes_polygons"].xy.tobytes()
+    return [cached_tables_path(path) for path in maps], lambda i: cached_tables(maps[i])["lanes_polygons"].xy.tobytes()
 
 
 def log_tables(folder: Path) -> Kept:
@@ -302,7 +302,7 @@ def test_a_town(tmp_path: Path, lines: Lines, several: bool) -> None:
     """Tables and maps alike; whoever indexes it mends it, and clips are what they were."""
     settings = TownSettings(cameras=(), lidar_beams=0)
     if several:
-        reader: SensedReader = SyntheticTownsReader([3], logs_per_town=1, cache_dir=tmp_path, settings=settings)
+        reader: TownLogReader = SyntheticTownsReader([3], logs_per_town=1, cache_dir=tmp_path, settings=settings)
     else:
         reader = SyntheticReader(tmp_path, 1, 0, settings)
     ref = reader.index().refs[0]

@@ -19,7 +19,7 @@ from factory.stages.warm import compile_kernels, compiling_ahead
 from tasks.kernels.compiled import cache_dir, kernel_sources, remove_unused_caches, sources_digest
 
 REPOSITORY = Path(__file__).resolve().parents[3]
-DECORATORS = {"njit", "jit", "kernel", "inlined", "inner_kernel", "hidden_kernel", "drawing_kernel"}
+DECORATORS = {"njit", "jit", "kernel", "inlined", "inner_kernel", "hidden_kernel", "numpy_division_kernel"}
 
 
 def test_every_source_that_compiles_something_is_in_the_digest() -> None:
@@ -30,7 +30,7 @@ def test_every_source_that_compiles_something_is_in_the_digest() -> None:
             nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
             compiles = any(
                 node.module in ("numba", "tasks.kernels.compiled")
-                and {"njit", "jit", "kernel", "inlined", "inner_kernel", "hidden_kernel", "drawing_kernel"}
+                and {"njit", "jit", "kernel", "inlined", "inner_kernel", "hidden_kernel", "numpy_division_kernel"}
                 & {a.name for a in node.names}
                 for node in nodes
             )

@@ -11,7 +11,7 @@ from factory.config.run import load_config
 from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, run_attempt
 from factory.pipeline import FactoryWork
 from factory.run import main as run_main
-from factory.setup.calibrate import calibrate, measure
+from factory.setup.calibrate import estimate_run_size, measure
 from factory.setup.settings import Run, assemble
 from factory.setup.vocabulary import save_vocabulary
 from factory.store.reader import SampleTable, labels_of
@@ -114,7 +114,7 @@ def test_a_dry_run_counts_the_labels_time_and_bytes() -> None:
     assert with_labels.seconds["labels"] > 0.0 and without.seconds["labels"] == 0.0
     bytes_each = 9 * -(-150 // 8) + 4 + 2 * 150 + 4
     assert with_labels.row_bytes - without.row_bytes >= with_labels.accepted * bytes_each
-    assert "  labels " in calibrate(street(), refs)
+    assert "  labels " in estimate_run_size(street(), refs)
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from factory.stages.rows import sample_row
-from factory.store.schema import BOOKKEEPING, COLUMNS, MAP_RADIUS_M, sample_row_to_table
-from tasks.attempt import Judged, drive_as_human, perturbed_scene
+from factory.store.schema import BOOKKEEPING, COLUMNS, MAP_RADIUS_M, sample_rows_to_table
+from tasks.attempt import Judged, drive_under_log_replay, perturbed_scene
 from tasks.attempt import drive_and_judge as judge
 from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.experts.protocol import Human
@@ -25,7 +25,7 @@ POSE_COLUMNS = {name for name, column in COLUMNS.items() if column.shape and col
 
 
 def human(clip: Clip) -> dict[str, object]:
-    return sample_row(clip, None, drive_as_human(scene_of_clip(clip), Human(), PdmSettings(), RNG))
+    return sample_row(clip, None, drive_under_log_replay(scene_of_clip(clip), Human(), PdmSettings(), RNG))
 
 
 def simulated(clip: Clip) -> tuple[Candidate, Judged]:
@@ -50,7 +50,7 @@ def test_both_kinds_of_row_fit_the_schema(row: dict[str, object]) -> None:
     books = {"round": 0, "candidate_index": 0} | {
         name: "x" for name in BOOKKEEPING if name not in ("round", "candidate_index")
     }
-    table = sample_row_to_table([row | no_images | books, human(street_clip()) | no_images | books])
+    table = sample_rows_to_table([row | no_images | books, human(street_clip()) | no_images | books])
     assert table.num_rows == 2
     for name in ("vocabulary_index", "proposal_10hz", "perturbed_states", "candidate_end", "stage1_score"):
         assert table[name].is_null().to_pylist() == [False, True], f"{name} is null for the human alone"

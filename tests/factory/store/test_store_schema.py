@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from factory.store.schema import COLUMNS, FIELDS, SCHEMA, BadRow, Stamp, sample_row_to_table, table_to_rows
+from factory.store.schema import COLUMNS, FIELDS, SCHEMA, BadRow, Stamp, sample_rows_to_table, table_to_rows
 from tests.factory.store.formats import formats_table
 from tests.factory.toy import row_of, stream
 
@@ -29,7 +29,7 @@ def same(a: object, b: object) -> bool:
 
 def test_a_row_comes_back_as_it_went_in() -> None:
     row = full_row()
-    table = sample_row_to_table([row])
+    table = sample_rows_to_table([row])
     assert table.schema.equals(SCHEMA, check_metadata=True)
     back = table_to_rows(table)[0]
     assert [name for name in row if not same(row[name], back[name])] == []
@@ -38,7 +38,7 @@ def test_a_row_comes_back_as_it_went_in() -> None:
 
 def test_an_empty_world_is_a_valid_sample() -> None:
     empty = {f.name: [] for f in FIELDS if f.shape and isinstance(f.shape[0], str)}
-    back = table_to_rows(sample_row_to_table([full_row() | empty]))[0]
+    back = table_to_rows(sample_rows_to_table([full_row() | empty]))[0]
     assert back["agent_boxes"].shape == (0, 56, 5)  # type: ignore[attr-defined]
     assert back["lane_polygons"] == []
 
@@ -74,7 +74,7 @@ def test_the_docs_say_what_the_schema_is() -> None:
 )
 def test_a_row_that_does_not_fit_is_refused_by_column(change: dict[str, object], message: str) -> None:
     with pytest.raises(BadRow, match=message):
-        sample_row_to_table([full_row() | change])
+        sample_rows_to_table([full_row() | change])
 
 
 def test_absent_agents_may_be_nan_and_nullable_columns_may_be_left_out() -> None:
@@ -82,5 +82,5 @@ def test_absent_agents_may_be_nan_and_nullable_columns_may_be_left_out() -> None
     for name, column in COLUMNS.items():
         if column.nullable:
             del row[name]
-    back = table_to_rows(sample_row_to_table([row]))[0]
+    back = table_to_rows(sample_rows_to_table([row]))[0]
     assert back["stage1_nc"] is None and back["images"] is None and back["label_progress"] is None

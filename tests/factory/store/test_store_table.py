@@ -12,7 +12,7 @@ import pytest
 
 import factory.store.table as table_module
 from factory.store.location import Location, Shard, write_shard
-from factory.store.schema import SAMPLES, Stamp, TableSpec, sample_row_to_table
+from factory.store.schema import SAMPLES, Stamp, TableSpec, sample_rows_to_table
 from factory.store.table import DuplicateKey, KeyedTable
 from tests.factory.toy import row_of, stream
 
@@ -148,7 +148,7 @@ def test_a_query_on_scores_reads_kilobytes_of_a_shard(location: Location) -> Non
         image = {"camera": "front", "time_s": 0.0, "ego_pose": np.eye(4).ravel(), "jpeg": rng.bytes(2**20)}
         stamp = Stamp(f"id{i:02d}", "recovery", "d", 0, i, "v", "s", "{}")
         made.append(row_of(rng) | vars(stamp) | {"images": [image]})
-    written = write_shard(location, SAMPLES, sample_row_to_table(made))
+    written = write_shard(location, SAMPLES, sample_rows_to_table(made))
     assert written.size > 40 * 2**20
     counting = Counting(f"{location.uri}/{written.path}")
     scores = pq.ParquetFile(pa.PythonFile(counting, "r")).read(["attempt_id", "stage2_score"])
@@ -159,7 +159,7 @@ def test_jpegs_are_stored_as_they_are_and_all_else_with_dictionaries_and_zstd(lo
     image = {"camera": "front", "time_s": 0.0, "ego_pose": np.eye(4).ravel(), "jpeg": bytes(10_000)}
     stamp = Stamp("id", "recovery", "d", 0, 0, "v", "s", "{}")
     row = row_of(stream("images")) | vars(stamp) | {"images": [image]}
-    written = write_shard(location, SAMPLES, sample_row_to_table([row]))
+    written = write_shard(location, SAMPLES, sample_rows_to_table([row]))
     group = pq.ParquetFile(f"{location.uri}/{written.path}").metadata.row_group(0)
     leaves = {leaf.path_in_schema: leaf for leaf in map(group.column, range(group.num_columns))}
     (jpeg,) = (leaves.pop(path) for path in SAMPLES.packed)

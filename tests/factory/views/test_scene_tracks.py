@@ -14,7 +14,7 @@ from factory.stages.scene_file import read_scene, write_scene
 from factory.store.samples import ClipCandidates, Store
 from factory.views.scene_files import logged_vehicles
 from tasks.render.scene.asset import BlockRange, PhotoPose, RenderAsset
-from tasks.render.scene.engine import Vehicles, render, vehicles_at
+from tasks.render.scene.engine import PlacedAgents, agents_at_time, render
 from tasks.render.scene.movers import boxes_at, world_from_boxes
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.project import ANTIALIASED
@@ -64,7 +64,7 @@ def block(tmp_path: Path) -> Path:
     return tmp_path / "block.safetensors"
 
 
-def beside(there: Vehicles, j: int) -> Pinhole:
+def beside(there: PlacedAgents, j: int) -> Pinhole:
     """A camera 8 m beside a box, which looks at it."""
     pose = np.eye(4)
     pose[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # along the world's y
@@ -84,7 +84,7 @@ def test_a_block_goes_out_with_its_vehicles_and_its_pictures_come_back(
     assert len(found.nodes) == 2 and found.origin.tolist() == ORIGIN.tolist() and found.screen == ANTIALIASED
     renamed = dict(zip(found.nodes, whole.nodes))
     as_found = replace(found, nodes={renamed[token]: node for token, node in found.nodes.items()})
-    there = vehicles_at(clips()[0].agents, 4.0)
+    there = agents_at_time(clips()[0].agents, 4.0)
     for name in renamed.values():
         eye = beside(there, there.track_ids.index(name))
         first, second = (render(asset, [eye], there)[0].rgb for asset in (whole, as_found))

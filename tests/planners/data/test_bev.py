@@ -7,7 +7,7 @@ import pytest
 
 from factory.store.schema import AGENT_STEPS, NOW_INDEX
 from planners.data.batch import BevLayout
-from planners.data.bev import BevClass, bev_raster, nearest_agents
+from planners.data.bev import BevClass, bev_raster, nearest_vehicles
 from tasks.world.clip import AgentKind
 from tasks.world.frames import box_corners
 
@@ -112,7 +112,7 @@ def test_what_is_to_come_is_not_shown() -> None:
 
 def test_an_empty_world_is_background() -> None:
     assert not bev_raster(scene(), LAYOUT).any()
-    boxes, valid = nearest_agents(scene(), LAYOUT, 3)
+    boxes, valid = nearest_vehicles(scene(), LAYOUT, 3)
     assert boxes.shape == (3, 5) and not boxes.any() and not valid.any()
 
 
@@ -124,10 +124,10 @@ def test_a_shape_larger_than_the_raster_fills_it_and_one_beside_it_is_not_seen()
 def test_nearest_agents_are_vehicles_inside_in_order_of_distance() -> None:
     vehicles = [(20.0, 0.0, 0.1, 4.0, 2.0), (5.0, -5.0, 0.2, 5.0, 2.0), (40.0, 0, 0, 4, 2), (0.0, 17.0, 0, 4, 2)]
     sample = scene({AgentKind.VEHICLE: [*vehicles, (-7.0, 0, 0, 4, 2)], AgentKind.PEDESTRIAN: [(1.0, 0, 0, 1, 1)]})
-    boxes, valid = nearest_agents(sample, LAYOUT, 4)
+    boxes, valid = nearest_vehicles(sample, LAYOUT, 4)
     expected = np.array([(-7.0, 0, 0, 4, 2), vehicles[1], vehicles[0], (0,) * 5], np.float32)
     order = np.argsort(np.hypot(expected[:3, 0], expected[:3, 1]))
     np.testing.assert_array_equal(boxes[:3], expected[:3][order])
     assert valid.tolist() == [True, True, True, False] and not boxes[3].any()
     sample["agent_valid"][1, NOW_INDEX], sample["agent_boxes"][1, NOW_INDEX] = False, np.nan
-    assert nearest_agents(sample, LAYOUT, 1)[0][0].tolist() == [-7.0, 0, 0, 4, 2]
+    assert nearest_vehicles(sample, LAYOUT, 1)[0][0].tolist() == [-7.0, 0, 0, 4, 2]

@@ -9,7 +9,7 @@ import pytest
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from planners.data.batch import BevLayout, ImageLayout, Needs
-from planners.data.index import Dataset, DataSettings, make_feed, mixed_samples, open_data
+from planners.data.index import Dataset, DataSettings, make_feed, open_data, order_inputs
 from planners.data.mix import MixSettings
 from tests.planners.samples import FRONT_YAWS, grey_pictures, jpeg, pictures, plain, sample, write_table
 
@@ -226,5 +226,5 @@ def test_a_sample_takes_what_stays_in_memory_of_it(tmp_path: Path) -> None:
     extra = with_pictures - plans - 3 * (len(shot) + 2)
     assert extra.min() >= 0 and extra.max() < 300, "lengths, names and times"
     assert 640 <= plans.max() < 2000 and (seen - plans).min() > 1000
-    groups = mixed_samples(make_feed(data, Needs())).group
+    groups = order_inputs(make_feed(data, Needs())).group
     assert groups.tolist() == [0, 0, 1, 1]

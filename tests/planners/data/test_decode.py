@@ -7,10 +7,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from factory.stages.rows import label_columns
-from factory.store.reader import SampleTable, group_rows, labels_of
+from factory.store.reader import SampleTable, labels_of, row_group_sizes
 from factory.store.schema import COLUMNS, LABEL_COLUMNS
 from planners.data.batch import COMMANDS, BevLayout, ImageLayout, Needs
-from planners.data.bev import bev_raster, nearest_agents
+from planners.data.bev import bev_raster, nearest_vehicles
 from planners.data.decode import BatchBuffer, StoredRows, count_labels
 from planners.data.files import Footers, files_of, group_bytes, leaf_paths
 from planners.data.images import stitch_sample
@@ -105,7 +105,7 @@ def test_a_batch_is_what_its_rows_say(table: Path) -> None:
         assert np.array_equal(batch.plan_10hz[i], one["label_10hz"])
         assert np.array_equal(batch.image[i].permute(1, 2, 0), stitch_sample(one, IMAGE))
         assert np.array_equal(batch.bev[i], bev_raster(one, BEV))
-        boxes, valid = nearest_agents(one, BEV, 2)
+        boxes, valid = nearest_vehicles(one, BEV, 2)
         assert np.array_equal(batch.agents[i], boxes) and np.array_equal(batch.agents_valid[i], valid)
         meant = labels_of(one)
         assert np.array_equal(batch.labels["ddc"][i], meant.ddc)
@@ -159,7 +159,7 @@ def test_sizes_are_those_of_the_footer(table: Path) -> None:
     size = {metadata.column(i).path_in_schema: metadata.column(i).total_uncompressed_size for i in range(60)}
     sizes = group_bytes(parquet, ["label_2hz", "ego_status"])
     assert sizes.tolist() == [[size["label_2hz.list.element.list.element"], size["ego_status.list.element"]]]
-    assert group_rows(parquet).tolist() == [3]
+    assert row_group_sizes(parquet).tolist() == [3]
 
 
 def test_a_footer_is_parsed_once(table: Path) -> None:

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from factory.config.compose import ConfigError, compose, fill
-from planners.data.mix import MixSettings, Order, Samples, make_order, stream
+from planners.data.mix import MixSettings, Order, OrderInputs, make_order, stream
 
 N_REAL, N_SIM = 37, 90
 GROUP_ROWS, ROW_BYTES = 6, 2**18  # four rows are a megabyte
 
 
-def samples(n_real: int = N_REAL, n_sim: int = N_SIM) -> Samples:
+def samples(n_real: int = N_REAL, n_sim: int = N_SIM) -> OrderInputs:
     """Real and simulated samples take turns by place; row groups hold one kind each."""
     n = n_real + n_sim
     simulated = stream(0, "sides").permutation(np.arange(n) >= n_real)
@@ -22,7 +22,7 @@ def samples(n_real: int = N_REAL, n_sim: int = N_SIM) -> Samples:
     for kind in (False, True):
         inside = np.flatnonzero(simulated == kind)
         group[inside] = np.arange(len(inside)) // GROUP_ROWS + 1000 * kind
-    return Samples(simulated, group, np.full(n, ROW_BYTES))
+    return OrderInputs(simulated, group, np.full(n, ROW_BYTES))
 
 
 def order(mix: MixSettings, batch_size: int = 8, seed: int = 3, **kinds: Any) -> Order:
@@ -58,7 +58,7 @@ def test_row_groups_are_read_in_another_order_in_every_pass() -> None:
 
 def test_with_one_window_the_files_do_not_matter() -> None:
     mine = samples()
-    other = Samples(mine.simulated, stream(0, "groups").permutation(mine.group), mine.size)
+    other = OrderInputs(mine.simulated, stream(0, "groups").permutation(mine.group), mine.size)
     for mix in (MixSettings(), MixSettings(sim_ratio=0.5)):
         a, b = (make_order(s, mix, 8, 3).epoch(0).rows for s in (mine, other))
         assert np.array_equal(a, b)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from examples.csv_logs import write_log
-from factory.datasets.town.reader import SyntheticReader, TownPainter, town_log
+from factory.datasets.town.reader import SyntheticReader, TownPainter, parse_town_log_id
 from factory.datasets.town.settings import TownSettings
 from factory.exits import BAD_CONFIG, COMPLETE
 from planners.drive.cameras import NoCameras, Observer, PaintedCameras
@@ -81,10 +81,10 @@ def test_the_lights_are_the_log_s_and_go_on(photographed: Clip) -> None:
 
 
 def test_only_the_town_has_a_painter() -> None:
-    assert town_log("town-7-0000-straight-multi-lane") == (7, 0)
+    assert parse_town_log_id("town-7-0000-straight-multi-lane") == (7, 0)
     for other in ("7fab2350-7eaf-3b7e-a39d-6937a4c1bede", "town-0-0000-another-name"):
         with pytest.raises(ValueError, match="not of the synthetic town"):
-            town_log(other)
+            parse_town_log_id(other)
 
 
 class Counting(NoCameras):

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from planners.drive.summary import picture_differences, summarise_drives, summary_text
+from planners.drive.summary import picture_source_effects, summarise_drives, summary_text
 
 
 def row(clip: int, *, planner: str = "a", pictures: str = "none", start: int = -1, **more: Any) -> dict[str, Any]:
@@ -57,12 +57,12 @@ def test_what_the_engine_changes_is_over_the_starts_that_both_were_driven_from()
     """Three starts with the painter's pictures, of which two were driven with the engine's as well."""
     truth = [row(i, pictures="truth", route_completed=0.5) for i in range(3)]
     engine = [row(i, pictures="engine", route_completed=0.5 - 0.1 * i) for i in range(2)]
-    (one,) = picture_differences([*truth, *engine])
+    (one,) = picture_source_effects([*truth, *engine])
     assert one.drives == 2
     assert one.shares["route_completed"].difference == pytest.approx(-0.05)
     assert one.shares["route_completed"].low == pytest.approx(-0.1)
     assert one.shares["at_fault_collision"].difference == 0.0
-    assert picture_differences(truth) == []
+    assert picture_source_effects(truth) == []
 
 
 def test_of_one_drive_there_is_no_interval_and_the_text_has_a_dash() -> None:
@@ -72,6 +72,6 @@ def test_of_one_drive_there_is_no_interval_and_the_text_has_a_dash() -> None:
 
 def test_the_text_names_every_planner_and_what_its_brackets_are() -> None:
     rows = [row(0, pictures="truth"), row(1, pictures="truth"), row(0, pictures="engine"), row(1, pictures="engine")]
-    told = summary_text(summarise_drives(rows), picture_differences(rows), 0.95)
+    told = summary_text(summarise_drives(rows), picture_source_effects(rows), 0.95)
     assert "engine - truth" in told
     assert told.endswith("[95 % intervals over towns; -: from one alone nothing can be drawn]")

@@ -18,7 +18,7 @@ from planners.evaluation.aggregation import SummaryLine
 from planners.evaluation.evaluate import EvaluateSettings, evaluate, fallback_notes, main, settings_of
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.planner_names import EvaluatedPlanner, find_planner, find_planners
-from planners.evaluation.planning import all_plans, as_shown, plan_samples
+from planners.evaluation.planning import all_plans, plan_samples, without_future
 from planners.evaluation.score_rows import read_record, read_rows
 from planners.training.checkpoint import save_checkpoint
 from tasks.reward.aggregate import COLUMNS
@@ -217,14 +217,14 @@ def test_a_record_says_what_was_evaluated(benchmark: StreetBenchmark, tmp_path: 
 def test_a_planner_sees_nothing_that_comes_after_now(benchmark: StreetBenchmark) -> None:
     for key in (benchmark.keys[0], FrameKey.follow_up("a", 0)[0]):
         sample = benchmark.sample(key)
-        shown = as_shown(sample)
+        shown = without_future(sample)
         assert not shown["label_10hz"].any() and sample["label_10hz"].any()
         assert np.isnan(shown["agent_boxes"][:, 16:]).all() and not shown["agent_valid"][:, 16:].any()
         np.testing.assert_array_equal(shown["agent_boxes"][:, :16], sample["agent_boxes"][:, :16])
         assert "stage2_score" not in shown and not shown["light_states"][:, 16:].any()
         for name in ("ego_history_10hz", "ego_status", "command", "route_centerline", "lane_polygons"):
             assert shown[name] is sample[name]
-    assert np.isnan(as_shown(benchmark.sample(benchmark.keys[0]))["parent_states"][1]).all()
+    assert np.isnan(without_future(benchmark.sample(benchmark.keys[0]))["parent_states"][1]).all()
 
 
 def test_a_planner_that_needs_images_is_refused_by_name_before_any_plans(

@@ -11,7 +11,7 @@ from planners.data.batch import BevLayout, ImageLayout, Needs
 from planners.data.index import DataSettings, open_dataset
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
-from planners.evaluation.planning import as_shown, batch_samples, columns_shown
+from planners.evaluation.planning import batch_samples, columns_to_read, without_future
 from tests.planners.samples import grey_pictures, sample, write_table
 
 NEEDS = Needs(image=ImageLayout(width=48, height=12), bev=BevLayout(cell_m=1.0), n_agents=3)
@@ -33,7 +33,9 @@ def test_a_batch_is_the_loaders_but_for_the_plans(table: Path) -> None:
     dataset = open_dataset(DataSettings(real=str(table), sim=str(table)))
     (loaded,) = Loader(dataset, NEEDS, MixSettings(), batch_size=8, workers=1).epoch(0)
     rows = SampleTable(table)
-    shown = batch_samples([as_shown(rows.sample(name, columns_shown(NEEDS))) for name in loaded.attempt_ids], NEEDS)
+    shown = batch_samples(
+        [without_future(rows.sample(name, columns_to_read(NEEDS))) for name in loaded.attempt_ids], NEEDS
+    )
     assert shown.attempt_ids == loaded.attempt_ids
     for name in ("status", "history", "image", "bev", "agents", "agents_valid", "simulated"):
         mine, theirs = getattr(shown, name), getattr(loaded, name)
@@ -42,10 +44,10 @@ def test_a_batch_is_the_loaders_but_for_the_plans(table: Path) -> None:
 
 
 def test_only_what_is_needed_is_read() -> None:
-    small = columns_shown(Needs())
+    small = columns_to_read(Needs())
     assert "images" not in small and "agent_boxes" not in small
-    assert set(columns_shown(NEEDS)) > {"images", "cameras", "agent_boxes", *small}
-    everything = columns_shown(None)
+    assert set(columns_to_read(NEEDS)) > {"images", "cameras", "agent_boxes", *small}
+    everything = columns_to_read(None)
     assert "images" in everything and not {"stage2_score", "label_subscores"} & set(everything)
 
 

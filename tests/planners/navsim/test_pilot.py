@@ -10,7 +10,7 @@ import torch
 
 from factory.config.compose import ConfigError
 from planners.data.batch import COMMANDS, ImageLayout
-from planners.evaluation.planning import as_shown, batch_samples, plan_samples
+from planners.evaluation.planning import batch_samples, plan_samples, without_future
 from planners.models.planner import Planner
 from planners.navsim.agent import agent_input_arrays
 from planners.navsim.serve import FRONT, AgentPlanner, agent_cameras, observation_of
@@ -59,7 +59,7 @@ def test_the_rig_s_own_pictures_differ_as_little_as_a_jpeg_decoded_smaller(tmp_p
     planner, size = made("ltf_small"), (1920, 1080)
     pilot = AgentPlanner(saved(planner, tmp_path))
     theirs = pilot.batch_of(observation_of(agent_input_arrays(agent_input(FRONT, size=size), FRONT), FRONT))
-    ours = batch_samples([as_shown(row(FRONT, size=size))], planner.needs_to_plan)
+    ours = batch_samples([without_future(row(FRONT, size=size))], planner.needs_to_plan)
     assert theirs.image is not None and ours.image is not None
     assert (theirs.image.float() - ours.image.float()).abs().mean() < 0.5
     np.testing.assert_allclose(planner.plan(theirs), planner.plan(ours), atol=0.02)
@@ -69,7 +69,7 @@ def test_the_batch_holds_what_the_row_s_does(tmp_path: Path) -> None:
     planner = made("diffusiondrive_small")
     pilot = AgentPlanner(saved(planner, tmp_path))
     theirs = pilot.batch_of(observation_of(agent_input_arrays(agent_input(FRONT), FRONT), FRONT))
-    ours = batch_samples([as_shown(row(FRONT))], planner.needs)
+    ours = batch_samples([without_future(row(FRONT))], planner.needs)
     for name in ("status", "history", "image"):
         assert torch.equal(getattr(theirs, name), getattr(ours, name)), name
     assert theirs.bev is None and ours.bev is not None, "it is looked at in training alone"

@@ -15,7 +15,7 @@ from factory.readers.pickles import Record, load_records
 from planners.__main__ import main as planners
 from planners.navsim.agent import agent_input_arrays
 from planners.navsim.serve import FRONT, AgentPlanner, observation_of
-from planners.navsim.submit import split_scenes, submission_bytes
+from planners.navsim.submit import scenes_of_split, submission_bytes
 from tests.factory.datasets.navsim import scene_pickles
 from tests.factory.datasets.navsim.openscene_writer import write_frames
 from tests.planners.navsim import agent_inputs
@@ -109,7 +109,7 @@ def test_constant_velocity_is_the_public_agent_s_closed_form_in_both_stages(file
 
 def test_what_is_seen_of_a_scene_is_what_the_agent_is_shown(files: Path) -> None:
     folders = files / "navsim_logs/test", files / "sensor_blobs/test", files / "navhard_two_stage"
-    scenes = split_scenes(read_selection(str(files / "split.yaml")), *folders)
+    scenes = scenes_of_split(read_selection(str(files / "split.yaml")), *folders)
     found = {scene.token: scene for scene in (*scenes.first_stage(), *filter(None, scenes.second_stage()))}
     frames = log_frames()
     for token, k in (*((frames[k]["token"], k) for k in STAGE_ONE), *zip(TOKENS, STAGE_TWO)):

@@ -8,7 +8,7 @@ import numpy as np
 
 from factory.store.schema import AGENT_STEPS
 from planners.data.batch import BevLayout
-from planners.data.bev import BevClass, bev_raster, nearest_agents
+from planners.data.bev import BevClass, bev_raster, nearest_vehicles
 from tasks.world.clip import AgentKind
 from tests.planners.published.formula import AGENTS, street
 from tests.planners.published.ours import Difference
@@ -41,7 +41,7 @@ def differences_in_targets(path: Path) -> tuple[str, list[Difference]]:
             *(stored[x] for x in ("bev", "agents", "there")),
         )
     ours = bev_raster(street_sample(), PUBLIC)[0]
-    boxes, valid = nearest_agents(street_sample(), PUBLIC, AGENTS)
+    boxes, valid = nearest_vehicles(street_sample(), PUBLIC, AGENTS)
     off = ours != theirs
     lines = off & ((ours == BevClass.CENTERLINE) | (theirs == BevClass.CENTERLINE))
     versions = ", ".join(f"{name} {version}" for name, version in told["versions"].items())

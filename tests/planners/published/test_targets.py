@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from planners.data.bev import BevClass, bev_raster, nearest_agents
+from planners.data.bev import BevClass, bev_raster, nearest_vehicles
 from tests.planners.published.targets import PUBLIC, differences_in_targets, street_sample
 
 RECORD = Path(__file__).parent / "recorded" / "targets.npz"
@@ -27,4 +27,4 @@ def test_as_ours_are_drawn_they_are_others() -> None:
     ours = replace(PUBLIC, public=False)
     assert (bev_raster(street_sample(), ours)[0, ::-1, ::-1] != bev).mean() > 0.05
     assert not (bev == BevClass.CROSSING).any() and there.all()
-    assert nearest_agents(street_sample(), ours, len(there))[1].sum() < len(there)
+    assert nearest_vehicles(street_sample(), ours, len(there))[1].sum() < len(there)

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from planners.study import arms as module
-from planners.study.arms import ArmDrives, HeldAgainst, arm_differences, clean_route, comparison_tables, read_arm_drives
+from planners.study.arms import (
+    ArmDrives,
+    HeldAgainst,
+    arm_differences,
+    comparison_tables,
+    read_arm_drives,
+    route_without_failure,
+)
 from planners.training.many import Training
 from tests.planners.drive.test_summary import row
 
@@ -31,9 +38,9 @@ def drives_of(
 
 
 def test_a_drive_with_a_failure_has_completed_nothing_cleanly() -> None:
-    assert clean_route(row(0, route_completed=0.7)) == 0.7
-    assert clean_route(row(0, route_completed=0.7, off_road_events=2)) == 0.0
-    assert clean_route(row(0, route_completed=0.7, at_fault_collision=True)) == 0.0
+    assert route_without_failure(row(0, route_completed=0.7)) == 0.7
+    assert route_without_failure(row(0, route_completed=0.7, off_road_events=2)) == 0.0
+    assert route_without_failure(row(0, route_completed=0.7, at_fault_collision=True)) == 0.0
 
 
 def test_arms_are_held_against_each_other_where_all_have_driven(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:

@@ -9,9 +9,9 @@ import pytest
 import torch
 import torch.multiprocessing as mp
 
-from planners.training.fit import LOSSES, Loop, fit
+from planners.training.fit import LOSSES, FitSettings, fit
 from planners.training.optim import TrainingSettings
-from planners.training.processes import join_processes
+from planners.training.processes import join_process_group
 from tests.planners.toy import Toy, ToyBatches, ToySettings
 
 TRAINING = TrainingSettings(epochs=2, batch_size=4, learning_rate=0.01)
@@ -40,14 +40,14 @@ def _started(rank: int, port: int, part: Any, out: Path) -> None:
 
 
 def without_chance(rank: int, out: Path) -> None:
-    with join_processes("cpu") as world:
+    with join_process_group("cpu") as world:
         assert (world.rank, world.size) == (rank, 2)
         torch.manual_seed(0)
         planner = Toy(ToySettings(dropout=0.0), {})
         world.wait()
         batches = ToyBatches(20, 4, world.rank, world.size)
         with patch("planners.training.fit.build_optimiser", sgd):
-            fit(planner, batches, TRAINING, Loop(1, 10, log_every=3), world, out, {})
+            fit(planner, batches, TRAINING, FitSettings(1, 10, log_every=3), world, out, {})
         weights = torch.cat([p.detach().flatten() for p in planner.parameters()])
         torch.testing.assert_close(world.mean(weights), weights)
         assert world.any_process(rank == 1) and not world.any_process(False)
@@ -64,8 +64,8 @@ def test_two_processes_compute_what_one_does(tmp_path: Path) -> None:
     in_two(without_chance, tmp_path / "two")
     torch.manual_seed(0)
     alone = Toy(ToySettings(dropout=0.0), {})
-    with join_processes("cpu") as world, patch("planners.training.fit.build_optimiser", sgd):
-        fit(alone, ToyBatches(20, 4), TRAINING, Loop(1, 10, log_every=3), world, tmp_path / "one", {})
+    with join_process_group("cpu") as world, patch("planners.training.fit.build_optimiser", sgd):
+        fit(alone, ToyBatches(20, 4), TRAINING, FitSettings(1, 10, log_every=3), world, tmp_path / "one", {})
 
     def totals(folder: str) -> list[float]:
         lines = (tmp_path / folder / LOSSES).read_text().splitlines()[1:]

@@ -21,7 +21,7 @@ from tasks.render.gate import (
     to_box_frame,
     vehicle_fault,
 )
-from tasks.render.scene.engine import Vehicles
+from tasks.render.scene.engine import PlacedAgents
 from tasks.render.scene.sensed import Photo
 from tasks.render.splatting.raster import View
 from tasks.world.clip import AgentKind, Pinhole
@@ -153,7 +153,7 @@ def test_what_others_hide_says_nothing(hidden: str) -> None:
 
 def test_only_a_photo_from_near_enough_is_held_beside() -> None:
     here, then = eye_at(1.5, -0.8), eye_at(0.0)
-    there = Vehicles(("car",), (AgentKind.VEHICLE,), BOX[None])
+    there = PlacedAgents(("car",), (AgentKind.VEHICLE,), BOX[None])
     wrong = painted(here, BOX[None], phase=2.5)
     view = View(wrong, np.full((HEIGHT, WIDTH), 20.0, np.float32), np.ones((HEIGHT, WIDTH), np.float32))
 

@@ -14,7 +14,7 @@ from tasks.render.gate import (
     GateSettings,
     Sightings,
     VehiclePhotos,
-    box_outline,
+    box_mask,
     check_drive_pictures,
     estimate_fading,
     expected_likeness,
@@ -25,7 +25,7 @@ from tasks.render.gate import (
     to_box_frame,
 )
 from tasks.render.scene.asset import Exposure, RenderAsset
-from tasks.render.scene.engine import Vehicles, render, vehicles_at
+from tasks.render.scene.engine import PlacedAgents, agents_at_time, render
 from tasks.render.scene.movers import BEYOND_M
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.raster import View
@@ -197,13 +197,13 @@ def test_photos_that_show_the_car_are_found_with_where_they_were_taken_from() ->
     assert find_sightings(FILES, [replace(FRONT, name="rear")], street.tracks()) == {}  # took none of them
 
 
-def ahead(*distances_m: float) -> tuple[Vehicles, Pinhole]:
+def ahead(*distances_m: float) -> tuple[PlacedAgents, Pinhole]:
     """Cars of 2 x 2 m straight ahead at these distances from the lens to their backs, and a camera at the origin."""
     boxes = np.array([[d + 2.0, 0.0, 0.0, 0.0, 4.0, 2.0, 2.0] for d in distances_m])
     pose = street.EGO_FROM_CAMERA.copy()
     pose[:3, 3] = 0.0
     names = tuple(f"car-{k}" for k in range(len(boxes)))
-    return Vehicles(names, (AgentKind.VEHICLE,) * len(boxes), boxes), Pinhole(street.INTRINSICS, pose, *SIZE)
+    return PlacedAgents(names, (AgentKind.VEHICLE,) * len(boxes), boxes), Pinhole(street.INTRINSICS, pose, *SIZE)
 
 
 def empty_view() -> View:
@@ -216,7 +216,7 @@ def test_a_vehicle_s_share_is_that_of_its_outline() -> None:
     ((j, share),) = large_vehicles(there, eye, empty_view(), 0.01)
     side = 100.0 * (2.0 + 2.0 * BEYOND_M) / (8.0 - BEYOND_M)  # px, of its back
     assert j == 0 and share == pytest.approx(side**2 / (street.WIDTH * street.HEIGHT), rel=0.06)
-    assert box_outline(there.boxes[0], eye).mean() == pytest.approx(share)
+    assert box_mask(there.boxes[0], eye).mean() == pytest.approx(share)
     assert list(large_vehicles(there, eye, empty_view(), 2.0 * share)) == []
 
 
@@ -229,14 +229,14 @@ def test_a_vehicle_behind_another_or_behind_a_wall_is_not_looked_at() -> None:
     assert list(large_vehicles(behind, eye, empty_view(), 0.0)) == []
     walker = replace(there, kinds=(AgentKind.PEDESTRIAN,) * 2)
     assert list(large_vehicles(walker, eye, empty_view(), 0.01)) == []
-    assert list(large_vehicles(Vehicles((), (), np.zeros((0, 7))), eye, empty_view(), 0.01)) == []
+    assert list(large_vehicles(PlacedAgents((), (), np.zeros((0, 7))), eye, empty_view(), 0.01)) == []
 
 
 def test_a_vehicle_beside_the_camera_counts_though_part_of_it_lies_behind() -> None:
     there, eye = ahead(-1.0)
     boxes = there.boxes + np.array([[0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
     ((_, share),) = large_vehicles(replace(there, boxes=boxes), eye, empty_view(), 0.03)
-    assert share == pytest.approx(float(box_outline(boxes[0], eye).mean())) and share > 0.03
+    assert share == pytest.approx(float(box_mask(boxes[0], eye).mean())) and share > 0.03
 
 
 def test_similarity_is_one_for_the_same_and_forgives_blur_more_than_streaks() -> None:
@@ -261,8 +261,8 @@ def test_a_photo_of_another_exposure_is_told_by_what_was_learned_of_it(street_as
 
 
 def test_a_vehicle_outside_the_photo_has_no_likeness(street_asset: RenderAsset) -> None:
-    there = vehicles_at(street.tracks(), 0.5)
+    there = agents_at_time(street.tracks(), 0.5)
     away = replace(street.photo(2.0, 0.0, 0.5), world_from_camera=street.ego_pose(60.0) @ street.EGO_FROM_CAMERA)
     assert likeness_to_photo(street_asset, away, street.tracks(), there.track_ids) == {"car": 0.0}
     eye = Pinhole(FRONT.intrinsics, away.world_from_camera, *SIZE)
-    assert not box_outline(there.boxes[0], eye).any() and render(street_asset, [eye], there)
+    assert not box_mask(there.boxes[0], eye).any() and render(street_asset, [eye], there)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.attempt import Judged, drive_and_judge, drive_as_human, perturbed_scene
+from tasks.attempt import Judged, drive_and_judge, drive_under_log_replay, perturbed_scene
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Human, Plan
 from tasks.reward.epdms import Scores, prepare_scene, score
@@ -40,7 +40,7 @@ def simulated() -> Judged:
 
 @pytest.fixture(scope="module")
 def human() -> Judged:
-    return drive_as_human(scene_of_clip(street_clip()), Human(), PdmSettings(), np.random.default_rng(0))
+    return drive_under_log_replay(scene_of_clip(street_clip()), Human(), PdmSettings(), np.random.default_rng(0))
 
 
 def labelled(judged: Judged, vocabulary: Vocabulary = VOCABULARY) -> VocabularyLabels:

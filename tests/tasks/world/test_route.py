@@ -8,6 +8,7 @@ import shapely
 
 from tasks.world.frames import to_world
 from tasks.world.road_map import (
+    CenterlineFinder,
     Lane,
     MapLayer,
     MapPolygon,
@@ -15,7 +16,6 @@ from tasks.world.road_map import (
     Rings,
     RoadMap,
     Route,
-    RouteFinder,
     centerline_from,
     centerline_from_boundaries,
     driven_lanes,
@@ -151,7 +151,7 @@ def test_from_a_lane_that_does_not_lead_there_the_centerline_ends_where_it_can()
 
 def test_off_the_road_the_nearest_lane_of_the_route_counts() -> None:
     road_map = two_lane_road()
-    finder = RouteFinder(road_map, route_of_log(road_map, drive((5, -4), (60, -4))))
+    finder = CenterlineFinder(road_map, route_of_log(road_map, drive((5, -4), (60, -4))))
     assert finder.starting_lane(np.array([10.0, -9.0, 0.0])) == "b"
     assert finder.starting_lane(np.array([-9.0, 0.5, 0.0])) == "a"
 
@@ -163,7 +163,7 @@ def test_of_overlapping_lanes_the_one_with_the_ego_s_heading_is_taken() -> None:
         lane("left", [(0, 0), (10, 4), (14, 14)], is_intersection=True, predecessors=("s",)),
     )
     route = route_of_log(road_map, drive((-15, 0), (20, 0)))
-    both = RouteFinder(
+    both = CenterlineFinder(
         road_map, type(route)(route.lane_path, (*route.roadblock_ids, "rbc_left"), frozenset(road_map.lanes))
     )
     assert both.starting_lane(np.array([4.0, 0.8, 0.0])) == "straight"
@@ -184,7 +184,7 @@ def test_the_route_does_not_depend_on_where_the_world_lies() -> None:
 
 def test_centerlines_are_shared_and_cannot_be_written() -> None:
     road_map = two_lane_road()
-    finder = RouteFinder(road_map, route_of_log(road_map, drive((5, -4), (60, -4))))
+    finder = CenterlineFinder(road_map, route_of_log(road_map, drive((5, -4), (60, -4))))
     line = finder.centerline_from(np.array([10.0, -4.0, 0.0]))
     assert line is finder.centerline_from(np.array([12.0, -4.3, 0.1]))
     with pytest.raises(ValueError, match="read-only"):
@@ -225,7 +225,7 @@ def ahead(poses: np.ndarray, pose: tuple[float, float, float], motion: np.ndarra
     road_map, at = two_lane_road(motion), np.array(pose)
     if motion is not None:
         poses, at = to_world(motion, poses), to_world(motion, at)
-    return RouteFinder(road_map, route_of_log(road_map, poses)).metres_ahead(at, 0.5, 0.5, 20.0)
+    return CenterlineFinder(road_map, route_of_log(road_map, poses)).metres_ahead(at, 0.5, 0.5, 20.0)
 
 
 @pytest.mark.parametrize("motion", [None, np.array([120.0, -40.0, 1.1])])
@@ -259,5 +259,5 @@ def test_a_way_ahead_that_goes_in_a_circle_has_an_end() -> None:
         lane("z", [(500, 0), (520, 0)]),
     )
     blocks = tuple(road_map.roadblock_of[name] for name in "stz")
-    finder = RouteFinder(road_map, Route(("s", "t", "z"), blocks, frozenset("stz")))
+    finder = CenterlineFinder(road_map, Route(("s", "t", "z"), blocks, frozenset("stz")))
     assert finder.metres_ahead(np.array([0.0, 0.0, 0.0]), 0.5, 0.5, 20.0) == pytest.approx(24.0)

@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 from factory.datasets.av2.reader import read_map
-from factory.datasets.navsim.maps import City, cache_file, cached_tables, open_city
+from factory.datasets.navsim.maps import City, cached_tables, cached_tables_path, open_city
 from factory.datasets.town.town import _vector_map, plan_log
 from factory.readers.base import BadClip
 from tasks.world.road_map import MapLayer, RoadMap
@@ -114,7 +114,7 @@ def test_kept_tables_are_the_file_s_and_damage_is_mended(root: Path, caplog: pyt
         assert shapely.equals_identical(table.shapes, kept[layer].shapes).all()
         for name, column in table.columns.items():
             np.testing.assert_array_equal(column, kept[layer].columns[name])
-    file = cache_file(path)
+    file = cached_tables_path(path)
     whole_bytes = file.read_bytes()
     file.write_bytes(whole_bytes[: len(whole_bytes) // 2])
     assert cached_tables(path).keys() == fresh.keys()

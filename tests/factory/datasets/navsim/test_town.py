@@ -15,7 +15,7 @@ from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import write_logs
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW, Clip
-from tasks.world.road_map import LightState, RoadMap, RouteFinder, driving_command
+from tasks.world.road_map import CenterlineFinder, LightState, RoadMap, driving_command
 from tasks.world.vocabulary import kinematic_trajectories
 from tests.factory.datasets.navsim.geopackage_writer import CITIES, ORIGIN, stub_rows, write_root
 from tests.factory.datasets.navsim.navsim_town import write_town
@@ -61,7 +61,7 @@ def moved(clip: Clip) -> Clip:
     agents = replace(clip.agents, boxes=shift(clip.agents.boxes))
     states = shift(clip.ego_states)
     road_map = _moved_map(clip.road_map)
-    line = RouteFinder(road_map, clip.route).centerline_from(states[NOW, :3])
+    line = CenterlineFinder(road_map, clip.route).centerline_from(states[NOW, :3])
     return replace(clip, ego_states=states, world_from_ego=poses, agents=agents, centerline=line, road_map=road_map)
 
 

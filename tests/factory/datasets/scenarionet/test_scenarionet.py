@@ -10,9 +10,9 @@ from factory.datasets.scenarionet.reader import (
     SLOPE_STEPS,
     LoggedTrack,
     ScenarioNetReader,
+    fitted_velocities,
     read_log,
     resampled,
-    slope_velocities,
 )
 from factory.readers.base import ClipRef
 from tasks.world.clip import CLIP_STEPS, NOW, AgentKind
@@ -271,9 +271,9 @@ def test_slope_velocities_ignore_absent_frames_and_far_origins():
     xy = np.stack([1e6 + 3.0 * t, 2e6 - 4.0 * t], axis=1)[:, None]
     valid = np.ones((30, 1), bool)
     valid[[4, 5, 20]] = False
-    velocity = slope_velocities(np.where(valid[..., None], xy, 0.0), valid)
+    velocity = fitted_velocities(np.where(valid[..., None], xy, 0.0), valid)
     np.testing.assert_allclose(velocity[valid], np.tile([3.0, -4.0], (27, 1)), atol=1e-6)
     assert np.isnan(velocity[~valid]).all()
     alone = np.zeros((30, 1), bool)
     alone[15] = True
-    assert (slope_velocities(xy, alone)[15] == 0.0).all() and SLOPE_STEPS == 5
+    assert (fitted_velocities(xy, alone)[15] == 0.0).all() and SLOPE_STEPS == 5

@@ -20,7 +20,7 @@ from tasks.render.fit.reconstruct import (
 from tasks.render.fit.start import FitProblem, prepare_fit
 from tasks.render.fit.state import BETA1, SHAPES, SLACK_M, FitState, height_above_road
 from tasks.render.scene.asset import psnr
-from tasks.render.scene.engine import Vehicles, render
+from tasks.render.scene.engine import PlacedAgents, render
 from tasks.render.scene.sensed import Photo, Sweep, Tracks
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import moved, turned_quats
@@ -259,7 +259,7 @@ def test_a_car_is_learned_in_its_own_box_and_can_be_put_elsewhere(prepared: tupl
     photo = problem.train[0].photo
     pose = photo.world_from_camera.copy()
     pose[:3, 3] += problem.origin
-    moved = Vehicles(("car",), (AgentKind.VEHICLE,), box[None])
+    moved = PlacedAgents(("car",), (AgentKind.VEHICLE,), box[None])
     picture = render(asset, [Pinhole(photo.intrinsics, pose, 64, 36)], moved)[0].rgb
     u = int(50 * (1.0 * 2.0 / 12.0) + 32)  # 2 m to the right, 12 m ahead of the camera
     red, green, _ = picture[19:22, u - 1 : u + 2].mean(axis=(0, 1))

@@ -8,7 +8,7 @@ import street
 
 from tasks.render.scene import engine
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import NOBODY, render, vehicles_at
+from tasks.render.scene.engine import NOBODY, agents_at_time, render
 from tasks.render.splatting.gaussians import EMPTY
 from tasks.render.splatting.raster import View
 from tasks.render.views import render_views
@@ -33,7 +33,7 @@ def test_the_pipeline_s_frames_are_the_same_function_s(street_asset: RenderAsset
     rig = [Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), street.EGO_FROM_CAMERA)]
     size = (street.WIDTH, street.HEIGHT)
     frames = render_views(street_asset, rig, street.ego_pose(3.0)[None], street.tracks(), [8], *size)
-    drawn = render(street_asset, [FRONT], vehicles_at(street.tracks(), 0.8))[0].rgb
+    drawn = render(street_asset, [FRONT], agents_at_time(street.tracks(), 0.8))[0].rgb
     np.testing.assert_array_equal(frames[0, 0], np.rint(drawn * 255.0).astype(np.uint8))
 
 
@@ -74,9 +74,9 @@ def test_a_camera_that_sees_no_gaussian_sees_the_sky_map_and_never_black(street_
 
 
 def test_nobody_is_there_unless_named_and_the_far_are_left_out(street_asset: RenderAsset) -> None:
-    there = vehicles_at(street.tracks(), 0.8)
+    there = agents_at_time(street.tracks(), 0.8)
     assert there.track_ids == ("car",) and there.boxes[0] == pytest.approx(street.car_box(0.8))
-    away = vehicles_at(street.tracks(), 0.8, np.array([500.0, 0.0]), 150.0)
+    away = agents_at_time(street.tracks(), 0.8, np.array([500.0, 0.0]), 150.0)
     assert away.track_ids == () and away.boxes.shape == NOBODY.boxes.shape
     with_car, without = (render(street_asset, [FRONT], who)[0].rgb for who in (there, away))
     assert (np.abs(with_car - without).max(axis=-1) > 0.2).mean() > 0.005

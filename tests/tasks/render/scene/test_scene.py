@@ -8,17 +8,17 @@ from factory.stages.warm import compile_render_kernels
 from tasks.render.scene import depth, movers, stereo, surfels
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.build import AssetSettings, build_asset
-from tasks.render.scene.engine import NOBODY, Vehicles, render
+from tasks.render.scene.engine import NOBODY, PlacedAgents, render
 from tasks.render.scene.sensed import Photo
 from tasks.render.splatting import project, raster
 from tasks.world.clip import AgentKind, Pinhole
 
 
-def car_at(box: np.ndarray, name: str = "car") -> Vehicles:
-    return Vehicles((name,), (AgentKind.VEHICLE,), box[None])
+def car_at(box: np.ndarray, name: str = "car") -> PlacedAgents:
+    return PlacedAgents((name,), (AgentKind.VEHICLE,), box[None])
 
 
-def picture(asset: RenderAsset, pose: np.ndarray, vehicles: Vehicles) -> np.ndarray:
+def picture(asset: RenderAsset, pose: np.ndarray, vehicles: PlacedAgents) -> np.ndarray:
     camera = Pinhole(street.INTRINSICS, pose, street.WIDTH, street.HEIGHT)
     return np.rint(render(asset, [camera], vehicles)[0].rgb * 255).astype(np.uint8)
 

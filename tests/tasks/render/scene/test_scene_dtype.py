@@ -9,7 +9,7 @@ import street
 
 from factory.stages.scene_file import read_scene, write_scene
 from tasks.render.scene.asset import RenderAsset, compose_gaussians, psnr
-from tasks.render.scene.engine import render, vehicles_at
+from tasks.render.scene.engine import agents_at_time, render
 from tasks.render.settings import SceneDtype
 from tasks.render.splatting.gsplat_backend import arguments
 from tasks.world.clip import Pinhole
@@ -26,7 +26,7 @@ def halved(street_asset: RenderAsset, tmp_path: Path) -> RenderAsset:
 def test_pictures_of_a_scene_in_16_bits_are_those_of_the_whole_one(
     street_asset: RenderAsset, halved: RenderAsset
 ) -> None:
-    there = vehicles_at(street.tracks(), 0.8)
+    there = agents_at_time(street.tracks(), 0.8)
     aside = replace(FRONT, world_from_camera=street.ego_pose(1.0, -1.5) @ street.EGO_FROM_CAMERA)
     for whole, half in zip(*(render(asset, [FRONT, aside], there) for asset in (street_asset, halved))):
         assert 60.0 < psnr(half.rgb, whole.rgb) < 100.0
@@ -35,7 +35,7 @@ def test_pictures_of_a_scene_in_16_bits_are_those_of_the_whole_one(
 
 def test_gsplat_is_given_float32_for_its_kernels_take_no_less(halved: RenderAsset) -> None:
     """gsplat 1.5.3 composites float (RasterizeToPixels3DGSFwd.cu) and projects float or double, no other type."""
-    there = vehicles_at(street.tracks(), 0.8)
+    there = agents_at_time(street.tracks(), 0.8)
     given = arguments(compose_gaussians(halved, there.track_ids, there.kinds, there.boxes), [FRONT])
     arrays = [value for value in given.values() if isinstance(value, np.ndarray)]
     assert len(arrays) == 7 and all(array.dtype == np.float32 for array in arrays)

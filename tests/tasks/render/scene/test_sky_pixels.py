@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tasks.render.scene.sky import may_be_sky, smooth_around
+from tasks.render.scene.sky import is_smooth_around, may_be_sky
 
 HEIGHT, WIDTH = 180, 480
 
@@ -16,6 +16,6 @@ def test_a_boarded_wall_is_not_smooth_and_clouds_are() -> None:
     rgb = np.full((HEIGHT, WIDTH, 3), 0.75, np.float32)
     rgb[:, : WIDTH // 2] += 0.1 * np.linspace(0.0, 1.0, HEIGHT)[:, None, None]  # clouds
     rgb[::5, WIDTH // 2 :] -= 0.12  # the shadow of each board
-    smooth = smooth_around(rgb, np.ones((HEIGHT, WIDTH), bool))
+    smooth = is_smooth_around(rgb, np.ones((HEIGHT, WIDTH), bool))
     margin = 20
     assert smooth[:, : WIDTH // 2 - margin].all() and not smooth[:, WIDTH // 2 + margin :].any()

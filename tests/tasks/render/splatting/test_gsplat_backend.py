@@ -10,7 +10,7 @@ import street
 
 from tasks.render.gate import check_drive_pictures
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import Backend, render, require_backend, vehicles_at
+from tasks.render.scene.engine import Backend, agents_at_time, render, require_backend
 from tasks.render.settings import GateSettings
 from tasks.render.splatting import gsplat_backend, sh
 from tasks.render.splatting.gaussians import Gaussians
@@ -152,7 +152,7 @@ def test_the_gpu_draws_the_cpu_s_image(street_asset: RenderAsset) -> None:
         require()
     except BackendMissing as error:
         pytest.skip(str(error))
-    there = vehicles_at(street.tracks(), 0.8)
+    there = agents_at_time(street.tracks(), 0.8)
     for asset in (street_asset, replace(street_asset, background=cloud(3000, 15))):
         (slow,) = render(asset, [FRONT], there)
         for backend in (Backend.GSPLAT, Backend.GSPLAT_DENSE):
