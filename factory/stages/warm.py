@@ -32,7 +32,7 @@ from tasks.render.scene.sensed import Photo, Sweep
 from tasks.render.scene.stereo import choose_partners, wide_baseline_depth
 from tasks.render.settings import FitSettings, RenderMode, RenderSettings, SceneFrom
 from tasks.render.splatting.sh import rotate_coefficients
-from tasks.reward.epdms import prepare_scene, score
+from tasks.reward.epdms import INDEX_FROM_ROWS, prepare_scene, score
 from tasks.reward.labels import hit_after_s, vocabulary_labels
 from tasks.rollout.simulate import SeenTraffic, TrafficSettings, prepare_traffic, simulate
 from tasks.settings import PdmSettings
@@ -189,13 +189,13 @@ def _compile_and_mark(name: str) -> int:
 
 
 def _compile_judge() -> None:
-    """Scores, and all that an attempt among the log's traffic enters.
+    """Scores, of a few trajectories and of many, and all that an attempt among the log's traffic enters.
 
     `plan` is compiled meanwhile and takes half as long: it is there when the attempt asks for it.
     """
     scene, ahead = _tiny_scene()
     prepared = prepare_scene(scene, scene.agents.window(scene.step, scene.step + HORIZON_STEPS + 1))
-    standing = np.tile(scene.ego_state, (2, HORIZON_STEPS + 1, 1))
+    standing = np.tile(scene.ego_state, (INDEX_FROM_ROWS, HORIZON_STEPS + 1, 1))
     score(prepared, standing, normalise="pairs")
     judged = drive_and_judge(scene, Plan(ahead), REPLAY, PdmSettings())
     vocabulary_labels(Vocabulary(kinematic_trajectories(2, 0)), scene, judged.prepared, judged.reference)

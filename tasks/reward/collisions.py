@@ -96,6 +96,20 @@ def centroid(box: Box) -> tuple[float, float]:
 N_TIMES = HORIZON_STEPS + 1
 STOPPED_SPEED_MPS = 0.05
 LENGTH, WIDTH = 2.0 * HALF_LENGTH, 2.0 * HALF_WIDTH  # of the ego [m]
+CIRCUMRADIUS = math.hypot(HALF_LENGTH, HALF_WIDTH)  # of the ego [m]
+CELL_M = 2.0
+CELLS_PER_SIDE = 64  # a power of two
+
+
+class Cells(NamedTuple):
+    """Which objects an ego may touch, by the time and the square cell that its centre is in.
+
+    The cells repeat after CELLS_PER_SIDE in x and y, so the grid has no edges; what stands a whole period away is told
+    apart by the boxes themselves.
+    """
+
+    starts: ShortInts  # items[starts[c]:starts[c + 1]] are the objects of cell c, times outermost; (2,): one for all
+    items: ShortInts
 
 
 class Obstacles(NamedTuple):
@@ -104,13 +118,79 @@ class Obstacles(NamedTuple):
     boxes: Array  # (T, N, 5) centre x, y [m], heading [rad], length, width [m]; NaN when absent
     is_stopped: Bools  # (N,) no road user, or at most 0.05 m/s when first seen
     collision_score: Array  # (N,) what an at-fault collision leaves of NC: 0 for road users, else 0.5
-    spans: Array  # (N, 5) see spans_of
+    spans: Array  # (N, 5) see extents_over_time
+    axes: Array  # (T, N, 2) cos, sin of the headings; (0, N, 2) without an index
+    cells: Cells  # the index; empty without one
 
 
 @kernel
 def obstacles_of(boxes: Array, is_stopped: Bools, collision_score: Array) -> Obstacles:
     """Obstacles from boxes (T, N, 5), is_stopped (N,) and collision_score (N,)."""
-    return Obstacles(boxes, is_stopped, collision_score, extents_over_time(boxes))
+    no_axes, no_cells = np.empty((0, len(is_stopped), 2)), Cells(np.empty(0, np.int32), np.empty(0, np.int32))
+    return Obstacles(boxes, is_stopped, collision_score, extents_over_time(boxes), no_axes, no_cells)
+
+
+@kernel
+def with_index(obstacles: Obstacles) -> Obstacles:
+    """The same obstacles, quicker to look up: only many trajectories repay it."""
+    n_times, n_items = obstacles.boxes.shape[:2]
+    axes = np.empty((n_times, n_items, 2))
+    starts, items = np.zeros(n_times * CELLS_PER_SIDE * CELLS_PER_SIDE + 1, np.int32), np.empty(0, np.int32)
+    for fill in (False, True):  # counted, summed to the cells' ends, filled from there
+        for t in range(n_times):
+            for item in range(n_items):
+                box = box_at(obstacles, t, item)
+                axes[t, item, 0], axes[t, item, 1] = box.cos, box.sin
+                _register(box, t, item, fill, starts, items)
+        if not fill:
+            end = 0
+            for cell in range(len(starts)):
+                end += starts[cell]
+                starts[cell] = end
+            items = np.empty(end, np.int32)
+    boxes, is_stopped, collision_score = obstacles.boxes, obstacles.is_stopped, obstacles.collision_score
+    return Obstacles(boxes, is_stopped, collision_score, obstacles.spans, axes, Cells(starts, items))
+
+
+@kernel
+def _register(box: Box, t: int, item: int, fill: bool, starts: ShortInts, items: ShortInts) -> None:
+    """Count an object in, or write it into, the cells that come within the ego's circumradius of its box at step t."""
+    margin = CIRCUMRADIUS + ROUNDING_M
+    reach_x = 0.5 * (box.length * abs(box.cos) + box.width * abs(box.sin)) + margin
+    reach_y = 0.5 * (box.length * abs(box.sin) + box.width * abs(box.cos)) + margin
+    if not math.isfinite(box.x + box.y + reach_x + reach_y):
+        return
+    left, low = math.floor((box.x - reach_x) / CELL_M), math.floor((box.y - reach_y) / CELL_M)
+    right = min(math.floor((box.x + reach_x) / CELL_M), left + CELLS_PER_SIDE - 1)
+    high = min(math.floor((box.y + reach_y) / CELL_M), low + CELLS_PER_SIDE - 1)
+    everywhere = right - left == CELLS_PER_SIDE - 1 or high - low == CELLS_PER_SIDE - 1
+    center_reach = margin + math.sqrt(0.5) * CELL_M  # from the box to a cell's centre
+    for row in range(low, high + 1):
+        dy = (row + 0.5) * CELL_M - box.y
+        for column in range(left, right + 1):
+            dx = (column + 0.5) * CELL_M - box.x
+            along = max(abs(box.cos * dx + box.sin * dy) - 0.5 * box.length, 0.0)
+            across = max(abs(box.cos * dy - box.sin * dx) - 0.5 * box.width, 0.0)
+            if everywhere or along * along + across * across <= center_reach * center_reach:
+                cell = _cell(t, row, column)
+                if fill:
+                    starts[cell] -= 1
+                    items[starts[cell]] = item
+                else:
+                    starts[cell] += 1
+
+
+@kernel
+def _cell(t: int, row: int, column: int) -> int:
+    return (t * CELLS_PER_SIDE + (row & (CELLS_PER_SIDE - 1))) * CELLS_PER_SIDE + (column & (CELLS_PER_SIDE - 1))
+
+
+@kernel
+def cell_of(cells: Cells, t: int, x: float, y: float) -> int:
+    """The cell whose items are all the objects that an ego body centred on (x, y) [m] at step t may touch."""
+    if len(cells.starts) == 2:
+        return 0
+    return _cell(t, math.floor(y / CELL_M), math.floor(x / CELL_M))
 
 
 @kernel
@@ -177,8 +257,10 @@ def extents_over_time(boxes: Array) -> Array:
 
 
 @kernel
-def within_reach(obstacles: Obstacles, body: Body) -> ShortInts:
-    """The objects that are not out of reach of a placed body all along its way and as far ahead as it looks."""
+def within_reach(obstacles: Obstacles, body: Body) -> Cells:
+    """The index, or where none is made: who is not out of reach of a placed body all along where it looks."""
+    if len(obstacles.axes) > 0:
+        return obstacles.cells
     least_x, least_y, most_x, most_y = _looked_at(body)
     spans = obstacles.spans
     items = np.empty(len(spans), np.int32)
@@ -194,7 +276,7 @@ def within_reach(obstacles: Obstacles, body: Body) -> ShortInts:
         ):
             items[n] = item
             n += 1
-    return items[:n]
+    return Cells(np.array([0, n], np.int32), items[:n])
 
 
 @kernel
@@ -202,6 +284,8 @@ def box_at(obstacles: Obstacles, t: int, item: int) -> Box:
     """Where an object is at step t; NaN when absent."""
     x, y, heading = obstacles.boxes[t, item, 0], obstacles.boxes[t, item, 1], obstacles.boxes[t, item, 2]
     length, width = obstacles.boxes[t, item, 3], obstacles.boxes[t, item, 4]
+    if len(obstacles.axes) > 0:
+        return Box(x, y, heading, obstacles.axes[t, item, 0], obstacles.axes[t, item, 1], length, width)
     return Box(x, y, heading, math.cos(heading), math.sin(heading), length, width)
 
 
@@ -226,18 +310,20 @@ TTC_STEPS = (0, 3, 6, 9)  # projections 0, 0.3, 0.6, 0.9 s ahead
 
 @kernel
 def first_collision(
-    obstacles: Obstacles, items: ShortInts, states: Array, body: Body, ignored: Bools
+    obstacles: Obstacles, cells: Cells, states: Array, body: Body, ignored: Bools
 ) -> tuple[float, float]:
     """NC in {0, 0.5, 1} and the time index of the first collision at fault, inf where there is none.
 
-    items: the obstacles in reach; states: (41, 11) of one trajectory; body: placed there, with its flags; ignored: (N,)
-    scratch.
+    cells: the obstacles within reach; states: (41, 11) of one trajectory; body: placed there, with its flags; ignored:
+    (N,) scratch.
     """
     ignored[:] = False
     nc, first = 1.0, math.inf
     for t in range(states.shape[0]):
         ego = Box(body.x[t], body.y[t], states[t, HEADING], body.cos[t], body.sin[t], LENGTH, WIDTH)
-        for item in items:
+        cell = cell_of(cells, t, ego.x, ego.y)
+        for entry in range(cells.starts[cell], cells.starts[cell + 1]):
+            item = cells.items[entry]
             if ignored[item] or out_of_reach(obstacles, t, item, ego):
                 continue
             other = box_at(obstacles, t, item)
@@ -255,7 +341,7 @@ def first_collision(
 
 @kernel
 def first_time_to_collision(
-    obstacles: Obstacles, items: ShortInts, states: Array, body: Body, map_index: MapIndex, ignored: Bools
+    obstacles: Obstacles, cells: Cells, states: Array, body: Body, map_index: MapIndex, ignored: Bools
 ) -> float:
     """First time index at which the ego, going straight on for up to 0.9 s, runs into something; inf: none.
 
@@ -270,7 +356,9 @@ def first_time_to_collision(
             gone = body.speed[t] * (step * 0.1)
             x, y = body.x[t] + c * gone, body.y[t] + s * gone
             ego = Box(x, y, states[t, HEADING], c, s, LENGTH, WIDTH)
-            for item in items:
+            cell = cell_of(cells, t + step, x, y)
+            for entry in range(cells.starts[cell], cells.starts[cell + 1]):
+                item = cells.items[entry]
                 if ignored[item] or out_of_reach(obstacles, t + step, item, ego):
                     continue
                 other = box_at(obstacles, t + step, item)

@@ -10,7 +10,14 @@ from hypothesis import strategies as st
 
 from tasks.reward.areas import index_map
 from tasks.reward.centerline import MULTIPLE_LANES, NON_DRIVABLE, empty_body, place_body
-from tasks.reward.collisions import first_collision, first_time_to_collision, obstacles_of, within_reach
+from tasks.reward.collisions import (
+    Obstacles,
+    first_collision,
+    first_time_to_collision,
+    obstacles_of,
+    with_index,
+    within_reach,
+)
 from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y, box_corners, to_world
 from tasks.world.geometry import ego_boxes, touching
 from tasks.world.road_map import MapLayer, MapPolygon
@@ -31,19 +38,22 @@ class World:
     collision_score: np.ndarray  # (N,)
 
 
-def contacts(world: World) -> np.ndarray:
+def objects(world: World) -> Obstacles:
+    return obstacles_of(world.boxes, world.is_stopped, world.collision_score)
+
+
+def contacts(world: World, obstacles: Obstacles) -> np.ndarray:
     """NC, its index, TTC's index (K, 3) by the kernels."""
     found = np.empty((len(world.states), 3))
-    obstacles = obstacles_of(world.boxes, world.is_stopped, world.collision_score)
     ignored = np.ones(obstacles.boxes.shape[1], dtype=bool)
     map_index = index_map([MapPolygon("crossing", MapLayer.INTERSECTION, world.crossing)], frozenset())
     for k, states in enumerate(world.states):
         body = empty_body(len(states))
         place_body(states, PACIFICA.rear_axle_to_center, body)
         body.flags[:] = world.flags[k]
-        items = within_reach(obstacles, body)
-        found[k, :2] = first_collision(obstacles, items, states, body, ignored)
-        found[k, 2] = first_time_to_collision(obstacles, items, states, body, map_index, ignored)
+        cells = within_reach(obstacles, body)
+        found[k, :2] = first_collision(obstacles, cells, states, body, ignored)
+        found[k, 2] = first_time_to_collision(obstacles, cells, states, body, map_index, ignored)
     return found
 
 
@@ -152,7 +162,13 @@ def worlds(draw: st.DrawFn) -> World:
 @settings(max_examples=150)
 @given(worlds())
 def test_both_rules_equal_the_numpy_version(world: World) -> None:
-    np.testing.assert_array_equal(contacts(world), slow_contacts(world))
+    np.testing.assert_array_equal(contacts(world, with_index(objects(world))), slow_contacts(world))
+
+
+@settings(max_examples=25)
+@given(worlds())
+def test_objects_without_an_index_give_the_same(world: World) -> None:
+    np.testing.assert_array_equal(contacts(world, objects(world)), contacts(world, with_index(objects(world))))
 
 
 def test_what_is_exactly_ahead_may_count_as_not_ahead_where_rounding_lifts_the_cosine() -> None:
@@ -169,7 +185,7 @@ def test_what_is_exactly_ahead_may_count_as_not_ahead_where_rounding_lifts_the_c
             is_stopped=np.ones(1, dtype=bool),
             collision_score=np.zeros(1),
         )
-        found = contacts(world)
+        found = contacts(world, with_index(objects(world)))
         np.testing.assert_array_equal(found, slow_contacts(world))
         verdicts.add(float(found[0, 2]))
     assert verdicts == {0.0, np.inf}
@@ -187,6 +203,6 @@ def test_objects_left_out_along_a_path_are_those_that_nothing_on_it_touches() ->
     body = empty_body(41)
     place_body(states, PACIFICA.rear_axle_to_center, body)
     kept = within_reach(obstacles_of(boxes, np.zeros(7, dtype=bool), np.zeros(7)), body)
-    assert kept.tolist() == [0, 1, 2, 6]
+    assert kept.items.tolist() == [0, 1, 2, 6]
     ego = np.array([40.0, 0.0, 0.0, PACIFICA.length, PACIFICA.width])
     assert [i for i in range(7) if touching(ego, boxes[:, i]).any()] == [2, 6]  # from the path's end
