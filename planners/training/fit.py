@@ -114,7 +114,7 @@ class Batches(Protocol):
 
 
 @dataclass(frozen=True)
-class FitSettings:
+class StepSettings:
     """How a training runs, beside what it computes."""
 
     seed: int
@@ -136,7 +136,7 @@ def fit(
     planner: Planner,
     batches: Batches,
     training: TrainingSettings,
-    loop: FitSettings,
+    loop: StepSettings,
     process: TrainingProcess,
     out: Path,
     record: Mapping[str, Any],
@@ -237,7 +237,7 @@ def _step(
     batch: Batch,
     rate: float,
     clip: float | None,
-    loop: FitSettings,
+    loop: StepSettings,
     process: TrainingProcess,
 ) -> tuple[dict[str, Tensor], list[Tensor]]:
     """One optimiser step; the terms of the loss, detached, and SCALING where there is some, without a wait for it."""

@@ -41,7 +41,7 @@ from planners.training.checkpoint import (
     read_record,
     settings_record,
 )
-from planners.training.fit import FitSettings, Precision, fit, total_steps
+from planners.training.fit import Precision, StepSettings, fit, total_steps
 from planners.training.optim import TrainingSettings
 from planners.training.processes import RaySettings, TrainingProcess, join_process_group
 
@@ -203,7 +203,7 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
             why = f"a batch of {asked} takes more samples than there are"
             print(f"note: planner.training.batch_size={asked} -> {training.batch_size}: {why}")
         print(_plan_text(config, record, loader, resume_from), flush=True)
-    loop = FitSettings(
+    loop = StepSettings(
         seed=config.seed,
         steps=steps,
         accumulate=config.accumulate,

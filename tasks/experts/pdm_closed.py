@@ -37,11 +37,11 @@ from tasks.world.frames import (
 )
 from tasks.world.geometry import (
     ego_boxes,
+    nearest_on_edge,
     ring_contains,
     rings_distance,
     rings_touch,
     segments_touch,
-    to_line,
     to_segment,
     wrapped,
 )
@@ -139,7 +139,7 @@ def project(paths: DrivePaths, path: int, px: float, py: float) -> float:
     for k in range(inverse.shape[0]):
         ex, ey = next_x[k] - x[k], next_y[k] - y[k]
         ux, uy = px - x[k], py - y[k]
-        squares[k] = to_line(ux, uy, ex, ey, (ux * ex + uy * ey) * inverse[k])[1]
+        squares[k] = nearest_on_edge(ux, uy, ex, ey, (ux * ex + uy * ey) * inverse[k])[1]
         bound = min(bound, squares[k])
     bound += _TIE_M2 * (1.0 + bound)
     nearest, found = np.inf, 0.0
@@ -437,7 +437,7 @@ def _edges_around(swept: Corridors, path: int, x: float, y: float, squares: Arra
     for e in range(squares.shape[0]):
         ex, ey = bx[e] - ax[e], by[e] - ay[e]
         ux, uy = x - ax[e], y - ay[e]
-        squares[e] = to_line(ux, uy, ex, ey, (ux * ex + uy * ey) * inverse_square[e])[1]
+        squares[e] = nearest_on_edge(ux, uy, ex, ey, (ux * ex + uy * ey) * inverse_square[e])[1]
         straddles = (ay[e] > y) != (by[e] > y)
         crossings += straddles & ((ux * ey < uy * ex) == (ey > 0.0))
     return crossings % 2 == 1

@@ -492,13 +492,13 @@ def _first_crossing(edges: Array, bounded: Bits, crossed: ShortInts, entry: Shor
                 one, other = entry[i] >> 1, entry[k] >> 1
                 for w in range(bounded.shape[1]):
                     both = bounded[one, w] & bounded[other, w]
-                    if both and _parts(edges, one, other) and _parts(edges, other, one):
+                    if both and _splits_clearly(edges, one, other) and _splits_clearly(edges, other, one):
                         return one, 64 * w + int(math.log2(both & (~both + np.uint64(1))))
     return -1, -1
 
 
 @kernel
-def _parts(edges: Array, line: int, edge: int) -> bool:
+def _splits_clearly(edges: Array, line: int, edge: int) -> bool:
     """Whether a line has the ends of an edge on either side, neither of them within rounding."""
     ax, ay, bx, by = edges[line]
     n_left = 0
@@ -631,7 +631,7 @@ def _collect_others(index: MapIndex, x: Array, y: Array, held: RegionsAtPoints) 
                 for w in range(others.shape[1]):
                     others[n, w] ^= bounded[entry[i] >> 1, w]
         if on_line:
-            _leave_edges(index, q, x[p], y[p], others, n)
+            _drop_boundary_regions(index, q, x[p], y[p], others, n)
         parts[p] = 0
         for w in range(others.shape[1]):
             for part in range(playing.shape[0]):
@@ -641,7 +641,7 @@ def _collect_others(index: MapIndex, x: Array, y: Array, held: RegionsAtPoints) 
 
 
 @kernel
-def _leave_edges(index: MapIndex, q: int, x: float, y: float, others: Bits, n: int) -> None:
+def _drop_boundary_regions(index: MapIndex, q: int, x: float, y: float, others: Bits, n: int) -> None:
     """Take the regions on whose boundary a point of crossed cell q lies out of row n of `others`."""
     for i in range(index.crossed[q, FIRST], index.crossed[q, LAST]):
         e = index.entry[i] >> 1

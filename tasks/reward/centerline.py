@@ -165,7 +165,7 @@ DDC_TOLERATED_M, DDC_FAILED_M = 2.0, 6.0
 
 
 @kernel
-def lane_keeping(line: Centerline, body: Body) -> float:
+def lane_keeping_failure(line: Centerline, body: Body) -> float:
     """The time index that completes 20 steps in a row off the centreline, inf where there is none.
 
     Steps inside an intersection neither count nor interrupt the count. A step is only looked at when 20 could be
@@ -193,7 +193,7 @@ def lane_keeping(line: Centerline, body: Body) -> float:
 
 
 @kernel
-def driving_direction(body: Body) -> tuple[float, float]:
+def driving_direction_compliance(body: Body) -> tuple[float, float]:
     """DDC in {0, 0.5, 1}, and the first time index with 2 m or more against traffic within 1 s (inf: none)."""
     x, y, flags = body.x, body.y, body.flags
     n = len(x)

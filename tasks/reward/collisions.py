@@ -340,7 +340,7 @@ def first_collision(
 
 
 @kernel
-def first_time_to_collision(
+def first_ttc_violation(
     obstacles: Obstacles, cells: Cells, states: Array, body: Body, map_index: MapIndex, ignored: Bools
 ) -> float:
     """First time index at which the ego, going straight on for up to 0.9 s, runs into something; inf: none.

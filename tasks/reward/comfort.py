@@ -159,7 +159,7 @@ _SCRATCH_ROWS = N_FLAGS + 4
 
 
 @kernel
-def comfort_history(past_states: Array) -> Array:
+def interpolated_history(past_states: Array) -> Array:
     """Ego states (14, 11) at -1.5, -1.4 .. -0.2 s, interpolated linearly between states (4, 11) at 2 Hz.
 
     Rates of yaw and steering are not part of the public interpolation and are 0.
@@ -181,13 +181,13 @@ def comfort_history(past_states: Array) -> Array:
 
 @register_jitable
 def comfort_scratch() -> Array:
-    """Scratch (10, 55) for `comfort_along`, one per thread."""
+    """Scratch (10, 55) for `first_uncomfortable_step`, one per thread."""
     return np.empty((_SCRATCH_ROWS, HISTORY_ROWS + HORIZON_STEPS + 1))
 
 
 @kernel
-def comfort_along(
-    history: Array,  # (14, 11) ego states, see comfort_history
+def first_uncomfortable_step(
+    history: Array,  # (14, 11) ego states, see interpolated_history
     states: Array,  # (41, 11) of one trajectory
     scratch: Array,  # (10, 55), see comfort_scratch
     flags: Bools,  # (6,) out, as in LIMITS

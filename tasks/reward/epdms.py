@@ -19,10 +19,10 @@ from tasks.reward.centerline import (
     Body,
     Centerline,
     as_states,
-    driving_direction,
+    driving_direction_compliance,
     empty_body,
     index_centerline,
-    lane_keeping,
+    lane_keeping_failure,
     place_body,
     progress_m,
 )
@@ -30,12 +30,12 @@ from tasks.reward.collisions import (
     N_TIMES,
     Obstacles,
     first_collision,
-    first_time_to_collision,
+    first_ttc_violation,
     obstacles_of_tracks,
     with_index,
     within_reach,
 )
-from tasks.reward.comfort import N_FLAGS, comfort_along, comfort_history, comfort_scratch
+from tasks.reward.comfort import N_FLAGS, comfort_scratch, first_uncomfortable_step, interpolated_history
 from tasks.subscores import (
     EC_WEIGHT,
     INDEX,
@@ -128,7 +128,7 @@ def prepare(
     if ego_state0 is None and past_states is not None:
         ego_state0 = past_states[-1]
     return PreparedScene(
-        history=None if past_states is None else comfort_history(read_only(past_states)),
+        history=None if past_states is None else interpolated_history(read_only(past_states)),
         centerline=_indexed_line(np.shape(centerline), np.ascontiguousarray(centerline, np.float64).tobytes()),
         map_index=_indexed_map(tuple(polygons), route_lane_ids),
         obstacles=_obstacles(objects, ego_state0 if drop_touching else None),
@@ -267,14 +267,14 @@ def judge_one(
     cells = within_reach(obstacles, body)
     out.scores[NC, k], out.fails[NC, k] = first_collision(obstacles, cells, states, body, scratch.ignored)
     out.fails[DAC, k] = _first_with(body.flags, NON_DRIVABLE)
-    out.scores[DDC, k], out.fails[DDC, k] = driving_direction(body)
+    out.scores[DDC, k], out.fails[DDC, k] = driving_direction_compliance(body)
     out.fails[TLC, k] = first_red(context.red_lanes, body, HALF_LENGTH, HALF_WIDTH)
-    out.fails[TTC, k] = first_time_to_collision(obstacles, cells, states, body, context.map_index, scratch.ignored)
-    out.fails[LK, k] = lane_keeping(context.centerline, body)
+    out.fails[TTC, k] = first_ttc_violation(obstacles, cells, states, body, context.map_index, scratch.ignored)
+    out.fails[LK, k] = lane_keeping_failure(context.centerline, body)
     last = states.shape[0] - 1
     out.ep_raw_m[k] = progress_m(context.centerline, body.x[0], body.y[0], body.x[last], body.y[last])
     if len(context.history) > 0:
-        out.fails[HC, k] = comfort_along(context.history, states, scratch.comfort, out.comfort[k])
+        out.fails[HC, k] = first_uncomfortable_step(context.history, states, scratch.comfort, out.comfort[k])
     else:
         out.fails[HC, k] = math.inf
         out.comfort[k] = True

@@ -11,7 +11,7 @@ import numpy as np
 
 from tasks.kernels.compiled import inner_kernel, kernel
 from tasks.world.arrays import Array, Bytes, Ints
-from tasks.world.geometry import to_line, wrapped
+from tasks.world.geometry import nearest_on_edge, wrapped
 
 # Polylines in kernels: between their points, past their ends, how they are headed, and what is nearest on them.
 
@@ -108,7 +108,7 @@ def arc_length_and_offset(xy: Array, length: Array, poses: Array) -> Array:
         for k in range(xy.shape[0] - 1):
             ex, ey = xy[k + 1, 0] - xy[k, 0], xy[k + 1, 1] - xy[k, 1]
             dx, dy = poses[i, 0] - xy[k, 0], poses[i, 1] - xy[k, 1]
-            f, square = to_line(dx, dy, ex, ey, (dx * ex + dy * ey) / max(ex * ex + ey * ey, 1e-12))
+            f, square = nearest_on_edge(dx, dy, ex, ey, (dx * ex + dy * ey) / max(ex * ex + ey * ey, 1e-12))
             if square < best:
                 best = square
                 out[i, 0] = length[k] + f * (length[k + 1] - length[k])
@@ -328,7 +328,7 @@ def project_on_path(paths: Paths, m: int, x: float, y: float) -> tuple[float, fl
             px, py = paths.xy[m, k, 0], paths.xy[m, k, 1]
             ex, ey = paths.xy[m, k + 1, 0] - px, paths.xy[m, k + 1, 1] - py
             dx, dy = x - px, y - py
-            f, square = to_line(dx, dy, ex, ey, (dx * ex + dy * ey) / (ex * ex + ey * ey))
+            f, square = nearest_on_edge(dx, dy, ex, ey, (dx * ex + dy * ey) / (ex * ex + ey * ey))
             if square < best:
                 best = square
                 best_s = (k + f) * PATH_SPACING_M

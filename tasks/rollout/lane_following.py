@@ -30,7 +30,7 @@ from tasks.rollout.corridor import (
 from tasks.world.arrays import Array, Bools, Bytes, Ints
 from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentTracks, Scene
 from tasks.world.frames import wrap_angle
-from tasks.world.geometry import to_line, wrapped
+from tasks.world.geometry import nearest_on_edge, wrapped
 from tasks.world.road_map import Lane, LightState, RoadMap
 
 # The lanes cars drive on, as flat arrays: which are near a pose, and what follows each.
@@ -147,7 +147,7 @@ def _distances(poses: Array, points: Array, first: Ints, discs: Array, lanes: In
             for k in range(first[lane], first[lane + 1] - 1):
                 ex, ey = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
                 dx, dy = x - points[k, 0], y - points[k, 1]
-                square = to_line(dx, dy, ex, ey, (dx * ex + dy * ey) / max(ex * ex + ey * ey, 1e-12))[1]
+                square = nearest_on_edge(dx, dy, ex, ey, (dx * ex + dy * ey) / max(ex * ex + ey * ey, 1e-12))[1]
                 if square < best:
                     best, best_k = square, k
             if best <= COST_CAP_M * COST_CAP_M:

@@ -20,7 +20,7 @@ def wrapped(angle: float) -> float:
 
 
 @inlined
-def to_line(dx: float, dy: float, ex: float, ey: float, along: float) -> tuple[float, float]:
+def nearest_on_edge(dx: float, dy: float, ex: float, ey: float, along: float) -> tuple[float, float]:
     """The fraction 0..1 of an edge (ex, ey) nearest to a point (dx, dy) from its start, and the squared distance to it.
 
     along: the point's projection onto the line, in lengths of the edge.

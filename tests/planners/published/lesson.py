@@ -22,7 +22,7 @@ from factory.config.compose import ConfigError
 from factory.exits import Stopped
 from planners.data.batch import Batch
 from planners.published.import_planner import import_weights
-from planners.training.fit import LOSSES, FitSettings, fit, step_seed
+from planners.training.fit import LOSSES, StepSettings, fit, step_seed
 from planners.training.optim import FACTOR, TrainingSettings, build_optimiser
 from planners.training.processes import TrainingProcess
 from tasks.world.arrays import Array
@@ -135,7 +135,7 @@ def learned(lesson: Lesson, names: Mapping[str, list[int]], first: int, out: Pat
         torch.manual_seed(int(lesson.seeds[0]))
         gradients = gradient_norms(found, batches.at(0))
         optimiser = told_of(build_optimiser(lesson.training, found.planner))
-        loop = FitSettings(SEED, lesson.steps, log_every=1, checkpoint_every=0)
+        loop = StepSettings(SEED, lesson.steps, log_every=1, checkpoint_every=0)
         with suppress(Stopped):
             fit(found.planner, batches, lesson.training, loop, TrainingProcess(0, 1, torch.device("cpu")), out, {})
     with (out / LOSSES).open(newline="", encoding="utf-8") as file:

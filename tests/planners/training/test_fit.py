@@ -27,7 +27,7 @@ from planners.training.checkpoint import (
     planner_digest,
     read_record,
 )
-from planners.training.fit import LOSSES, VALIDATION, FitSettings, Precision, fit, total_steps
+from planners.training.fit import LOSSES, VALIDATION, Precision, StepSettings, fit, total_steps
 from planners.training.optim import TrainingSettings
 from planners.training.processes import TrainingProcess
 from tasks.caches import json_with_checksum
@@ -46,7 +46,15 @@ def train(out: Path, batches: ToyBatches, resume: Path | None = None, **loop: An
     planner = toy()
     steps = total_steps(batches, TRAINING, None)
     fit(
-        planner, batches, TRAINING, FitSettings(**{"seed": 1, "steps": steps, **loop}), ALONE, out, {}, resume, measured
+        planner,
+        batches,
+        TRAINING,
+        StepSettings(**{"seed": 1, "steps": steps, **loop}),
+        ALONE,
+        out,
+        {},
+        resume,
+        measured,
     )
     return planner
 
@@ -154,7 +162,7 @@ def test_a_step_goes_against_the_gradient_of_the_whole_batch_whatever_parts_it_i
 ) -> None:
     planner, training = without_chance(), TrainingSettings(epochs=1, batch_size=4, learning_rate=0.1)
     expected = [p.detach() - 0.1 * g for p, g in zip(planner.parameters(), gradient_of_the_first_batch(planner))]
-    fit(planner, ToyBatches(4, 4), training, FitSettings(1, 1, parts, precision), ALONE, tmp_path, {})
+    fit(planner, ToyBatches(4, 4), training, StepSettings(1, 1, parts, precision), ALONE, tmp_path, {})
     near = {"rtol": 1e-5, "atol": 1e-7} if precision == "fp32" else {"rtol": 0.0, "atol": 5e-4}
     for found, wanted in zip(planner.parameters(), expected):
         torch.testing.assert_close(found.detach(), wanted, **near)
@@ -171,7 +179,7 @@ def test_a_gradient_above_the_clip_is_shortened_to_it_and_one_below_is_left_alon
     norm = float(torch.cat([g.flatten() for g in gradient]).norm())
     training = TrainingSettings(epochs=1, batch_size=4, learning_rate=0.1, gradient_clip=share * norm)
     before = [p.detach().clone() for p in planner.parameters()]
-    fit(planner, ToyBatches(4, 4), training, FitSettings(1, 1, precision=precision), ALONE, tmp_path, {})
+    fit(planner, ToyBatches(4, 4), training, StepSettings(1, 1, precision=precision), ALONE, tmp_path, {})
     near = {"rtol": 1e-4, "atol": 1e-6} if precision == "fp32" else {"rtol": 0.0, "atol": 5e-4 * norm}
     for was, found, full in zip(before, planner.parameters(), gradient):
         torch.testing.assert_close(was - found.detach(), 0.1 * min(share, 1.0) * full, **near)
@@ -179,7 +187,7 @@ def test_a_gradient_above_the_clip_is_shortened_to_it_and_one_below_is_left_alon
 
 def test_the_rate_of_a_step_is_the_schedules_and_the_one_that_is_logged(tmp_path: Path, stepped_by: list[Sgd]) -> None:
     training = TrainingSettings(epochs=3, batch_size=4, learning_rate=0.01, schedule="cosine", warmup_steps=3)
-    fit(without_chance(), ToyBatches(20, 4), training, FitSettings(1, 15, log_every=4), ALONE, tmp_path, {})
+    fit(without_chance(), ToyBatches(20, 4), training, StepSettings(1, 15, log_every=4), ALONE, tmp_path, {})
     (optimiser,) = stepped_by
     logged = [float(row["learning_rate"]) for row in rows(tmp_path / LOSSES)]
     assert optimiser.rates == pytest.approx(logged, rel=1e-5)
@@ -189,7 +197,7 @@ def test_the_rate_of_a_step_is_the_schedules_and_the_one_that_is_logged(tmp_path
 
 def test_an_epoch_of_a_schedule_is_the_loaders(tmp_path: Path, stepped_by: list[Sgd]) -> None:
     training = TrainingSettings(epochs=3, batch_size=4, learning_rate=0.01, warmup_epochs=2.0, by_epoch=True)
-    fit(without_chance(), ToyBatches(20, 4), training, FitSettings(1, 15, log_every=4), ALONE, tmp_path, {})
+    fit(without_chance(), ToyBatches(20, 4), training, StepSettings(1, 15, log_every=4), ALONE, tmp_path, {})
     (optimiser,) = stepped_by
     assert optimiser.rates == pytest.approx([0.005] * 5 + [0.01] * 10)
     assert [float(row["learning_rate"]) for row in rows(tmp_path / LOSSES)] == optimiser.rates
@@ -209,7 +217,7 @@ def test_every_step_of_every_rank_draws_its_own_and_the_same_again(tmp_path: Pat
     def drawn(rank: int, seed: int = 1) -> list[float]:
         planner = Dice(ToySettings(), {})  # what was drawn to build it does not matter
         process = TrainingProcess(rank, 1, torch.device("cpu"))
-        fit(planner, ToyBatches(20, 4), TRAINING, FitSettings(seed, 5), process, tmp_path / f"{rank}-{seed}", {})
+        fit(planner, ToyBatches(20, 4), TRAINING, StepSettings(seed, 5), process, tmp_path / f"{rank}-{seed}", {})
         return list(planner.drawn)
 
     first, second = drawn(0), drawn(1)
@@ -256,7 +264,7 @@ def test_the_best_checkpoint_stays_whatever_interrupts(tmp_path: Path, stop_afte
     keep = {"validate_every": 2, "checkpoint_every": 5, "keep": Keep(best="off_m")}
 
     def go_on(batches: ToyBatches, resume: Path | None = None) -> None:
-        loop = FitSettings(seed=1, steps=15, **keep)  # type: ignore[arg-type]
+        loop = StepSettings(seed=1, steps=15, **keep)  # type: ignore[arg-type]
         fit(toy(), batches, TRAINING, loop, ALONE, tmp_path, {}, resume, lambda planner: {"off_m": next(at)})
 
     if stop_after is None:
@@ -281,7 +289,7 @@ def test_a_training_killed_behind_its_best_checkpoint_goes_on_from_it_without_a_
             raise Killed
         return measured(planner)
 
-    loop = FitSettings(seed=1, steps=15, validate_every=2, log_every=20, keep=Keep(best="weight"))
+    loop = StepSettings(seed=1, steps=15, validate_every=2, log_every=20, keep=Keep(best="weight"))
     with pytest.raises(Killed):
         fit(toy(), ToyBatches(20, 4), TRAINING, loop, ALONE, tmp_path, {}, None, once)
     assert newest_checkpoint(tmp_path).name == "00000002"

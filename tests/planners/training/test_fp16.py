@@ -14,7 +14,7 @@ from factory.exits import Stopped
 from planners.data.batch import Batch
 from planners.models.planner import Planner
 from planners.training.checkpoint import load_training, newest_checkpoint
-from planners.training.fit import LOSSES, SCALER, FitSettings, fit
+from planners.training.fit import LOSSES, SCALER, StepSettings, fit
 from planners.training.optim import TrainingSettings
 from tests.planners.models import test_diffusiondrive, test_gtrs_dense, test_ltf
 from tests.planners.toy import Toy, ToyBatches, ToySettings
@@ -42,7 +42,14 @@ def loud_steps() -> list[int]:
 
 def train(out: Path, planner: Toy, steps: int, batches: Any = None, resume: Path | None = None) -> Toy:
     fit(
-        planner, batches or ToyBatches(20, 4), TRAINING, FitSettings(1, steps, precision="fp16"), ALONE, out, {}, resume
+        planner,
+        batches or ToyBatches(20, 4),
+        TRAINING,
+        StepSettings(1, steps, precision="fp16"),
+        ALONE,
+        out,
+        {},
+        resume,
     )
     return planner
 
@@ -80,7 +87,7 @@ def test_a_resumed_training_has_the_scale_it_had(tmp_path: Path) -> None:
     for name, weights in whole.state_dict().items():
         assert torch.equal(resumed.state_dict()[name], weights), name
     with pytest.raises(ValueError, match="trained in fp16: go on in the same precision"):
-        fit(loud(), ToyBatches(20, 4), TRAINING, FitSettings(1, 15), ALONE, out, {}, newest_checkpoint(out))
+        fit(loud(), ToyBatches(20, 4), TRAINING, StepSettings(1, 15), ALONE, out, {}, newest_checkpoint(out))
 
 
 class Again(ToyBatches):
@@ -110,7 +117,7 @@ def test_the_loss_follows_that_of_fp32(tmp_path: Path, name: str) -> None:
     for precision in ("fp32", "fp16"):
         planner, batch = LEARNERS[name]()
         training = TrainingSettings(epochs=1, batch_size=8, learning_rate=3e-4, optimiser="adamw", gradient_clip=1.0)
-        loop = FitSettings(1, 30, precision=precision)  # type: ignore[arg-type]
+        loop = StepSettings(1, 30, precision=precision)  # type: ignore[arg-type]
         fit(planner, Again(batch), training, loop, ALONE, tmp_path / precision, {})
         curves.append(np.array([float(row["total"]) for row in rows(tmp_path / precision / LOSSES)]))
     full, half = curves

@@ -9,7 +9,7 @@ import pytest
 import torch
 import torch.multiprocessing as mp
 
-from planners.training.fit import LOSSES, FitSettings, fit
+from planners.training.fit import LOSSES, StepSettings, fit
 from planners.training.optim import TrainingSettings
 from planners.training.processes import join_process_group
 from tests.planners.toy import Toy, ToyBatches, ToySettings
@@ -47,7 +47,7 @@ def without_chance(rank: int, out: Path) -> None:
         world.wait()
         batches = ToyBatches(20, 4, world.rank, world.size)
         with patch("planners.training.fit.build_optimiser", sgd):
-            fit(planner, batches, TRAINING, FitSettings(1, 10, log_every=3), world, out, {})
+            fit(planner, batches, TRAINING, StepSettings(1, 10, log_every=3), world, out, {})
         weights = torch.cat([p.detach().flatten() for p in planner.parameters()])
         torch.testing.assert_close(world.mean(weights), weights)
         assert world.any_process(rank == 1) and not world.any_process(False)
@@ -65,7 +65,7 @@ def test_two_processes_compute_what_one_does(tmp_path: Path) -> None:
     torch.manual_seed(0)
     alone = Toy(ToySettings(dropout=0.0), {})
     with join_process_group("cpu") as world, patch("planners.training.fit.build_optimiser", sgd):
-        fit(alone, ToyBatches(20, 4), TRAINING, FitSettings(1, 10, log_every=3), world, tmp_path / "one", {})
+        fit(alone, ToyBatches(20, 4), TRAINING, StepSettings(1, 10, log_every=3), world, tmp_path / "one", {})
 
     def totals(folder: str) -> list[float]:
         lines = (tmp_path / folder / LOSSES).read_text().splitlines()[1:]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tasks.kernels.compiled import read_only
-from tasks.reward.comfort import N_FLAGS, comfort_along, comfort_scratch, comfortable
+from tasks.reward.comfort import N_FLAGS, comfort_scratch, comfortable, first_uncomfortable_step
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, YAW_RATE
 
 
@@ -18,7 +18,7 @@ def test_it_is_history_comfort_instant_by_instant() -> None:
         states[:, [AX, AY, HEADING, YAW_RATE]] = smooth
         flags = np.empty(N_FLAGS, np.bool_)
         history, drive = states[:14].copy(), states[14:].copy()
-        first = comfort_along(history, drive, comfort_scratch(), flags)
+        first = first_uncomfortable_step(history, drive, comfort_scratch(), flags)
         within = comfortable(read_only(states))
         assert within.all() == flags.all() == np.isinf(first)
         judged.add(bool(flags.all()))

@@ -14,10 +14,10 @@ from tasks.reward.centerline import (
     ONCOMING,
     Body,
     arc_length_at,
-    driving_direction,
+    driving_direction_compliance,
     index_centerline,
     is_off_centerline,
-    lane_keeping,
+    lane_keeping_failure,
     progress_m,
 )
 from tests.tasks.reward.slow import progress as slow
@@ -111,8 +111,8 @@ def test_the_three_rules_equal_their_slow_twins(data: st.DataObject, points: np.
     )
     gained = progress_m(line, body.x[0], body.y[0], body.x[-1], body.y[-1])
     np.testing.assert_allclose(gained, slow.progress_along(shape, centers)[0], rtol=0, atol=1e-9)
-    assert lane_keeping(line, body) == slow.lane_keeping(shape, centers, areas)[1][0]
-    ddc, first = driving_direction(body)
+    assert lane_keeping_failure(line, body) == slow.lane_keeping(shape, centers, areas)[1][0]
+    ddc, first = driving_direction_compliance(body)
     slow_ddc, slow_first = slow.driving_direction_compliance(centers, areas)
     assert (ddc, first) == (slow_ddc[0], slow_first[0])
 
@@ -151,10 +151,10 @@ def test_exactly_half_a_metre_is_not_off(origin: tuple[float, float]) -> None:
 )
 def test_driving_direction_sums_eleven_steps_against_traffic(step_m: float, ddc: float, first: float) -> None:
     x = step_m * np.arange(41)
-    assert driving_direction(body_at(x, 0 * x, ONCOMING)) == (ddc, first)
-    assert driving_direction(body_at(0 * x, -x, ONCOMING | NON_DRIVABLE)) == (ddc, first)
-    assert driving_direction(body_at(x, 0 * x, ONCOMING | CENTER_IN_INTERSECTION)) == (1.0, np.inf)
-    assert driving_direction(body_at(x, 0 * x, NON_DRIVABLE)) == (1.0, np.inf)
+    assert driving_direction_compliance(body_at(x, 0 * x, ONCOMING)) == (ddc, first)
+    assert driving_direction_compliance(body_at(0 * x, -x, ONCOMING | NON_DRIVABLE)) == (ddc, first)
+    assert driving_direction_compliance(body_at(x, 0 * x, ONCOMING | CENTER_IN_INTERSECTION)) == (1.0, np.inf)
+    assert driving_direction_compliance(body_at(x, 0 * x, NON_DRIVABLE)) == (1.0, np.inf)
 
 
 def test_a_long_centreline_stays_exact() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tasks.reward.comfort import comfort_history
+from tasks.reward.comfort import interpolated_history
 from tasks.reward.epdms import score
 from tasks.world.frames import AX, AY, HEADING, X
 from tests.tasks.reward.straight_street import drive, past_of, street
@@ -52,7 +52,7 @@ def test_history_is_interpolated_across_the_heading_jump_and_ends_at_minus_0_2_s
     past = np.zeros((4, 11))
     past[:, X] = [0.0, 5.0, 10.0, 15.0]
     past[:, HEADING] = [3.1, -3.1, -3.0, -2.9]
-    rows = comfort_history(past)
+    rows = interpolated_history(past)
     assert rows.shape == (14, 11)
     np.testing.assert_allclose(rows[:, X], np.arange(14.0), atol=1e-12)
     assert np.abs(np.diff(rows[:, HEADING])).max() < 0.03

@@ -7,7 +7,13 @@ from hypothesis import strategies as st
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from tasks.reward import comfort
-from tasks.reward.comfort import LIMITS, comfort_along, comfort_history, comfort_scratch, extended_comfort
+from tasks.reward.comfort import (
+    LIMITS,
+    comfort_scratch,
+    extended_comfort,
+    first_uncomfortable_step,
+    interpolated_history,
+)
 from tasks.world.frames import AX, AY, HEADING, PACIFICA, VX, YAW_ACCEL, YAW_RATE
 from tests.tasks.reward.slow import comfort as slow
 
@@ -22,7 +28,7 @@ FILTERS = {  # window, order, derivative
 
 def judged(history: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, float]:
     flags = np.empty(6, dtype=bool)
-    first = comfort_along(history, states, comfort_scratch(), flags)
+    first = first_uncomfortable_step(history, states, comfort_scratch(), flags)
     return flags, first
 
 
@@ -56,7 +62,7 @@ def drives(draw: st.DrawFn, n_rows: int) -> np.ndarray:
 @settings(max_examples=80)
 @given(past=drives(4), states=drives(41))
 def test_flags_and_first_step_equal_the_slow_twin(past: np.ndarray, states: np.ndarray) -> None:
-    history = comfort_history(past)
+    history = interpolated_history(past)
     flags, first = judged(history, states)
     comfortable, slow_flags, slow_first = slow.history_comfort(history, states[None], PACIFICA)
     assert np.array_equal(flags, slow_flags[0])

@@ -13,7 +13,7 @@ from tasks.reward.centerline import MULTIPLE_LANES, NON_DRIVABLE, empty_body, pl
 from tasks.reward.collisions import (
     Obstacles,
     first_collision,
-    first_time_to_collision,
+    first_ttc_violation,
     obstacles_of,
     with_index,
     within_reach,
@@ -53,7 +53,7 @@ def contacts(world: World, obstacles: Obstacles) -> np.ndarray:
         body.flags[:] = world.flags[k]
         cells = within_reach(obstacles, body)
         found[k, :2] = first_collision(obstacles, cells, states, body, ignored)
-        found[k, 2] = first_time_to_collision(obstacles, cells, states, body, map_index, ignored)
+        found[k, 2] = first_ttc_violation(obstacles, cells, states, body, map_index, ignored)
     return found
 
 

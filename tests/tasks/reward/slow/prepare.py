@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tasks.reward.comfort import comfort_history
+from tasks.reward.comfort import interpolated_history
 from tasks.world.clip import HORIZON_STEPS, MOVING_KINDS, AgentTracks
 from tasks.world.frames import PACIFICA, Vehicle, box_corners
 from tasks.world.geometry import ego_boxes, touching
@@ -83,7 +83,7 @@ def prepare(
         ego_state0 = past_states[-1]
     return PreparedScene(
         vehicle=vehicle,
-        history=None if past_states is None else comfort_history(past_states),
+        history=None if past_states is None else interpolated_history(past_states),
         centerline=shapely.LineString(centerline[:, :2]),
         regions=_regions(polygons, route_lane_ids),
         obstacles=_obstacles(objects.window(0, N_TIMES), ego_state0 if drop_touching else None, vehicle),
