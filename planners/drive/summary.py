@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from planners.drive.starts import LOGGED
-from planners.evaluation.bootstrap import LEVELS, Interval, clusters_of, paired_interval
+from planners.evaluation.bootstrap import LEVELS, Interval, cluster_labels_by_level, paired_interval
 from tasks.world.arrays import Array
 
 Row = Mapping[str, Any]  # of the table `drives`
@@ -95,7 +95,7 @@ def _mean(values: Array, clusters: Sequence[str], confidence: float, weights: Ar
 
 def coarsest_clusters(rows: Sequence[Row]) -> tuple[str, Sequence[str]]:
     """Of clips that share a log or a town, whole ones are taken: no independent draws else (planners.evaluation)."""
-    known = clusters_of([row["clip_id"] for row in rows], [row["log_id"] for row in rows])
+    known = cluster_labels_by_level([row["clip_id"] for row in rows], [row["log_id"] for row in rows])
     several = [level for level in LEVELS if level in known and len(set(known[level])) > 1]
     level = several[-1] if several else "clip"
     return level, known[level]

@@ -11,7 +11,7 @@ import numpy as np
 
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow
-from tasks.reward.aggregate import COLUMNS, FrameScores, Group, TwoStageScores, aggregate, is_uniform, means_of
+from tasks.reward.aggregate import COLUMNS, FrameScores, Group, TwoStageScores, aggregate, has_uniform_weights, means_of
 from tasks.world.arrays import Array
 
 HumanFilter = Literal["unfiltered", "filtered"]
@@ -94,7 +94,7 @@ def summarise_clips(clips: Sequence[ClipResult]) -> Summary:
         raise ValueError("no frame was scored")
     groups = [clip.groups for clip in clips if clip.groups is not None]
     shares = [
-        float(np.mean([is_uniform(pair[side].endpoint_xy, pair[side].starts_xy) for pair in groups]))
+        float(np.mean([has_uniform_weights(pair[side].endpoint_xy, pair[side].starts_xy) for pair in groups]))
         if groups
         else np.nan
         for side in (0, 1)

@@ -29,7 +29,7 @@ def town_of(log_id: str) -> str:
     return found[1] if found else ""
 
 
-def clusters_of(clips: Sequence[str], logs: Sequence[str]) -> Mapping[str, tuple[str, ...]]:
+def cluster_labels_by_level(clips: Sequence[str], logs: Sequence[str]) -> Mapping[str, tuple[str, ...]]:
     """Level -> cluster of each clip, for those of LEVELS that are known of every clip; logs: empty where unknown."""
     towns = [town_of(log) for log in logs]
     known = {"clip": clips, "log": logs, "town": towns}

@@ -30,7 +30,7 @@ from planners.evaluation.aggregation import (
     collect_scores,
     group_by_clip,
 )
-from planners.evaluation.bootstrap import LEVELS, Interval, clusters_of, paired_interval
+from planners.evaluation.bootstrap import LEVELS, Interval, cluster_labels_by_level, paired_interval
 from planners.evaluation.score_rows import read_record, read_rows
 from tasks.reward.aggregate import COLUMNS
 
@@ -83,7 +83,7 @@ def _by_level(a: RunScores, b: RunScores, settings: CompareSettings) -> ByLevel:
             draws=settings.draws,
             seed=settings.seed,
         )
-        for level, clusters in clusters_of(a.clips, a.logs).items()
+        for level, clusters in cluster_labels_by_level(a.clips, a.logs).items()
     }
 
 

@@ -120,15 +120,15 @@ class TwoStageScores:
 def follow_up_weights(endpoint_xy: Array, starts_xy: Array) -> Array:
     """Weights (M,), sum 1, of follow-up frames that start at (M, 2) for a plan that ends at (2,).
 
-    Gaussian in the distance, variance 0.1 m^2; uniform where `is_uniform`.
+    Gaussian in the distance, variance 0.1 m^2; uniform where `has_uniform_weights`.
     """
     weights = _gaussian(endpoint_xy, starts_xy)
-    if is_uniform(endpoint_xy, starts_xy):
+    if has_uniform_weights(endpoint_xy, starts_xy):
         return np.full(len(weights), 1.0 / len(weights))
     return weights / weights.sum()
 
 
-def is_uniform(endpoint_xy: Array, starts_xy: Array) -> bool:
+def has_uniform_weights(endpoint_xy: Array, starts_xy: Array) -> bool:
     """Whether all frames are too far (beyond 1.92 m) for a weight, or a distance is NaN."""
     total = float(_gaussian(endpoint_xy, starts_xy).sum())
     return bool(np.isnan(total) or np.isclose(total, 0.0))

@@ -416,7 +416,7 @@ def _binomial_sums(values: Array, t: int, b: int) -> Sums:
 
 
 @inlined
-def _grown(k: Sums, speed: float, w: float) -> tuple[float, float]:
+def _turn_and_bend(k: Sums, speed: float, w: float) -> tuple[float, float]:
     """`turn` / dt and `bend` / dt^2 of the module's docstring."""
     turn = speed * k[0] + w * k[1]
     vv = (N - 1.0) * k[0] - k[1]
@@ -438,10 +438,10 @@ def _commands(
     w = accel * dt
     own = steering * per_wheel_base
     k = (own * ONES[0] - path[0], own * ONES[1] - path[1], own * ONES[2] - path[2], own * ONES[3] - path[3])
-    turn, bend = _grown(k, speed, w)
+    turn, bend = _turn_and_bend(k, speed, w)
     lateral_free = lateral + dt * (speed * ONES[0] + w * ONES[1]) * heading + dt * dt * bend
     heading_free = wrap(heading + dt * turn)
-    turn_unit, bend_unit = _grown(RAMP, speed, w)
+    turn_unit, bend_unit = _turn_and_bend(RAMP, speed, w)
     lateral_unit = dt * dt * dt * per_wheel_base * bend_unit
     heading_unit = dt * dt * per_wheel_base * turn_unit
     pull = lateral_unit * Q_LATERAL * lateral_free + heading_unit * Q_HEADING * heading_free

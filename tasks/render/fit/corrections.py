@@ -35,19 +35,19 @@ FLOOR, PULL = 1e-4, 0.2  # added to variances in [0, 1]^2: FLOOR always, PULL / 
 
 
 @dataclass(frozen=True)
-class SharedColours:
+class OverlapColourMoments:
     """What C cameras show of points that another camera sees as well: moments of colours in [0, 1], by pair."""
 
     count: Array  # (C, C) points that cameras c and d both see; nothing on the diagonal
     first: Array  # (C, C, 3) sums of the colours that c shows of them
     second: Array  # (C, C, 3, 3) sums of their products
 
-    def __add__(self, other: "SharedColours") -> "SharedColours":
+    def __add__(self, other: "OverlapColourMoments") -> "OverlapColourMoments":
         """Of the points of both."""
-        return SharedColours(self.count + other.count, self.first + other.first, self.second + other.second)
+        return OverlapColourMoments(self.count + other.count, self.first + other.first, self.second + other.second)
 
 
-def shared_colours(colours: Array, seen: Bools) -> SharedColours:
+def shared_colours(colours: Array, seen: Bools) -> OverlapColourMoments:
     """The moments of M points' `colours` (C, M, 3) in [0, 1] in C cameras that have `seen` (C, M) them."""
     n, both = len(colours), seen.astype(np.float64)
     products = colours[..., :, None] * colours[..., None, :]
@@ -56,10 +56,10 @@ def shared_colours(colours: Array, seen: Bools) -> SharedColours:
     count = both @ both.T
     others = 1.0 - np.eye(n)
     sums, count = sums * others[..., None], count * others
-    return SharedColours(count, sums[..., :3], sums[..., 3:].reshape(n, n, 3, 3))
+    return OverlapColourMoments(count, sums[..., :3], sums[..., 3:].reshape(n, n, 3, 3))
 
 
-def align_cameras(of: SharedColours) -> F32:
+def align_cameras(of: OverlapColourMoments) -> F32:
     """Rows (C, 12) that make cameras agree on the points that several of them see.
 
     A row is a 3 x 3 matrix minus the identity, then 3 offsets (`tasks.render.fit.corrections`). What brings the common
@@ -115,7 +115,7 @@ def _moments(count: Array, first: Array, second: Array) -> tuple[Array, Array]:
     return mean, second.sum(axis=0) / n - np.outer(mean, mean)
 
 
-def _aligned_moments(of: SharedColours, matrices: Array, offsets: Array, c: int) -> tuple[Array, Array, Array]:
+def _aligned_moments(of: OverlapColourMoments, matrices: Array, offsets: Array, c: int) -> tuple[Array, Array, Array]:
     """Moments (D, ...) of what the other cameras, as they are aligned by now, show of the points shared with `c`."""
     count, first, second = of.count[:, c], of.first[:, c], of.second[:, c]
     turned = np.einsum("dij,dj->di", matrices, first)

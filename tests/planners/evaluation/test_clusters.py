@@ -1,7 +1,7 @@
 """Which clips share a log, and which a town."""
 
 from factory.datasets.town.town import log_name
-from planners.evaluation.bootstrap import clusters_of, town_of
+from planners.evaluation.bootstrap import cluster_labels_by_level, town_of
 
 
 def test_a_synthetic_log_names_its_town() -> None:
@@ -16,11 +16,11 @@ def test_logs_of_other_data_sets_name_none() -> None:
 
 def test_a_level_is_there_where_every_clip_has_it() -> None:
     logs = [log_name(1, 0), log_name(1, 1)]
-    assert clusters_of(["a", "b"], logs) == {
+    assert cluster_labels_by_level(["a", "b"], logs) == {
         "clip": ("a", "b"),
         "log": tuple(logs),
         "town": ("town-1", "town-1"),
     }
-    assert list(clusters_of(["a", "b"], ["scene-1", "scene-2"])) == ["clip", "log"]
-    assert list(clusters_of(["a", "b"], [logs[0], "scene-2"])) == ["clip", "log"]
-    assert list(clusters_of(["a", "b"], [logs[0], ""])) == ["clip"]
+    assert list(cluster_labels_by_level(["a", "b"], ["scene-1", "scene-2"])) == ["clip", "log"]
+    assert list(cluster_labels_by_level(["a", "b"], [logs[0], "scene-2"])) == ["clip", "log"]
+    assert list(cluster_labels_by_level(["a", "b"], [logs[0], ""])) == ["clip"]
