@@ -14,10 +14,10 @@ import numpy as np
 from factory.graph.steps import (
     AcceptedDrive,
     BlockReport,
-    Columns,
     NotReady,
     PreparedClip,
     RejectedAttempt,
+    SampleColumns,
     StopCheck,
     never_stop,
 )
@@ -232,7 +232,7 @@ class FactoryWork:
 
     # What the reward accepts is drawn.
 
-    def draw(self, driven: AcceptedDrive) -> Columns | RejectedAttempt:
+    def draw(self, driven: AcceptedDrive) -> SampleColumns | RejectedAttempt:
         """The pictures; RejectedAttempt where they are no sample's. Raises BadClip."""
         watch, drive, before = Stopwatch(), drive_of(driven), scene_cache_counts()
         with watch.timing("render"):
@@ -241,7 +241,7 @@ class FactoryWork:
             pictures = {} if unfit is not None else self.imaging.pictures(sensed, drive.candidate, drive.sampled)
         if unfit is not None:
             return RejectedAttempt(unfit, _subscores(drive), watch.seconds, _all_in_memory(before))
-        return Columns(pictures, watch.seconds, _all_in_memory(before))
+        return SampleColumns(pictures, watch.seconds, _all_in_memory(before))
 
     def unfit(self, clip: Clip, drive: Drive) -> Rejected | None:
         """Why the pictures of an accepted drive are no sample's; `clip` with its sensor files. Raises BadClip.
@@ -261,7 +261,7 @@ class FactoryWork:
 
     # All else of the row; the graph writes it.
 
-    def label(self, driven: AcceptedDrive) -> Columns:
+    def label(self, driven: AcceptedDrive) -> SampleColumns:
         """All but the pictures, the vocabulary labels among it."""
         watch, drive = Stopwatch(), drive_of(driven)
         judged = drive.sampled
@@ -271,7 +271,7 @@ class FactoryWork:
                 labelled = vocabulary_labels(self.labels_of, judged.scene, judged.prepared, judged.reference)
                 labels = label_columns(labelled)
         row = sample_row(judged.scene.clip, drive.candidate, judged)
-        return Columns({**row, **drive.row_overrides, **labels}, watch.seconds)
+        return SampleColumns({**row, **drive.row_overrides, **labels}, watch.seconds)
 
     # The block that a clip's pictures are drawn from is built before.
 

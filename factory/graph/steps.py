@@ -75,7 +75,7 @@ class AcceptedDrive:
 
 
 @dataclass(frozen=True)
-class Columns:
+class SampleColumns:
     """Some columns of a sample, of factory.store.schema less the ones in its BOOKKEEPING."""
 
     row: Mapping[str, object]
@@ -151,11 +151,11 @@ class Work(Protocol):
         """Rollout, expert, rollout and reward of one candidate."""
         ...
 
-    def draw(self, driven: AcceptedDrive) -> Columns | RejectedAttempt:
+    def draw(self, driven: AcceptedDrive) -> SampleColumns | RejectedAttempt:
         """The columns of its pictures and the `tags` they add; RejectedAttempt where the pictures are no sample's."""
         ...
 
-    def label(self, driven: AcceptedDrive) -> Columns:
+    def label(self, driven: AcceptedDrive) -> SampleColumns:
         """All other columns."""
         ...
 
@@ -165,15 +165,15 @@ class PartialAttempt:
     """An attempt that some stages are done of."""
 
     driven: AcceptedDrive
-    drawn: Columns | None = None
+    drawn: SampleColumns | None = None
 
 
 def run_stage(
     work: Work, stage: str, so_far: PreparedClip | PartialAttempt, candidate: int, expert: str
-) -> PartialAttempt | Columns | RejectedAttempt:
+) -> PartialAttempt | SampleColumns | RejectedAttempt:
     """The next stage of an attempt (tasks.stages.ATTEMPT) from where it stands.
 
-    Columns: the sample's. Seconds are those of all stages so far.
+    SampleColumns: the sample's. Seconds are those of all stages so far.
     """
     if stage == "drive":
         assert isinstance(so_far, PreparedClip)
@@ -190,10 +190,10 @@ def run_stage(
     labelled = work.label(driven)
     tags = [*labelled.row["tags"], *drawn.row.get("tags", ())]  # type: ignore[misc]
     seconds = {**driven.seconds, **drawn.seconds, **labelled.seconds}
-    return Columns({**labelled.row, **drawn.row, "tags": tags}, seconds, drawn.scene_at_hand)
+    return SampleColumns({**labelled.row, **drawn.row, "tags": tags}, seconds, drawn.scene_at_hand)
 
 
-def run_attempt(work: Work, prepared: PreparedClip, candidate: int, expert: str) -> Columns | RejectedAttempt:
+def run_attempt(work: Work, prepared: PreparedClip, candidate: int, expert: str) -> SampleColumns | RejectedAttempt:
     """One attempt, whole."""
     so_far: PreparedClip | PartialAttempt = prepared
     for stage in ATTEMPT:

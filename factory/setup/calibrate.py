@@ -11,7 +11,7 @@ from typing import Any
 
 from factory.config.run import RunConfig, load_config
 from factory.graph.plan import candidate_order
-from factory.graph.steps import Columns, run_attempt
+from factory.graph.steps import SampleColumns, run_attempt
 from factory.readers.base import ClipRef
 from factory.setup.settings import Run
 from factory.store.schema import BOOKKEEPING, sample_rows_to_table
@@ -96,7 +96,7 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
                 result = run_attempt(run.work, prepared, candidate, expert)
                 sums.attempts += 1
                 sums.seconds.update(result.seconds)
-                if isinstance(result, Columns):
+                if isinstance(result, SampleColumns):
                     sums.accepted += 1
                     blank: dict[str, object] = dict.fromkeys(BOOKKEEPING, "") | {"round": 0, "candidate_index": 0}
                     sums.row_bytes += int(sample_rows_to_table([{**blank, **result.row}]).nbytes)

@@ -106,7 +106,7 @@ def compile_kernels(parts: Sequence[str], enough: Event | None = None) -> None:
         return
     try:
         make_cache_dir()
-        with (cache_dir() / f"lock-{_part_key()}").open("w") as lock:
+        with (cache_dir() / f"lock-{_code_digest()}").open("w") as lock:
             if enough is None:  # somebody waits
                 print("compiling kernels, once for this version: about a minute", file=sys.stderr, flush=True)
             with _one_at_a_time, locked(lock):
@@ -121,7 +121,7 @@ def compile_kernels(parts: Sequence[str], enough: Event | None = None) -> None:
         raise NotReady(cache_write_error(error)) from error
 
 
-def _part_key() -> str:
+def _code_digest() -> str:
     """8 hex digits of the processor and of what is called here for it to be compiled."""
     sha = hashlib.sha256(processor_key().encode())
     sha.update(Path(__file__).read_bytes())
@@ -130,7 +130,7 @@ def _part_key() -> str:
 
 def part_marker(name: str) -> Path:
     """The file that lists what a part has in the cache."""
-    return cache_dir() / f"compiled-{_part_key()}-{name}"
+    return cache_dir() / f"compiled-{_code_digest()}-{name}"
 
 
 def _is_compiled(name: str) -> bool:

@@ -32,7 +32,7 @@ from factory.config.arguments import run_request_command
 from factory.exits import COMPLETE
 from factory.graph.execute import Execution, execute
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
-from factory.graph.steps import AcceptedDrive, Columns, PreparedClip, RejectedAttempt
+from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt, SampleColumns
 from factory.readers.base import ClipRef
 from factory.store.samples import Store
 from tasks.stages import Rejected
@@ -90,9 +90,9 @@ class WaitingWork(ToyWork):
             (name, any_row() | {"clip_id": prepared.clip_id, "content_digest": digest}), {"reward": 0.01}
         )
 
-    def draw(self, driven: AcceptedDrive) -> Columns:
+    def draw(self, driven: AcceptedDrive) -> SampleColumns:
         drawn = super().draw(driven)
-        assert isinstance(drawn, Columns)
+        assert isinstance(drawn, SampleColumns)
         name, _ = driven.payload  # type: ignore[misc]
         image: Any = drawn.row["images"]
         noise = np.random.default_rng(zlib.crc32(name.encode())).bytes(self.row_kb * 1024)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from factory.graph.steps import AcceptedDrive, Columns
+from factory.graph.steps import AcceptedDrive, SampleColumns
 from tests.factory.toy import ToyWork
 from tests.planners.samples import FRONT_YAWS, jpeg, pictures, plain, sample
 
@@ -20,7 +20,7 @@ class FilmedWork(ToyWork):
 
     shown: Mapping[str, Any] = field(default_factory=lambda: {**WORLD, **VIEW, **TIMES})
 
-    def draw(self, driven: AcceptedDrive) -> Columns:
+    def draw(self, driven: AcceptedDrive) -> SampleColumns:
         drawn = super().draw(driven)
-        assert isinstance(drawn, Columns)
-        return Columns({**drawn.row, **self.shown})
+        assert isinstance(drawn, SampleColumns)
+        return SampleColumns({**drawn.row, **self.shown})

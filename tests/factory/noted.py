@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from factory.graph.steps import (
     AcceptedDrive,
     BlockReport,
-    Columns,
     PreparedClip,
     RejectedAttempt,
+    SampleColumns,
     StopCheck,
     never_stop,
 )
@@ -46,10 +46,10 @@ class NotedWork(FactoryWork):
         with self.noted("drive"):
             return super().drive(prepared, candidate, expert)
 
-    def draw(self, driven: AcceptedDrive) -> Columns | RejectedAttempt:
+    def draw(self, driven: AcceptedDrive) -> SampleColumns | RejectedAttempt:
         with self.noted("render"):
             return super().draw(driven)
 
-    def label(self, driven: AcceptedDrive) -> Columns:
+    def label(self, driven: AcceptedDrive) -> SampleColumns:
         with self.noted("label"):
             return super().label(driven)

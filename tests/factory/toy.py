@@ -18,9 +18,9 @@ from factory.graph.execute import Execution, RunSummary, execute
 from factory.graph.steps import (
     AcceptedDrive,
     BlockReport,
-    Columns,
     PreparedClip,
     RejectedAttempt,
+    SampleColumns,
     StopCheck,
     never_stop,
 )
@@ -179,18 +179,18 @@ class ToyWork:
         row["label_10hz"] = payload["states"][candidate % 6, 1:].astype(np.float32)
         return AcceptedDrive((name, row), {"reward": 0.01})
 
-    def draw(self, driven: AcceptedDrive) -> Columns | RejectedAttempt:
+    def draw(self, driven: AcceptedDrive) -> SampleColumns | RejectedAttempt:
         name, row = driven.payload  # type: ignore[misc]
         self._note(f"render {name} on {where()}")
         if self._trouble(f"{name}:render") == "unfit":
             return RejectedAttempt(Rejected("render", "blank"), {"nc": 1.0}, {"render": 0.02})
-        return Columns({key: row[key] for key in PICTURES} | {"tags": ["drawn"]}, {"render": 0.02}, True)
+        return SampleColumns({key: row[key] for key in PICTURES} | {"tags": ["drawn"]}, {"render": 0.02}, True)
 
-    def label(self, driven: AcceptedDrive) -> Columns:
+    def label(self, driven: AcceptedDrive) -> SampleColumns:
         name, row = driven.payload  # type: ignore[misc]
         self._note(f"label {name} on {where()}")
         self._trouble(f"{name}:label")
-        return Columns({key: value for key, value in row.items() if key not in PICTURES}, {"labels": 0.03})
+        return SampleColumns({key: value for key, value in row.items() if key not in PICTURES}, {"labels": 0.03})
 
     def _note(self, line: str) -> None:
         if self.journal:

@@ -9,7 +9,7 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import load_config
-from factory.graph.steps import Columns, PreparedClip, RejectedAttempt, run_attempt
+from factory.graph.steps import PreparedClip, RejectedAttempt, SampleColumns, run_attempt
 from factory.readers.base import BadClip
 from factory.setup.settings import Run, assemble
 from factory.store.schema import BOOKKEEPING, sample_rows_to_table
@@ -100,7 +100,7 @@ def test_my_reader_and_my_expert_make_samples(package: Path) -> None:
     prepared = run.work.prepare(run.index.refs[0])
     assert isinstance(prepared, PreparedClip)
     results = [run_attempt(run.work, prepared, candidate.index, "mine") for candidate in prepared.candidates]
-    rows = [result.row for result in results if isinstance(result, Columns)]
+    rows = [result.row for result in results if isinstance(result, SampleColumns)]
     assert rows, [result.rejected for result in results if isinstance(result, RejectedAttempt)]
     rows.append(run_attempt(run.work, prepared, -1, "human").row)  # type: ignore[union-attr]
     books = dict.fromkeys(BOOKKEEPING, "x") | {"round": 0, "candidate_index": 0}

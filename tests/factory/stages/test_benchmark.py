@@ -13,7 +13,7 @@ import pytest
 from factory.config.run import BenchmarkSettings, load_config
 from factory.datasets.town.settings import TownSettings
 from factory.exits import COMPLETE
-from factory.graph.steps import Columns, PreparedClip, RejectedAttempt, run_attempt
+from factory.graph.steps import PreparedClip, RejectedAttempt, SampleColumns, run_attempt
 from factory.pipeline import BenchmarkWork, FactoryWork
 from factory.readers.base import ClipRef
 from factory.setup.settings import assemble, run_identity
@@ -207,7 +207,7 @@ def test_a_pair_falls_together_at_the_pictures(tmp_path: Path) -> None:
     assert "at step 50" in pair[0].rejected.detail  # type: ignore[union-attr]
     for expert, at in (("human_before", -1), ("follow_up", 0), ("follow_up_before", 0)):
         result = run_attempt(drawn, prepared, at, expert)
-        assert isinstance(result, Columns)
+        assert isinstance(result, SampleColumns)
         assert result.row["image_source"] == ("photo" if at < 0 else "render")
         assert [image["time_s"] for image in result.row["images"]] == [pytest.approx(0.0, abs=1e-6)]  # type: ignore[attr-defined]
 

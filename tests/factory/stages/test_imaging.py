@@ -10,7 +10,7 @@ import pytest
 from factory.config.run import load_config
 from factory.datasets.town.reader import SyntheticReader
 from factory.datasets.town.settings import TownSettings
-from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, run_attempt
+from factory.graph.steps import HUMAN_CANDIDATE, PreparedClip, SampleColumns, run_attempt
 from factory.pipeline import FactoryWork
 from factory.readers.base import BadClip
 from factory.setup.settings import assemble
@@ -51,7 +51,7 @@ def clip_of(root: Path, out: Path) -> Clip:
 def human_row(root: Path, out: Path, *overrides: str) -> dict[str, object]:
     work, prepared = prepared_by(root, out, *overrides)
     human = run_attempt(work, prepared, HUMAN_CANDIDATE, HUMAN)
-    assert isinstance(human, Columns)
+    assert isinstance(human, SampleColumns)
     return dict(human.row)
 
 
@@ -67,7 +67,7 @@ def test_a_human_sample_has_a_photo_of_every_camera_at_every_instant_also_withou
 def test_photos_too_far_apart_for_parallax_give_a_simulated_drive_no_pictures(town: Path, tmp_path: Path) -> None:
     work, prepared = prepared_by(town, tmp_path)
     results = (run_attempt(work, prepared, row.index, "pdm_closed") for row in prepared.candidates)
-    sample = next(result for result in results if isinstance(result, Columns))
+    sample = next(result for result in results if isinstance(result, SampleColumns))
     assert sample.row["image_source"] == "none" and sample.row["images"] is None
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from factory.config.run import load_config
-from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, run_attempt
+from factory.graph.steps import HUMAN_CANDIDATE, PreparedClip, SampleColumns, run_attempt
 from factory.pipeline import FactoryWork
 from factory.setup.settings import assemble
 from factory.store.funnel import Funnel, funnel_of
@@ -76,4 +76,4 @@ def test_the_log_s_own_drive_is_never_refused_for_its_end(tmp_path: Path) -> Non
     clip = prepared.payload.clip  # type: ignore[attr-defined]
     route = replace(clip.route, lane_ids=frozenset({"in"}), roadblock_ids=("rb_in", "rb_elsewhere"))
     elsewhere = replace(prepared, payload=replace(prepared.payload, clip=replace(clip, route=route)))  # type: ignore[type-var]
-    assert isinstance(run_attempt(work, elsewhere, HUMAN_CANDIDATE, "human"), Columns)
+    assert isinstance(run_attempt(work, elsewhere, HUMAN_CANDIDATE, "human"), SampleColumns)

@@ -8,7 +8,7 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.config.run import load_config
-from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, run_attempt
+from factory.graph.steps import HUMAN_CANDIDATE, PreparedClip, SampleColumns, run_attempt
 from factory.pipeline import FactoryWork
 from factory.run import main as run_main
 from factory.setup.calibrate import estimate_run_size, measure
@@ -49,11 +49,11 @@ def prepared() -> PreparedClip:
     return found
 
 
-def sample(work: FactoryWork, expert: str) -> tuple[Columns, Judged]:
+def sample(work: FactoryWork, expert: str) -> tuple[SampleColumns, Judged]:
     """The first accepted attempt of the street, and what was judged in it."""
     for candidate in [HUMAN_CANDIDATE] if expert == HUMAN else range(len(prepared().candidates)):
         result = run_attempt(work, prepared(), candidate, expert)
-        if isinstance(result, Columns):
+        if isinstance(result, SampleColumns):
             judged = work.trace(prepared(), candidate, expert).judged
             assert judged is not None
             return result, judged

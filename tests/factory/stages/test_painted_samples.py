@@ -12,7 +12,7 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import load_config, typed_run_config
-from factory.graph.steps import Columns, PreparedClip, run_attempt
+from factory.graph.steps import PreparedClip, SampleColumns, run_attempt
 from factory.pipeline import FactoryWork
 from factory.setup.settings import assemble
 from tasks.render.scene.asset import psnr
@@ -39,7 +39,7 @@ def prepared_by(towns: Path, *words: str) -> tuple[FactoryWork, PreparedClip]:
 
 def row_of(work: FactoryWork, prepared: PreparedClip, candidate: int, expert: str) -> dict[str, object]:
     found = run_attempt(work, prepared, candidate, expert)
-    assert isinstance(found, Columns)
+    assert isinstance(found, SampleColumns)
     return dict(found.row)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from factory.config.run import load_config
-from factory.graph.steps import HUMAN_CANDIDATE, Columns, PreparedClip, RejectedAttempt, run_attempt
+from factory.graph.steps import HUMAN_CANDIDATE, PreparedClip, RejectedAttempt, SampleColumns, run_attempt
 from factory.pipeline import FactoryWork, WholeClip
 from factory.readers.base import BadClip
 from factory.setup.settings import assemble, run_identity
@@ -45,9 +45,9 @@ def prepared_by(work: FactoryWork) -> PreparedClip:
     return prepared
 
 
-def first_sample(work: FactoryWork, prepared: PreparedClip) -> Columns:
+def first_sample(work: FactoryWork, prepared: PreparedClip) -> SampleColumns:
     results = (run_attempt(work, prepared, row.index, "pdm_closed") for row in prepared.candidates)
-    return next(result for result in results if isinstance(result, Columns))
+    return next(result for result in results if isinstance(result, SampleColumns))
 
 
 def test_a_block_below_the_gate_drops_the_experts_and_keeps_the_human(small_town: Path, tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_a_block_below_the_gate_drops_the_experts_and_keeps_the_human(small_town
     assert prepared.dropped is not None and (prepared.dropped.stage, prepared.dropped.reason) == ("render", "psnr")
     assert prepared.candidates == ()
     human = run_attempt(work, prepared, HUMAN_CANDIDATE, HUMAN)
-    assert isinstance(human, Columns) and human.row["image_source"] == "photo"
+    assert isinstance(human, SampleColumns) and human.row["image_source"] == "photo"
 
 
 @pytest.mark.slow
@@ -67,7 +67,7 @@ def test_a_marked_block_keeps_its_candidates_and_tags_its_samples(small_town: Pa
     marked = first_sample(work, prepared)
     assert marked.row["image_source"] == "render" and "low_psnr" in marked.row["tags"]  # type: ignore[operator]
     human = run_attempt(work, prepared, HUMAN_CANDIDATE, HUMAN)
-    assert isinstance(human, Columns) and "low_psnr" not in human.row["tags"]  # type: ignore[operator]
+    assert isinstance(human, SampleColumns) and "low_psnr" not in human.row["tags"]  # type: ignore[operator]
 
 
 @pytest.mark.slow
@@ -79,12 +79,12 @@ def test_a_drive_that_cannot_be_shown_is_dropped_and_the_human_s_is_not(small_to
         result for result in results if isinstance(result, RejectedAttempt) and result.rejected.stage == "render"
     ]
     assert dropped and {result.rejected.reason for result in dropped} == {"blank"}
-    assert not any(isinstance(result, Columns) for result in results)
+    assert not any(isinstance(result, SampleColumns) for result in results)
     assert dropped[0].subscores["nc"] == 1.0  # the reward had accepted it
-    assert isinstance(run_attempt(strict, prepared, HUMAN_CANDIDATE, HUMAN), Columns)
+    assert isinstance(run_attempt(strict, prepared, HUMAN_CANDIDATE, HUMAN), SampleColumns)
     for override in ("render.gate.enabled=false", "render=none", "render=map"):
         lenient = strict_on(small_town, tmp_path, override, contrast_min=1.0)
-        assert isinstance(first_sample(lenient, prepared), Columns)
+        assert isinstance(first_sample(lenient, prepared), SampleColumns)
 
 
 @pytest.mark.slow
@@ -99,7 +99,7 @@ def test_a_drive_past_a_vehicle_unlike_its_photos_is_dropped_and_at_zero_it_is_n
     details = [rejected.detail for rejected in dropped if rejected.reason == "unlike_photos"]
     assert details and {detail.split(":")[0] for detail in details} <= stored
     lenient = strict_on(small_town, tmp_path, vehicle_min=0.0, vehicle_share=0.001)
-    assert isinstance(first_sample(lenient, prepared), Columns)
+    assert isinstance(first_sample(lenient, prepared), SampleColumns)
 
 
 @pytest.mark.slow
@@ -124,7 +124,7 @@ def test_the_earlier_frame_of_a_pair_shows_its_own_instants_from_where_the_ego_w
     log, shown = work.reader.read(ref), []
     for expert, step in ((HUMAN, NOW), (HUMAN_BEFORE, NOW - 5)):
         accepted = run_attempt(work, prepared, HUMAN_CANDIDATE, expert)
-        assert isinstance(accepted, Columns)
+        assert isinstance(accepted, SampleColumns)
         np.testing.assert_allclose(accepted.row["now_pose"], log.ego_states[step, :3], atol=1e-6)  # type: ignore[arg-type]
         shown.append({round(image["time_s"], 3): image for image in accepted.row["images"]})  # type: ignore[attr-defined]
     later, earlier = shown
@@ -147,7 +147,7 @@ def test_with_an_open_gate_the_log_s_future_is_the_label_of_every_perturbed_stat
     results = [run_attempt(work, prepared, row.index, "logged") for row in prepared.candidates[:4]]
     assert len(results) == 4
     for result in results:
-        assert isinstance(result, Columns)
+        assert isinstance(result, SampleColumns)
         now = np.asarray(result.row["now_pose"])
         assert np.hypot(*(now - log[NOW + HORIZON_STEPS, :3])[:2]) > 0.3  # perturbed
         wanted = to_local(now, log[NOW + HORIZON_STEPS + 1 : NOW + 2 * HORIZON_STEPS + 1, :3])
@@ -255,7 +255,7 @@ def test_the_log_s_own_drive_alone_needs_no_candidates_and_no_block(small_town: 
     assert isinstance(prepared, PreparedClip)
     assert prepared.candidates == () and prepared.dropped is None and work.identity.prepare_digest == UNLISTED
     accepted = run_attempt(work, prepared, HUMAN_CANDIDATE, "human")
-    assert isinstance(accepted, Columns) and accepted.row["image_source"] == "photo"
+    assert isinstance(accepted, SampleColumns) and accepted.row["image_source"] == "photo"
     logged = work.reader.read(ref).ego_states[NOW : NOW + 1 + HORIZON_STEPS, :3]
     label = to_local(logged[0], logged[1:])  # to the last bit of a float32: no tracker drove it
     assert np.array_equal(np.float32(accepted.row["label_10hz"]), np.float32(label))  # type: ignore[arg-type]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.graph.execute import Execution, RunSummary
-from factory.graph.steps import AcceptedDrive, Columns, PreparedClip, RejectedAttempt
+from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt, SampleColumns
 from factory.readers.base import ClipRef
 from factory.store.funnel import funnel_of
 from factory.store.samples import Store
@@ -36,8 +36,8 @@ class PicturedWork(ToyWork):
         self.watching()
         return super().drive(prepared, candidate, expert)
 
-    def draw(self, driven: AcceptedDrive) -> Columns:
-        return Columns(pictures(dict.fromkeys(FRONT_YAWS, VIEW)))
+    def draw(self, driven: AcceptedDrive) -> SampleColumns:
+        return SampleColumns(pictures(dict.fromkeys(FRONT_YAWS, VIEW)))
 
 
 def run(out: Path, rounds: int = 2, watching: Callable[[], None] = lambda: None, n: int = len(REFS)) -> RunSummary:
