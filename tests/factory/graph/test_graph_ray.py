@@ -42,7 +42,7 @@ def two_cpus() -> Iterator[None]:
 @pytest.mark.parametrize(
     "begun",
     [
-        "import factory.graph.on_ray.graph as m; m.connect(1)",
+        "import factory.graph.on_ray.graph as m; m.join_or_start_cluster(1)",
         "import planners.training.on_ray as m; held = m._connected(); held.__enter__()",
     ],
 )
