@@ -119,6 +119,7 @@ def left_of(mark: str) -> list[str]:
         time.sleep(0.1)
 
 
+@pytest.mark.chaos
 @pytest.mark.ray
 @pytest.mark.slow
 def test_a_command_goes_on_where_ray_ends_the_process_whose_raylet_is_gone(tmp_path: Path) -> None:

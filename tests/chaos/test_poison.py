@@ -27,6 +27,7 @@ def run(out: Path, work: WildWork, executor: str) -> RunSummary:
     return execute(work, refs(8), ["human"], 1, Store(out), how, say=str)
 
 
+@pytest.mark.chaos
 @pytest.mark.ray
 @pytest.mark.slow
 def test_experts_that_do_harm_are_told_of_and_touch_no_other(tmp_path: Path) -> None:

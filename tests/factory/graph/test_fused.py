@@ -167,6 +167,7 @@ def test_the_town_s_pictures_are_drawn_on_the_gpu_node_and_its_drives_made_on_th
     assert_same_tables(tmp_path / "ray", tmp_path / "local")
 
 
+@pytest.mark.chaos
 @pytest.mark.ray
 @pytest.mark.slow
 def test_a_node_that_leaves_before_the_first_task_is_done_without(tmp_path: Path, cluster: Any) -> None:

@@ -117,6 +117,7 @@ def test_a_run_that_dies_with_its_plug_in_learns_of_it(tmp_path: Path, plain: Ca
     assert_same_tables(tmp_path / "out", plain())
 
 
+@pytest.mark.chaos
 @pytest.mark.slow
 def test_a_hanging_walk_is_seen_while_it_hangs_and_a_signal_ends_the_run(tmp_path: Path) -> None:
     journal = tmp_path / "journal"

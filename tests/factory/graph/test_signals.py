@@ -36,7 +36,7 @@ if __name__ == "__main__":
     ("executor", "how", "number", "code"),
     [
         ("local", "compiled loop", signal.SIGTERM, -signal.SIGKILL),
-        pytest.param("ray", "compiled loop", signal.SIGHUP, INTERRUPTED, marks=pytest.mark.ray),
+        pytest.param("ray", "compiled loop", signal.SIGHUP, INTERRUPTED, marks=[pytest.mark.ray, pytest.mark.chaos]),
     ],
 )
 def test_a_first_signal_ends_a_run_that_hangs(
