@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
+from numbers import Integral
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
@@ -375,3 +376,13 @@ def _some(names: Sequence[object]) -> str:
     """The first few of many."""
     first = ", ".join(name if isinstance(name, str) else shown(name) for name in names[:3])
     return first + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def id_text(value: object) -> str | None:
+    """What names a thing in a file, as text: a text or a whole number; None of all that names nothing.
+
+    `str` would make one thing of all those whose id is None, NaN or empty.
+    """
+    if isinstance(value, str):
+        return str(value) if value.strip() else None
+    return str(int(value)) if isinstance(value, Integral) and not isinstance(value, bool) else None

@@ -18,7 +18,6 @@ import re
 import zipfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import chain
-from numbers import Integral
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
 
@@ -223,16 +222,6 @@ def check_values(value: object, n_bytes: int, file: str, field: str) -> None:
             raise refuse(f"values nested more than {MAX_DEPTH} deep")
         if so_far[0] > most:
             raise refuse(f"values that refer to each other so often that they are more than {most:,}")
-
-
-def id_text(value: object) -> str | None:
-    """What names a thing in a file, as text: a text or a whole number; None of all that names nothing.
-
-    `str` would make one thing of all those whose id is None, NaN or empty.
-    """
-    if isinstance(value, str):
-        return str(value) if value.strip() else None
-    return str(int(value)) if isinstance(value, Integral) and not isinstance(value, bool) else None
 
 
 def _parts(value: object) -> Iterable[object] | None:

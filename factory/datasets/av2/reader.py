@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from factory.datasets.av2 import ANNOTATIONS, EXTRINSICS, INTRINSICS, POSES, log_folders
 from factory.files import matching
-from factory.readers.base import BadClip, ClipRef, folder_split
+from factory.readers.base import BadClip, ClipRef, folder_split, id_text
 from factory.readers.logs import (
     STEP_MS,
     LoggedDrive,
@@ -30,7 +30,6 @@ from factory.readers.logs import (
     files_within,
     route_of_drive,
 )
-from factory.readers.pickles import id_text
 from factory.readers.points import read_feather
 from tasks.world.arrays import Array, Bools, Indices, Ints
 from tasks.world.clip import MOVING_KINDS, STEP_S, AgentKind, AgentTracks, Camera, SensorFile

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from factory.readers.base import BadClip, bytes_of
-from factory.readers.pickles import Record, id_text, load_plain, load_records
+from factory.readers.base import BadClip, bytes_of, id_text
+from factory.readers.pickles import Record, load_plain, load_records
 from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.clip import AgentKind

@@ -31,8 +31,7 @@ from factory.datasets.scenarionet.map import (
     paved_areas,
     resampled_line,
 )
-from factory.readers.base import BadClip
-from factory.readers.pickles import id_text
+from factory.readers.base import BadClip, id_text
 from factory.wording import shown
 from tasks.world.arrays import Array, Indices
 from tasks.world.road_map import (

@@ -45,7 +45,7 @@ from factory.datasets.py123d.arrow import (
 from factory.datasets.py123d.map import read_map
 from factory.datasets.scenarionet.reader import FIT_STEPS, MAX_GAP_S, smooth_drive
 from factory.files import file_digest, matching, matching_below
-from factory.readers.base import SPLITS, BadClip, ClipRef
+from factory.readers.base import SPLITS, BadClip, ClipRef, id_text
 from factory.readers.logs import (
     STEP_MS,
     LoggedDrive,
@@ -56,7 +56,6 @@ from factory.readers.logs import (
     files_within,
     route_of_drive,
 )
-from factory.readers.pickles import id_text
 from factory.wording import shown
 from tasks.world.arrays import Array, Indices
 from tasks.world.clip import STEP_S, AgentKind, Camera, SensorFile

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from shapely.geometry import LineString, Polygon
 
-from factory.readers.base import BadClip
-from factory.readers.pickles import id_text
+from factory.readers.base import BadClip, id_text
 from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.road_map import (

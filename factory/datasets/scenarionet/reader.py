@@ -31,7 +31,16 @@ from factory.datasets.scenarionet.photos import (
 from factory.datasets.scenarionet.settings import ScenarioNetClips
 from factory.files import matching_below
 from factory.readers.apart import ProcessFunction
-from factory.readers.base import BadClip, ClipIndex, ClipRef, bytes_of, folder_split, nuscenes_split, waymo_split
+from factory.readers.base import (
+    BadClip,
+    ClipIndex,
+    ClipRef,
+    bytes_of,
+    folder_split,
+    id_text,
+    nuscenes_split,
+    waymo_split,
+)
 from factory.readers.logs import (
     STEP_MS,
     LoggedDrive,
@@ -42,7 +51,7 @@ from factory.readers.logs import (
     files_within,
     route_of_drive,
 )
-from factory.readers.pickles import id_text, load_plain
+from factory.readers.pickles import load_plain
 from factory.wording import shown
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import CLIP_STEPS, STEP_S, AgentKind, AgentTracks
