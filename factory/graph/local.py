@@ -8,6 +8,7 @@ import secrets
 import signal
 import tempfile
 import time
+from abc import ABC, abstractmethod
 from collections import OrderedDict, defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -237,31 +238,29 @@ def not_ready_error(failure: Failure) -> Exception:
     return NotReady(failure.error) if failure.kind is ErrorKind.INPUT else RuntimeError(failure.error)
 
 
-class Graph:
+class Graph(ABC):
     """What both executors offer: submit a function of factory.graph.steps, wait for reports."""
 
     parallelism = 1  # tasks at once
     cores = os.cpu_count() or 1  # that one task can have
-    attempt_tasks: Sequence[Sequence[str]] = (
-        ATTEMPT,
-    )  # the stages of an attempt, by the tasks that they are fused into
+    attempt_tasks: Sequence[Sequence[str]] = (ATTEMPT,)  # the stages of an attempt, by task
     record_metric: Record = staticmethod(record_nothing)
 
+    @abstractmethod
     def submit(self, step: str, *args: Any) -> Ticket:
         """Run `step`; arguments may be results of earlier tickets. What STEPS says is supplied to it."""
-        raise NotImplementedError
 
     def attempts_per_task(self) -> int:
         """Of a walk: more than 1 where `attempts` make them, whose tasks have a list of rows."""
         return 1
 
+    @abstractmethod
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
         """A finished task and its report (a steps.Failure where it died); None when the time is up."""
-        raise NotImplementedError
 
+    @abstractmethod
     def close(self) -> None:
         """Begin and await nothing more."""
-        raise NotImplementedError
 
 
 class LocalGraph(Graph):

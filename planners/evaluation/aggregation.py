@@ -318,5 +318,5 @@ def _percent(value: float) -> str:
 
 
 def _plain(value: float) -> float | str:
-    """Nothing where there is no number."""
+    """As a CSV holds it: an empty text for NaN."""
     return "" if np.isnan(value) else value

@@ -6,8 +6,8 @@ import pytest
 from tasks.reward.centerline import CENTER_IN_INTERSECTION, MULTIPLE_LANES, NON_DRIVABLE, ONCOMING
 from tasks.world.frames import PACIFICA, X, Y
 from tasks.world.road_map import MapLayer
-from tests.tasks.reward.rules.test_areas_twin import flags_along
 from tests.tasks.reward.straight_street import rectangle
+from tests.tasks.reward.test_areas_twin import flags_along
 
 MAP = [
     rectangle("own", MapLayer.LANE, (0.0, -2.0), (50.0, 2.0)),
