@@ -158,7 +158,7 @@ DOUBLED = b"2\x86"  # DUP TUPLE2: twice the value before
 )
 def test_keys_that_never_hash_and_nests_that_overflow_are_refused_unread(stream: bytes) -> None:
     """180 pairs of the pair before hold 2^180 values: in 370 bytes a key whose hash never ends."""
-    with pytest.raises(BadClip, match=r"clip.pkl: pickle: (values nested|a key of|a member of)"):
+    with pytest.raises(BadClip, match=r"clip.pkl: pickle: (a member of|(values nested|a key of).* at byte)"):
         load_plain(stream, "clip.pkl")
 
 
