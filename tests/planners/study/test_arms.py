@@ -44,8 +44,8 @@ def test_a_drive_with_a_failure_has_completed_nothing_cleanly() -> None:
 
 
 def test_arms_are_held_against_each_other_where_all_have_driven(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
-    """The second arm completes a tenth more of every route, but of a fourth one that the first has not driven."""
-    rows = [row(i, planner=f"{ARMS[0]}-0", route_completed=0.5) for i in range(3)]
+    """The second arm completes a tenth more of three routes; each has driven one that the other has not."""
+    rows = [row(i, planner=f"{ARMS[0]}-0", route_completed=0.5) for i in (0, 1, 2, 4)]
     rows += [row(i, planner=f"{ARMS[1]}-0", route_completed=0.6) for i in range(4)]
     rows += [row(i, planner="constant_velocity", route_completed=0.2) for i in range(3)]
     (found,) = drives_of(monkeypatch, tmp_path, rows)
