@@ -1,4 +1,4 @@
-"""Trainings of 1 and 2 processes, killed on their way: what the same and what other numbers of them go on to."""
+"""Trainings of 1 and 4 processes, killed on their way: what the same and what other numbers of them go on to."""
 
 import multiprocessing
 import os
@@ -28,7 +28,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # processes start one
 
 SAMPLES, BATCH, STEPS = 60, 8, 40  # five epochs of 7 batches and a part of the next
 EPOCH = SAMPLES // BATCH
-NUMBERS = (1, 2)
+NUMBERS = (1, 4)  # of two the sum is the same in any order
 NOTES, NAP_S = "TESTS_NOTES", "TESTS_NAP_S"
 
 
@@ -163,7 +163,7 @@ def test_the_same_number_goes_on_to_the_same_weights_to_the_last_bit(trainings: 
             assert torch.equal(ours["optimiser"]["state"][index][name], value), (index, name)
 
 
-@pytest.mark.parametrize(("before", "after"), [(1, 1), (2, 2), (1, 2), (2, 1)])
+@pytest.mark.parametrize(("before", "after"), [(1, 1), (4, 4), (1, 4), (4, 1)])
 def test_any_number_goes_on_with_the_samples_that_were_left(trainings: Trainings, before: int, after: int) -> None:
     name = trainings.folder / f"{before}-to-{after}"
     resumed = name if name.exists() else trainings.goes_on(before, after)
