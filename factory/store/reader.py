@@ -8,13 +8,12 @@ files they stand in; `iterate` goes file by file instead, which is what a pass o
     sample = samples[0]                       # dict: column -> array, text, number or None
     front = image_of(sample, "front", 0.0)    # (height, width, 3) uint8 RGB
     labels = labels_of(sample)                # the scores of a whole vocabulary from this sample's scene
-    batch = to_torch(sample)
 """
 
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -26,9 +25,6 @@ from factory.store.schema import SAMPLES, SCHEMA, VERSION_PROPERTY, table_to_row
 from factory.store.table import KeyedTable, fixed_bytes, keys_with_prefix
 from tasks.reward.label_bytes import VocabularyLabels, decode
 from tasks.world.arrays import Bytes, Ints
-
-if TYPE_CHECKING:
-    import torch
 
 Sample = dict[str, Any]
 TIME_TOLERANCE_S = 0.05
@@ -109,10 +105,9 @@ class SampleTable:
         """One sample, or some of its columns; reads the row group it stands in."""
         at = self._row_number(which) if isinstance(which, str) else which
         path = self._paths[self._files[at]]
-        _check_columns(columns)
         with raising_damaged_file(f"{self._table.location.uri}/{path}"):
             group, row = find_row_group(self._file(path), int(self._rows[at]))
-            (sample,) = read_rows(self._file(path), group, self._partitions[path], columns, slice(row, row + 1))
+        (sample,) = self.rows(path, group, columns, slice(row, row + 1))
         return sample
 
     def _row_number(self, attempt_id: str) -> int:
@@ -126,14 +121,21 @@ class SampleTable:
 
     def iterate(self, columns: Sequence[str] | None = None) -> Iterator[Sample]:
         """Every sample once, file by file, one row group in memory."""
-        _check_columns(columns)
+        for path, group, _ in self.row_groups():
+            yield from self.rows(path, group, columns)
+
+    def row_groups(self) -> Iterator[tuple[str, int, int]]:
+        """Of every row group its file, its number there and its rows, file by file."""
         for path in sorted(self._partitions):
             with raising_damaged_file(f"{self._table.location.uri}/{path}"):
-                groups = len(row_group_sizes(self._file(path)))
-            for group in range(groups):
-                with raising_damaged_file(f"{self._table.location.uri}/{path}"):
-                    rows = read_rows(self._file(path), group, self._partitions[path], columns)
-                yield from rows
+                sizes = row_group_sizes(self._file(path))
+            yield from ((path, group, n_rows) for group, n_rows in enumerate(sizes.tolist()))
+
+    def rows(self, path: str, group: int, columns: Sequence[str] | None, rows: slice = slice(None)) -> list[Sample]:
+        """Samples of one row group. Raises KeyError for unknown columns, OSError for a damaged file, by name."""
+        _check_columns(columns)
+        with raising_damaged_file(f"{self._table.location.uri}/{path}"):
+            return read_rows(self._file(path), group, self._partitions[path], columns, rows)
 
 
 def read_samples(
@@ -223,16 +225,3 @@ def labels_of(sample: Mapping[str, Any], vocabulary: str | None = None) -> Vocab
         )
     except ValueError as error:
         raise ValueError(f"{name}: label_{error}") from error
-
-
-def to_torch(sample: Mapping[str, Any]) -> "dict[str, torch.Tensor]":
-    """The numeric columns as tensors (copies); ragged, text, struct and null columns are left out."""
-    import torch
-
-    tensors = {}
-    for name, value in sample.items():
-        if isinstance(value, np.ndarray) and value.dtype.kind in "bif":
-            tensors[name] = torch.from_numpy(value.copy())
-        elif isinstance(value, bool | int | float):
-            tensors[name] = torch.tensor(value)
-    return tensors

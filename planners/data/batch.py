@@ -4,13 +4,19 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from tasks.settings import constant
-from tasks.world.arrays import FloatArray
+from tasks.world.arrays import F32, FloatArray
 
 COMMANDS = ("left", "straight", "right", "unknown")  # order of the one-hot driving command
+
+
+def one_hot_command(command: str) -> F32:
+    """(4,) in the order of COMMANDS. Raises ValueError for another."""
+    return (np.arange(len(COMMANDS)) == COMMANDS.index(command)).astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from factory.store.reader import TIME_TOLERANCE_S, labels_of
 from factory.store.schema import COLUMNS, LABEL_COLUMNS, Column
-from planners.data.batch import COMMANDS, Batch, BevLayout, ImageLayout, Needs
+from planners.data.batch import COMMANDS, Batch, BevLayout, ImageLayout, Needs, one_hot_command
 from planners.data.images import stitch
 from planners.data.index import AGENT_COLUMNS, BEV_COLUMNS
 from tasks.reward.label_bytes import CRC_BYTES
@@ -105,7 +105,7 @@ class BatchBuffer:
     def fill(self, i: int, stored: StoredRows, row: int) -> None:
         """Decode a row as sample i. Raises ValueError for what cannot be decoded."""
         arrays, needs = self._arrays, self._needs
-        arrays["status"][i, : len(COMMANDS)] = np.arange(len(COMMANDS)) == COMMANDS.index(stored.value("command", row))
+        arrays["status"][i, : len(COMMANDS)] = one_hot_command(stored.value("command", row))
         arrays["status"][i, len(COMMANDS) :] = stored.value("ego_status", row)
         arrays["history"][i] = stored.value("ego_history_2hz", row)
         arrays["plan_2hz"][i] = stored.value("label_2hz", row)
