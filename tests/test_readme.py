@@ -44,7 +44,7 @@ from tests.pages import PAGES, REPOSITORY, Command, blocks, commands, named_in_p
 
 ALL_COMMANDS = [command for page in PAGES for command in commands(page)]
 IN_PROSE = list(dict.fromkeys(command for page in PAGES for command in named_in_prose(page)))
-PYTHON_BLOCKS = blocks("README.md", "python")
+LOOKS, TRAINS = blocks("README.md", "python")
 RUN_ELSEWHERE = {
     "docs/queries.md": "tests/test_queries.py runs them",
 }
@@ -86,16 +86,38 @@ def demo_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("block", PYTHON_BLOCKS, ids=range(len(PYTHON_BLOCKS)))
-def test_python_runs_as_written_in_the_small_install(demo_home: Path, tmp_path: Path, block: str) -> None:
+def test_python_that_looks_runs_as_written_in_the_small_install(demo_home: Path, tmp_path: Path) -> None:
     path = f"{as_if_installed(SMALL, tmp_path)}{os.pathsep}{REPOSITORY}"
     env = os.environ | {"PYTHONPATH": path, "XDG_CACHE_HOME": str(demo_home / "cache")}
     env["NUMBA_CACHE_DIR"] = str(cache_dir().parent)  # a cache of its own for towns, but no second compilation
     done = subprocess.run(
-        [sys.executable, "-c", block], cwd=demo_home, env=env, capture_output=True, text=True, timeout=200
+        [sys.executable, "-c", LOOKS], cwd=demo_home, env=env, capture_output=True, text=True, timeout=200
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "model", ["as written", "torch.nn.Sequential(torch.nn.Linear(8, 32), torch.nn.Linear(32, 24))"]
+)
+def test_the_loop_trains_its_model_and_one_of_the_readers_own(
+    demo_home: Path, monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    monkeypatch.chdir(demo_home)
+    before, loop, passes = TRAINS.partition("for batch in ")
+    assert "torch.nn.Linear(8, 24)" in before
+    names: dict[str, Any] = {}
+    exec(before if model == "as written" else before.replace("torch.nn.Linear(8, 24)", model), names)
+
+    def distance() -> float:
+        batch = names["data"].collate([names["data"][0]])
+        return float((names["model"](batch["status"]) - batch["label_2hz"].flatten(1)).abs().mean().detach())
+
+    at_first = distance()
+    for _ in range(50):
+        exec(loop + passes, names)
+    assert distance() < 0.99 * at_first
 
 
 @pytest.mark.slow
@@ -265,6 +287,5 @@ def pairs(arguments: list[str]) -> dict[str, str]:
 
 
 def test_there_is_something_to_check() -> None:
-    assert len(PYTHON_BLOCKS) == 1
     assert len(ALL_COMMANDS) >= 60 and len(IN_PROSE) >= 40
     assert {"README.md", "docs/extend.md", "deploy/RUNBOOK.md"} <= {command.page for command in ALL_COMMANDS}
