@@ -24,6 +24,11 @@ def time_text(seconds: float) -> str:
     return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
+def time_left_text(ends_ms: float | None, now_ms: float) -> str:
+    """Of what will end then, both since 1970; None: nobody knows yet."""
+    return "?" if ends_ms is None else time_text(max(0.0, ends_ms - now_ms) / 1000.0)
+
+
 def one_line(error: BaseException) -> str:
     """What an error says, without a client's colours and line breaks."""
     try:

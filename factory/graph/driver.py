@@ -35,7 +35,7 @@ from factory.graph.plan import (
     past_from_outcome,
     tries_so_far,
 )
-from factory.graph.progress import ProgressLine, RunCounts, RunForecast, RunMetrics, RunTotals, Workload
+from factory.graph.progress import Note, ProgressLine, RunCounts, RunForecast, RunMetrics, RunTotals, Workload
 from factory.graph.steps import (
     AttemptReport,
     AttemptUnfinished,
@@ -421,12 +421,12 @@ class RunDriver:
         return self._stopping.is_set()
 
     def loop(
-        self, graph: Graph, commits: CommitQueue, metrics: RunMetrics, episodes: EpisodeScheduler | None = None
+        self, graph: Graph, commits: CommitQueue, metrics: RunMetrics, episodes: EpisodeScheduler | None, note: Note
     ) -> None:
         """Until nothing is left, or stopped and drained. Raises DiskFull once a disk is full, and MachineFailure."""
         self._graph, self._commits, self._metrics, self._episodes = graph, commits, metrics, episodes
         commits.on_commit = self._on_commit
-        with ProgressLine(len(self._plan.todo), self._forecast.left_s, doing=self._doing) as progress:
+        with ProgressLine(len(self._plan.todo), self._forecast.left_s, doing=self._doing, note=note) as progress:
             self._work_through(graph, commits, progress)
         if self.executed.uncached:
             what = f"{self.executed.uncached} prepared clips could not be kept ({self._uncached})"

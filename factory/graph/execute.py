@@ -10,9 +10,9 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from deltalake.exceptions import DeltaError
 
@@ -39,8 +39,8 @@ from factory.graph.local import (
     notes_folder,
 )
 from factory.graph.own_process import AGAIN, NEW_CLUSTERS, new_cluster_text
-from factory.graph.plan import RunPlan, RunRecords, Try, make_plan, plan_after_crash, read_crash, retry_policy
-from factory.graph.progress import RunMetrics, RunTotals
+from factory.graph.plan import RunPlan, RunRecords, make_plan, plan_after_crash, read_crash, retry_policy
+from factory.graph.progress import Outlook, RunMetrics, RunTotals
 from factory.graph.steps import NotReady, Work
 from factory.readers.base import ClipRef
 from factory.store.funnel import Funnel, funnel_of
@@ -235,14 +235,35 @@ class _Run:
 
     def _loop(self, graph: Graph) -> None:
         store, how, episodes = self._store, self._how, self._episodes
-        self._ended.began_ms = _write_current_run(store, self._plan, self._experts, self._rounds, how.command)
+        document = self._current_run()
+        self._ended.began_ms = document["began_ms"]
+
+        def note(outlook: Outlook) -> None:
+            with suppress(OSError):  # for people, and again in some seconds; a commit to the same place says it
+                store.location.write(CURRENT_RUN, (json.dumps(document | asdict(outlook), indent=1) + "\n").encode())
+
+        note(Outlook(self._ended.began_ms))
         metrics = RunMetrics(graph.record_metric, store.location)
         with calling_on_stop_signal(self._driver.stop_soon), _stop_after(self._driver.stop, how.minutes):
             if episodes is not None:
                 episodes.start(graph)
-            self._driver.loop(graph, CommitQueue(graph, store, how.shard_bytes, how.shard_seconds), metrics, episodes)
+            commits = CommitQueue(graph, store, how.shard_bytes, how.shard_seconds)
+            self._driver.loop(graph, commits, metrics, episodes, note)
             if episodes is not None:
                 episodes.remove_outdated()
+
+    def _current_run(self) -> dict[str, Any]:
+        """current_run.json: what the run has before it, for who watches; the beginning."""
+        plan, command = self._plan, self._how.command
+        return {
+            "began_ms": int(time.time() * 1000),
+            "clips": len(plan.todo) + len(plan.done),
+            "clips_left": len(plan.todo),
+            "experts": list(self._experts),
+            "rounds": self._rounds,
+            "folder": os.getcwd(),
+            "command": None if command is None else list(command),
+        }
 
     def _end_broken(self, message: str) -> None:
         self._ended.exit_code, self._ended.message, self._ended.is_broken = INTERRUPTED, message, True
@@ -315,31 +336,6 @@ def _attempt_counts(funnel: Funnel, experts: Sequence[str]) -> dict[str, int]:
         Kind.FAILED.value: sum(row.failed for row in rows) + broken,
         Kind.EXHAUSTED.value: sum(funnel.exhausted.get(expert, 0) for expert in experts),
     }
-
-
-def _write_current_run(
-    store: Store, plan: RunPlan, experts: Sequence[str], rounds: int, command: Sequence[str] | None
-) -> int:
-    """current_run.json: when the run began and how many walks it has before it, for who watches; the beginning."""
-    walks = [
-        step
-        for clip in plan.todo
-        for walk in clip.walks
-        if (step := clip.steps.get(walk.expert)) is None or isinstance(step, Try) or walk.needs_exhausted_row(step)
-    ]
-    began_ms = int(time.time() * 1000)
-    document = {
-        "began_ms": began_ms,
-        "clips": len(plan.todo) + len(plan.done),
-        "clips_left": len(plan.todo),
-        "walks_left": len(walks),
-        "experts": list(experts),
-        "rounds": rounds,
-        "folder": os.getcwd(),
-        "command": None if command is None else list(command),
-    }
-    store.location.write(CURRENT_RUN, (json.dumps(document, indent=1) + "\n").encode())
-    return began_ms
 
 
 def write_last_run(store: Store, summary: RunSummary) -> None:

@@ -18,10 +18,10 @@ from rich.progress import BarColumn, Progress, TextColumn
 from factory.graph.steps import AttemptReport, BatchReport, BlockReport, Failure, PrepareReport
 from factory.store.location import Location, Shard
 from factory.store.samples import Kind, Outcome
-from factory.wording import rate_text, time_text
+from factory.wording import rate_text, time_left_text, time_text
 
 LINE_EVERY_S = 15.0
-ASK_EVERY_S = 2.0  # how far long tasks are
+ASK_EVERY_S = 5.0  # when the run will end, and how far long tasks are
 
 
 @dataclass
@@ -148,8 +148,20 @@ class RunTotals:
         )
 
 
+@dataclass(frozen=True)
+class Outlook:
+    """What a run says of itself while it goes on; current_run.json holds it, for pages to say the same."""
+
+    said_ms: int = 0  # since 1970
+    ends_ms: int | None = None  # likewise; None: not known yet
+    doing: str = ""  # how far long tasks are
+
+
+Note = Callable[[Outlook], None]  # takes it every few seconds
+
+
 class ProgressLine(Bar):
-    """Shows a Tally against `total` clips."""
+    """Shows a Tally against `total` clips; `note` takes each outlook."""
 
     def __init__(
         self,
@@ -157,27 +169,28 @@ class ProgressLine(Bar):
         left_s: Callable[[float], float | None],  # seconds of the run so far -> seconds left, if that is known
         stream: TextIO | None = None,
         doing: Callable[[], str] = str,  # how far long tasks are
+        note: Note = lambda outlook: None,
     ) -> None:
         super().__init__("clips", total, stream=stream or sys.stderr)
-        self.left_s, self.doing = left_s, doing
-        self._told, self._asked = "", -math.inf
+        self.left_s, self.doing, self.note = left_s, doing, note
+        self._outlook = Outlook()
+        self._asked = -math.inf
 
     def show(self, tally: RunCounts, last: bool = False) -> None:
         """So far is the run."""
+        if last or time.monotonic() - self._asked >= ASK_EVERY_S:
+            self._asked = time.monotonic()
+            now_ms, left_s = int(time.time() * 1000), self.left_s(self._asked - self._began)
+            ends_ms = None if left_s is None else now_ms + int(1000 * left_s)
+            self._outlook = Outlook(now_ms, ends_ms, self.doing())
+            self.note(self._outlook)
         self.update(tally.clips, lambda elapsed_s: self.text(tally, elapsed_s), last)
 
     def text(self, tally: RunCounts, elapsed_s: float) -> str:
         rate = tally.clips / elapsed_s if elapsed_s > 0 else 0.0
-        left_s = self.left_s(elapsed_s)
-        left = "?" if left_s is None else time_text(left_s)
+        left = time_left_text(self._outlook.ends_ms, time.time() * 1000)
         counts = f"{tally.accepted} accepted, {tally.rejected} rejected, {tally.failed} failed"
-        return "  ".join(filter(None, [rate_text(rate, " clips"), counts, f"ETA {left}", self._long_task_text()]))
-
-    def _long_task_text(self) -> str:
-        now = time.monotonic()
-        if now - self._asked >= ASK_EVERY_S:
-            self._asked, self._told = now, self.doing()
-        return self._told
+        return "  ".join(filter(None, [rate_text(rate, " clips"), counts, f"ETA {left}", self._outlook.doing]))
 
 
 # What a run tells a monitoring system: the table of metrics, and the one place that records them.

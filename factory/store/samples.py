@@ -355,6 +355,7 @@ def _outcome_codes(
 
 
 OnChange = Literal["stop", "keep", "redo"]
+QUIET_S = 900.0  # a run that said it began and was not heard of for so long is taken for gone
 RUN_FILE = "run.json"
 CURRENT_RUN = "current_run.json"  # what the newest run set out to do; over once last_run.json has its began_ms
 LAST_RUN = "last_run.json"
@@ -389,6 +390,32 @@ def refuse_other_schema(out: Location) -> None:
         return
     if other := why_other_schema(out.uri, version):
         raise OtherSchema(other)
+
+
+class NewestRun:
+    """What the newest run set out to do (current_run.json), and what the last that ended did (last_run.json)."""
+
+    def __init__(self, current: bytes | None, last: bytes | None) -> None:
+        self.current, self.last = _fields_of(current), _fields_of(last)
+
+    @property
+    def goes_on(self) -> bool:
+        """It has begun and nothing tells its end: neither its own, nor that of a later one which never began."""
+        began, ended = self.current.get("began_ms", 0), self.last
+        stopped_later = not ended.get("began_ms") and ended.get("ended_ms", 0) >= began
+        return bool(began) and began != ended.get("began_ms") and not stopped_later
+
+    def heard_s_ago(self, committed_ms: int, now_s: float) -> float:
+        """Since it began, last said how far it is, or committed something."""
+        return now_s - max(committed_ms, self.current.get("began_ms", 0), self.current.get("said_ms", 0)) / 1e3
+
+
+def _fields_of(data: bytes | None) -> dict[str, Any]:
+    """Of a file for people; none where it is damaged, which verify names."""
+    try:
+        return dict(json.loads(data or b"{}"))
+    except (ValueError, TypeError):
+        return {}
 
 
 class Store:
@@ -521,12 +548,14 @@ class Store:
         except (ValueError, KeyError, TypeError) as error:
             raise ChangedRun(f"{self.location.uri}/{RUN_FILE}: not readable: {error}") from error
 
-    def began_ms(self, ended: bool = False) -> int:
-        """When the newest run began, since 1970; ended: when that which ended last did. 0 where nothing says so."""
-        try:
-            return int(json.loads(self.location.read(LAST_RUN if ended else CURRENT_RUN) or b"{}").get("began_ms", 0))
-        except (ValueError, TypeError, AttributeError):  # damaged: it is for people, and verify names it
-            return 0
+    def last_commit_ms(self) -> int:
+        """Of any table, since 1970; 0: nothing was committed."""
+        files = (file for table in self.tables for file in table.file_facts().values())
+        return max((file.written_ms for file in files), default=0)
+
+    def newest_run(self) -> NewestRun:
+        """As its files say it."""
+        return NewestRun(*(self.location.read(name) for name in (CURRENT_RUN, LAST_RUN)))
 
     def history(self, identity: RunIdentity, expert_digests: Mapping[str, str]) -> History:
         """Everything the tables know, samples winning over outcomes of the same attempt."""

@@ -33,7 +33,7 @@ from factory.store.location import (
     raising_damaged_file,
     write_shard,
 )
-from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, ChangedRun, Store
+from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, QUIET_S, ChangedRun, Store
 from factory.store.table import (
     COPIES,
     LOG,
@@ -247,7 +247,6 @@ def _damaged_episodes(store: Store) -> list[DamagedPart]:
 TEMPORARY = re.compile(r"(.*/)?(\..*\.tmp|\.trial-[0-9a-f]+|_commit_.*\.tmp|.*\.draft)")
 FULL_BYTES = 128 * 2**20  # of a shard, as a run closes it
 SMALL = 0.5  # of that: shards below are merged
-QUIET_S = 900.0  # a run that said it began and has committed nothing for so long is taken for gone
 
 
 class RunInProgress(RuntimeError):
@@ -274,10 +273,9 @@ def claim_for_upkeep(store: Store) -> None:
 
 def refuse_while_running(store: Store) -> None:
     """Raises RunGoesOn where a run has begun, not ended, and done something lately."""
-    current, last = store.began_ms(), store.began_ms(ended=True)
-    written = (file.written_ms for table in store.tables for file in table.file_facts().values())
-    quiet_s = time.time() - max([current, *written]) / 1e3
-    if current and current != last and quiet_s < QUIET_S:
+    run = store.newest_run()
+    quiet_s = run.heard_s_ago(store.last_commit_ms(), time.time())
+    if run.goes_on and quiet_s < QUIET_S:
         raise RunInProgress(
             f"{store.location.uri}: a run is writing here; wait until it has ended. "
             f"If it was killed, give its command again, or wait {(QUIET_S - quiet_s) / 60:.0f} minutes"

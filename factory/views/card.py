@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from factory import __version__
 from factory.store.funnel import Funnel, funnel_of_tables, funnel_tables
-from factory.store.samples import CURRENT_RUN, Kind, Store
+from factory.store.samples import Kind, Store
 from factory.store.schema import SCHEMA_VERSION
 from factory.store.table import text_codes
 from factory.views.status import STATUS, value_counts
@@ -107,7 +107,7 @@ def _sources_section(samples: pa.Table) -> Iterator[str]:
 def _settings_section(store: Store) -> Iterator[str]:
     record = _newest_run_record(store)
     told = json.loads(store.location.read("report.json") or b"{}").get("facts", {})
-    command = json.loads(store.location.read(CURRENT_RUN) or b"{}").get("command")
+    command = store.newest_run().current.get("command")
     yield "\n## How it was made\n"
     yield f"driving-data-factory {__version__}, settings `{record['settings_hash']}`."
     if command is not None:
@@ -193,11 +193,10 @@ def _newest_run_record(store: Store) -> dict[str, Any]:
 
 def _state(store: Store) -> str:
     """How the newest run ended, in words; one that nothing has ended was killed or still goes on."""
-    last = json.loads(store.location.read("last_run.json") or b"{}")
-    current = json.loads(store.location.read(CURRENT_RUN) or b"{}")
-    if last.get("began_ms") != current.get("began_ms"):
+    run = store.newest_run()
+    if run.goes_on:
         return "not finished: the same command goes on"
-    return STATUS.get(last.get("exit_code", -1), ("not finished", ""))[0]
+    return STATUS.get(run.last.get("exit_code", -1), ("not finished", ""))[0]
 
 
 def _orphans(store: Store) -> int:

@@ -36,6 +36,12 @@ AGENT_COLOURS: dict[str, Colour] = {
     AgentKind.BICYCLE: (120, 90, 180),
 }
 OBJECT: Colour = (150, 150, 130)
+BEV_LEGEND: Mapping[str, Colour] = (  # of a sample from above: everything that is drawn
+    {"logged": LOGGED, "perturbed": PERTURBED, "expert": EXPERT, "ego": EGO}
+    | {kind.lower(): colour for kind, colour in AGENT_COLOURS.items()}
+    | {"object": OBJECT, "red light": RED_LIGHT, "road": ROAD, "lane edge": LANE_EDGE}
+    | {"route": ROUTE, "crossing": CROSSING}
+)
 _SHIFT = 4  # OpenCV draws at 1/16 pixel with this many fractional bits
 
 

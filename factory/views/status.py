@@ -1,6 +1,5 @@
 """How a run stands, from its tables: its store, what is in it, what failed."""
 
-import json
 import os
 import shlex
 import time
@@ -11,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 from factory.config.arguments import Refused
 from factory.exits import EXIT_CODE_TEXT
-from factory.wording import one_line
+from factory.wording import one_line, time_left_text, time_text
 from tasks.subscores import RECORDS
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from factory.store.location import Location
-    from factory.store.samples import Store
+    from factory.store.samples import NewestRun, Store
     from factory.store.table import KeyedTable
 
 RETRY = {
@@ -114,11 +113,15 @@ def _long_running_tasks(store: "Store") -> Iterable[str]:
 
 
 def _last_run(store: "Store") -> Iterable[str]:
-    data = store.location.read("last_run.json")
-    if data is None:
-        yield "newest run    did not finish; run the same command again to go on"
+    newest = store.newest_run()
+    if newest.goes_on or not newest.last:
+        committed_ms, now_s = store.last_commit_ms(), time.time()
+        word, _ = run_state(newest, committed_ms, now_s)
+        left = time_left_text(newest.current.get("ends_ms"), now_s * 1000)
+        heard = f"{word}, last heard of {time_text(newest.heard_s_ago(committed_ms, now_s))} ago"
+        yield f"newest run    {heard}: " + (f"ETA {left}" if word == RUNNING else QUIET)
         return
-    run = json.loads(data)
+    run = newest.last
     yield f"newest run    exit code {run['exit_code']}: {EXIT_CODE_TEXT[run['exit_code']]}"
     executed = ", ".join(f"{name} {count}" for name, count in run["executed"].items())
     yield f"executed      {executed}"
@@ -198,6 +201,19 @@ STATUS = {  # exit code -> words, tone
     3: ("complete, with failed attempts", "warn"),
     4: ("interrupted: the same command goes on", "warn"),
 }
+RUNNING = "running"
+QUIET = "it did not finish, or is at one long task; if it is gone, the same command goes on"
+
+
+def run_state(run: "NewestRun", committed_ms: int, now_s: float) -> tuple[str, str]:
+    """Word and tone of the newest run: of one that goes on, or of how the last one ended, never both."""
+    from factory.store.samples import QUIET_S
+
+    if not run.goes_on:
+        return STATUS.get(run.last.get("exit_code", -1), ("run status unknown", "warn"))
+    quiet = run.heard_s_ago(committed_ms, now_s) > QUIET_S
+    return ("quiet", "warn") if quiet else (RUNNING, "live")
+
 
 REASON_WORDS = {
     **{record.name: record.wrong for record in RECORDS},

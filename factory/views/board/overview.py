@@ -6,7 +6,6 @@ A share or a time that is not defined is null; names end in their unit, `_ms` is
 import threading
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -19,15 +18,15 @@ from factory.store.samples import Kind
 from factory.store.schema import TableSpec
 from factory.store.table import KeyedTable, text_equals
 from factory.views.board.gallery import FILTERS
-from factory.views.board.watch import Snapshot, decode_dictionaries
-from factory.views.status import GATE_WORDS, PAPER_CLIP_PERCENT, REASON_WORDS, STATUS, value_counts
+from factory.views.board.watch import Snapshot
+from factory.views.pictures import BEV_LEGEND
+from factory.views.status import GATE_WORDS, PAPER_CLIP_PERCENT, QUIET, REASON_WORDS, RUNNING, run_state, value_counts
+from factory.wording import time_left_text, time_text
 from tasks.stages import STAGES
 
-QUIET_S = 900.0  # a run that commits nothing for so long is said to be quiet
 N_BUCKETS = 60
 BINS = (40, 24)  # along, aside
 REACH_M = (20.0, 2.0)  # where run.json does not say: the paper's
-WALK = ["clip_id", "expert", "candidate_index"]
 STEPS = {
     "clip": "the clip was read",
     "perturb": "the perturbation held",
@@ -47,6 +46,7 @@ def overview(shot: Snapshot, where: str, now_s: float) -> Json:
     simulated = [row for row in funnel.rows if row.simulated]
     failed = shot.outcomes.filter(pa.array(text_equals(shot.outcomes["kind"], Kind.FAILED.value)))
     stage_times, of = _stage_times(shot)
+    last = shot.run.last
     before = Counter(funnel.clip_outcomes) + Counter(funnel.clips_without_candidates)
     return {
         "version": shot.version,
@@ -66,37 +66,38 @@ def overview(shot: Snapshot, where: str, now_s: float) -> Json:
             "sample_bytes": shot.sample_bytes,
         },
         "facts": _facts(shot),
-        "notes": [*([shot.last["message"]] if shot.last.get("message") else []), *shot.last.get("notes", [])],
+        "notes": [] if shot.run.goes_on else [*filter(None, [last.get("message")]), *last.get("notes", [])],
         "steps": _steps(funnel),
         "acceptance": _acceptance(funnel),
         "exhausted": funnel.exhausted,  # expert -> walks at the end of their candidates
         "reasons": _reasons(funnel),
         "clip_reasons": [_reason(name, count) for name, count in before.most_common()],
         "gates": [_reason(gate, count, words=GATE_WORDS) for gate, count in funnel.gates.items()],
-        "balance": [asdict(one) for one in funnel.balance.stages],  # planned = accepted + rejected + failed + pending
-        "planned": funnel.balance.samples,  # the same of all samples
+        "planned": funnel.balance.samples,  # samples: planned = accepted + rejected + failed + pending
         "throughput": _throughput(shot, now_s),
         "stage_times": stage_times,  # worker seconds
         "stage_times_of": of,  # what they are measured on
         "coverage": _coverage(shot),
         "failed_kinds": dict(Counter(value_counts(failed["error_kind"])).most_common()),
+        "legend": {name: f"rgb{colour}" for name, colour in BEV_LEGEND.items()},
         "facets": {name: sorted(map(str, value_counts(shot.samples[name]))) for name in FILTERS},
     }
 
 
 def _state(shot: Snapshot, now_s: float) -> Json:
-    """How the newest run goes; tone: good, warn, bad or live."""
-    word, tone, detail = *STATUS.get(shot.last.get("exit_code", -1), ("run status unknown", "warn")), ""
-    if shot.live:
-        word, tone = "running", "live"
-        if _is_quiet(shot, now_s):
-            word, tone = "quiet", "warn"
-            detail = "nothing was committed for a while: a long reconstruction, or the run is gone; then run it again"
-    return {"word": word, "tone": tone, "live": shot.live, "detail": detail, "last_commit_ms": shot.last_commit_ms}
-
-
-def _is_quiet(shot: Snapshot, now_s: float) -> bool:
-    return now_s - max(shot.last_commit_ms, shot.current.get("began_ms", 0)) / 1000.0 > QUIET_S
+    """How the newest run goes; tone: good, warn or live; left: as its terminal says it."""
+    run, (word, tone) = shot.run, run_state(shot.run, shot.last_commit_ms, now_s)
+    running, last = word == RUNNING, run.last
+    took_ms = 0 if run.goes_on or not last.get("began_ms") else last.get("ended_ms", 0) - last["began_ms"]
+    return {
+        "word": word,
+        "tone": tone,
+        "live": run.goes_on,
+        "detail": run.current.get("doing", "") if running else QUIET if run.goes_on else "",
+        "left": time_left_text(run.current.get("ends_ms"), now_s * 1000) if running else None,
+        "took": time_text(took_ms / 1000.0) if took_ms > 0 else None,
+        "last_commit_ms": shot.last_commit_ms,
+    }
 
 
 def _facts(shot: Snapshot) -> dict[str, str]:
@@ -134,7 +135,7 @@ def _acceptance(funnel: Funnel) -> list[Json]:
     found = []
     for row in funnel.rows:
         published = PAPER_CLIP_PERCENT.get(row.expert, ())
-        named = ("expert", "round", "tried", "accepted", "rejected", "failed", "clips", "clips_before")
+        named = ("expert", "round", "simulated", "tried", "accepted", "rejected", "failed", "clips", "clips_before")
         rates = {name: getattr(row, name) for name in ("attempt_rate", "first_try_rate", "clip_rate")}
         found.append(
             {name: getattr(row, name) for name in named}
@@ -166,20 +167,19 @@ def _reasons(funnel: Funnel) -> list[Json]:
 
 
 def _throughput(shot: Snapshot, now_s: float) -> Json:
-    """Rows by the time of their commit, in buckets; of a live run also the walks that ended since it began."""
+    """Rows by the time of their commit, in buckets."""
     samples = shot.samples["_written_ms"].to_numpy()
     others = shot.outcomes["_written_ms"].to_numpy()
-    began = shot.current.get("began_ms", 0)
+    began = shot.run.current.get("began_ms", 0)
     times = np.concatenate([samples, others])
     times = times[times >= began]
     start = began or int(times.min(initial=int(now_s * 1000)))
-    end = int(now_s * 1000) if shot.live else int(times.max(initial=start))
+    end = int(now_s * 1000) if shot.run.goes_on else int(times.max(initial=start))
     width = max(1.0, (end - start) / 1000.0 / N_BUCKETS)
     edges = start + 1000.0 * width * np.arange(N_BUCKETS + 1)
     edges[-1] += 1.0
     made = int((samples >= start).sum())
     hours = (end - start) / 3.6e6
-    done, walks, eta = _walk_progress(shot, began, (end - start) / 1000.0) if shot.live else (None, None, None)
     return {
         "began_ms": start,
         "ended_ms": end,
@@ -187,35 +187,15 @@ def _throughput(shot: Snapshot, now_s: float) -> Json:
         "samples": np.histogram(samples, edges)[0].tolist(),
         "attempts": np.histogram(times, edges)[0].tolist(),
         "samples_per_hour": made / hours if hours > 0 else None,
-        "walks_done": done,  # (clip, expert)
-        "walks": walks,
-        "eta_s": None if _is_quiet(shot, now_s) else eta,
     }
 
 
-def _walk_progress(shot: Snapshot, began_ms: int, elapsed_s: float) -> tuple[int, int, float | None]:
-    """Walks that ended since the run began, these and those still pending, and the seconds left at this rate."""
-    rounds, experts = shot.current["rounds"], shot.current["experts"]
-    samples, outcomes = (
-        decode_dictionaries(rows.filter(pc.greater_equal(rows["_written_ms"], began_ms)).select(columns))
-        for rows, columns in ((shot.samples, [*WALK, "round"]), (shot.outcomes, [*WALK, "kind"]))
-    )
-    once = pc.less(samples["candidate_index"], 0)
-    last = samples.filter(pc.or_(once, pc.greater_equal(samples["round"], rounds - 1)))
-    ended = set(zip(last["clip_id"].to_pylist(), last["expert"].to_pylist()))
-    stands = pc.is_in(outcomes["kind"], value_set=pa.array([Kind.EXHAUSTED.value, Kind.FAILED.value]))
-    last = outcomes.filter(pc.or_(stands, pc.less(outcomes["candidate_index"], 0)))  # of a whole clip it is -1 too
-    for clip_id, expert in zip(last["clip_id"].to_pylist(), last["expert"].to_pylist()):
-        ended |= {(clip_id, name) for name in ([expert] if expert else experts)}
-    walks = len(ended) + shot.funnel.balance.walks_pending
-    return len(ended), walks, (walks - len(ended)) * elapsed_s / len(ended) if ended else None
-
-
 def _stage_times(shot: Snapshot) -> tuple[list[Json], str]:
-    if shot.live or not shot.last.get("seconds"):
+    spent = shot.run.last.get("seconds")
+    if shot.run.goes_on or not spent:
         times = [{"stage": stage, "tasks": n, "seconds": seconds} for stage, (n, seconds) in shot.seconds.items()]
         return times, "the attempts that were turned down so far (accepted ones are timed when the run ends)"
-    return [{"stage": stage, **spent} for stage, spent in shot.last["seconds"].items()], "the newest run, all workers"
+    return [{"stage": stage, **times} for stage, times in spent.items()], "the newest run, all workers"
 
 
 def _coverage(shot: Snapshot) -> Json:

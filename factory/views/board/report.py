@@ -86,7 +86,7 @@ def write_facts(store: Store, assembled: "Run") -> None:
 def report_page(store: Store, shot: Snapshot, pictures: Pictures, extra: Mapping[str, Any]) -> bytes:
     """The file.
 
-    extra: what the live page does not show: facts, settings, left_out (static/extra.js reads it).
+    extra: what the live page does not show: facts, settings, left_out.
     """
     looks = gallery(shot, {"simulated": "1"}, 1, N_LOOKS)
     items = [gallery_card(shot, row) for row in _shown(shot, [item["attempt_id"] for item in looks["items"]])]

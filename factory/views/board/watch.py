@@ -8,7 +8,6 @@ attempt of the newest group may be missing, and one that failed and then succeed
 knows to count once; the next look sees the whole group.
 """
 
-import json
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,7 +21,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from factory.store import funnel
-from factory.store.samples import CURRENT_RUN, PLANS, Store
+from factory.store.samples import CURRENT_RUN, LAST_RUN, PLANS, RUN_FILE, NewestRun, Store
 from factory.store.table import KeyedTable, LiveFile, pack_small, packed_tables
 from tasks.world.arrays import F32, Ints
 
@@ -164,23 +163,12 @@ class Snapshot:
     sample_paths: Sequence[str]  # by _file
     candidate_paths: Sequence[str]
     sample_bytes: int
+    last_commit_ms: int  # of these three, since 1970; 0: none
     seconds: Mapping[str, tuple[int, float]]  # stage -> attempts, seconds: of rejected attempts
     end_points: Sequence[Points]  # each (N, 2) x, y [m], of all candidates, frame of the logged pose at T+H
     accepted_points: Sequence[Points]  # likewise, of those that became samples
     runs: Sequence[Mapping[str, Any]]  # records of run.json, oldest first
-    last: Mapping[str, Any]  # last_run.json, empty where there is none
-    current: Mapping[str, Any]  # current_run.json, likewise
-
-    @property
-    def last_commit_ms(self) -> int:
-        """Of rows, since 1970; 0: none."""
-        newest = [pc.max(t["_written_ms"]).as_py() for t in (self.samples, self.outcomes, self.candidates)]
-        return max((ms for ms in newest if ms is not None), default=0)
-
-    @property
-    def live(self) -> bool:
-        """A run was announced that has not told how it ended."""
-        return bool(self.current) and self.current["began_ms"] != self.last.get("began_ms")
+    run: NewestRun
 
     @cached_property
     def funnel(self) -> funnel.Funnel:
@@ -226,7 +214,7 @@ class Watch:
     def _new_snapshot(self, known: Snapshot | None) -> Snapshot:
         tables = (self._outcomes, self._samples, self._candidates)
         changed = [table.refresh() for table in tables]
-        run_files = tuple(self.store.location.read(name) for name in ("run.json", "last_run.json", CURRENT_RUN))
+        run_files = tuple(self.store.location.read(name) for name in (RUN_FILE, CURRENT_RUN, LAST_RUN))
         if known is not None and not any(changed) and run_files == self._run_files:
             return known
         self._run_files = run_files
@@ -242,12 +230,12 @@ class Watch:
             sample_paths=tuple(self._samples.paths),
             candidate_paths=tuple(self._candidates.paths),
             sample_bytes=sum(file.n_bytes for file in self._samples.files.values()),
+            last_commit_ms=max((file.written_ms for t in tables for file in t.files.values()), default=0),
             seconds=_summed([part.seconds for part in self._outcomes.parts.values()]),
             end_points=[part.end_points for part in self._candidates.parts.values()],
             accepted_points=[part.end_points for part in self._samples.parts.values()],
             runs=self.store.runs(),
-            last=json.loads(run_files[1] or b"{}"),
-            current=json.loads(run_files[2] or b"{}"),
+            run=NewestRun(*run_files[1:]),
         )
 
 

@@ -24,10 +24,11 @@ def test_without_a_terminal_there_is_one_plain_line_at_the_end() -> None:
 
 
 def test_rate_and_time_left_are_told() -> None:
-    progress = ProgressLine(10, lambda elapsed_s: 4.0 * elapsed_s if elapsed_s > 1.0 else None, io.StringIO())
+    progress = ProgressLine(10, lambda elapsed_s: 16.2, io.StringIO())
+    assert progress.text(RunCounts(), elapsed_s=0.5).endswith("ETA ?")
+    progress.show(RunCounts(clips=2))
     assert progress.text(RunCounts(clips=2), elapsed_s=4.0).startswith("30.00 clips/min")
     assert progress.text(RunCounts(clips=2), elapsed_s=4.0).endswith("ETA 16 s")
-    assert progress.text(RunCounts(), elapsed_s=0.5).endswith("ETA ?")
 
 
 def test_the_line_ends_with_how_far_long_tasks_are() -> None:

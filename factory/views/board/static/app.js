@@ -30,9 +30,9 @@ async function show({ quiet = false } = {}) {
     content = [h("section", { class: "error" }, h("h2", null, "This cannot be shown"), h("p", null, error.message), h("p", null, h("a", { href: "#/" }, "To the overview")))];
   }
   if (mine !== asked) return;
-  const open = [...main.querySelectorAll("details")].map((d) => d.open);
+  const open = [...main.querySelectorAll("details[open]")].map((d) => d.dataset.fold);
   main.replaceChildren(...content.filter(Boolean));
-  if (quiet) main.querySelectorAll("details").forEach((d, i) => (d.open = open[i] ?? false));
+  if (quiet) main.querySelectorAll("details").forEach((d) => (d.open = open.includes(d.dataset.fold)));
   else scrollTo(0, 0);
   main.classList.remove("waiting");
   main.dataset.ready = location.hash || "#/";

@@ -47,7 +47,7 @@ export function heat(title, cells, reachAlong, reachAside, kind) {
     marks.push(s("text", { x: left - 5, y: y + 4, "text-anchor": "end" }, sign(part * reachAside)));
   }
   const total = cells.flat().reduce((a, b) => a + b, 0);
-  const caption = h("figcaption", null, h("b", null, title), ` ${count(total)}, at most ${count(most)} in a cell`);
+  const caption = h("figcaption", { class: "keys" }, h("i", { class: `key ${kind}` }), h("b", null, title), ` ${count(total)}, at most ${count(most)} in a cell`);
   return h("figure", { class: "heat" }, s("svg", { viewBox: `0 0 ${left + width + 8} ${top + height + foot}`, role: "img", "aria-label": title }, marks), caption);
 }
 

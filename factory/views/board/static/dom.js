@@ -68,10 +68,19 @@ export async function ask(path) {
 export const section = (title, lead, ...content) =>
   h("section", null, h("h2", null, title), lead ? h("p", { class: "lead" }, lead) : null, ...content);
 
+export const fold = (title, fact, ...content) =>
+  h("details", { "data-fold": title }, h("summary", null, title, h("span", { class: "dim" }, fact)), ...content);
+
+// Everything that a picture from above draws, in the colours it is drawn in.
+export const legend = (o) =>
+  h("p", { class: "keys" }, Object.entries(o.legend).map(([name, background]) => h("span", null, h("i", { class: "key", style: { background } }), name)));
+
+export const listed = (name, rows) => table(name, ["what", "why"], Object.entries(rows).map(([k, v]) => h("tr", null, h("th", { scope: "row" }, k), h("td", null, v))));
+
 // A title that ends in * is of a column that a narrow screen leaves out; its cells have the class roomy.
 export function table(name, head, rows) {
   const titled = (title) => h("th", { scope: "col", class: title.endsWith("*") ? "roomy" : null }, title.replace("*", ""));
-  const top = h("thead", null, h("tr", null, head.map(titled)));
+  const top = head.some(Boolean) ? h("thead", null, h("tr", null, head.map(titled))) : null;
   return h("div", { class: "wide" }, h("table", { class: name }, top, h("tbody", null, rows)));
 }
 

@@ -1,6 +1,6 @@
 // Samples as cards, by page, with filters that stand in the address.
 
-import { ask, count, h, picture, plural, score, still } from "./dom.js";
+import { ask, count, h, legend, picture, plural, score, still } from "./dom.js";
 
 const FILTERS = { expert: "expert", round: "round", image_source: "images", command: "command", log_id: "log" };
 const ORDERS = { newest: "newest first", worst: "lowest score first", best: "highest score first" };
@@ -8,7 +8,7 @@ const ORDERS = { newest: "newest first", worst: "lowest score first", best: "hig
 export function card(item) {
   const front = item.image_source === "none" ? null : picture(item, "front.jpg", "front camera");
   const bev = picture(item, "bev.jpg", "from above: logged grey, perturbed orange, expert blue");
-  const words = [h("b", null, item.expert), ` round ${item.round}, ${item.command} `, h("span", { class: "score" }, score(item.stage2_score)),
+  const words = [h("b", null, item.expert), ` round ${item.round}, ${item.command} `, h("span", { class: "score", title: "of the expert's drive" }, `EPDMS ${score(item.stage2_score)}`),
     h("small", null, `${item.log_id}`)];
   return h("a", { class: "card", href: `#/sample/${item.attempt_id}`, "data-id": item.attempt_id },
     h("span", { class: `views${front ? "" : " alone"}` }, front, bev), h("span", { class: "words" }, words));
@@ -32,8 +32,7 @@ export async function galleryPage(query) {
     h("a", { class: `button${page.page > 1 ? "" : " off"}`, href: page.page > 1 ? address({ page: String(page.page - 1) }) : null, "data-go": "back" }, "← back"),
     h("span", { id: "total" }, `${plural(page.total, "sample")}, page ${count(page.page)} of ${count(page.pages)}`),
     h("a", { class: `button${page.page < page.pages ? "" : " off"}`, href: page.page < page.pages ? address({ page: String(page.page + 1) }) : null, "data-go": "on" }, "on →"));
-  const key = h("p", { class: "keys" }, h("span", null, h("i", { class: "key logged" }), "logged"), h("span", null, h("i", { class: "key perturbed" }), "perturbed"),
-    h("span", null, h("i", { class: "key expert" }), "expert"), h("span", null, h("i", { class: "key ego" }), "ego"), h("span", null, h("b", { class: "score" }, "1.000"), "EPDMS of the expert's drive"));
+  const key = legend(overview);
   const cards = page.items.length ? h("div", { class: "cards" }, page.items.map(card)) : h("p", { class: "nothing" }, "No sample fits.");
   if (still) {
     const some = h("p", { class: "lead", id: "total" }, `${count(page.items.length)} of ${plural(page.total, "sample")}: the newest, and some as unlike each other as can be.`);

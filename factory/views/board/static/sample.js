@@ -1,10 +1,11 @@
 // One sample: its cameras, its drive from above, its scores, where it comes from, and its siblings.
 
 import { ends } from "./charts.js";
-import { address, ask, h, holds, picture, plural, score, section, still, table } from "./dom.js";
+import { address, ask, fold, h, holds, legend, picture, plural, score, section, still, table } from "./dom.js";
 
 const STEPS = 56;
 const NOW = 15;
+const SLOW_MS = 150; // a picture that takes longer is said to be loading
 const SCORES = {
   nc: "no at-fault collision", dac: "drivable area compliance", ddc: "driving direction compliance", tlc: "traffic light compliance", ep: "ego progress",
   ttc: "time to collision", lk: "lane keeping", hc: "history comfort", ec: "extended comfort", score: "EPDMS, all together",
@@ -12,7 +13,7 @@ const SCORES = {
 
 export async function samplePage(id) {
   const [w, o] = await Promise.all([ask(`/api/samples/${id}`), ask("/api/overview")]);
-  return [head(w), h("div", { class: "two" }, player(w), scores(w)), cameras(w), siblings(w, o.coverage), lineage(w)];
+  return [head(w), h("div", { class: "two" }, player(w, o), scores(w)), cameras(w), siblings(w, o.coverage), lineage(w)];
 }
 
 function head(w) {
@@ -29,18 +30,24 @@ function episode(i) {
   return h("a", { class: "button", href: `/episode/${i.attempt_id}.mcap`, download: `sample_${i.attempt_id}.mcap`, title: "for Foxglove, Lichtblick or Rerun" }, "↓ MCAP");
 }
 
-function player(w) {
+function player(w, o) {
   const at = (step) => address(w.item, "bev.jpg", `&size=600&step=${step}`);
-  const image = h("img", { src: at(NOW), alt: "the scene from above", class: "bev", width: 600, height: 600 });
-  const time = h("output", null, "0.0 s: now");
+  const image = h("img", { alt: "the scene from above", class: "bev", width: 600, height: 600 });
+  const time = h("output");
   const range = h("input", { type: "range", min: 0, max: STEPS - 1, value: NOW, "aria-label": "time" });
   const button = h("button", { type: "button", "data-go": "play" }, "▶ play");
   let timer = 0;
-  const show = () => {
+  const say = (doing) => {
     const t = (Number(range.value) - NOW) / 10;
-    image.src = at(range.value);
-    time.textContent = `${t > 0 ? "+" : ""}${t.toFixed(1)} s${t ? "" : ": now"}`;
+    time.textContent = `${t > 0 ? "+" : ""}${t.toFixed(1)} s${doing || (t ? "" : ": now")}`;
   };
+  const show = () => {
+    image.src = at(range.value);
+    say("");
+    setTimeout(() => image.complete || say(": loading"), SLOW_MS);
+  };
+  image.addEventListener("load", () => say(""));
+  image.addEventListener("error", () => say(": no picture"));
   const tick = () => {
     if (!range.isConnected) return clearInterval(timer);
     if (!image.complete) return undefined;
@@ -54,16 +61,15 @@ function player(w) {
     timer = plays ? 0 : setInterval(tick, 100);
     button.textContent = plays ? "▶ play" : "■ stop";
   });
-  const key = h("p", { class: "keys" }, h("span", null, h("i", { class: "key logged" }), "logged"), h("span", null, h("i", { class: "key perturbed" }), "perturbed, before now"),
-    h("span", null, h("i", { class: "key expert" }), "expert, from now: the label"));
-  return section("From above", "60 m from bottom to top, the ego pointing up. Now is 0 s: what led here before it, the label after it.", key, image, still ? null : h("div", { class: "player" }, button, range, time));
+  show();
+  return section("From above", "60 m from bottom to top, the ego pointing up. Now is 0 s: what led here, perturbed, before it; the expert's drive, the label, after it.", image, legend(o), still ? null : h("div", { class: "player" }, button, range, time));
 }
 
 function scores(w) {
   const cell = (value, fails) => h("td", { class: `n${value !== null && value < 1 ? " low" : ""}` }, score(value), fails === null ? null : h("small", null, `fails at ${fails.toFixed(1)} s`));
   const rows = w.scores.map((one) => h("tr", { "data-score": one.name, class: one.name === "score" ? "sum" : null },
     h("th", { scope: "row" }, SCORES[one.name] ?? one.name, h("small", null, one.name)), cell(one.stage1, one.stage1_fails_s), cell(one.stage2, one.stage2_fails_s)));
-  return section("Scores", "1 is best. The perturbation is the way to now, the drive is the label from now.", table("scores", ["", "perturbation", "drive"], rows));
+  return section("Scores", "1 is best, what is below it is orange. The perturbation is the way to now, the drive is the label from now.", table("scores", ["", "perturbation", "drive"], rows));
 }
 
 function cameras(w) {
@@ -93,11 +99,11 @@ function siblings(w, grid) {
     h("td", { class: "n" }, one.end_x_m === null ? "-" : `${one.end_x_m.toFixed(1)}, ${one.end_y_m.toFixed(2)}`),
     h("td", { class: "dim roomy" }, one.detail)));
   const lead = `The perturbations of this clip in the order in which ${w.item.expert} tried them: ${fell} were turned down. Each round goes on until one is accepted.`;
-  const key = h("p", { class: "keys" }, ["accepted", "rejected", "untried"].map((kind) => h("span", null, h("i", { class: `dot ${kind}` }), kind)));
+  const key = h("p", { class: "keys" }, [...new Set(all.map((one) => one.kind)), "this sample"].map((kind) => h("span", null, h("i", { class: `dot ${kind.replace("this sample", "here")}` }), kind)));
   return section("Siblings", lead, key, ends(all, grid.reach_along_m, grid.reach_aside_m), table("siblings", ["#", "became", "why", "ends at x, y [m]", "detail*"], rows));
 }
 
 function lineage(w) {
   const rows = Object.entries(w.lineage).map(([k, v]) => h("tr", null, h("th", { scope: "row" }, k), h("td", null, v)));
-  return section("Lineage", null, table("settings", ["", ""], rows));
+  return fold("Lineage", "what it was made from and by", table("settings", ["", ""], rows));
 }

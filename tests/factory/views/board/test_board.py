@@ -1,10 +1,13 @@
 """The dashboard's answers are what the tables hold, also while a run goes on; nothing else can be asked out of it."""
 
 import http.client
+import io
 import json
 import shutil
 import threading
+import time
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +17,11 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.config.run import load_config
+from factory.graph.progress import Outlook, ProgressLine, RunCounts
 from factory.setup.settings import assemble
 from factory.store.reader import SampleTable
-from factory.store.samples import Store
-from factory.views.board.overview import QUIET_S, overview
+from factory.store.samples import QUIET_S, Store
+from factory.views.board.overview import overview
 from factory.views.board.server import SERVED, STATIC, Board, Server
 from factory.views.board.watch import Watch
 from factory.views.pictures import crop_to_60_m, encode_image, sample_bev
@@ -27,6 +31,7 @@ from tests.factory.views.board.runs import EVIL, REFS, VIEW, counted, run, told
 
 main = COMMANDS["dashboard"].load()
 export_main = COMMANDS["export"].load()
+status_main = COMMANDS["status"].load()
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +84,7 @@ def test_the_numbers_are_those_of_the_tables_while_a_run_goes_on(tmp_path: Path)
     for tables, answer in seen:
         assert told(answer) == tables
         assert answer["state"]["live"] and answer["state"]["word"] == "running"
-        assert 0 <= answer["throughput"]["walks_done"] <= answer["throughput"]["walks"] == 6 * 3
+        assert not answer["notes"] and answer["planned"]["planned"] == 6 * (2 + 2 + 1)
     answer = get(board, "/api/overview")
     assert told(answer) == counted(tmp_path) and not answer["state"]["live"]
     run(tmp_path, 3)
@@ -98,16 +103,39 @@ def test_a_run_that_has_only_begun_is_shown(tmp_path: Path) -> None:
 def test_a_run_that_went_silent_is_said_to_be_quiet_and_to_have_no_end_in_sight(tmp_path: Path) -> None:
     run(tmp_path, 1, n=2)
     shot = Watch(Store(tmp_path)).snapshot()
-    began = shot.current["began_ms"]
-    assert shot.last["began_ms"] == began and not shot.live
+    began = shot.run.current["began_ms"]
+    assert shot.run.last["began_ms"] == began and not shot.run.goes_on
     (tmp_path / "last_run.json").unlink()
     shot = Watch(Store(tmp_path)).snapshot()
-    last_s = shot.last_commit_ms / 1000.0
+    last_s = max(shot.last_commit_ms, shot.run.current["said_ms"]) / 1000.0
     soon, late = (overview(shot, "", last_s + waited) for waited in (1.0, QUIET_S + 1.0))
     assert (soon["state"]["word"], late["state"]["word"]) == ("running", "quiet")
-    ahead = soon["throughput"]
-    assert ahead["walks_done"] == ahead["walks"] == 6 and ahead["eta_s"] == 0.0
-    assert late["throughput"]["eta_s"] is None
+    assert (soon["state"]["left"], late["state"]["left"]) == ("0 s", None) and soon["planned"]["pending"] == 0
+
+
+def test_a_run_over_a_stopped_one_is_running_and_its_time_left_is_that_of_its_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(tmp_path, 1, n=2)
+    old = json.loads((tmp_path / "last_run.json").read_text()) | {"exit_code": 4, "message": "interrupted; run again"}
+    (tmp_path / "last_run.json").write_text(json.dumps(old))
+
+    def words() -> str:
+        status_main([f"out={tmp_path}"])
+        answer = overview(Watch(Store(tmp_path)).snapshot(), "", time.time())
+        return f"{answer['state']} {answer['notes']} {capsys.readouterr().out}"
+
+    assert "interrupted" in (ended := words()) and "running" not in ended
+    told: list[Outlook] = []
+    line = ProgressLine(10, lambda elapsed_s: 3077.0, stream := io.StringIO(), note=told.append)
+    line.show(RunCounts(2), last=True)
+    begun = {"began_ms": old["began_ms"] + 1, "command": None} | asdict(told[0])
+    (tmp_path / "current_run.json").write_text(json.dumps(begun))
+    assert "interrupted" not in (going := words()) and "running" in going
+    assert "'left': '51 min'" in going and "ETA 51 min" in going and "ETA 51 min" in stream.getvalue()
+    never_began = old | {"began_ms": 0, "ended_ms": begun["began_ms"] + 1}
+    (tmp_path / "last_run.json").write_text(json.dumps(never_began))
+    assert "interrupted" in (ended := words()) and "running" not in ended
 
 
 def test_only_new_files_are_read(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,14 +4,17 @@ import re
 import shutil
 import subprocess
 import threading
+import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from factory.commands.table import COMMANDS
 from factory.store.samples import Store
-from factory.views.board.server import Board, Server
+from factory.views.board.server import Answer, Board, Server
+from factory.views.pictures import BEV_LEGEND
 from tests.factory.views.board.runs import EVIL, counted, run
 
 report_main = COMMANDS["report"].load()
@@ -22,6 +25,9 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on the PATH"),
 ]
 Dump = Callable[..., str]
+COUNTED = ("samples", "clips", "failed")
+SAY = """new MutationObserver(() => (document.body.dataset.said += ` ${document.querySelector("output")?.textContent}`))
+  .observe(document.body, { subtree: true, childList: true })"""
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +76,7 @@ def test_the_overview_shows_the_tables_also_after_more_was_committed(out: Path, 
         run(out, rounds)
         page, wanted = dump("#/"), counted(out)
         shown = tiles(page)
-        assert {name: int(shown[name]) for name in ("samples", "attempts", "clips", "failed")} == {
-            name: wanted[name] for name in ("samples", "attempts", "clips", "failed")
-        }
+        assert {name: int(shown[name]) for name in COUNTED} == {name: wanted[name] for name in COUNTED}
         totals = re.findall(r'data-reason="([^"]*)".*?</tr>', page)
         assert set(totals) == set(wanted["reasons"])
         head = r'<tr><th scope="row">(\w+)(?:<small>[^<]*</small>)?</th>'
@@ -81,6 +85,44 @@ def test_the_overview_shows_the_tables_also_after_more_was_committed(out: Path, 
         assert accepted == wanted["accepted"]
         simulated = min(6, wanted["simulated"])
         assert page.count("data-loaded") == 2 * simulated and "no picture" not in page
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_what_is_asked_first_stands_first_and_details_are_folded(out: Path, dump: Dump, width: int) -> None:
+    page = dump("#/", width)
+    titles = re.findall(r"<h2>([^<]*)</h2>", page)
+    assert titles[:3] == ["Accepted", "Why the rest was not", "What it looks like"]
+    assert page.rindex("<section>") < page.index("<details") and "<details open" not in page
+    rows = [re.sub(r"<th.*?</th>", "", row) for row in re.findall(r"<tr.*?</tr>", page)]
+    said = [re.findall(r">([^<>]+)<", row) for row in rows]
+    assert [row for row in said if row and all(re.fullmatch(r"0|0\.0\s%|0 s|-", text) for text in row)] == []
+    legend = re.findall(r'<i class="key" style="background: ([^;]*);"></i>([^<]*)', page)
+    assert {name: tuple(map(int, re.findall(r"\d+", rgb))) for rgb, name in legend} == BEV_LEGEND
+    drawn = set(re.findall(r'class="(tried|made|untried-cell|accepted-cell)"', page))
+    assert drawn and drawn <= set(re.findall(r'<i class="key ([\w-]+)"', page))
+    assert ("paper" in re.findall(r'<i class="key ([\w-]+)"', page)) or 'title="paper' not in page
+
+
+def test_the_player_says_that_its_picture_loads(out: Path, tmp_path: Path) -> None:
+    class SlowBoard(Board):
+        def answer(self, target: str) -> Answer:
+            found = super().answer(target)
+            if "bev.jpg" in target:
+                time.sleep(2.0)
+            if target == "/static/app.js":
+                return replace(found, body=found.body + SAY.encode())
+            if target == "/":  # the browser waits for a picture in the page as it comes
+                return replace(found, body=found.body.replace(b"<main", b"<img src=/picture/x/bev.jpg><main"))
+            return found
+
+    shown = Store(out).samples.read(["attempt_id"])["attempt_id"][0]
+    with Server(SlowBoard(Store(out)), "127.0.0.1", 0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_address[1]}/#/sample/{shown}"
+        options = ["--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}", "--dump-dom"]
+        page = subprocess.run([str(CHROMIUM), *options, address], capture_output=True, text=True, timeout=200).stdout
+        server.shutdown()
+    assert re.search(r'data-said="[^"]*0\.0 s: loading[^"]*"', page) and "<output>0.0 s: now</output>" in page
 
 
 def test_the_gallery_and_a_sample_show_their_pictures_and_nothing_from_data_is_markup(out: Path, dump: Dump) -> None:
@@ -105,9 +147,7 @@ def test_a_report_is_the_same_page_in_one_file(out: Path, dump: Dump) -> None:
     at, wanted = f"file://{out / 'report.html'}", counted(out)
     page = dump("#/", at=at)
     shown = tiles(page)
-    assert {name: int(shown[name]) for name in ("samples", "attempts", "clips", "failed")} == {
-        name: wanted[name] for name in ("samples", "attempts", "clips", "failed")
-    }
+    assert {name: int(shown[name]) for name in COUNTED} == {name: wanted[name] for name in COUNTED}
     assert page.count("data-loaded") == 2 * min(6, wanted["simulated"]) and "no picture" not in page
     page = dump("#/gallery", at=at)
     ids = re.findall(r'data-id="(\w+)"', page)
