@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 from deltalake.exceptions import DeltaError
 
@@ -235,14 +235,14 @@ class _Run:
 
     def _loop(self, graph: Graph) -> None:
         store, how, episodes = self._store, self._how, self._episodes
-        document = self._current_run()
-        self._ended.began_ms = document["began_ms"]
+        self._ended.began_ms = began_ms = int(time.time() * 1000)
+        document = {"began_ms": began_ms, "folder": os.getcwd(), "command": how.command and list(how.command)}
 
         def note(outlook: Outlook) -> None:
             with suppress(OSError):  # for people, and again in some seconds; a commit to the same place says it
                 store.location.write(CURRENT_RUN, (json.dumps(document | asdict(outlook), indent=1) + "\n").encode())
 
-        note(Outlook(self._ended.began_ms))
+        note(Outlook(began_ms))
         metrics = RunMetrics(graph.record_metric, store.location)
         with calling_on_stop_signal(self._driver.stop_soon), _stop_after(self._driver.stop, how.minutes):
             if episodes is not None:
@@ -251,19 +251,6 @@ class _Run:
             self._driver.loop(graph, commits, metrics, episodes, note)
             if episodes is not None:
                 episodes.remove_outdated()
-
-    def _current_run(self) -> dict[str, Any]:
-        """current_run.json: what the run has before it, for who watches; the beginning."""
-        plan, command = self._plan, self._how.command
-        return {
-            "began_ms": int(time.time() * 1000),
-            "clips": len(plan.todo) + len(plan.done),
-            "clips_left": len(plan.todo),
-            "experts": list(self._experts),
-            "rounds": self._rounds,
-            "folder": os.getcwd(),
-            "command": None if command is None else list(command),
-        }
 
     def _end_broken(self, message: str) -> None:
         self._ended.exit_code, self._ended.message, self._ended.is_broken = INTERRUPTED, message, True

@@ -176,7 +176,6 @@ class BalanceSheet:
     """All stages; none where no run wrote down its plan."""
 
     stages: tuple[Balance, ...] = ()
-    walks_pending: int = 0  # (clip, expert) with a pending sample
 
     @property
     def samples(self) -> dict[str, int]:
@@ -215,16 +214,14 @@ def balance_sheet(plans: pa.Table, attempts: Attempts, lists: pa.Table) -> Balan
         _balance(CLIP, "", -1, np.ones(len(clips), bool), read, dropped, broken),
         _balance(PERTURB, "", -1, read, read & ~empty, read & empty, np.zeros(len(clips), bool)),
     ]
-    walks_pending = 0
     for expert, wanted in sorted(rounds.items()):
         fell, broke, made = _walk_ends(attempts, expert, at, len(clips))
         fell, broke = fell | dropped, broke | broken
         pending = int(np.count_nonzero((made < wanted) & ~fell & ~broke))
-        walks_pending += pending
         found += _of_attempts(attempts, expert, at, pending)
         for number in range(int(wanted.max())):
             found.append(_balance(WRITE, expert, number, wanted > number, made > number, fell, broke))
-    return BalanceSheet(tuple(found), walks_pending)
+    return BalanceSheet(tuple(found))
 
 
 def _of_attempts(attempts: Attempts, expert: str, at: Ints, pending: int) -> list[Balance]:

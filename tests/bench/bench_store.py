@@ -101,7 +101,7 @@ def write(out: Path, attempts: int, commits: int) -> None:
             fell.append(_replaced(_outcome(), rejected))
         store.samples.commit(shards)
         store.outcomes.commit([_shard(store, OUTCOMES, pa.concat_tables(fell))])
-    told = {"began_ms": 1, "rounds": ROUNDS, "experts": list(EXPERTS), "command": None, "folder": "/"}
+    told = {"began_ms": 1, "command": None, "folder": "/"}
     last = {"began_ms": 1, "exit_code": 0, "message": "", "executed": {}, "seconds": {}, "notes": []}
     for name, document in (("current_run.json", told), ("last_run.json", last)):
         (out / name).write_text(json.dumps(document))

@@ -50,7 +50,6 @@ def overview(shot: Snapshot, where: str, now_s: float) -> Json:
     before = Counter(funnel.clip_outcomes) + Counter(funnel.clips_without_candidates)
     return {
         "version": shot.version,
-        "taken_ms": int(shot.taken_s * 1000),
         "where": where,
         "state": _state(shot, now_s),
         "counts": {
@@ -78,7 +77,6 @@ def overview(shot: Snapshot, where: str, now_s: float) -> Json:
         "stage_times": stage_times,  # worker seconds
         "stage_times_of": of,  # what they are measured on
         "coverage": _coverage(shot),
-        "failed_kinds": dict(Counter(value_counts(failed["error_kind"])).most_common()),
         "legend": {name: f"rgb{colour}" for name, colour in BEV_LEGEND.items()},
         "facets": {name: sorted(map(str, value_counts(shot.samples[name]))) for name in FILTERS},
     }

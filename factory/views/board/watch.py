@@ -155,7 +155,6 @@ class Snapshot:
     `plain`), and _file, _row, _written_ms."""
 
     version: str  # of samples, outcomes and candidates, "-" for one that is not there yet
-    taken_s: float  # since 1970
     samples: pa.Table
     outcomes: pa.Table
     candidates: pa.Table
@@ -222,7 +221,6 @@ class Watch:
         self._plans = self.store.plans.read()
         return Snapshot(
             version=".".join("-" if t.table.version is None else str(t.table.version) for t in tables),
-            taken_s=time.time(),
             samples=self._samples.rows(),
             outcomes=self._outcomes.rows(),
             candidates=self._candidates.rows(),

@@ -1,30 +1,16 @@
 """Pictures of samples; sides are words: nobody has to know that y points left."""
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
 from factory.store.reader import SampleTable, decode_stored_image
 from factory.store.samples import Store
-from factory.views.pictures import (
-    BACKGROUND,
-    BEV_LEGEND,
-    EXPERT,
-    LANE_EDGE,
-    LOGGED,
-    PERTURBED,
-    Boxes,
-    DrawnPath,
-    MapShapes,
-    draw_bev,
-    encode_image,
-    letterboxed,
-    sample_sheet,
-)
+from factory.views import pictures
+from factory.views.pictures import BACKGROUND, BEV_LEGEND, LANE_EDGE, encode_image, letterboxed, sample_sheet
 from factory.views.rendered_again import ASIDE_M, _yaw_to_the_right
 from factory.views.status import side_text, turn_text
-from tasks.world.arrays import Array
-from tasks.world.clip import AgentKind
 from tasks.world.frames import to_local
 from tests.factory.toy import ToyWork, executed, refs
 
@@ -58,18 +44,14 @@ def test_a_picture_keeps_its_aspect_and_survives_coding() -> None:
 
 
 def test_every_colour_that_is_drawn_from_above_has_a_legend() -> None:
-    def square(x: float, y: float) -> Array:
-        return np.array([[x, y], [x + 6.0, y], [x + 6.0, y + 6.0], [x, y + 6.0]])
-
-    rings = [[square(20.0, 8.0 * i)] for i in range(-2, 3)]
-    kinds = [*AgentKind, "cone"]
-    boxes = Boxes(np.array([[-10.0, 8.0 * i, 0.0, 4.0, 4.0] for i in range(len(kinds))]), kinds)
-    here, way = np.zeros(3), np.array([[0.0, 0.0], [0.0, -12.0]])
-    paths = [DrawnPath(way + 6.0 * i, c, "", width_px=12) for i, c in enumerate((LOGGED, PERTURBED, EXPERT))]
-    colours, counts = np.unique(
-        draw_bev(here, MapShapes(*rings), boxes, here, paths).reshape(-1, 3), axis=0, return_counts=True
-    )
-    drawn = {tuple(map(int, colour)) for colour, n in zip(colours, counts) if n > 400}  # fewer: where edges blend
+    here, square = np.zeros(3), 6.0 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    shapes = pictures.MapShapes(*([square + np.array([20.0, 8.0 * i])] for i in range(-2, 3)))
+    kinds = [*pictures.AGENT_COLOURS, "cone"]
+    boxes = pictures.Boxes(np.array([[-10.0, 8.0 * i, 0.0, 4.0, 4.0] for i in range(len(kinds))]), kinds)
+    colours = (pictures.LOGGED, pictures.PERTURBED, pictures.EXPERT)
+    paths = [pictures.DrawnPath(square[:2] + 9.0 * i, c, "", width_px=20) for i, c in enumerate(colours)]
+    pixels = pictures.draw_bev(here, shapes, boxes, here, paths).reshape(-1, 3).tolist()
+    drawn = {colour for colour, n in Counter(map(tuple, pixels)).items() if n > 400}  # fewer: where edges blend
     assert drawn == {*BEV_LEGEND.values(), BACKGROUND} - {LANE_EDGE}, "its lines of one pixel are all edges"
 
 

@@ -134,7 +134,7 @@ function coverage(o) {
 
 function gates(o) {
   const most = Math.max(1, ...o.gates.map((g) => g.total));
-  const rows = o.gates.map((g) => h("tr", null, reason(g), h("td", null, bar(g.total / most, count(g.total)))));
+  const rows = o.gates.filter((g) => g.total).map((g) => h("tr", null, reason(g), h("td", null, bar(g.total / most, count(g.total)))));
   return rows.length ? fold("Perturbation gates", "what was dropped before any attempt",
     h("p", { class: "lead" }, `Vocabulary trajectories dropped, summed over ${count(o.counts.clips)} clips; ${count(o.counts.candidates)} became candidates. One trajectory may fall to several gates.`),
     table("gates", ["gate", "dropped"], rows)) : null;

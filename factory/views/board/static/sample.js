@@ -92,7 +92,7 @@ function siblings(w, grid) {
   const all = w.siblings.map((one) => ({ ...one, here: one.attempt_id === w.item.attempt_id }));
   if (w.item.candidate_index < 0) return null;
   const fell = all.filter((one) => one.kind === "rejected").length;
-  const rows = all.map((one) => h("tr", { class: one.here ? "here" : one.kind, "data-kind": one.kind },
+  const rows = all.filter((one) => one.kind !== "untried").map((one) => h("tr", { class: one.here ? "here" : one.kind, "data-kind": one.kind },
     h("td", { class: "n" }, one.candidate_index),
     h("td", null, one.kind === "accepted" ? (one.here ? h("b", null, "this sample") : h(holds(one.attempt_id) ? "a" : "span", { href: `#/sample/${one.attempt_id}` }, `accepted, round ${one.round}`)) : one.kind),
     h("td", null, one.words || one.reason, one.words ? h("small", null, one.reason) : null),

@@ -106,14 +106,10 @@ def test_what_is_asked_first_stands_first_and_details_are_folded(out: Path, dump
 def test_the_player_says_that_its_picture_loads(out: Path, tmp_path: Path) -> None:
     class SlowBoard(Board):
         def answer(self, target: str) -> Answer:
+            time.sleep(2.0 if "bev.jpg" in target else 0.0)
             found = super().answer(target)
-            if "bev.jpg" in target:
-                time.sleep(2.0)
-            if target == "/static/app.js":
-                return replace(found, body=found.body + SAY.encode())
-            if target == "/":  # the browser waits for a picture in the page as it comes
-                return replace(found, body=found.body.replace(b"<main", b"<img src=/picture/x/bev.jpg><main"))
-            return found
+            waits = found.body.replace(b"<main", b"<img src=/picture/x/bev.jpg><main")  # as the browser does for it
+            return replace(found, body=waits + SAY.encode() if target == "/static/app.js" else waits)
 
     shown = Store(out).samples.read(["attempt_id"])["attempt_id"][0]
     with Server(SlowBoard(Store(out)), "127.0.0.1", 0) as server:
