@@ -20,7 +20,7 @@ function header(o) {
   const tiles = [
     ["samples", count(c.samples), `${count(c.simulated)} simulated, ${count(c.samples - c.simulated)} logged, ${bytes(c.sample_bytes)}`],
     ["accepted", percent(c.simulated_attempts ? c.simulated / c.simulated_attempts : null), made],
-    s.left ? ["left", s.left === "?" ? "not known yet" : `about ${s.left}`, s.detail || "at this rate"] : s.took && ["taken", s.took, "by the newest run"],
+    s.left ? ["left", s.left, s.detail || (s.left === "?" ? "not known yet" : "at this rate")] : s.took && ["taken", s.took, "by the newest run"],
     ["clips", count(c.clips), plural(c.candidates, "candidate perturbation")],
     c.failed && ["failed", count(c.failed), "see the errors", "#/failed"],
   ].filter(Boolean).map(([name, value, note, link]) =>
