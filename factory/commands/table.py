@@ -59,7 +59,7 @@ PLANNERS: Mapping[str, Command] = {
     "train": Command("fit a planner to logged and simulated samples", "planners.training.train"),
     "import": Command("a released checkpoint of the public code as ours", "planners.published.import_planner"),
     "evaluate": Command("EPDMS of planners on held-out clips", "planners.evaluation.evaluate"),
-    "compare": Command("how two planners differ, with intervals", "planners.evaluation.compare"),
+    "compare": Command("how two planners differ, with intervals", "planners.study.compare"),
     "serve": Command("plans for NAVSIM's own evaluation, whose agent asks", "planners.navsim.serve"),
     "submit": Command("plans of a NAVSIM split as its leaderboard takes them", "planners.navsim.submit"),
     "drive": Command("planners in closed loop, until something ends the drive", "planners.drive.drive"),

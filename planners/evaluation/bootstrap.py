@@ -48,6 +48,7 @@ class Interval:
     high: float
     a: float = np.nan
     b: float = np.nan
+    n: int = 0  # clips, or clusters of them, that were drawn
 
     @property
     def is_clear(self) -> bool:
@@ -77,7 +78,7 @@ def paired_interval(
     cluster_of_clip, n_clusters = _indices(clusters if clusters is not None else range(a.shape[1]), a.shape[1])
     mean_a, mean_b = (float((x * w).sum() / w.sum()) for x, w in zip((a, b), counts))
     if n_clusters == 1 and clusters is not None:
-        return Interval(mean_b - mean_a, np.nan, np.nan, mean_a, mean_b)
+        return Interval(mean_b - mean_a, np.nan, np.nan, mean_a, mean_b, n_clusters)
     rng = np.random.default_rng(seed)
     paired = len(a) == len(b)
     differences = np.empty(draws)
@@ -94,7 +95,7 @@ def paired_interval(
         half = stdtrit(n_clusters - 1, (1.0 + confidence) / 2.0) * error
         low = min(low, max(mean_b - mean_a - half, b.min() - a.max()))  # no mean leaves the range of its scores
         high = max(high, min(mean_b - mean_a + half, b.max() - a.min()))
-    return Interval(mean_b - mean_a, float(low), float(high), mean_a, mean_b)
+    return Interval(mean_b - mean_a, float(low), float(high), mean_a, mean_b, n_clusters)
 
 
 def _cluster_influences(scores: Array, weights: Array, cluster_of_clip: Indices) -> Array:

@@ -1,12 +1,5 @@
-"""`python -m planners compare a=<run> b=<run>`: how two evaluated planners differ, with confidence intervals.
+"""How evaluated planners differ, with confidence intervals over clips, logs and towns: what `planners compare` prints.
 
-    python -m planners compare a=eval/ltf_real b=eval/ltf_sim
-    python -m planners compare a=[eval/real_0,eval/real_1] b=[eval/sim_0,eval/sim_1] out=difference.csv
-    python -m planners compare a=ltf_sim_navhard.csv.gz b=evaluations/ltf
-
-A run is a folder that `python -m planners evaluate` made of one planner, or a table that NAVSIM's own scripts wrote
-(`.csv`, `.csv.gz`), against which a folder stands with the tables that it has. Several runs of a side are trainings of
-one planner with other seeds: clips and seeds are both drawn, pairs of seeds where both sides have equally many.
 Intervals over logs and over towns, where they are known, take all clips of one together
 (planners/evaluation/bootstrap.py): clips of one log share their scene, and an interval over clips alone is too narrow.
 """
@@ -19,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from factory.config.arguments import command
-from factory.config.compose import ConfigError, compose, fill
+from factory.config.compose import ConfigError
 from planners.evaluation import navsim
 from planners.evaluation.aggregation import (
     FILTERS_NOTE,
@@ -32,7 +24,6 @@ from planners.evaluation.aggregation import (
 )
 from planners.evaluation.bootstrap import LEVELS, Interval, cluster_labels_by_level, paired_interval
 from planners.evaluation.score_rows import read_record, read_rows
-from tasks.reward.aggregate import COLUMNS
 
 
 @dataclass(frozen=True)
@@ -41,6 +32,7 @@ class CompareSettings:
 
     a: str | list[str]  # folder of an evaluated planner, table of NAVSIM's, or a list of them
     b: str | list[str]
+    drives: str | None = None  # the folder where `planners drive` let both sides drive
     column: str = "score"  # or a sub-score: nc dac tlc ddc ep ttc lk hc ec
     confidence: float = 0.95
     draws: int = 10_000
@@ -49,6 +41,7 @@ class CompareSettings:
 
 
 Measure = navsim.Measure
+FINAL: Measure = ("final", "unfiltered")
 ByLevel = Mapping[str, Interval]  # of planners.evaluation.bootstrap.LEVELS, those that are known
 
 
@@ -143,6 +136,25 @@ def _bounds(one: Interval, nothing: str) -> str:
     return f"{one.low:+.4f} .. {one.high:+.4f}" if np.isfinite(one.low) else nothing
 
 
+def scores_told(found: Mapping[Measure, ByLevel], settings: CompareSettings) -> str:
+    """`told` of the two-stage score, else of one stage's, over the highest level of which there are two clusters."""
+    measure = FINAL if FINAL in found else next(iter(found))
+    known = [level for level, one in found[measure].items() if np.isfinite(one.low)] or ["clip"]
+    what = "EPDMS" if settings.column == "score" else settings.column.upper()
+    words = f"two-stage {what}" if measure == FINAL else what
+    return told(words, found[measure][known[-1]], known[-1], settings.confidence)
+
+
+def told(what: str, one: Interval, level: str, confidence: float, unit: str = "") -> str:
+    """What both sides have in hundredths, the difference, its interval over clusters of a level, and what that says."""
+    said = f"{what} {100 * one.b:.1f}{unit} against {100 * one.a:.1f}{unit}, {100 * one.difference:+.1f}"
+    if not np.isfinite(one.low):
+        return f"{said} (no interval)"
+    verdict = ("better" if one.low > 0.0 else "worse") if one.is_clear else "no difference told from zero"
+    ends = f"{100 * one.low:+.1f} to {100 * one.high:+.1f}"
+    return f"{said} ({100 * confidence:g} % over {one.n} {level}s: {ends}), {verdict}"
+
+
 def write_csv(path: Path, found: Mapping[Measure, ByLevel]) -> None:
     """One line a measure."""
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -174,21 +186,3 @@ def check_same_rules(folders: Sequence[str]) -> None:
         for what in ("benchmark_digest", "rules"):
             if record[what] != records[0][what]:
                 raise ConfigError(f"{folders[0]} and {folder} differ in their {what}: evaluate both the same way")
-
-
-@command("compare", CompareSettings)
-def main(argv: Sequence[str]) -> None:
-    """The command."""
-    settings = fill(CompareSettings, compose("compare", argv, CompareSettings), "compare")
-    if settings.column not in COLUMNS:
-        raise ConfigError(f"compare.column={settings.column}: one of {', '.join(COLUMNS)}")
-    sides = [[side] if isinstance(side, str) else side for side in (settings.a, settings.b)]
-    if of_tables := any(map(navsim.is_table, [*sides[0], *sides[1]])):
-        found = compare_tables(sides[0], sides[1], settings)
-    else:
-        a, b = (read_runs(side) for side in sides)
-        check_same_rules([*sides[0], *sides[1]])
-        found = compare(a, b, settings)
-    print(comparison_text(found, settings.confidence, of_tables))
-    if settings.out is not None:
-        write_csv(Path(settings.out), found)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from planners.evaluation.aggregation import summarise
-from planners.evaluation.compare import main
 from planners.evaluation.evaluate import EvaluateSettings, evaluate
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.navsim import file_name, read_table, score_of_columns, write_tables
 from planners.evaluation.planner_names import find_planners
 from planners.evaluation.score_rows import FrameRow, read_rows
+from planners.study.compare import main
 from tasks.reward.aggregate import COLUMNS, FrameScores
 from tests.planners.small_benchmark import StreetBenchmark
 

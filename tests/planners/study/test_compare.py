@@ -1,0 +1,97 @@
+"""The sentence that says whether a planner got better: of scores and of drives, by closed forms."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from factory.store.location import Location, write_shard
+from planners.drive.work import DRIVES, SCHEMA, open_drives
+from planners.evaluation.bootstrap import Interval
+from planners.evaluation.compare import told
+from planners.evaluation.score_rows import write_record, write_rows
+from planners.study.compare import main
+from tests.planners.made_rows import clip_rows
+
+TOWNS = 4
+
+
+def test_a_sentence_says_what_an_interval_says() -> None:
+    def said(low: float, high: float) -> str:
+        return told("EPDMS", Interval(0.045, low, high, 0.265, 0.31, n=8), "town", 0.95)
+
+    numbers = "EPDMS 31.0 against 26.5, +4.5"
+    assert said(-0.023, 0.113) == f"{numbers} (95 % over 8 towns: -2.3 to +11.3), no difference told from zero"
+    assert said(0.01, 0.08) == f"{numbers} (95 % over 8 towns: +1.0 to +8.0), better"
+    assert said(np.nan, np.nan) == f"{numbers} (no interval)"
+    worse = told("routes", Interval(-0.1, -0.2, -0.05, 0.5, 0.4, n=3), "log", 0.9, " %")
+    assert worse == "routes 40.0 % against 50.0 %, -10.0 (90 % over 3 logs: -20.0 to -5.0), worse"
+
+
+def evaluated(folder: Path, score: float) -> str:
+    """A planner of this score in both stages, in a clip of each of the towns."""
+    folder.mkdir()
+    follow_ups = [((score, score), (0.0, 0.0), (0.0, 0.0))]
+    ends = ((0.0, 0.0), (0.0, 0.0))
+    rows = [clip_rows(f"c{i}", score, (1.0, 1.0), ends, follow_ups, f"town-{i}-0000-curve") for i in range(TOWNS)]
+    write_rows(folder, [row for clip in rows for row in clip])
+    facts = {"planner": folder.name, "planner_digest": folder.name, "benchmark_digest": "", "rules": {}}
+    write_record(folder, facts)
+    return str(folder)
+
+
+def driven(out: Path, *rows: dict[str, Any]) -> None:
+    """A table of drives; of what is not told of one, zeros."""
+    blank = {field.name: {pa.string(): "", pa.bool_(): False}.get(field.type, 0) for field in SCHEMA}
+    blank |= {"settings": "{}", "ego_states": [], "plans": []}
+    named = [blank | {"drive_id": f"{i}"} | row for i, row in enumerate(rows)]
+    table = open_drives(Location.parse(out))
+    table.claim()
+    table.commit([write_shard(table.location, DRIVES, pa.Table.from_pylist(named, schema=SCHEMA))])
+
+
+def drive(planner: str, town: int, completed: float, **more: Any) -> dict[str, Any]:
+    where = {"clip_id": f"c{town}", "log_id": f"town-{town}-0000-curve", "start": -1, "pictures": "none"}
+    return where | {"planner_digest": planner, "route_completed": completed} | more
+
+
+def test_the_last_line_tells_scores_and_drives_over_towns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A tenth better in every clip; of four routes one more is driven cleanly, so zero lies within."""
+    a, b = evaluated(tmp_path / "real", 0.5), evaluated(tmp_path / "mixed", 0.6)
+    failed = {"off_road_events": 1}
+    rows = [drive("real", i, 1.0, **(failed if i < 2 else {})) for i in range(TOWNS)]
+    rows += [drive("mixed", i, 1.0, **(failed if i < 1 else {})) for i in range(TOWNS)]
+    driven(tmp_path / "drives", *rows)
+    assert main([f"a={a}", f"b={b}", f"drives={tmp_path / 'drives'}", "draws=200"]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    scores = "mixed against real: two-stage EPDMS 60.0 against 50.0, +10.0 (95 % over 4 towns: +10.0 to +10.0), better"
+    half = 100 * 3.182446 * 0.25  # Student's t of three degrees of freedom, times the standard error
+    ends = f"{25 - half:+.1f} to +100.0"  # no mean leaves the range of its scores
+    routes = f"75.0 % against 50.0 %, +25.0 (95 % over 4 towns: {ends}), no difference told from zero"
+    assert last == f"{scores}; routes driven cleanly {routes}"
+    assert main([f"a={a}", f"b={b}", "draws=200"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == scores
+
+
+@pytest.mark.parametrize("unequal", [{"start": 0}, {"settings": '{"loop": {"seconds": 5.0}}'}, {"pictures": "truth"}])
+def test_drives_from_other_starts_are_not_held_against_each_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], unequal: dict[str, Any]
+) -> None:
+    a, b = evaluated(tmp_path / "real", 0.5), evaluated(tmp_path / "mixed", 0.6)
+    words = [f"a={a}", f"b={b}", f"drives={tmp_path / 'drives'}", "draws=50"]
+    assert main(words) == 2
+    assert "there are of real 0, mixed 0" in capsys.readouterr().err
+    driven(tmp_path / "drives", drive("real", 0, 1.0), drive("real", 1, 1.0), drive("mixed", 0, 1.0))
+    assert main(words) == 2
+    assert "there are of real 2, mixed 1: let all of them drive" in capsys.readouterr().err
+    other = [drive("mixed", i, 1.0) | unequal for i in range(2)]
+    driven(tmp_path / "others", drive("real", 0, 1.0), drive("real", 1, 1.0), *other)
+    assert main([*words[:2], f"drives={tmp_path / 'others'}", "draws=50"]) == 2
+    assert "drives from the same starts are needed" in capsys.readouterr().err
+
+
+def test_drives_go_with_evaluated_folders_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["a=first.csv", "b=second.csv", f"drives={tmp_path}"]) == 2
+    assert "drives= goes with folders" in capsys.readouterr().err
