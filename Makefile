@@ -30,7 +30,7 @@ sys.exit(sys.version.split()[0] != sys.argv[1])
 endef
 export FITS IS_WHOLE
 
-.PHONY: install demo test unit lint format docs chaos mutants bench gpu-check clean
+.PHONY: install demo first-planner test unit lint format docs chaos mutants bench gpu-check clean
 
 install: $(VENV)/.installed
 
@@ -53,6 +53,10 @@ $(VENV)/.installed: $(VENV)/.run
 
 demo: $(VENV)/.run
 	$(PY) -m factory.run preset=demo out=$(DEMO)
+
+# The commands of docs/tutorials/first_planner.md, as they stand there; ARGS="steps=3000" changes values of theirs.
+first-planner: install
+	$(PY) -m tests.first_planner $(ARGS)
 
 # Kernels are compiled once before two test processes would both do it.
 test: install

@@ -37,8 +37,7 @@ def evaluated(folder: Path, score: float) -> str:
     ends = ((0.0, 0.0), (0.0, 0.0))
     rows = [clip_rows(f"c{i}", score, (1.0, 1.0), ends, follow_ups, f"town-{i}-0000-curve") for i in range(TOWNS)]
     write_rows(folder, [row for clip in rows for row in clip])
-    facts = {"planner": folder.name, "planner_digest": folder.name, "benchmark_digest": "", "rules": {}}
-    write_record(folder, facts)
+    write_record(folder, {"planner": folder.name, "planner_digest": folder.name, "benchmark_digest": "", "rules": {}})
     return str(folder)
 
 
@@ -60,9 +59,8 @@ def drive(planner: str, town: int, completed: float, **more: Any) -> dict[str, A
 def test_the_last_line_tells_scores_and_drives_over_towns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A tenth better in every clip; of four routes one more is driven cleanly, so zero lies within."""
     a, b = evaluated(tmp_path / "real", 0.5), evaluated(tmp_path / "mixed", 0.6)
-    failed = {"off_road_events": 1}
-    rows = [drive("real", i, 1.0, **(failed if i < 2 else {})) for i in range(TOWNS)]
-    rows += [drive("mixed", i, 1.0, **(failed if i < 1 else {})) for i in range(TOWNS)]
+    failed = {"real": 2, "mixed": 1}
+    rows = [drive(who, i, 1.0, off_road_events=int(i < n)) for who, n in failed.items() for i in range(TOWNS)]
     driven(tmp_path / "drives", *rows)
     assert main([f"a={a}", f"b={b}", f"drives={tmp_path / 'drives'}", "draws=200"]) == 0
     last = capsys.readouterr().out.splitlines()[-1]
@@ -75,23 +73,17 @@ def test_the_last_line_tells_scores_and_drives_over_towns(tmp_path: Path, capsys
     assert capsys.readouterr().out.splitlines()[-1] == scores
 
 
-@pytest.mark.parametrize("unequal", [{"start": 0}, {"settings": '{"loop": {"seconds": 5.0}}'}, {"pictures": "truth"}])
 def test_drives_from_other_starts_are_not_held_against_each_other(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], unequal: dict[str, Any]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    a, b = evaluated(tmp_path / "real", 0.5), evaluated(tmp_path / "mixed", 0.6)
-    words = [f"a={a}", f"b={b}", f"drives={tmp_path / 'drives'}", "draws=50"]
-    assert main(words) == 2
-    assert "there are of real 0, mixed 0" in capsys.readouterr().err
-    driven(tmp_path / "drives", drive("real", 0, 1.0), drive("real", 1, 1.0), drive("mixed", 0, 1.0))
-    assert main(words) == 2
-    assert "there are of real 2, mixed 1: let all of them drive" in capsys.readouterr().err
-    other = [drive("mixed", i, 1.0) | unequal for i in range(2)]
-    driven(tmp_path / "others", drive("real", 0, 1.0), drive("real", 1, 1.0), *other)
-    assert main([*words[:2], f"drives={tmp_path / 'others'}", "draws=50"]) == 2
-    assert "drives from the same starts are needed" in capsys.readouterr().err
-
-
-def test_drives_go_with_evaluated_folders_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runs = [f"a={evaluated(tmp_path / 'real', 0.5)}", f"b={evaluated(tmp_path / 'mixed', 0.6)}", "draws=50"]
+    real, mixed = ([drive(who, i, 1.0) for i in range(2)] for who in ("real", "mixed"))
+    others = [{"start": 0}, {"settings": '{"loop": {"seconds": 5.0}}'}, {"pictures": "truth"}]
+    tables = [[], [*real, mixed[0]], *([*real, mixed[0], mixed[1] | other] for other in others)]
+    for n, (rows, mine) in enumerate(zip(tables, (0, 2, 2, 2, 2))):
+        if rows:
+            driven(tmp_path / f"{n}", *rows)
+        assert main([*runs, f"drives={tmp_path / f'{n}'}"]) == 2
+        assert f"from the same starts are needed, there are of real {mine}, mixed" in capsys.readouterr().err
     assert main(["a=first.csv", "b=second.csv", f"drives={tmp_path}"]) == 2
     assert "drives= goes with folders" in capsys.readouterr().err
