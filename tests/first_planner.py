@@ -4,6 +4,7 @@
 done again, so the same call goes on.
 """
 
+import os
 import shlex
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from collections.abc import Sequence
 from tests.pages import commands
 
 PAGE = "docs/tutorials/first_planner.md"
+ONE_THREAD = {"OMP_NUM_THREADS": "1"}  # a small network gains nothing by more, and loses much where cores are busy
 
 
 def page_commands(overrides: Sequence[str]) -> list[list[str]]:
@@ -34,7 +36,7 @@ def main(overrides: Sequence[str]) -> int:
     began = time.monotonic()
     for _, *words in page_commands(overrides):
         print(f"\n[{time.monotonic() - began:.0f} s] python {shlex.join(words)}", flush=True)
-        if code := subprocess.run([sys.executable, *words]).returncode:
+        if code := subprocess.run([sys.executable, *words], env=ONE_THREAD | os.environ).returncode:
             return code
     return 0
 

@@ -91,8 +91,8 @@ def main(argv: Sequence[str]) -> None:
         found = compare(of_a, of_b, settings)
     sentence = scores_told(found, settings)
     if settings.drives is not None:
-        records = [[read_record(Path(run)) for run in side] for side in (a, b)]
-        sentence += f"; {drives_told(settings.drives, *records, settings)}"
+        first, second = ([read_record(Path(run)) for run in side] for side in (a, b))
+        sentence += f"; {drives_told(settings.drives, first, second, settings)}"
     if settings.out is not None:
         write_csv(Path(settings.out), found)
     print(comparison_text(found, settings.confidence, of_tables))
