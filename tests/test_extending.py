@@ -20,7 +20,8 @@ from factory.readers.base import BadClip
 from factory.run import main as run_main
 from factory.setup.settings import open_reader
 from factory.store.reader import SampleTable
-from planners.models.planner import PlannerChoice, build_planner
+from planners.models.planner import build_planner
+from planners.models.settings import PlannerChoice
 from planners.training.checkpoint import load_planner
 from planners.training.train import main as train_main
 from tasks.experts.protocol import Plan

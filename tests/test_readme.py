@@ -33,7 +33,7 @@ from planners.drive.settings import settings_of as drive_settings
 from planners.evaluation.compare import CompareSettings
 from planners.evaluation.evaluate import settings_of as evaluate_settings
 from planners.evaluation.replay import settings_of as replay_settings
-from planners.models.planner import settings_of
+from planners.models.settings import settings_of
 from planners.published.import_planner import config_of as import_config
 from planners.training.train import TrainConfig
 from tasks.caches import user_cache

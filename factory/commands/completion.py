@@ -78,8 +78,7 @@ def completion(request: CompletionRequest) -> None:
         source <(python -m factory completion bash)             for this shell; into ~/.bashrc for all
         source <(python -m factory completion zsh)              after compinit
 
-    Completes `factory ...` and `planners ...`, `python -m` of both, and of factory.run and planners.drive. Keys of
-    planners' commands take the time that PyTorch takes to be imported.
+    Completes `factory ...` and `planners ...`, `python -m` of both, and of factory.run and planners.drive.
     """
     script = {"bash": BASH, "zsh": ZSH}[request.shell]
     print(script.replace("PYTHON", sys.executable).replace("MODULES", "|".join(MODULES)), end="")

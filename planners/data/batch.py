@@ -1,15 +1,19 @@
 """What a planner asks of a sample, and what it is given: the contract between the loader and the planners."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from tasks.settings import constant
 from tasks.world.arrays import F32, FloatArray
+
+if TYPE_CHECKING:  # PyTorch is imported where something is computed: settings are read without it
+    import torch
+    from torch import Tensor
 
 COMMANDS = ("left", "straight", "right", "unknown")  # order of the one-hot driving command
 
@@ -86,7 +90,7 @@ class Batch:
     def __len__(self) -> int:
         return len(self.attempt_ids)
 
-    def parts(self, n: int) -> "list[Batch]":
+    def parts(self, n: int) -> list[Batch]:
         """The same samples in n batches of equal size, in order. Raises ValueError where they do not divide."""
         if len(self) % n:
             raise ValueError(f"a batch of {len(self)} does not divide into {n} parts of equal size")
@@ -99,8 +103,9 @@ class Batch:
 
         return [replace(self, **{f.name: cut(getattr(self, f.name), i * size) for f in fields(self)}) for i in range(n)]
 
-    def to(self, device: torch.device | str) -> "Batch":
+    def to(self, device: torch.device | str) -> Batch:
         """The same on a device."""
+        from torch import Tensor
 
         def moved(value: Any) -> Any:
             if isinstance(value, Tensor):

@@ -6,13 +6,11 @@ fill, sample by sample.
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from factory.store.reader import TIME_TOLERANCE_S, labels_of
 from factory.store.schema import COLUMNS, LABEL_COLUMNS, Column
@@ -22,6 +20,9 @@ from planners.data.index import AGENT_COLUMNS, BEV_COLUMNS
 from tasks.reward.label_bytes import CRC_BYTES
 from tasks.subscores import LABELLED
 from tasks.world.arrays import Bools, Bytes
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Stitch = Callable[[Sequence[Bytes], ImageLayout, Bytes], None]
 
@@ -81,8 +82,9 @@ class BatchBuffer:
         self, size: int, needs: Needs, n_labels: int, pinned: bool = False, keep_pictures: bool = False
     ) -> None:
         """n_labels: K of the vocabulary; keep_pictures: what is decoded stays with its row, for the next pass."""
+        import torch
 
-        def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        def empty(*shape: int, dtype: torch.dtype = torch.float32) -> "Tensor":
             return torch.empty((size, *shape), dtype=dtype, pin_memory=pinned)
 
         self._needs, self._keep_pictures = needs, keep_pictures
@@ -126,6 +128,8 @@ class BatchBuffer:
 
     def batch(self, attempt_ids: Sequence[str], simulated: Bools, imitate: Bools) -> Batch:
         """What was filled. The image is channels last in memory, as it was decoded."""
+        import torch
+
         tensors: dict[str, Any] = dict(self._tensors)
         if "image" in tensors:
             tensors["image"] = tensors["image"].permute(0, 3, 1, 2)

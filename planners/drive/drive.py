@@ -31,7 +31,6 @@ from factory.graph.parallel import WorkerDied, parallel_map
 from factory.graph.progress import RateBar
 from factory.graph.steps import TaskStopped
 from factory.readers.base import ClipRef, painter_of
-from factory.setup.settings import choose_vocabulary, open_reader
 from factory.store.location import Location
 from factory.store.table import AnotherWriter, KeyedTable
 from planners.drive.drivers import make_driver
@@ -108,6 +107,8 @@ def read_drives(settings: DriveSettings) -> tuple[list[Row], bool]:
 
 
 def _requested_drives(settings: DriveSettings) -> RequestedDrives:
+    from factory.setup.settings import choose_vocabulary, open_reader  # half a second that no refusal waits for
+
     planners = _planners(settings)
     reader, index = open_reader(settings.clips)
     if any("truth" in kinds for _, kinds in planners) and painter_of(reader) is None:

@@ -12,7 +12,6 @@ from typing import Any
 import pyarrow as pa
 
 from factory.readers.base import BadClip, ClipReader, ClipRef, painter_of, read_clip
-from factory.setup.settings import cache_folder
 from factory.store.location import Location, write_shard
 from factory.store.schema import TableSpec, canonical_json, schema_of
 from factory.store.table import KeyedTable
@@ -221,6 +220,8 @@ class DriveWork:
     def _cameras(self, clip: Clip, pictures: Pictures) -> DriveCameras:
         """Of all drives of a clip. Raises BadClip where the engine has no scene of it."""
         if pictures == "engine":
+            from factory.setup.settings import cache_folder
+
             cache_dir = self.settings.cache or cache_folder(self.out.uri)
             return open_rendered_cameras(clip, self.settings.render, cache_dir)
         if pictures == "truth":

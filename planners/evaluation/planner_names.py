@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from factory.config.compose import ConfigError, compose
 from factory.config.plugins import import_object, plugin_named, plugins_by_name
@@ -31,9 +31,12 @@ from factory.config.words import did_you_mean, expand_home
 from planners.data.batch import Needs
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.scoring import Plans, PreparedFrame, human_plans, pdm_plans
-from planners.models.gtrs_dense import Ensemble, GtrsDense
-from planners.models.planner import BUILT_IN, OWN, Planner, PlannerChoice, build_planner
+from planners.models.settings import BUILT_IN, OWN, PlannerChoice
 from planners.training import checkpoint
+
+if TYPE_CHECKING:
+    from planners.models.gtrs_dense import Ensemble
+    from planners.models.planner import Planner
 
 Privileged = Callable[[Mapping[FrameKey, PreparedFrame]], Plans]  # of a clip's frames
 
@@ -140,8 +143,10 @@ def needs_of(made: Any) -> Needs | None:
     return getattr(made, "needs", None)
 
 
-def _trained(folders: Sequence[Path], changed: Mapping[str, Any] | None) -> Planner | Ensemble:
+def _trained(folders: Sequence[Path], changed: Mapping[str, Any] | None) -> "Planner | Ensemble":
     """One planner, or the ensemble of several. Raises ConfigError where they cannot be one."""
+    from planners.models.gtrs_dense import Ensemble, GtrsDense
+
     models = [(str(folder), checkpoint.load_planner(folder, changed)) for folder in folders]
     if len(models) == 1:
         return models[0][1]
@@ -155,12 +160,16 @@ def _trained(folders: Sequence[Path], changed: Mapping[str, Any] | None) -> Plan
         raise ConfigError(f"ensemble: {error}") from error
 
 
-def _built(name: str) -> Planner:
+def _built(name: str) -> "Planner":
+    from planners.models.planner import build_planner
+
     return build_planner(PlannerChoice(name), {}).eval()
 
 
 def _imported(spec: str) -> Any:
     """The user's planner. Raises ConfigError."""
+    from planners.models.planner import Planner, build_planner
+
     target = import_object(spec, "planner", OWN)
     if isinstance(target, type) and issubclass(target, Planner):
         return build_planner(PlannerChoice(spec), {}).eval()

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from factory.config.compose import ConfigError
 from factory.graph.progress import RateBar
@@ -169,9 +168,11 @@ def _planned(
 
 
 def _loaded(one: EvaluatedPlanner, device: str) -> Any:
+    from torch import nn
+
     assert one.load is not None
     made = one.load()
-    return made.to(device) if isinstance(made, torch.nn.Module) else made
+    return made.to(device) if isinstance(made, nn.Module) else made
 
 
 def _shown_to(needs: Needs | None, samples: Samples, device: str) -> Batch | Samples:
@@ -197,6 +198,8 @@ def check_plan(plan: Array, name: str) -> None:
 
 def plan_batch(made: Any, batch: Batch) -> Array:
     """What a planner answers to a batch, (B, 8 or 40, 3). Raises ValueError for anything else."""
+    import torch
+
     with torch.inference_mode():
         plans = made.plan(batch)
     array = plans.detach().double().cpu().numpy() if isinstance(plans, torch.Tensor) else np.asarray(plans, np.float64)

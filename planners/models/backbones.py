@@ -9,9 +9,8 @@ from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import torch
 from safetensors.torch import load_file
@@ -22,20 +21,12 @@ from torch.utils.checkpoint import checkpoint
 
 from factory.readers.pickles import load_tensors
 from factory.wording import one_line
+from planners.models.settings import STRIDES, BackboneSettings
 
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of red, green, blue in 0 .. 1
-STRIDES = (4, 8, 16, 32)
-
-
-@dataclass(frozen=True)
-class BackboneSettings:
-    """Which network, and where its weights come from."""
-
-    name: Literal["resnet34", "vovnet99", "small"] = "resnet34"
-    pretrained: str | None = None  # .safetensors, .pth or .pt under the published names; None: random weights
-    widths: tuple[int, ...] = (16, 32, 64, 128)  # of `small`, one residual block each
-    pixels: Literal["imagenet", "unit"] = "imagenet"  # 0 .. 255 become ImageNet's mean 0 and deviation 1, or 0 .. 1
-    frozen_norm: bool = False  # normalisations keep their statistics in training; scale and shift are learned
+IMAGENET_MEAN, IMAGENET_STD = (
+    (0.485, 0.456, 0.406),
+    (0.229, 0.224, 0.225),
+)  # of red, green, blue in 0 .. 1
 
 
 class Backbone(nn.Module, ABC):

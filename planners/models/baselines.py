@@ -5,7 +5,6 @@ gives away. The third sees a raster of the labelled world and is named after it,
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import ClassVar
 
@@ -13,15 +12,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from planners.data.batch import Batch, BevLayout, Needs
+from planners.data.batch import Batch, Needs
 from planners.data.bev import BevClass
-from planners.models.planner import PlanFrom, Planner, add_base_plan, constant_velocity_plan, evaluating, imitation_l1
+from planners.models.planner import Planner, add_base_plan, constant_velocity_plan, evaluating, imitation_l1
+from planners.models.settings import ConstantVelocitySettings, EgoMlpBevSettings, EgoMlpSettings
 from tasks.world.arrays import FloatArray
-
-
-@dataclass(frozen=True)
-class ConstantVelocitySettings:
-    """Nothing to set."""
 
 
 class ConstantVelocity(Planner):
@@ -43,14 +38,6 @@ class ConstantVelocity(Planner):
 
     def plan(self, batch: Batch) -> Tensor:
         return constant_velocity_plan(batch)
-
-
-@dataclass(frozen=True)
-class EgoMlpSettings:
-    """Of the one that sees its status alone."""
-
-    hidden: tuple[int, ...] = (512, 512, 512)  # widths of the hidden layers
-    plan_from: PlanFrom = "zero"  # what the regressed poses are added to
 
 
 class EgoMlp(Planner):
@@ -84,18 +71,6 @@ class EgoMlp(Planner):
     def _poses(self, batch: Batch) -> Tensor:
         poses = self.layers(self.features(batch)).float().view(-1, 8, 3)
         return add_base_plan(self.settings.plan_from, poses, batch)
-
-
-@dataclass(frozen=True)
-class EgoMlpBevSettings(EgoMlpSettings):
-    """The raster, and the convolutions over it, each of stride 2."""
-
-    bev: BevLayout = field(
-        default_factory=lambda: BevLayout(ahead_m=48.0, behind_m=16.0, cell_m=0.5, times_s=(-1.0, -0.5, 0.0))
-    )
-    classes: int = 4  # numbers that a class of cell is told by
-    channels: tuple[int, ...] = (16, 32, 64, 64)
-    features: int = 256  # that the map is folded into
 
 
 class EgoMlpBev(EgoMlp):

@@ -20,9 +20,8 @@ plans lie where the layer before put them.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -31,22 +30,18 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from planners.data.batch import Batch, BevLayout, Needs
-from planners.models.backbones import BackboneSettings
 from planners.models.layers import (
     AgentHead,
     Attention,
     BevHead,
     Decoder,
-    FusionSettings,
     LatentFusion,
-    NetworkSettings,
-    Sizes,
     auxiliary_losses,
     copy_first_layer,
     initialise_as_public,
 )
 from planners.models.planner import Planner, TrainingData, evaluating, read_array
-from tasks.settings import constant
+from planners.models.settings import DiffusionDriveSettings
 from tasks.world.arrays import FloatArray
 
 WAYPOINTS = 8  # 0.5 .. 4.0 s
@@ -274,39 +269,6 @@ def focal_loss(logits: Tensor, target: Tensor) -> Tensor:
     wrong = (1.0 - chance) * target + chance * (1.0 - target)
     balance = FOCAL_ALPHA * target + (1.0 - FOCAL_ALPHA) * (1.0 - target)
     return balance * wrong**FOCAL_GAMMA * F.binary_cross_entropy_with_logits(logits, target, reduction="none")
-
-
-SMALL = FusionSettings(  # a step of 16 samples takes 0.1 s of a core
-    backbone=BackboneSettings("small", widths=(16, 32, 64, 96)),
-    latent_size=64,
-    image_tokens=(2, 8),
-    latent_tokens=(2, 2),
-    layers=1,
-    expansion=2,
-    dropout=0.0,
-    bev_channels=16,
-)
-
-
-@dataclass(frozen=True)
-class DiffusionDriveSettings(NetworkSettings):
-    """DiffusionDrive's."""
-
-    SIZES: ClassVar[Mapping[str, Sizes]] = {
-        "paper": Sizes(),
-        "public": Sizes(FusionSettings(image_tokens=(8, 32))),
-        "small": Sizes(SMALL, width=48, hidden=96, layers=2, heads=4, agents=10, cell_m=1.0),
-    }
-    anchors: str | None = None  # .npy (A, 8, 2); null: clusters of the plans to be trained on
-    n_anchors: int = 20  # of them
-    dropout: float = 0.1  # in the cascade
-    offsets_from: Literal["noisy", "anchors"] = "noisy"  # what the first refinement's plans are added to
-    trajectory_weight: float = constant(12.0)  # of all refinements together
-    confidence_weight: float = 10.0  # within it
-    regression_weight: float = constant(8.0)
-    agent_class_weight: float = constant(10.0)
-    agent_box_weight: float = constant(1.0)
-    bev_weight: float = constant(14.0)
 
 
 class EncodedScene(NamedTuple):

@@ -14,7 +14,7 @@ is ours: edge pixels are repeated as in DrQ (Kostrikov et al. 2021), few enough 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -22,25 +22,21 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from planners.data.batch import Batch, ImageLayout, Needs
-from planners.models.backbones import STRIDES, BackboneSettings, build_backbone
-from planners.models.layers import (
-    Decoder,
-    FusionSettings,
-    LatentFusion,
-    Layer,
-    NetworkSettings,
-    Sizes,
-    initialise_as_public,
-)
+from planners.models.backbones import build_backbone
+from planners.models.layers import Decoder, LatentFusion, Layer, initialise_as_public
 from planners.models.planner import Planner, TrainingData, evaluating, read_array
-from tasks.settings import constant
-from tasks.subscores import HALVES, LABELLED
+from planners.models.settings import (
+    STRIDES,
+    BackboneSettings,
+    FusionSettings,
+    GtrsDenseSettings,
+    WeightingName,
+)
+from tasks.subscores import HALVES
 from tasks.world.arrays import FloatArray
 from tasks.world.vocabulary import Vocabulary
 
 IMITATION = "imitation"
-
-WeightingName = Literal["release", "close"]
 
 
 @dataclass(frozen=True)
@@ -128,42 +124,6 @@ VELOCITY = slice(4, 6)  # of the status, after the one-hot command
 AT_2HZ = slice(4, None, 5)  # of 40 poses at 10 Hz
 LOSS_WEIGHTS = {"nc": 3.0, "dac": 3.0, "tlc": 3.0, "ttc": 4.0, "lk": 2.0, "ep": 2.0}  # of the others 1
 SIGMA_M2 = 0.5  # of the imitated distribution
-SMALL = BackboneSettings("small")
-
-
-@dataclass(frozen=True)
-class GtrsDenseSettings(NetworkSettings):
-    """GTRS-Dense's."""
-
-    SIZES: ClassVar[Mapping[str, Sizes]] = {
-        "paper": Sizes(),
-        "public": Sizes(FusionSettings(latent_channels=4)),
-        "small": Sizes(FusionSettings(SMALL), width=64, hidden=128, layers=2, heads=4, picture=SMALL),
-    }
-    vocabulary: str | None = None  # .npy (K, 40, 3): the one whose labels the samples carry
-    inference_vocabulary: str | None = None  # .npy of another to choose from; published: 8,192 for navhard
-    inference_entries: int | None = None  # or that many of the first, evenly spaced; null for both: all
-    weighting: WeightingName = "release"
-    encoder: Literal["fused", "picture"] = "fused"  # as published with ResNet-34; with V2-99
-    kept: float = 0.5  # share of the vocabulary in a training step
-    velocity_noise_mps: tuple[float, float] = constant((1.0, 0.2))  # deviation along and across, in training
-    image_shift: float = constant(1 / 256)  # largest, as a share of the width, in training: half a degree
-
-    def __post_init__(self) -> None:
-        if self.inference_vocabulary is not None and self.inference_entries is not None:
-            raise ValueError("inference_vocabulary and inference_entries: give one of them")
-        if not 0.0 < self.kept <= 1.0:
-            raise ValueError(f"kept={self.kept}: a share of the vocabulary above 0, at most 1")
-
-    @property
-    def backbone(self) -> BackboneSettings:
-        """Of an encoder of the picture alone."""
-        return self.over_pictures(self.network.picture)
-
-    @property
-    def sub_scores(self) -> tuple[str, ...]:
-        """Those that a head learns: the public model has none for history comfort."""
-        return tuple(name for name in LABELLED if not (self.is_public and name == "hc"))
 
 
 class TrajectoryScorer(nn.Module):

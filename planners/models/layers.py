@@ -12,19 +12,18 @@ heads, losses and constants of the public TransfuserModel and transfuser_loss.
 """
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal, NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 
-from planners.data.batch import Batch, BevLayout, ImageLayout
+from planners.data.batch import Batch
 from planners.data.bev import BevClass
-from planners.models.backbones import STRIDES, BackboneSettings, BasicBlock, build_backbone
-from tasks.settings import constant
+from planners.models.backbones import BasicBlock, build_backbone
+from planners.models.settings import STRIDES, FusionSettings
 
 
 class Attention(nn.Module):
@@ -97,85 +96,6 @@ class Decoder(nn.Module):
         for layer in self.layers:
             queries = layer(queries, memory)
         return queries
-
-
-@dataclass(frozen=True)
-class FusionSettings:
-    """Sizes of the fusion."""
-
-    backbone: BackboneSettings = field(default_factory=BackboneSettings)  # of the picture; the latent's has no weights
-    latent_size: int = 256  # cells to a side, a multiple of 32
-    latent_channels: int = 1
-    image_tokens: tuple[int, int] = (16, 64)  # rows, columns that every map of the picture is averaged to
-    latent_tokens: tuple[int, int] = (8, 8)
-    layers: int = 2  # of each of the four transformers
-    heads: int = 4
-    expansion: int = 4  # of their feed-forward parts
-    dropout: float = 0.1
-    bev_channels: int = 64
-
-    def __post_init__(self) -> None:
-        if self.latent_size % STRIDES[-1]:
-            raise ValueError(f"latent_size={self.latent_size}: give a multiple of {STRIDES[-1]}")
-
-
-Variant = Literal["paper", "public", "small"]
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """Of a network; the defaults are the paper's and the public code's."""
-
-    fusion: FusionSettings = field(default_factory=FusionSettings)
-    width: int = 256  # of the decoders
-    hidden: int = 1024
-    layers: int = 3
-    heads: int = 8
-    agents: int = 30  # vehicles that are learnt beside planning, the nearest
-    cell_m: float = 0.25  # of the raster from above
-    picture: BackboneSettings = field(default_factory=lambda: BackboneSettings("vovnet99"))  # of an encoder of it alone
-
-
-@dataclass(frozen=True)
-class NetworkSettings:
-    """What planners with a picture have in common."""
-
-    image: ImageLayout = field(default_factory=ImageLayout)
-    variant: Variant = "paper"  # public: as the public code, whose checkpoints it takes; small: for two cores
-    pretrained: str | None = None  # the picture's backbone: .safetensors, .pth or .pt, published names; null: random
-    sizes: Sizes | None = constant(None)  # in the place of the variant's
-    SIZES: ClassVar[Mapping[str, Sizes]] = {"paper": Sizes(), "public": Sizes()}  # by variant
-
-    @property
-    def is_public(self) -> bool:
-        """Whether everything is as in the public code: pixels, targets, the weights to begin with."""
-        return self.variant == "public"
-
-    @property
-    def network(self) -> Sizes:
-        """The sizes."""
-        return self.sizes or self.SIZES[self.variant]
-
-    @property
-    def picture(self) -> ImageLayout:
-        """The picture, decoded as the variant does."""
-        return replace(self.image, decoding="full") if self.is_public else self.image
-
-    @property
-    def bev(self) -> BevLayout:
-        """The raster that is learnt beside planning."""
-        return BevLayout(cell_m=self.network.cell_m, public=self.is_public)
-
-    @property
-    def fusion(self) -> FusionSettings:
-        """With the weights that the picture's backbone begins with."""
-        return replace(self.network.fusion, backbone=self.over_pictures(self.network.fusion.backbone))
-
-    def over_pictures(self, backbone: BackboneSettings) -> BackboneSettings:
-        """A backbone as the variant has it, with its first weights."""
-        if self.is_public:
-            backbone = replace(backbone, pixels="unit", frozen_norm=backbone.name == "vovnet99")
-        return replace(backbone, pretrained=self.pretrained)
 
 
 class Fused(NamedTuple):

@@ -5,64 +5,18 @@ picture of 2048 x 512: 56 M parameters (SimScale, supplement, table 4).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from planners.data.batch import Batch, Needs
-from planners.models.backbones import BackboneSettings
-from planners.models.layers import (
-    AgentHead,
-    BevHead,
-    FusionSettings,
-    LatentFusion,
-    NetworkSettings,
-    Sizes,
-    auxiliary_losses,
-    initialise_as_public,
+from planners.models.layers import AgentHead, BevHead, LatentFusion, auxiliary_losses, initialise_as_public
+from planners.models.planner import Planner, add_base_plan, bound_heading, evaluating, imitation_l1, visible_status
+from planners.models.settings import (
+    LtfSettings,
 )
-from planners.models.planner import (
-    PlanFrom,
-    Planner,
-    Status,
-    add_base_plan,
-    bound_heading,
-    evaluating,
-    imitation_l1,
-    visible_status,
-)
-from tasks.settings import constant
 from tasks.world.arrays import FloatArray
-
-SMALL = FusionSettings(  # a step of 16 samples takes 0.1 s of a core
-    backbone=BackboneSettings("small"),
-    latent_size=96,
-    image_tokens=(2, 8),
-    latent_tokens=(3, 3),
-    layers=1,
-    expansion=2,
-    dropout=0.0,
-    bev_channels=16,
-)
-
-
-@dataclass(frozen=True)
-class LtfSettings(NetworkSettings):
-    """Latent TransFuser's."""
-
-    SIZES: ClassVar[Mapping[str, Sizes]] = {
-        "paper": Sizes(),
-        "public": Sizes(FusionSettings(image_tokens=(8, 32))),
-        "small": Sizes(SMALL, width=64, hidden=128, layers=2, heads=4, agents=10, cell_m=1.0),
-    }
-    plan_from: PlanFrom = "zero"  # what the regressed positions are added to
-    status: Status = "all"  # what of the ego's own it sees; speed: no acceleration
-    trajectory_weight: float = constant(10.0)  # the unit that the others are weighed against
-    agent_class_weight: float = 10.0
-    agent_box_weight: float = 1.0
-    bev_weight: float = 10.0
 
 
 class Ltf(Planner):

@@ -15,20 +15,18 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from factory.config.compose import ConfigError, fill
-from factory.config.plugins import import_object, plugin_named, plugins_by_name
-from factory.config.shapes import deep_merge, defaults_of
-from factory.config.words import did_you_mean
+from factory.config.compose import ConfigError
 from planners.data.batch import COMMANDS, Batch, Needs, TrainingData
+from planners.models.settings import NO_PLANNER, PlanFrom, PlannerChoice, Status, named_class, settings_of
 from tasks.world.arrays import FloatArray
 
 
@@ -106,9 +104,6 @@ def evaluating(model: nn.Module) -> Iterator[None]:
         model.train(before)
 
 
-Status = Literal["all", "speed"]  # what of the ego's status is seen; speed: command and velocity, no acceleration
-
-
 def visible_status(which: Status, batch: Batch) -> Tensor:
     """(B, 8) of `batch.status`, zeros for what is not seen.
 
@@ -119,9 +114,6 @@ def visible_status(which: Status, batch: Batch) -> Tensor:
         return batch.status
     known = len(COMMANDS) + 2
     return torch.cat([batch.status[:, :known], torch.zeros_like(batch.status[:, known:])], -1)
-
-
-PlanFrom = Literal["zero", "constant_velocity"]  # what regressed poses are added to
 
 
 def bound_heading(poses: Tensor) -> Tensor:
@@ -155,43 +147,12 @@ def constant_velocity_plan(batch: Batch) -> Tensor:
     return torch.stack([ahead, torch.zeros_like(ahead), torch.zeros_like(ahead)], -1)
 
 
-BUILT_IN = {
-    "constant_velocity": "planners.models.baselines:ConstantVelocity",
-    "ego_mlp": "planners.models.baselines:EgoMlp",
-    "ego_mlp_bev": "planners.models.baselines:EgoMlpBev",
-    "ltf": "planners.models.ltf:Ltf",
-    "diffusiondrive": "planners.models.diffusiondrive:DiffusionDrive",
-    "gtrs_dense": "planners.models.gtrs_dense:GtrsDense",
-}
-OWN = "my.module:MyPlanner"  # how a class of the user's own is named
-
-
-@dataclass(frozen=True)
-class PlannerChoice:
-    """A planner and its settings, as conf/planner/*.yaml and checkpoints name it."""
-
-    name: str  # one of BUILT_IN, of an installed package's, or my.module:MyPlanner
-    settings: dict[str, Any] = field(default_factory=dict)
-
-
 def planner_class(name: str) -> type[Planner]:
     """The class of a planner. Raises ConfigError where there is none of that name."""
-    plugin = plugin_named("planner", name, BUILT_IN)
-    target = BUILT_IN.get(name, name) if plugin is None else plugin.reference
-    if ":" not in target:
-        known = [*BUILT_IN, *plugins_by_name("planner")]
-        meant = did_you_mean(name, known)
-        raise ConfigError(f"planner.name={name}: none of {', '.join(known)}{meant}; or name a class, {OWN}")
-    cls: Any = import_object(target, "planner.name", OWN)
+    cls = named_class(name)
     if not (isinstance(cls, type) and issubclass(cls, Planner)):
-        raise ConfigError(f"planner.name={name} is not a planners.models.planner.Planner")
+        raise ConfigError(NO_PLANNER.format(name))
     return cls
-
-
-def settings_of(choice: PlannerChoice) -> Any:
-    """The planner's own settings, its defaults for what is not named. Raises ConfigError for one it does not have."""
-    shape = planner_class(choice.name).settings_type
-    return fill(shape, deep_merge(defaults_of(shape), choice.settings), "planner.settings")
 
 
 def build_planner(choice: PlannerChoice, arrays: Mapping[str, FloatArray]) -> Planner:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from factory.config.arguments import Refused
 from factory.config.compose import ConfigError
@@ -70,6 +69,8 @@ class AgentPlanner:
 
         Raises ConfigError for a planner that wants what NAVSIM shows no agent, and for cameras that it has not.
         """
+        from torch import nn
+
         who = find_planner(planner)
         if who.load is None:
             raise ConfigError(f"planner={planner} plans from the log itself, which NAVSIM shows no agent")
@@ -80,7 +81,7 @@ class AgentPlanner:
         needs: Needs = replace(getattr(made, "needs_to_plan", asked), labels=None)
         if needs.bev is not None or needs.n_agents:
             raise ConfigError(f"planner={planner} looks at a raster of map and agents, which NAVSIM shows no agent")
-        self._made = made.to(device) if isinstance(made, torch.nn.Module) else made
+        self._made = made.to(device) if isinstance(made, nn.Module) else made
         self._needs, self._undistort, self._device = needs, undistort, device
         self._by_direction = needs.image is not None and not (cameras or needs.image.cameras)
         self.cameras = agent_cameras(needs.image, cameras)

@@ -12,28 +12,29 @@ planner=<out>`, `train init_from=<out>` and NAVSIM's agent take it. GTRS-Dense c
 trained with unless another one is named. Nothing of the file runs: it is read as tensors and plain values.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, compose, fill
 from factory.config.words import SHOW, split_off_cfg
 from factory.files import file_digest
 from factory.readers.pickles import load_tensors
-from planners.models.diffusiondrive import POINT_FEATURES, REFINEMENTS, WAYPOINTS, DiffusionDriveSettings
-from planners.models.gtrs_dense import IMITATION, GtrsDenseSettings, inference_arrays
-from planners.models.ltf import LtfSettings
-from planners.models.planner import Planner, PlannerChoice, build_planner, settings_of
+from planners.models.settings import DiffusionDriveSettings, GtrsDenseSettings, LtfSettings, PlannerChoice, settings_of
 from planners.training.checkpoint import FOLDER, put_weights, save_checkpoint
 from planners.training.train import PlannerEntry
 from tasks.subscores import RECORDS
 from tasks.world.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from planners.models.planner import Planner
 
 # A public state dict read into a planner's: every number of it is moved, or named as left aside.
 #
@@ -74,6 +75,8 @@ class WeightMoves:
 
     def move_joined(self, names: Sequence[str], ours: str) -> None:
         """Weights and biases of several linear maps as those of one, their outputs one after the other."""
+        import torch
+
         for kind in ("weight", "bias"):
             parts = tuple(f"{name}.{kind}" for name in names)
             self.ours[f"{ours}.{kind}"] = torch.cat([self._taken(part) for part in parts])
@@ -143,6 +146,8 @@ def read_public_weights(path: Path) -> dict[str, Tensor]:
 
 def unwrapped_weights(content: object, source: str) -> dict[str, Tensor]:
     """`content` of a Lightning checkpoint, or a bare state dict, as names of the public model. Raises ConfigError."""
+    from torch import Tensor
+
     if isinstance(content, Mapping) and isinstance(content.get("state_dict"), Mapping):
         content = content["state_dict"]
     if not isinstance(content, Mapping) or not all(isinstance(value, Tensor) for value in content.values()):
@@ -215,6 +220,8 @@ def move_ltf(moves: WeightMoves, settings: LtfSettings) -> Arrays:
 
 def move_diffusiondrive(moves: WeightMoves, settings: DiffusionDriveSettings) -> Arrays:
     """V2TransfuserModel as DiffusionDrive."""
+    from planners.models.diffusiondrive import REFINEMENTS
+
     move_fusion(moves, "encoder.fusion.")
     moves.move_layer("_bev_downscale", "encoder.narrow")
     moves.move_layer("_status_encoding", "encoder.status")
@@ -247,6 +254,8 @@ def move_diffusiondrive(moves: WeightMoves, settings: DiffusionDriveSettings) ->
 
 def move_gtrs_dense(moves: WeightMoves, settings: GtrsDenseSettings) -> Arrays:
     """HydraModel as GtrsDense. Its decoder and agents' head at the top are in the file and in no forward pass."""
+    from planners.models.gtrs_dense import IMITATION
+
     if settings.encoder == "fused":
         move_fusion(moves, "tokens.fusion.")
         moves.move_layer("_bev_downscale", "tokens.narrow")
@@ -285,6 +294,10 @@ def _points_reordered(weight: Tensor) -> Tensor:
 
     A point's numbers there (gen_sineembed_for_position) and here (planners.models.diffusiondrive.waves) are the same.
     """
+    import torch
+
+    from planners.models.diffusiondrive import POINT_FEATURES, WAYPOINTS
+
     pairs = POINT_FEATURES // 4
     columns = torch.arange(WAYPOINTS * POINT_FEATURES).view(WAYPOINTS, 2, pairs, 2)
     ours = columns.flip(1).transpose(2, 3)  # points, (x, y), (sine, cosine), frequency
@@ -356,6 +369,9 @@ def import_weights(choice: PlannerChoice, public: Mapping[str, Tensor], source: 
 
     source: for messages. Raises ConfigError where a weight is missing, unknown, or of another shape.
     """
+    from planners.models.gtrs_dense import inference_arrays
+    from planners.models.planner import build_planner
+
     if choice.name not in FAMILIES:
         raise ConfigError(f"planner.name={choice.name}: only {', '.join(FAMILIES)} have public checkpoints")
     settings = settings_of(choice)

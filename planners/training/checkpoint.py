@@ -10,6 +10,8 @@ own. No file of it holds code; a planner of a user's own package is imported by 
 what is installed.
 """
 
+from __future__ import annotations
+
 import hashlib
 import json
 import os
@@ -18,21 +20,22 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
-from torch import Tensor
 
 from factory.config.compose import ConfigError
 from factory.config.shapes import to_plain
 from factory.readers.pickles import load_tensors
 from factory.wording import one_line
-from planners.models.planner import Planner, PlannerChoice, build_planner, planner_class
+from planners.models.settings import PlannerChoice
 from tasks.caches import json_with_checksum, parse_json_with_checksum
 from tasks.world.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from planners.models.planner import Planner
 
 FOLDER = "checkpoints"
 RECORD, WEIGHTS, ARRAYS, TRAINING = "record.json", "weights.safetensors", "arrays.npz", "training.pt"
@@ -60,6 +63,9 @@ def save_checkpoint(
 
     record: what is to be known of the training, plain values; the planner's name and settings are added.
     """
+    import torch
+    from safetensors.torch import save_file
+
     folder = out / FOLDER / f"{step:08d}"
     unfinished = folder.with_name(f".{folder.name}.{os.getpid()}")
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -122,6 +128,8 @@ def load_planner(path: str | Path, changed: Mapping[str, Any] | None = None) -> 
     changed: settings of planning alone (`Planner.free_settings`) that are to be others than it was trained with.
     Raises ConfigError.
     """
+    from planners.models.planner import build_planner, planner_class
+
     folder = newest_checkpoint(Path(path))
     record = read_record(folder)
     choice = PlannerChoice(**record["planner"])
@@ -147,6 +155,9 @@ def load_arrays(folder: Path) -> dict[str, FloatArray]:
 
 def load_weights(planner: Planner, folder: Path) -> None:
     """Raises ConfigError where the weights are damaged or another model's, naming what differs."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
     _refuse_damaged(folder, WEIGHTS)
     try:
         stored = load_file(folder / WEIGHTS)

@@ -1,13 +1,14 @@
 """What a training steps by: its settings, the rate of every step, the optimiser."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import torch
-from torch import nn
-
-from planners.models.backbones import Backbone
+if TYPE_CHECKING:
+    import torch
+    from torch import nn
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,10 @@ FACTOR = "rate_factor"  # of an optimiser's group
 
 def build_optimiser(settings: TrainingSettings, model: nn.Module) -> torch.optim.Optimizer:
     """Adam or AdamW over everything that learns, in one kernel for all parameters of a rate."""
+    import torch
+
+    from planners.models.backbones import Backbone
+
     kind = torch.optim.Adam if settings.optimiser == "adam" else torch.optim.AdamW
     groups: list[dict[str, Any]] = [{"params": [p for p in model.parameters() if p.requires_grad]}]
     decay = settings.weight_decay if settings.backbone_decay is None else settings.backbone_decay

@@ -11,16 +11,15 @@ The same command on the same `out` goes on where it stopped, to the identical cu
 steps or on another number of processes. Exit codes: 0 complete, 2 bad settings or data, 4 interrupted and resumable.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
-
-import cv2
-import torch
+from typing import TYPE_CHECKING, Any, Literal
 
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, compose, fill
@@ -28,8 +27,7 @@ from factory.config.shapes import GIVE, deep_merge, to_plain
 from planners.data.index import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings, fitting_batch
-from planners.models.backbones import load_pretrained, set_recompute
-from planners.models.planner import Planner, PlannerChoice, build_planner, planner_class, settings_of
+from planners.models.settings import PlannerChoice, settings_class, settings_of
 from planners.training.checkpoint import (
     Keep,
     best_checkpoint,
@@ -41,9 +39,12 @@ from planners.training.checkpoint import (
     read_record,
     settings_record,
 )
-from planners.training.fit import Precision, StepSettings, fit, total_steps
 from planners.training.optim import TrainingSettings
 from planners.training.processes import RaySettings, TrainingProcess, join_process_group
+
+if TYPE_CHECKING:  # PyTorch is imported once the settings and the samples are found to fit
+    from planners.models.planner import Planner
+    from planners.training.fit import Precision
 
 LARGEST_BATCH = 32
 FURTHER = frozenset({"steps", "processes", "accumulate"})  # what may be another with resume=further
@@ -56,6 +57,8 @@ def make_validation(
 
     Raises ValueError where the tables are not what the planner needs.
     """
+    import torch
+
     where = {name: getattr(data, name) for name in ("storage_options", "pictures", "pictures_gb")}
     dataset = open_data(DataSettings(real=data.tables("val"), **where))
     needs = replace(planner.needs, labels=None)
@@ -139,8 +142,10 @@ def main(argv: Sequence[str]) -> None:
 
         train_on_ray(partial(train, config), config.ray, config.out)
     else:
+        config.training  # noqa: B018 - raises ConfigError for a planner that does not learn
+        dataset = open_data(config.data, mix=config.mix)  # what does not fit is told before PyTorch is imported
         with join_process_group(config.device) as process:
-            train(config, process)
+            train(config, process, dataset)
 
 
 def _with_planner_settings(values: dict[str, Any]) -> dict[str, Any]:
@@ -154,15 +159,24 @@ def _with_planner_settings(values: dict[str, Any]) -> dict[str, Any]:
 
 def _shapes_of(values: Mapping[str, Any]) -> Mapping[str, type[Any]]:
     name = values["planner"]["name"]
-    return {} if name == GIVE else {"planner.settings": planner_class(name).settings_type}
+    return {} if name == GIVE else {"planner.settings": settings_class(name)}
 
 
-def train(config: TrainConfig, process: TrainingProcess) -> None:
-    """The part of one process. Raises ConfigError or ValueError for what does not fit, Stopped when interrupted."""
+def train(config: TrainConfig, process: TrainingProcess, dataset: Dataset | None = None) -> None:
+    """The part of one process; dataset: the samples of `config.data`, None: opened here.
+
+    Raises ConfigError or ValueError for what does not fit, Stopped when interrupted.
+    """
     out = Path(config.out).absolute()
+    import cv2
+    import torch
+
+    from planners.models.backbones import set_recompute
+    from planners.training.fit import StepSettings, fit, total_steps
+
     cv2.setNumThreads(1)  # pictures are decoded side by side already
     settings = settings_of(config.planner)
-    dataset = open_data(config.data, mix=config.mix)
+    dataset = open_data(config.data, mix=config.mix) if dataset is None else dataset
     asked = config.training.batch_size
     if asked % (process.size * config.accumulate):
         raise ConfigError(
@@ -238,6 +252,8 @@ def _with_fitting_batch(config: TrainConfig, dataset: Dataset, process: Training
 
 def _planner(config: TrainConfig, settings: Any, dataset: Dataset) -> Planner:
     """The planner, built around what the samples give it; trained further, around what it was trained with."""
+    from planners.models.planner import build_planner, planner_class
+
     if config.init_from is not None:
         before = read_record(Path(config.init_from))["planner"]
         if before == {"name": config.planner.name, "settings": settings_record(settings)}:
@@ -251,6 +267,8 @@ def _planner(config: TrainConfig, settings: Any, dataset: Dataset) -> Planner:
 
 def _load_first_weights(planner: Planner, config: TrainConfig) -> dict[str, str]:
     """Fills in the weights that a training begins with; backbone -> where its weights are from."""
+    from planners.models.backbones import load_pretrained
+
     if config.init_from is None:
         return load_pretrained(planner)
     folder = newest_checkpoint(Path(config.init_from))

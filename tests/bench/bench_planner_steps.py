@@ -29,7 +29,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from factory.config.compose import compose, fill
 from planners.data.batch import Batch, Needs
 from planners.models.backbones import set_recompute
-from planners.models.planner import Planner, planner_class, settings_of
+from planners.models.planner import Planner, planner_class
+from planners.models.settings import settings_of
 from planners.training.optim import TrainingSettings, build_optimiser
 from planners.training.train import PlannerEntry
 from tasks.subscores import LABELLED

@@ -4,8 +4,7 @@ import numpy as np
 import torch
 
 from planners.data.batch import ImageLayout
-from planners.models.backbones import BackboneSettings
-from planners.models.layers import FusionSettings, Sizes
+from planners.models.settings import BackboneSettings, FusionSettings, Sizes
 from tasks.reward.label_bytes import VocabularyLabels
 
 PICTURE = ImageLayout(width=64, height=32)

@@ -1,5 +1,7 @@
 """What all commands do alike: help, exit codes, one line for what is wrong."""
 
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,6 +16,8 @@ from planners.evaluation.compare import CompareSettings
 from planners.evaluation.evaluate import EvaluateSettings
 from planners.evaluation.planner_names import find_planner
 from planners.evaluation.replay import ReplaySettings
+from planners.models.planner import planner_class
+from planners.models.settings import BUILT_IN
 from planners.published.import_planner import ImportConfig
 from planners.training.train import TrainConfig
 from tests.factory.text_keys import held, text_keys
@@ -105,3 +109,48 @@ def test_help_tells_the_choices_of_every_group_and_what_conf_gives(capsys: pytes
     assert "  mix: half, natural, rewards_only" in lines
     assert any(line.startswith('out: "runs/train/${planner.name}"  # ') for line in lines)
     assert not any(line.startswith(("mix:", "planner:")) for line in lines)
+
+
+REFUSED = (  # a misspelt key, an unknown planner, a value, data that is missing
+    "train data.rael=[x]",
+    "train planner=nobody",
+    "train planner=ltf_small planner.settings.varient=small",
+    "train planner=gtrs_dense_small steps=0",
+    "train planner=constant_velocity",
+    "train planner=ltf_small data.real=[/nowhere]",
+    "evaluate",
+    "evaluate benchmark=/nowhere planner=nobody",
+    "evaluate benchmark=/nowhere planner=human",
+    "compare a=/nowhere b=/nowhere",
+    "drive secnods=1",
+    "drive planner=nobody",
+    "drive planner=human clips=av2 clips.root=/nowhere",
+    "replay benchmark=/nowhere clip=0",
+    "import /nowhere.ckpt planner=ltf_public out=x",
+    "serve",
+    "submit",
+)
+
+
+@pytest.mark.slow
+def test_what_does_not_fit_is_told_and_keys_are_completed_before_pytorch_is_imported() -> None:
+    program = f"""
+import sys
+from factory.commands.completion import completions
+from planners.__main__ import main
+for words in {REFUSED}:
+    assert main(words.split()) == 2, words
+    assert "torch" not in sys.modules, words
+for command in {tuple(PLANNERS)}:
+    assert completions([command], "", "planners"), command
+assert "torch" not in sys.modules
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    lines = done.stderr.splitlines()
+    assert len(lines) == len(REFUSED) and all(line.startswith("error: ") for line in lines)
+
+
+def test_a_built_in_planner_has_the_settings_that_its_name_says() -> None:
+    for name, (_, settings) in BUILT_IN.items():
+        assert planner_class(name).settings_type is settings

@@ -15,8 +15,8 @@ from factory.views.board.overview import _reasons
 from factory.views.status import REASON_WORDS
 from planners.data.batch import Needs
 from planners.data.decode import BatchBuffer
-from planners.models.gtrs_dense import GtrsDenseSettings, TrajectoryScorer
-from planners.models.layers import Sizes
+from planners.models.gtrs_dense import TrajectoryScorer
+from planners.models.settings import GtrsDenseSettings, Sizes
 from tasks import subscores
 from tasks.attempt import ExpertGate, verdict
 from tasks.reward.aggregate import COLUMNS, columns_of

@@ -9,7 +9,8 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from planners.models.backbones import STRIDES, Backbone, BackboneSettings, build_backbone, load_pretrained
+from planners.models.backbones import Backbone, build_backbone, load_pretrained
+from planners.models.settings import STRIDES, BackboneSettings
 
 SMALL = BackboneSettings(name="small", widths=(4, 8, 12, 16))
 

@@ -10,7 +10,6 @@ from planners.data.batch import BevLayout
 from planners.models.diffusiondrive import (
     FOCAL_ALPHA,
     DiffusionDecoder,
-    DiffusionDriveSettings,
     add_noise,
     alphas_cumprod,
     checked_anchors,
@@ -22,8 +21,8 @@ from planners.models.diffusiondrive import (
     normalise_points,
     sinusoids,
 )
-from planners.models.layers import Sizes
 from planners.models.planner import read_array
+from planners.models.settings import DiffusionDriveSettings, Sizes
 
 
 def test_anchors_are_the_means_of_well_separated_clusters() -> None:

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from planners.data.batch import Batch
-from planners.models.diffusiondrive import DiffusionDrive, DiffusionDriveSettings, denormalise_points, normalise_points
+from planners.models.diffusiondrive import DiffusionDrive, denormalise_points, normalise_points
 from planners.models.planner import TrainingData
+from planners.models.settings import DiffusionDriveSettings
 from tests.planners import scenes
 from tests.planners.made_batch import made_batch
 

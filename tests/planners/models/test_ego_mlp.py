@@ -7,15 +7,9 @@ import torch
 from torch import nn
 
 from planners.data.batch import Batch, BevLayout, Needs
-from planners.models.baselines import (
-    ConstantVelocity,
-    ConstantVelocitySettings,
-    EgoMlp,
-    EgoMlpBev,
-    EgoMlpBevSettings,
-    EgoMlpSettings,
-)
+from planners.models.baselines import ConstantVelocity, EgoMlp, EgoMlpBev
 from planners.models.planner import Planner
+from planners.models.settings import ConstantVelocitySettings, EgoMlpBevSettings, EgoMlpSettings
 from tests.planners.made_batch import made_batch
 
 TINY_BEV = EgoMlpBevSettings(

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from planners.data.batch import Batch, ImageLayout, Needs
-from planners.models.gtrs_dense import GtrsDense, GtrsDenseSettings, imitation_target, random_shift
+from planners.models.gtrs_dense import GtrsDense, imitation_target, random_shift
 from planners.models.planner import TrainingData
+from planners.models.settings import GtrsDenseSettings
 from tasks.subscores import LABELLED
 from tasks.world.vocabulary import Vocabulary
 from tests.planners import scenes

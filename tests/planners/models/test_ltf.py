@@ -11,9 +11,10 @@ from torch import nn
 
 from planners.data.batch import Batch, ImageLayout
 from planners.models.backbones import load_pretrained
-from planners.models.baselines import ConstantVelocity, ConstantVelocitySettings
+from planners.models.baselines import ConstantVelocity
 from planners.models.layers import LatentFusion
-from planners.models.ltf import Ltf, LtfSettings
+from planners.models.ltf import Ltf
+from planners.models.settings import ConstantVelocitySettings, LtfSettings
 from tests.planners import scenes
 from tests.planners.made_batch import made_batch
 

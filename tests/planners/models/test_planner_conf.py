@@ -7,12 +7,16 @@ import pytest
 import yaml
 
 from factory.config.compose import conf_dir, fill
-from planners.models.backbones import BackboneSettings
-from planners.models.baselines import EgoMlpBevSettings, EgoMlpSettings
-from planners.models.diffusiondrive import DiffusionDriveSettings
-from planners.models.gtrs_dense import GtrsDenseSettings
-from planners.models.ltf import LtfSettings
-from planners.models.planner import PlannerChoice, settings_of
+from planners.models.settings import (
+    BackboneSettings,
+    DiffusionDriveSettings,
+    EgoMlpBevSettings,
+    EgoMlpSettings,
+    GtrsDenseSettings,
+    LtfSettings,
+    PlannerChoice,
+    settings_of,
+)
 from planners.training.optim import TrainingSettings
 
 NAMES = ("constant_velocity", "ego_mlp", "ego_mlp_small", "ego_mlp_bev", "ego_mlp_bev_small", "ltf", "ltf_small")

@@ -6,8 +6,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from planners.models.backbones import Backbone, BackboneSettings, build_backbone, set_recompute
-from planners.models.layers import FusionSettings, LatentFusion
+from planners.models.backbones import Backbone, build_backbone, set_recompute
+from planners.models.layers import LatentFusion
+from planners.models.settings import BackboneSettings, FusionSettings
 
 
 def learnt(settings: BackboneSettings, recompute: bool, size: int = 64) -> tuple[Backbone, Tensor, int]:

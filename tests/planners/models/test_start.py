@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from planners.models.backbones import BackboneSettings
-from planners.models.layers import Attention, Decoder, FusionSettings, LatentFusion, Layer, initialise_as_public
+from planners.models.layers import Attention, Decoder, LatentFusion, Layer, initialise_as_public
+from planners.models.settings import BackboneSettings, FusionSettings
 
 
 class Parts(nn.Module):

@@ -7,7 +7,8 @@ import torch
 import yaml
 
 from factory.config.compose import conf_dir
-from planners.models.planner import Planner, PlannerChoice, build_planner
+from planners.models.planner import Planner, build_planner
+from planners.models.settings import PlannerChoice
 from planners.training.checkpoint import save_checkpoint
 from tasks.world.arrays import FloatArray
 from tests.planners import scenes

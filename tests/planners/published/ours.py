@@ -15,7 +15,8 @@ from planners.data.batch import Batch
 from planners.models.diffusiondrive import DiffusionDrive, EncodedScene
 from planners.models.gtrs_dense import IMITATION, WEIGHTINGS, GtrsDense, weighted_total
 from planners.models.ltf import Ltf
-from planners.models.planner import Planner, PlannerChoice, evaluating
+from planners.models.planner import Planner, evaluating
+from planners.models.settings import PlannerChoice
 from planners.published.import_planner import SCORES, ImportedPlanner, import_weights
 from planners.training.train import PlannerEntry
 from tasks.world.arrays import Array

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from factory.config.compose import ConfigError
 from planners.data.batch import BevLayout
-from planners.models.planner import PlannerChoice
+from planners.models.settings import PlannerChoice
 from planners.published.import_planner import import_weights
 from tests.planners.published.formula import FROZEN, inputs
 from tests.planners.published.ours import (

@@ -16,7 +16,8 @@ import torch
 from factory.config.compose import ConfigError
 from factory.exits import Stopped
 from planners.data.batch import Batch
-from planners.models.planner import PlannerChoice, build_planner
+from planners.models.planner import build_planner
+from planners.models.settings import PlannerChoice
 from planners.training.checkpoint import (
     Keep,
     best_checkpoint,

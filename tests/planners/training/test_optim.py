@@ -5,8 +5,8 @@ import math
 import pytest
 from torch import nn
 
-from planners.models.backbones import BackboneSettings
-from planners.models.layers import FusionSettings, LatentFusion
+from planners.models.layers import LatentFusion
+from planners.models.settings import BackboneSettings, FusionSettings
 from planners.training.optim import TrainingSettings, build_optimiser, learning_rate, set_rate
 
 
