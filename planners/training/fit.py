@@ -46,6 +46,7 @@ class Curves:
         from torch.utils.tensorboard import SummaryWriter
 
         out.mkdir(parents=True, exist_ok=True)
+        self._out = out
         self._files = {
             LOSSES: _CsvRows(out / LOSSES, first_step),
             VALIDATION: _CsvRows(out / VALIDATION, first_step + 1),
@@ -57,9 +58,14 @@ class Curves:
         row = {"total": sum(terms.values()), **terms, "learning_rate": rate, **more}
         self._write(LOSSES, "loss", step, row)
 
-    def validation(self, step: int, measured: Mapping[str, float]) -> None:
-        """What the planner was worth after `step` steps."""
+    def validation(self, step: int, measured: Mapping[str, float], judge: str) -> str:
+        """What the planner was worth after `step` steps, in a line that holds it against the least `judge` so far."""
         self._write(VALIDATION, "validation", step, measured)
+        with (self._out / VALIDATION).open(newline="", encoding="utf-8") as rows:
+            worth = {int(row["step"]): float(row[judge]) for row in csv.DictReader(rows)}
+        best = min(worth, key=worth.__getitem__)
+        so_far = "the best so far" if best == step else f"best so far: {judge} {worth[best]:.4f} after step {best}"
+        return f"validation after step {step}: {', '.join(f'{k} {v:.4f}' for k, v in measured.items())}; {so_far}"
 
     def close(self) -> None:
         """Flush everything."""
@@ -194,7 +200,7 @@ def fit(
         if validate is None or curves is None:
             return {}
         measured = validate(planner)
-        curves.validation(step, measured)
+        print(curves.validation(step, measured, loop.keep.best or next(iter(measured))), flush=True)
         return measured
 
     asked = Event()

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -233,6 +234,16 @@ def train(config: TrainConfig, process: TrainingProcess, dataset: Dataset | None
         print(f"trained: {newest_checkpoint(out)}")
         if config.keep_best is not None:
             print(f"least {config.keep_best}: {best_checkpoint(out, config.keep_best)}")
+        print(_next_text(config.out, planner.needs_to_plan.image is not None))
+
+
+def _next_text(out: str, looks: bool) -> str:
+    """The commands that say what a trained planner is worth, to be pasted into a shell. looks: whether at pictures."""
+    drive = f"drive planner={out} clips.n_clips=6 films=6 out={out}/drives".split()
+    blind = [] if looks else ["clips.settings.cameras=[]", "clips.settings.lidar_beams=0"]
+    door = ["python", "-m", "planners"]
+    score = ["evaluate", "benchmark=runs/hard", f"planner={out}"]
+    return f"watch it drive: {shlex.join([*door, *drive, *blind])}\nscore it: {shlex.join([*door, *score])}"
 
 
 def _with_fitting_batch(config: TrainConfig, dataset: Dataset, process: TrainingProcess) -> TrainConfig:
