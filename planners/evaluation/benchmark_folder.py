@@ -5,6 +5,7 @@ benchmark.json says which clips count and with which follow-ups; what else stand
 
 import hashlib
 import json
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +20,19 @@ from tasks.hard_scenes import BenchmarkClip, GivenScenes, OneStageClip
 from tasks.world.clip import Scene
 
 IDENTITY = ("attempt_id", "clip_id", "expert", "candidate_index", "image_source", "settings_hash", "stage_versions")
-HOW = "make it with python -m factory.run preset=hard_benchmark, to its end"
+
+
+# Of towns that no page trains on: cameras are painted where frames are, so that no log has to be.
+MADE_BY = (
+    "python -m factory.run preset=hard_benchmark clips=synthetic_towns clips.split=test clips.first_seed=501 "
+    "'clips.settings.cameras=[]' clips.settings.lidar_beams=0 render=painter vocabulary.k=16384"
+)
+PAGE = "docs/training.md#evaluation"
+
+
+def how_to_make(out: str) -> str:
+    """One command that makes a benchmark in a folder."""
+    return f"make it, to its end: {MADE_BY} out={shlex.quote(out)}; of your own held-out logs: {PAGE}"
 
 
 class BenchmarkFolder:
@@ -43,13 +56,13 @@ class BenchmarkFolder:
         found = {FrameKey(row["clip_id"], row["expert"], row["candidate_index"]): row for row in rows}
         wanted = [key for clip_id in self._listed.clips for key in self._frames_of(clip_id)]
         if lacking := [key for key in wanted if key not in found]:
-            raise ConfigError(f"benchmark={path}: {lacking[0]} has no sample: {HOW}")
+            raise ConfigError(f"benchmark={path}: {lacking[0]} has no sample: {how_to_make(path)}")
         self._rows = {key: found[key] for key in wanted}
         self._scenes = SceneFiles(location.child("scenes"))
         if without := sorted(set(self._follow_ups) - set(self._scenes.clip_ids())):
             raise ConfigError(
                 f"benchmark={path}: no scenes of {len(without)} clips, such as {without[0]}, "
-                f"and plans cannot be driven in samples alone: {HOW}"
+                f"and plans cannot be driven in samples alone: {how_to_make(path)}"
             )
 
     @property
@@ -143,7 +156,7 @@ class BenchmarkFolder:
             raise self._damaged(clip_id, error) from error
 
     def _damaged(self, clip_id: str, error: Exception) -> ConfigError:
-        return ConfigError(f"benchmark={self.path}: scenes of clip {clip_id}: {error}: {HOW}")
+        return ConfigError(f"benchmark={self.path}: scenes of clip {clip_id}: {error}: {how_to_make(self.path)}")
 
 
 @dataclass(frozen=True)
@@ -173,7 +186,7 @@ def read_clip_logs(path: str) -> dict[str, str]:
 
 def _listed(path: str, document: bytes) -> _Listed:
     if not document:
-        raise ConfigError(f"benchmark={path}: no {BENCHMARK_FILE} here: {HOW}")
+        raise ConfigError(f"benchmark={path}: no {BENCHMARK_FILE} here: {how_to_make(path)}")
     try:
         stored: dict[str, Any] = json.loads(document)
         if stored["format"] != FORMAT:
@@ -183,10 +196,12 @@ def _listed(path: str, document: bytes) -> _Listed:
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, ConfigError):
             raise
-        raise ConfigError(f"benchmark={path}: {BENCHMARK_FILE} cannot be read ({error}): {HOW}") from error
+        raise ConfigError(
+            f"benchmark={path}: {BENCHMARK_FILE} cannot be read ({error}): {how_to_make(path)}"
+        ) from error
     if not clips:
         why = "; ".join(sorted({str(clip["why"]) for clip in left_out})) or "it read none"
-        raise ConfigError(f"benchmark={path}: none of its clips counts: {why}")
+        raise ConfigError(f"benchmark={path}: none of its clips counts: {why}: {how_to_make('<another folder>')}")
     return _Listed(int(stored.get("stages", 2)), clips, len(left_out))
 
 

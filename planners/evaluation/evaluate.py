@@ -15,7 +15,7 @@ planners/evaluation/planner_names.py says. Every planner gets a folder: its plan
 benchmark or the rules changed; the same command goes on after a kill. All planners of a command share what scoring
 prepares of a frame, so name several at once.
 
-    summary.csv                   all planners of this command
+    summary.csv                   all planners that were evaluated into `out` by the same rules, earlier ones first
     <planner>/navsim_*.csv        of NAVSIM's benchmarks: the tables that its own scripts write, by the score's filter
     one_stage                     the logged frames, as navtest
     stage_one, stage_two, final   as navhard: stage two weighted by how near a follow-up starts to the plan's end,
@@ -34,13 +34,30 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, fill
 from factory.config.datasets import find_function, words_of
 from factory.config.shapes import to_plain
+from factory.files import matching
 from factory.graph.progress import RateBar
-from planners.evaluation.aggregation import SummaryLine, summarise, summary_lines, table_text, write_table
+from planners.evaluation.aggregation import (
+    BOUNDS,
+    PAPER,
+    ClipResult,
+    RunScores,
+    SummaryLine,
+    collect_scores,
+    group_by_clip,
+    stage_title,
+    summarise,
+    summary_lines,
+    table_text,
+    write_table,
+)
 from planners.evaluation.benchmark_folder import BenchmarkFolder
+from planners.evaluation.bootstrap import Interval, cluster_labels_by_level, paired_interval
 from planners.evaluation.frames import Benchmark, FrameKey
 from planners.evaluation.navsim import write_tables
 from planners.evaluation.planner_names import EvaluatedPlanner, compose_with_planner, find_planners, needs_of
@@ -57,11 +74,12 @@ from planners.evaluation.scoring import (
     score_lone,
 )
 from tasks.experts.pdm_closed import PdmSettings
+from tasks.reward.aggregate import follow_up_weights, has_uniform_weights
 from tasks.rollout.simulate import TrafficSettings, traffic_record
 from tasks.stages import stage_versions
 from tasks.world.arrays import Array
 
-MOST_UNIFORM = 0.2  # share of clips in the uniform fallback
+MOST_UNIFORM = 0.2  # share of groups in the uniform fallback above which stage two says little
 
 
 @dataclass(frozen=True)
@@ -108,7 +126,7 @@ def _told(rules: Rules) -> dict[str, object]:
 
 
 def evaluate(benchmark: Benchmark, who: Sequence[EvaluatedPlanner], settings: EvaluateSettings) -> list[SummaryLine]:
-    """Plan, score, write; the lines of all planners in their order.
+    """Plan, score, write; the lines of all planners in their order, of those evaluated into `out` before as well.
 
     Raises ConfigError where a planner cannot plan from this benchmark, before any is planned.
     """
@@ -140,10 +158,18 @@ def evaluate(benchmark: Benchmark, who: Sequence[EvaluatedPlanner], settings: Ev
             if benchmark.tokens:
                 write_tables(out / one.label, rows[one.label], benchmark.tokens)
             write_record(out / one.label, {**identities[one.label], "planner": one.label, "frames": len(keys)})
-    lines = [line for one in who for line in summary_lines(one.label, summarise(read_rows(out / one.label)))]
+    labels = [*(_done_before(out, shared) if settings.tables else ()), *identities]
+    labels = sorted(dict.fromkeys(labels), key=lambda label: (label not in BOUNDS, label in identities))
+    lines = [line for label in labels for line in summary_lines(label, summarise(read_rows(out / label)))]
     if settings.tables:
         write_table(out, lines)
     return lines
+
+
+def _done_before(out: Path, shared: Mapping[str, Any]) -> list[str]:
+    """The planners in a folder that were evaluated on the same benchmark by the same rules, oldest first."""
+    records = sorted(matching(out, f"*/{RECORD}"), key=lambda path: path.stat().st_mtime)
+    return [path.parent.name for path in records if is_done(path.parent, shared)]
 
 
 def check_needs(benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[EvaluatedPlanner]) -> None:
@@ -202,14 +228,56 @@ def _prepared(benchmark: Benchmark, clip_id: str, rules: Rules) -> ClipFrames | 
     return prepare_clip(benchmark.scenes(clip_id), rules)
 
 
-def fallback_notes(lines: Sequence[SummaryLine]) -> list[str]:
-    """A line for each planner with more clips in the uniform fallback than a two-stage score should rest on."""
-    return [
-        f"{line.planner}: {100.0 * line.uniform_share:.0f} % of its plans end beyond 1.92 m of every follow-up, "
-        f"whose scores then weigh the same; above {100.0 * MOST_UNIFORM:.0f} % stage two says little of this planner\n"
-        for line in lines
-        if (line.stage, line.human_filter) == ("final", "filtered") and line.uniform_share > MOST_UNIFORM
-    ]
+def what_decides(results: Mapping[str, Sequence[ClipResult]]) -> list[str]:
+    """On how much each planner's score rests, where it lies, and which differences mean nothing.
+
+    Intervals are over the largest clusters of which there are two: towns, else logs, else clips. Planners are held
+    against the first that is none of BOUNDS, and that one against constant velocity.
+    """
+    two_stage = any(clip.groups is not None for clips in results.values() for clip in clips)
+    measure = ("final" if two_stage else "one_stage", PAPER)
+    scored = {label: collect_scores([clips], "score") for label, clips in results.items()}
+    runs = {label: found[measure] for label, found in scored.items() if measure in found}
+    if not runs:
+        return []
+    one = next(iter(runs.values()))
+    known = cluster_labels_by_level(one.clips, one.logs)
+    counted = " of ".join(f"{len(set(names))} {level}s" for level, names in known.items())
+    level, names = next(((k, v) for k, v in reversed(known.items()) if len(set(v)) > 1), ("clip", one.clips))
+
+    def interval(a: Array, b: RunScores) -> Interval:
+        return paired_interval(a, b.scores, weights=(b.weights, b.weights), clusters=names)
+
+    said = [f"{stage_title(measure[0])} ({PAPER}), decided by {counted}; 95 % intervals over {level}s:"]
+    for label, run in runs.items():
+        found = interval(np.zeros_like(run.scores), run)
+        said.append(f"  {label}: {100 * found.b:.1f} ({_ends(found, '.1f')}){_follow_ups_that_count(results[label])}")
+    own = [label for label in runs if label not in BOUNDS]
+    pairs = [(own[0], "constant_velocity")] if own and "constant_velocity" in runs else []
+    for b, a in [*pairs, *((label, own[0]) for label in own[1:])]:
+        found, apart = interval(runs[a].scores, runs[b]), int((runs[a].scores != runs[b].scores).sum())
+        verdict = "" if found.is_clear else ": no difference told from zero"
+        said.append(
+            f"  {b} against {a}: {100 * found.difference:+.1f} ({_ends(found, '+.1f')}), by {apart} clips{verdict}"
+        )
+    return said
+
+
+def _ends(found: Interval, form: str) -> str:
+    return f"{100 * found.low:{form}} to {100 * found.high:{form}}" if np.isfinite(found.low) else "no interval"
+
+
+def _follow_ups_that_count(clips: Sequence[ClipResult]) -> str:
+    """How many follow-ups stage two rests on: Kish's effective number of each group whose weights differ, summed."""
+    groups = [group for clip in clips for group in clip.groups or ()]
+    if not groups:
+        return ""
+    near = [group for group in groups if not has_uniform_weights(group.endpoint_xy, group.starts_xy)]
+    count = sum(1.0 / (follow_up_weights(group.endpoint_xy, group.starts_xy) ** 2).sum() for group in near)
+    said = f", stage two on {count:.0f} of {sum(len(group.stage_two) for group in groups)} follow-ups"
+    if (far := len(groups) - len(near)) > MOST_UNIFORM * len(groups):
+        said += f"; {far} of {len(groups)} plans end beyond 1.92 m of every one, all then weigh alike and say little"
+    return said
 
 
 def settings_of(argv: Sequence[str]) -> EvaluateSettings:
@@ -253,6 +321,10 @@ def run_evaluation(settings: EvaluateSettings) -> None:
     if benchmark.tokens and benchmark.left_out:
         total = benchmark.left_out + len({key.clip_id for key in benchmark.keys})
         print(f"{benchmark.left_out} of its {total} clips are left out: no published number is over so few")
-    print("".join(fallback_notes(lines)), end="")
+    results = {
+        label: group_by_clip(read_rows(Path(settings.out) / label))
+        for label in dict.fromkeys(line.planner for line in lines)
+    }
+    print("\n".join(what_decides(results)))
     if settings.tables:
         print(f"look at {Path(settings.out) / 'summary.csv'}")

@@ -27,8 +27,10 @@ from typing import TYPE_CHECKING, Any
 
 from factory.config.compose import ConfigError, compose
 from factory.config.plugins import import_object, plugin_named, plugins_by_name
+from factory.config.shapes import required_keys
 from factory.config.words import did_you_mean, expand_home
 from planners.data.batch import Needs
+from planners.evaluation.benchmark_folder import how_to_make
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.scoring import Plans, PreparedFrame, human_plans, pdm_plans
 from planners.models.settings import BUILT_IN, OWN, PlannerChoice
@@ -71,7 +73,7 @@ def _named(spec: str, label: str | None, changed: Mapping[str, Any] | None) -> E
     if spec in PRIVILEGED:
         return EvaluatedPlanner(name, spec, privileged=PRIVILEGED[spec])
     if spec in UNTRAINED:
-        return EvaluatedPlanner(name, spec, partial(_built, spec))
+        return EvaluatedPlanner(name, spec, partial(_imported, BUILT_IN[spec][0]))
     members = spec.split("+")
     if all(Path(member).is_dir() for member in members):
         newest = [
@@ -130,12 +132,19 @@ def compose_with_planner(
     """The values of a command line and conf/<name>.yaml, typed by `shape`, with `planner=` as text.
 
     Hydra would take it for a choice among conf/planner, which are planners to be trained.
-    completed: as of `compose`. Raises ConfigError, SettingsShown.
+    completed: as of `compose`. Raises ConfigError, for a benchmark that is to be given and is not with the command that
+    makes one; SettingsShown.
     """
     who = [argument for argument in argv if argument.startswith("planner=")]
     named = {"planner": who[-1].split("=", 1)[1]} if who else {}
     others = [argument for argument in argv if argument not in who]
-    return compose(name, others, shape, lambda values: completed(values | named))
+
+    def told(values: dict[str, Any]) -> dict[str, Any]:
+        if "benchmark" not in values and "benchmark" in required_keys(shape):
+            raise ConfigError(f"benchmark is missing: give benchmark=runs/hard; {how_to_make('runs/hard')}")
+        return completed(values | named)
+
+    return compose(name, others, shape, told)
 
 
 def needs_of(made: Any) -> Needs | None:
@@ -158,12 +167,6 @@ def _trained(folders: Sequence[Path], changed: Mapping[str, Any] | None) -> "Pla
         return Ensemble(scoring).eval()
     except ValueError as error:
         raise ConfigError(f"ensemble: {error}") from error
-
-
-def _built(name: str) -> "Planner":
-    from planners.models.planner import build_planner
-
-    return build_planner(PlannerChoice(name), {}).eval()
 
 
 def _imported(spec: str) -> Any:

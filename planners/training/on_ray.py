@@ -18,21 +18,21 @@ from ray.train import RunConfig, ScalingConfig, WorkerGroupError
 from ray.train.torch import TorchConfig, TorchTrainer, get_device
 
 from factory.exits import terminal_signals_blocked
-from planners.training.processes import RaySettings, TrainingProcess, join_process_group
+from planners.training.processes import TrainingProcess, join_process_group
 
 
-def train_on_ray(train: Callable[[TrainingProcess], None], settings: RaySettings, out: str) -> None:
-    """Call `train` in each of `settings.processes` processes. What one of them raises is raised here."""
-    gpu = settings.gpus > 0
+def train_on_ray(train: Callable[[TrainingProcess], None], out: str, processes: int, gpus: int, cpus: int) -> None:
+    """Call `train` in each of `processes`, with so many GPUs and CPUs each. What one of them raises is raised here."""
+    gpu = gpus > 0
     with _connected():
         trainer = TorchTrainer(
             _part,
             train_loop_config={"train": train},
             torch_config=TorchConfig(backend="nccl" if gpu else "gloo"),
             scaling_config=ScalingConfig(
-                num_workers=settings.processes,
+                num_workers=processes,
                 use_gpu=gpu,
-                resources_per_worker={"CPU": settings.cpus, **({"GPU": settings.gpus} if gpu else {})},
+                resources_per_worker={"CPU": cpus, **({"GPU": gpus} if gpu else {})},
             ),
             run_config=RunConfig(name="ray", storage_path=os.path.abspath(out)),
         )

@@ -1,26 +1,14 @@
 """The processes of one training: which of them this is, and what they tell each other."""
 
-from __future__ import annotations
-
 import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
-
-
-@dataclass(frozen=True)
-class RaySettings:
-    """The processes that Ray Train starts."""
-
-    processes: int = 2
-    gpus: int = 0  # of each
-    cpus: int = 1
+import torch
+import torch.distributed as dist
+from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -39,8 +27,6 @@ class TrainingProcess:
         """The mean over all processes, in all of them."""
         if self.size == 1:
             return values
-        import torch.distributed as dist
-
         total = values.clone()
         dist.all_reduce(total)
         return total / self.size
@@ -49,9 +35,6 @@ class TrainingProcess:
         """Whether the flag is set in any process."""
         if self.size == 1:
             return flag
-        import torch
-        import torch.distributed as dist
-
         told = torch.tensor([float(flag)], device=self.device)
         dist.all_reduce(told, op=dist.ReduceOp.MAX)
         return bool(told.item() > 0)
@@ -59,8 +42,6 @@ class TrainingProcess:
     def wait(self) -> None:
         """Until all processes are here."""
         if self.size > 1:
-            import torch.distributed as dist
-
             dist.barrier()
 
 
@@ -71,9 +52,6 @@ def join_process_group(device: str, place: torch.device | None = None) -> Iterat
     device: auto | cpu | cuda; place: the device itself, where that is known. Raises ValueError for cuda where there is
     none.
     """
-    import torch
-    import torch.distributed as dist
-
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError(
             "device=cuda, but PyTorch sees no GPU here: leave device=auto, or install a CUDA build of torch"

@@ -41,11 +41,11 @@ from planners.training.checkpoint import (
     settings_record,
 )
 from planners.training.optim import TrainingSettings
-from planners.training.processes import RaySettings, TrainingProcess, join_process_group
 
 if TYPE_CHECKING:  # PyTorch is imported once the settings and the samples are found to fit
     from planners.models.planner import Planner
     from planners.training.fit import Precision
+    from planners.training.processes import TrainingProcess
 
 LARGEST_BATCH = 32
 FURTHER = frozenset({"steps", "processes", "accumulate"})  # what may be another with resume=further
@@ -86,6 +86,15 @@ class PlannerEntry(PlannerChoice):
     """What conf/planner/*.yaml holds."""
 
     training: TrainingSettings | None = None
+
+
+@dataclass(frozen=True)
+class RaySettings:
+    """The processes that Ray Train starts."""
+
+    processes: int = 2
+    gpus: int = 0  # of each
+    cpus: int = 1
 
 
 @dataclass(frozen=True)
@@ -141,10 +150,12 @@ def main(argv: Sequence[str]) -> None:
     if config.executor == "ray":
         from planners.training.on_ray import train_on_ray
 
-        train_on_ray(partial(train, config), config.ray, config.out)
+        train_on_ray(partial(train, config), config.out, **dataclasses.asdict(config.ray))
     else:
         config.training  # noqa: B018 - raises ConfigError for a planner that does not learn
         dataset = open_data(config.data, mix=config.mix)  # what does not fit is told before PyTorch is imported
+        from planners.training.processes import join_process_group
+
         with join_process_group(config.device) as process:
             train(config, process, dataset)
 

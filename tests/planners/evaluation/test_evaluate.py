@@ -15,7 +15,7 @@ from torch import Tensor
 from factory.config.compose import ConfigError
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
 from planners.evaluation.aggregation import SummaryLine
-from planners.evaluation.evaluate import EvaluateSettings, evaluate, fallback_notes, main, settings_of
+from planners.evaluation.evaluate import EvaluateSettings, evaluate, main, settings_of
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.planner_names import EvaluatedPlanner, find_planner, find_planners
 from planners.evaluation.planning import all_plans, plan_samples, without_future
@@ -196,14 +196,6 @@ def test_rows_of_other_rules_never_stand_under_an_older_record(
             evaluate(benchmark, who, replace(first, two_stage_traffic=first.one_stage_traffic))
     for a, b in zip(expected, evaluate(benchmark, who, first)):
         np.testing.assert_array_equal(a.columns, b.columns)
-
-
-def test_a_planner_whose_plans_end_far_from_the_follow_ups_is_pointed_out(
-    benchmark: StreetBenchmark, tmp_path: Path
-) -> None:
-    lines = evaluate(benchmark, named("test_evaluate:Steady", "test_evaluate:Racing"), settings(tmp_path))
-    (note,) = fallback_notes(lines)
-    assert note.startswith("test_evaluate.Racing: 100 % of its plans")
 
 
 def test_a_record_says_what_was_evaluated(benchmark: StreetBenchmark, tmp_path: Path) -> None:
