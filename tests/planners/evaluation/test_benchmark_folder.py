@@ -67,7 +67,7 @@ def test_what_is_missing_is_named_at_once(tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=message):
             BenchmarkFolder(str(tmp_path))
 
-    refused("no benchmark.json here: make it with")
+    refused(r"no benchmark.json here: make it, .*python -m factory.run preset=hard_benchmark .*out=/")
     write_benchmark_folder(tmp_path, ("a",))
     document = json.loads((tmp_path / "benchmark.json").read_text())
 
