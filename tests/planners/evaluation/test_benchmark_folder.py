@@ -1,17 +1,20 @@
 """A benchmark on disk gives the frames of the one in memory, and says what it lacks."""
 
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from factory.config.compose import ConfigError
-from planners.evaluation.benchmark_folder import BenchmarkFolder
+from factory.config.run import load_config
+from planners.evaluation.benchmark_folder import MADE_BY, BenchmarkFolder
 from planners.evaluation.evaluate import EvaluateSettings, evaluate, main
 from planners.evaluation.planner_names import find_planners
 from planners.evaluation.score_rows import read_rows
 from planners.evaluation.scoring import Rules, prepare_clip, score_clip
+from tests.pages import commands
 from tests.planners.small_benchmark import StreetBenchmark, straight, write_benchmark_folder
 
 
@@ -89,3 +92,9 @@ def test_what_is_missing_is_named_at_once(tmp_path: Path) -> None:
         BenchmarkFolder(str(tmp_path)).scenes("a")
     (tmp_path / "scenes" / "a.npz").unlink()
     refused("no scenes of 1 clips, such as a")
+
+
+def test_a_page_names_the_command_that_a_refusal_does_and_the_factory_takes_it() -> None:
+    made_by = tuple(shlex.split(MADE_BY))
+    assert [command for command in commands("docs/training.md") if command.words[: len(made_by)] == made_by]
+    assert "follow_up" in load_config([*made_by[3:], "out=x"]).experts

@@ -14,14 +14,16 @@ from torch import Tensor
 
 from factory.config.compose import ConfigError
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
-from planners.evaluation.aggregation import SummaryLine
-from planners.evaluation.evaluate import EvaluateSettings, evaluate, main, settings_of
+from planners.evaluation.aggregation import SummaryLine, group_by_clip
+from planners.evaluation.benchmark_folder import MADE_BY
+from planners.evaluation.evaluate import EvaluateSettings, evaluate, main, settings_of, what_decides
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.planner_names import EvaluatedPlanner, find_planner, find_planners
 from planners.evaluation.planning import all_plans, plan_samples, without_future
 from planners.evaluation.score_rows import read_record, read_rows
 from planners.training.checkpoint import save_checkpoint
 from tasks.reward.aggregate import COLUMNS
+from tests.planners.made_rows import clip_rows
 from tests.planners.small_benchmark import StreetBenchmark, straight
 from tests.planners.toy import Toy, ToySettings
 
@@ -198,6 +200,44 @@ def test_rows_of_other_rules_never_stand_under_an_older_record(
         np.testing.assert_array_equal(a.columns, b.columns)
 
 
+def test_planners_of_the_same_benchmark_and_rules_stay_in_the_table(benchmark: StreetBenchmark, tmp_path: Path) -> None:
+    other = replace(settings(tmp_path), two_stage_traffic=settings(tmp_path).one_stage_traffic)
+    evaluate(benchmark, named("test_evaluate:Racing"), other)
+    for spec in ("test_evaluate:SteadyBatch", "constant_velocity", "test_evaluate:Steady"):
+        lines = evaluate(benchmark, named(spec), settings(tmp_path))
+    labels = ["constant_velocity", "test_evaluate.SteadyBatch", "test_evaluate.Steady"]
+    assert list(dict.fromkeys(line.planner for line in lines)) == labels
+    with (tmp_path / "summary.csv").open() as file:
+        assert list(dict.fromkeys(line["planner"] for line in csv.DictReader(file))) == labels
+    alone = evaluate(benchmark, named("test_evaluate:Steady"), replace(settings(tmp_path), tables=False))
+    assert {line.planner for line in alone} == {"test_evaluate.Steady"}
+
+
+def test_it_is_said_what_a_score_rests_on_and_which_difference_means_nothing() -> None:
+    """Three towns of a clip; follow-ups now at 0 and 0.5 m from the plan's end, before at 9 m, where both weigh alike.
+
+    Weights now 0.777300 and 0.222700, so that 1 / (0.777300^2 + 0.222700^2) = 1.53 of them count.
+    """
+
+    def planner(*final: float) -> list[Any]:
+        after = [((1.0, 1.0), (10.0, 0.0), (19.0, 0.0)), ((1.0, 1.0), (10.0, 0.5), (19.0, 0.0))]
+        made = [
+            clip_rows(f"{n}", 0.0, (score, score), ((10.0, 0.0), (10.0, 0.0)), after, f"town-{n}-0000-a")
+            for n, score in enumerate(final)
+        ]
+        return group_by_clip([row for rows in made for row in rows])
+
+    real, better = planner(0.2, 0.4, 0.6), planner(0.3, 0.5, 0.7)
+    told = what_decides({"constant_velocity": planner(0.1, 0.5, 0.7), "real": real, "better": better})
+    assert told[0] == "final (unfiltered), decided by 3 clips of 3 logs of 3 towns; 95 % intervals over towns:"
+    # Student's t of two degrees of freedom, 4.303 standard errors of 11.547, no further than the scores: 20 to 60
+    assert told[2].startswith("  real: 40.0 (20.0 to 60.0), stage two on 5 of 12 follow-ups; 3 of 6 plans end beyond")
+    against = "  real against constant_velocity: -3.3 (-32.0 to +25.4), by 3 clips: no difference told from zero"
+    assert told[4] == against  # 10, -10, -10: 4.303 standard errors of 6.667
+    assert told[5] == "  better against real: +10.0 (+10.0 to +10.0), by 3 clips"
+    assert what_decides({"alone": planner(0.5)})[1].startswith("  alone: 50.0 (no interval)")
+
+
 def test_a_record_says_what_was_evaluated(benchmark: StreetBenchmark, tmp_path: Path) -> None:
     evaluate(benchmark, named("human"), settings(tmp_path))
     record = read_record(tmp_path / "human")
@@ -281,7 +321,8 @@ def test_the_command_line_is_typed_and_complains_by_name(capsys: pytest.CaptureF
     assert settings_of(["benchmark=navhard"]).two_stage_traffic.mode == "navsim"
     assert settings_of(["benchmark=navhard", "traffic@two_stage_traffic=idm"]).two_stage_traffic.mode == "idm"
     for argv, message in (
-        (["planner=human"], "benchmark"),
+        (["planner=human"], f"benchmark is missing: give benchmark=runs/hard; make it, to its end: {MADE_BY}"),
+        (["planner=human", "benchmrak=x"], "did you mean benchmark="),
         ([f"benchmark={tmp_path}", "planer=human"], "planer"),
         ([f"benchmark={tmp_path}", "planner=human", "batch_size=0"], "batch_size"),
         ([f"benchmark={tmp_path}", "planner=human"], str(tmp_path)),

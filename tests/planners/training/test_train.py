@@ -1,6 +1,8 @@
 """The training command, used as its users do: on a table, killed, gone on with, and asked for what cannot be."""
 
+import csv
 import os
+import shlex
 import socket
 import subprocess
 import sys
@@ -12,6 +14,8 @@ import pytest
 import torch
 
 from factory.run import main as run_factory
+from planners.drive.settings import settings_of as drive_settings
+from planners.evaluation.evaluate import settings_of as evaluate_settings
 from planners.training.checkpoint import load_planner, newest_checkpoint, read_record
 from planners.training.fit import LOSSES, VALIDATION
 from planners.training.train import main
@@ -46,6 +50,15 @@ def test_it_trains_and_says_what_with(table: str, tmp_path: Path, capsys: pytest
         == 0
     )
     said = capsys.readouterr().out
+    worth = list(csv.DictReader((tmp_path / VALIDATION).open()))
+    lines = [line for line in said.splitlines() if line.startswith("validation after step ")]
+    for line, row in zip(lines, worth, strict=True):
+        assert f"step {row['step']}: ade_m {float(row['ade_m']):.4f}, fde_m {float(row['fde_m']):.4f}; " in line
+    first, last = (float(row["ade_m"]) for row in worth)
+    best = "the best so far" if last < first else f"best so far: ade_m {first:.4f} after step 10"
+    assert lines[0].endswith("; the best so far") and lines[1].endswith(best)
+    watch, score = (shlex.split(line.partition(": ")[2]) for line in said.splitlines()[-2:])
+    assert drive_settings(watch[4:]).planner == evaluate_settings(score[4:]).planner == str(tmp_path)
     assert "real: 8 samples" in said and "recovery: 16" in said and "18 steps; begins" in said
     assert f"least ade_m: {tmp_path}" in said
     record = read_record(tmp_path)
