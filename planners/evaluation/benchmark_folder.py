@@ -27,12 +27,11 @@ MADE_BY = (
     "python -m factory.run preset=hard_benchmark clips=synthetic_towns clips.split=test clips.first_seed=501 "
     "'clips.settings.cameras=[]' clips.settings.lidar_beams=0 render=painter vocabulary.k=16384"
 )
-PAGE = "docs/training.md#evaluation"
 
 
 def how_to_make(out: str) -> str:
     """One command that makes a benchmark in a folder."""
-    return f"make it, to its end: {MADE_BY} out={shlex.quote(out)}; of your own held-out logs: {PAGE}"
+    return f"make it, to its end: {MADE_BY} out={shlex.quote(out)}; of your own logs: docs/training.md#evaluation"
 
 
 class BenchmarkFolder:

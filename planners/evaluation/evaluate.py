@@ -242,29 +242,25 @@ def what_decides(results: Mapping[str, Sequence[ClipResult]]) -> list[str]:
         return []
     one = next(iter(runs.values()))
     known = cluster_labels_by_level(one.clips, one.logs)
-    counted = " of ".join(f"{len(set(names))} {level}s" for level, names in known.items())
-    level, names = next(((k, v) for k, v in reversed(known.items()) if len(set(v)) > 1), ("clip", one.clips))
+    level = [level for level, names in known.items() if level == "clip" or len(set(names)) > 1][-1]
 
-    def interval(a: Array, b: RunScores) -> Interval:
-        return paired_interval(a, b.scores, weights=(b.weights, b.weights), clusters=names)
+    def against(a: Array, b: RunScores, form: str) -> tuple[Interval, str]:
+        found = paired_interval(a, b.scores, weights=(b.weights, b.weights), clusters=known[level])
+        ends = f"{100 * found.low:{form}} to {100 * found.high:{form}}" if np.isfinite(found.low) else "no interval"
+        return found, f"{100 * found.difference:{form}} ({ends})"
 
+    counted = " of ".join(f"{len(set(names))} {name}s" for name, names in known.items())
     said = [f"{stage_title(measure[0])} ({PAPER}), decided by {counted}; 95 % intervals over {level}s:"]
     for label, run in runs.items():
-        found = interval(np.zeros_like(run.scores), run)
-        said.append(f"  {label}: {100 * found.b:.1f} ({_ends(found, '.1f')}){_follow_ups_that_count(results[label])}")
+        score = against(np.zeros_like(run.scores), run, ".1f")[1]
+        said.append(f"  {label}: {score}{_follow_ups_that_count(results[label])}")
     own = [label for label in runs if label not in BOUNDS]
     pairs = [(own[0], "constant_velocity")] if own and "constant_velocity" in runs else []
     for b, a in [*pairs, *((label, own[0]) for label in own[1:])]:
-        found, apart = interval(runs[a].scores, runs[b]), int((runs[a].scores != runs[b].scores).sum())
+        found, difference = against(runs[a].scores, runs[b], "+.1f")
         verdict = "" if found.is_clear else ": no difference told from zero"
-        said.append(
-            f"  {b} against {a}: {100 * found.difference:+.1f} ({_ends(found, '+.1f')}), by {apart} clips{verdict}"
-        )
+        said.append(f"  {b} against {a}: {difference}, by {(runs[a].scores != runs[b].scores).sum()} clips{verdict}")
     return said
-
-
-def _ends(found: Interval, form: str) -> str:
-    return f"{100 * found.low:{form}} to {100 * found.high:{form}}" if np.isfinite(found.low) else "no interval"
 
 
 def _follow_ups_that_count(clips: Sequence[ClipResult]) -> str:
@@ -325,6 +321,7 @@ def run_evaluation(settings: EvaluateSettings) -> None:
         label: group_by_clip(read_rows(Path(settings.out) / label))
         for label in dict.fromkeys(line.planner for line in lines)
     }
-    print("\n".join(what_decides(results)))
+    for line in what_decides(results):
+        print(line)
     if settings.tables:
         print(f"look at {Path(settings.out) / 'summary.csv'}")
