@@ -21,9 +21,8 @@ from tasks.world.clip import Scene
 
 IDENTITY = ("attempt_id", "clip_id", "expert", "candidate_index", "image_source", "settings_hash", "stage_versions")
 
-
-# Of towns that no page trains on: cameras are painted where frames are, so that no log has to be.
-MADE_BY = (
+HOW = "run the command that made it again, to its end"
+MADE_BY = (  # of towns that no page trains on; their cameras are painted where frames are, so that no log has to be
     "python -m factory.run preset=hard_benchmark clips=synthetic_towns clips.split=test clips.first_seed=501 "
     "'clips.settings.cameras=[]' clips.settings.lidar_beams=0 render=painter vocabulary.k=16384"
 )
@@ -55,13 +54,13 @@ class BenchmarkFolder:
         found = {FrameKey(row["clip_id"], row["expert"], row["candidate_index"]): row for row in rows}
         wanted = [key for clip_id in self._listed.clips for key in self._frames_of(clip_id)]
         if lacking := [key for key in wanted if key not in found]:
-            raise ConfigError(f"benchmark={path}: {lacking[0]} has no sample: {how_to_make(path)}")
+            raise ConfigError(f"benchmark={path}: {lacking[0]} has no sample: {HOW}")
         self._rows = {key: found[key] for key in wanted}
         self._scenes = SceneFiles(location.child("scenes"))
         if without := sorted(set(self._follow_ups) - set(self._scenes.clip_ids())):
             raise ConfigError(
                 f"benchmark={path}: no scenes of {len(without)} clips, such as {without[0]}, "
-                f"and plans cannot be driven in samples alone: {how_to_make(path)}"
+                f"and plans cannot be driven in samples alone: {HOW}"
             )
 
     @property
@@ -155,7 +154,7 @@ class BenchmarkFolder:
             raise self._damaged(clip_id, error) from error
 
     def _damaged(self, clip_id: str, error: Exception) -> ConfigError:
-        return ConfigError(f"benchmark={self.path}: scenes of clip {clip_id}: {error}: {how_to_make(self.path)}")
+        return ConfigError(f"benchmark={self.path}: scenes of clip {clip_id}: {error}: {HOW}")
 
 
 @dataclass(frozen=True)
@@ -195,12 +194,11 @@ def _listed(path: str, document: bytes) -> _Listed:
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, ConfigError):
             raise
-        raise ConfigError(
-            f"benchmark={path}: {BENCHMARK_FILE} cannot be read ({error}): {how_to_make(path)}"
-        ) from error
+        raise ConfigError(f"benchmark={path}: {BENCHMARK_FILE} cannot be read ({error}): {HOW}") from error
     if not clips:
         why = "; ".join(sorted({str(clip["why"]) for clip in left_out})) or "it read none"
-        raise ConfigError(f"benchmark={path}: none of its clips counts: {why}: {how_to_make('<another folder>')}")
+        more = "raise rounds and vocabulary.k of the command that made it, or lower benchmark.min_follow_ups"
+        raise ConfigError(f"benchmark={path}: none of its clips counts: {why}: {more}")
     return _Listed(int(stored.get("stages", 2)), clips, len(left_out))
 
 

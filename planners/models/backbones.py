@@ -23,10 +23,7 @@ from factory.readers.pickles import load_tensors
 from factory.wording import one_line
 from planners.models.settings import STRIDES, BackboneSettings
 
-IMAGENET_MEAN, IMAGENET_STD = (
-    (0.485, 0.456, 0.406),
-    (0.229, 0.224, 0.225),
-)  # of red, green, blue in 0 .. 1
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of red, green, blue in 0 .. 1
 
 
 class Backbone(nn.Module, ABC):

@@ -25,13 +25,7 @@ from planners.data.batch import Batch, ImageLayout, Needs
 from planners.models.backbones import build_backbone
 from planners.models.layers import Decoder, LatentFusion, Layer, initialise_as_public
 from planners.models.planner import Planner, TrainingData, evaluating, read_array
-from planners.models.settings import (
-    STRIDES,
-    BackboneSettings,
-    FusionSettings,
-    GtrsDenseSettings,
-    WeightingName,
-)
+from planners.models.settings import STRIDES, BackboneSettings, FusionSettings, GtrsDenseSettings, WeightingName
 from tasks.subscores import HALVES
 from tasks.world.arrays import FloatArray
 from tasks.world.vocabulary import Vocabulary

@@ -13,9 +13,7 @@ from torch import Tensor, nn
 from planners.data.batch import Batch, Needs
 from planners.models.layers import AgentHead, BevHead, LatentFusion, auxiliary_losses, initialise_as_public
 from planners.models.planner import Planner, add_base_plan, bound_heading, evaluating, imitation_l1, visible_status
-from planners.models.settings import (
-    LtfSettings,
-)
+from planners.models.settings import LtfSettings
 from tasks.world.arrays import FloatArray
 
 

@@ -153,7 +153,7 @@ def main(argv: Sequence[str]) -> None:
         train_on_ray(partial(train, config), config.out, **dataclasses.asdict(config.ray))
     else:
         config.training  # noqa: B018 - raises ConfigError for a planner that does not learn
-        dataset = open_data(config.data, mix=config.mix)  # what does not fit is told before PyTorch is imported
+        dataset = open_data(config.data, mix=config.mix)
         from planners.training.processes import join_process_group
 
         with join_process_group(config.device) as process:
@@ -250,11 +250,10 @@ def train(config: TrainConfig, process: TrainingProcess, dataset: Dataset | None
 
 def _next_text(out: str, looks: bool) -> str:
     """The commands that say what a trained planner is worth, to be pasted into a shell. looks: whether at pictures."""
-    drive = f"drive planner={out} clips.n_clips=6 films=6 out={out}/drives".split()
-    blind = [] if looks else ["clips.settings.cameras=[]", "clips.settings.lidar_beams=0"]
-    door = ["python", "-m", "planners"]
-    score = ["evaluate", "benchmark=runs/hard", f"planner={out}"]
-    return f"watch it drive: {shlex.join([*door, *drive, *blind])}\nscore it: {shlex.join([*door, *score])}"
+    blind = "" if looks else " 'clips.settings.cameras=[]' clips.settings.lidar_beams=0"
+    drive = f"drive {shlex.quote(f'planner={out}')} clips.n_clips=6{blind} films=6 {shlex.quote(f'out={out}/drives')}"
+    score = f"evaluate benchmark=runs/hard {shlex.quote(f'planner={out}')}"
+    return f"watch it drive: python -m planners {drive}\nscore it: python -m planners {score}"
 
 
 def _with_fitting_batch(config: TrainConfig, dataset: Dataset, process: TrainingProcess) -> TrainConfig:
