@@ -24,7 +24,7 @@ IDENTITY = ("attempt_id", "clip_id", "expert", "candidate_index", "image_source"
 HOW = "run the command that made it again, to its end"
 MADE_BY = (  # of towns that no page trains on; their cameras are painted where frames are, so that no log has to be
     "python -m factory.run preset=hard_benchmark clips=synthetic_towns clips.split=test clips.first_seed=501 "
-    "'clips.settings.cameras=[]' clips.settings.lidar_beams=0 render=painter vocabulary.k=16384"
+    "clips.first_window=2 'clips.settings.cameras=[]' clips.settings.lidar_beams=0 render=painter vocabulary.k=16384"
 )
 
 
