@@ -11,12 +11,11 @@ from factory.config.arguments import (
     POSITIONAL,
     RUN_SETTINGS,
     ComposedCommand,
-    config_groups,
     fields_with,
     request_class_of,
     request_keys,
 )
-from factory.config.compose import conf_dir
+from factory.config.compose import conf_dir, config_groups
 from factory.config.plugins import group_choices
 from factory.config.run import EXPERTS, built_in_classes, reader_settings_class
 from factory.config.shapes import allowed_values, dataclass_in, setting_keys

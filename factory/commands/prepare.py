@@ -46,7 +46,7 @@ class VocabularyRequest:
             if not equals:
                 raise ValueError(f"{key!r}: expected key=value; see --help")
             if key.partition(".")[0] != "clips":
-                meant = did_you_mean(key, list(request_keys(VocabularyRequest)))
+                meant = did_you_mean(key, [*request_keys(VocabularyRequest), "clips"])
                 raise ValueError(f"{key}: there is no such setting; see --help{meant}")
         if self.kinematic and (self.out is None or self.table is not None):
             raise ValueError("kinematic=true makes a vocabulary: give out=<file>.npy, and no table")

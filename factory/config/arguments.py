@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
-from factory.config.compose import conf_dir
+from factory.config.compose import conf_dir, config_groups
 from factory.config.plugins import group_choices
 from factory.config.shapes import allowed_values, defaults_of, required_keys, to_plain, yaml_lines
 from factory.config.words import SEVERAL, SHOW, ConfigError, SettingsShown, did_you_mean, expand_home, split_off_cfg
@@ -152,12 +152,6 @@ def help_text_of(about: str, keys: Mapping[str, Any], shape: type[Any]) -> str:
     ends = "Exit codes: 0 done, 2 refused in one line that says why; all: docs/configuration.md."
     told = [] if "exit codes" in about.lower() else [f"\n{ends}"]
     return "\n".join([about, "keys and defaults", *yaml_lines(keys, shape, {}), *told])
-
-
-def config_groups(conf: str) -> dict[str, str]:
-    """Group of choices in conf/<conf>.yaml, as a command line names it -> what is chosen there."""
-    text = (conf_dir() / f"{conf}.yaml").read_text(encoding="utf-8")
-    return dict(re.findall(r"^  - (\w+(?:@\w+)?): (\w+)$", text, re.M))
 
 
 def _default_values(shape: type[Any]) -> dict[str, Any]:

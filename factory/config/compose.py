@@ -2,11 +2,12 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
+from factory.config.datasets import how_to_read
 from factory.config.plugins import register_plugin_choices
 from factory.config.shapes import dataclass_in, deep_merge, defaults_of, required_keys, setting_keys, yaml_lines
 from factory.config.words import (
@@ -50,6 +51,12 @@ def conf_dir() -> Path:
     raise ConfigError(f"no conf/run.yaml in {here} or {here.parent}: the installation is incomplete, install it again")
 
 
+def config_groups(conf: str) -> dict[str, str]:
+    """Group of choices in conf/<conf>.yaml, as a command line names it -> what is chosen there."""
+    text = (conf_dir() / f"{conf}.yaml").read_text(encoding="utf-8")
+    return dict(re.findall(r"^  - (\w+(?:@\w+)?): (\w+)$", text, re.M))
+
+
 def compose(
     name: str,
     words: Sequence[str],
@@ -74,10 +81,16 @@ def compose(
 
     OmegaConf.register_new_resolver("runs", default_runs_folder, replace=True)
     groups = {path.name for root in (conf_dir(), *asked.folders) for path in folders_in(root)}
+    own = config_groups(name)
     overrides = []  # held against the dataclasses and not against conf/, which says few keys: Hydra takes any
     for word in map(as_hydra_override, asked.overrides):
         plain = word.lstrip("+")
-        overrides.append(word if re.split("[=@]", plain)[0] in groups else f"++{plain}")
+        group = plain.partition("=")[0]
+        if word == plain and group in groups and group not in own:
+            where = ", ".join(key for key in own if key.startswith(f"{group}@"))
+            known = [*own, *(key for key, _ in setting_keys(shape) if key != group)] if shape else [*own]
+            raise ConfigError(f"{group}: give {where}" if where else _no_such_setting(group, known))
+        overrides.append(word if group.partition("@")[0] in groups else f"++{plain}")
     register_plugin_choices(overrides, conf_dir(), asked.folders)
     if asked.folders:
         quoted = ",".join(f"'file://{folder!s}'" for folder in asked.folders)
@@ -96,14 +109,16 @@ def compose(
         what = "<folder>" if key.endswith("root") else "<value>"
         raise ConfigError(f"{key} is missing: give {key}={what}") from error
     except MissingConfigException as error:
-        raise ConfigError(unknown_choice_text(error.missing_cfg_file or "", error.options)) from error
+        missing = str(error.missing_cfg_file)
+        ways = how_to_read(missing.removeprefix("clips/")) if missing.startswith("clips/") else []
+        raise ConfigError(unknown_choice_text(missing, error.options, ways)) from error
     except (HydraException, OmegaConfBaseException) as error:
         cause = f" ({error.__cause__})" if error.__cause__ is not None else ""
         raise ConfigError(f"{str(error).strip()}{cause}".splitlines()[0]) from error
     assert isinstance(resolved, dict)
     values = {str(key): expand_home(value, str(key)) for key, value in resolved.items()}
     if shape is not None:
-        refuse_unknown(shape, values, "")
+        refuse_unknown(shape, values, "", others=own)
         values = deep_merge(defaults_of(shape), values)
         values = {**required_keys(shape), **values} if asked.shows else values
     values = completed(values)
@@ -176,19 +191,27 @@ def _message(error: Any) -> str:
 
 
 def refuse_unknown(
-    cls: type[Any], values: Mapping[str, Any], where: str, said: Callable[[str], str] = lambda key: ""
+    cls: type[Any],
+    values: Mapping[str, Any],
+    where: str,
+    said: Callable[[str], str] = lambda key: "",
+    others: Iterable[str] = (),
 ) -> None:
     """Raises ConfigError naming the first key, below `where`, that `cls` does not have, and the nearest that it has.
 
-    said: what else is known of such a key.
+    said: what else is known of such a key; others: what may stand beside the keys, and is meant at times.
     """
     prefix = f"{where}." if where else ""
     known = [key for key, _ in setting_keys(cls, prefix)]
     for key in _dotted_keys(cls, values, prefix):
         if key not in known:
-            meant = did_you_mean(key, known)
-            more = f"{meant.removesuffix('?')}=?" if meant else "; see --help"
-            raise ConfigError(said(key) or f"{key}: there is no such setting{more}")
+            raise ConfigError(said(key) or _no_such_setting(key, [*known, *others]))
+
+
+def _no_such_setting(key: str, known: Sequence[str]) -> str:
+    meant = did_you_mean(key, known)
+    more = f"{meant.removesuffix('?')}=?" if meant else "; see --help"
+    return f"{key}: there is no such setting{more}"
 
 
 def _dotted_keys(cls: type[Any], values: Mapping[str, Any], prefix: str) -> Iterator[str]:

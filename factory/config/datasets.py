@@ -3,6 +3,7 @@
 The package of a folder is light, and says what there is by these names, each of which may be missing:
 
     READERS             class in its module `reader` -> dataclass of the settings of `clips`
+    READS               name that people give to its logs, in small letters -> `clips=` for them, and its page
     camera_names        settings of clips -> names of the rig, before a log is read; ValueError where there is no log
     compile_kernels     what `python -m factory warm` compiles beside the kernels of runs
 
@@ -13,7 +14,9 @@ and by these words -> `module:function`, which is imported when the word is used
     BENCHMARKS          of `python -m planners evaluate benchmark=`: it makes the folder
 """
 
+import re
 from collections.abc import Mapping
+from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules, resolve_name
@@ -21,6 +24,7 @@ from types import ModuleType
 from typing import Any
 
 FOLDER = "factory.datasets"
+LIKE = 0.7  # a name of logs that is meant: waymo_open, argoverse
 
 
 @cache
@@ -40,6 +44,13 @@ def reader_settings(clips: Mapping[str, Any]) -> type[Any] | None:
     """The dataclass of a built-in reader's settings; None for a reader of the user's own."""
     shapes: Mapping[str, type[Any]] = getattr(data_set_of(clips), "READERS", {})
     return shapes.get(str(clips.get("_target_", "")).rpartition(".")[2])
+
+
+def how_to_read(name: str) -> list[str]:
+    """What reads logs of that name or one like it, each as READS says it; none where no data set knows them."""
+    ways = [getattr(found, "READS", {}) for found in data_sets().values()]
+    near = get_close_matches(re.sub(r"\W|_", "", name.lower()), {word: 0 for way in ways for word in way}, 1, LIKE)
+    return [way[near[0]] for way in ways if near and near[0] in way]
 
 
 def words_of(kind: str) -> dict[str, str]:

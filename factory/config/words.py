@@ -133,9 +133,11 @@ def expand_home(value: Any, key: str) -> Any:
     return path
 
 
-def unknown_choice_text(missing: str, choices: Sequence[str] | None) -> str:
-    """`missing`: group/choice as Hydra names it."""
+def unknown_choice_text(missing: str, choices: Sequence[str] | None, instead: Sequence[str] = ()) -> str:
+    """`missing`: group/choice as Hydra names it; instead: choices that do what is meant, each with what it needs."""
     group, _, choice = missing.rpartition("/")
+    if instead:
+        return f"{group}={choice}: give {'; or '.join(instead)}"
     known = sorted(choices or ())
     meant = did_you_mean(choice, known).replace("mean ", f"mean {group}=")
     return f"{group}={choice}: there is {', '.join(known) or 'no choice'}{meant}"
@@ -143,5 +145,6 @@ def unknown_choice_text(missing: str, choices: Sequence[str] | None) -> str:
 
 def did_you_mean(word: str, known: Sequence[str], cutoff: float = 0.6) -> str:
     """`; did you mean x?` where one is near, else nothing. cutoff: 0..1, the likeness that counts as near."""
-    found = get_close_matches(word, known, n=1, cutoff=cutoff)
-    return f"; did you mean {found[0]}?" if found else ""
+    known = {name.lower(): name for name in known}
+    found = get_close_matches(word.lower(), known, n=1, cutoff=cutoff)
+    return f"; did you mean {known[found[0]]}?" if found else ""

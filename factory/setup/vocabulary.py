@@ -36,6 +36,7 @@ class TrainWindows:
     logs: tuple[str, ...]  # train logs read, sorted
     clips_of_split: dict[str, int]  # clips read, by split
     broken: dict[str, str]  # clip id or log -> why it could not be read
+    takes_split: bool = False  # whether clips.split= can say that they are train logs
 
 
 def train_windows(reader: ClipReader, every_s: float = 0.5) -> TrainWindows:
@@ -71,7 +72,7 @@ def train_windows(reader: ClipReader, every_s: float = 0.5) -> TrainWindows:
         taken |= {(ref.log_id, ref.start_ms + step * STEP_MS) for step in starts}
         windows.append(human_windows(clip.ego_states, np.array(starts, dtype=np.intp)))
     trajectories = np.concatenate(windows) if windows else np.zeros((0, HORIZON_STEPS, 3))
-    return TrainWindows(trajectories, tuple(sorted(logs)), dict(splits), broken)
+    return TrainWindows(trajectories, tuple(sorted(logs)), dict(splits), broken, hasattr(reader, "split"))
 
 
 def build_vocabulary(windows: TrainWindows, k: int, seed: int) -> Vocabulary:
@@ -85,14 +86,21 @@ def build_recovery_table(windows: Sequence[TrainWindows], vocabularies: Sequence
     """All train windows, then all trajectories of the vocabularies. Raises ValueError where there is none at all."""
     parts = [part.trajectories for part in windows] + [vocabulary.trajectories for vocabulary in vocabularies]
     if not sum(map(len, parts)):
-        reasons = "; ".join(_no_train_log(part) for part in windows)
+        reasons = "; ".join(map(_no_train_log, windows))
         raise ValueError(f"a recovery table needs train logs or a vocabulary file: {reasons or 'neither was given'}")
     return RecoveryTable(np.concatenate(parts))
 
 
 def _no_train_log(windows: TrainWindows) -> str:
     found = ", ".join(f"{count} {split}" for split, count in sorted(windows.clips_of_split.items()))
-    return f"no train log: the clips read are {found or 'none'}, {len(windows.broken)} could not be read"
+    how = ": clips.split=train takes them as such" if windows.takes_split else ""
+    taken = [f"no train log, the clips are {found}{how}"] if found else []
+    others = len(windows.broken) - 1
+    first = [
+        windows.broken[name] + (f" ({others} others cannot be read either)" if others else "")
+        for name in sorted(windows.broken)[:1]
+    ]
+    return "; ".join([*first, *taken]) or "no train log, and no clip"
 
 
 def load_vocabulary(path: str | Path, first: int | None = None) -> Vocabulary:

@@ -74,7 +74,7 @@ def test_a_recovery_table_kept_of_train_logs_is_not_given_where_they_are_test(
     asked = ["clips=av2", f"clips.root={shared_root / 'data/av2/sensor/val'}", f"out={tmp_path}", "experts=[recovery]"]
     run = assemble(load_config([*asked, "clips.split=train", "limit=1"]))
     assert len(run.work.experts["recovery"].table)  # type: ignore[attr-defined]
-    with pytest.raises(ConfigError, match="no train log"):
+    with pytest.raises(ConfigError, match=r"no train log, the clips are 14 test: clips\.split=train takes them"):
         assemble(load_config([*asked, "clips.split=test", "limit=1"]))
 
 
