@@ -9,7 +9,7 @@ import json
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from typing import Any, Literal
@@ -361,6 +361,7 @@ CURRENT_RUN = "current_run.json"  # what the newest run set out to do; over once
 LAST_RUN = "last_run.json"
 IMPORTED = "import.source"  # a setting that tables of others' rows have, and no run
 WAYS_OUT = "Go on with on_change=keep, replace with on_change=redo, or choose another out"
+SHOWN = 3  # changed settings that a message names
 MADE_UNDER = ["attempt_id", "expert", "expert_digest", "settings_hash", "stage_versions"]
 
 
@@ -441,13 +442,17 @@ class Store:
         return ClipCache(self.location.child("cache/prepared"))
 
     def checked_records(
-        self, identity: RunIdentity, expert_digests: Mapping[str, str], on_change: OnChange
+        self,
+        identity: RunIdentity,
+        expert_digests: Mapping[str, str],
+        on_change: OnChange,
+        data_sets: Collection[str] = (),
     ) -> list[dict[str, Any]]:
         """Hold the run against the newest record of run.json; the records as they are to be, with this run's as newest.
 
         A record's on_change says whether rows of older records may stand among its own ("keep"); its expert digests
         are those of all experts so far. Writes nothing. Raises ChangedRun where they differ, on_change is "stop" and
-        there are samples; without one the run starts over.
+        there are samples; without one the run starts over. data_sets: of the run's clips, for what it says.
         """
         for expert in expert_digests:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", expert):
@@ -476,7 +481,7 @@ class Store:
             if changes and on_change == "stop" and not len(self.samples):
                 return [record]  # nothing stands on the settings that were: they were tried, found wrong and corrected
             if changes and on_change == "stop":
-                raise ChangedRun(f"{self.location.uri} was made with other settings: {'; '.join(changes)}. {WAYS_OUT}")
+                raise ChangedRun(self._why_changed(changes, data_sets))
             record["expert_digests"] = records[-1]["expert_digests"] | record["expert_digests"]
             if identity.prepare_digest == UNLISTED:  # lists of earlier runs stay what they are
                 record["prepare_digest"] = records[-1]["prepare_digest"]
@@ -485,6 +490,15 @@ class Store:
             if not changes:
                 records = records[:-1]
         return [*records, record]
+
+    def _why_changed(self, changes: Sequence[str], data_sets: Collection[str]) -> str:
+        more = f"; and {len(changes) - SHOWN} more" if len(changes) > SHOWN else ""
+        shown = f"{'; '.join(changes[:SHOWN])}{more}"
+        there = sorted(set(self.samples.read(["dataset"])["dataset"].unique().to_pylist()))
+        if data_sets and set(data_sets).isdisjoint(there):
+            holds = f"{self.location.uri} holds samples of {', '.join(there)}, made with other settings ({shown})"
+            return f"{holds}: choose another out for {', '.join(sorted(data_sets))}"
+        return f"{self.location.uri} was made with other settings: {shown}. {WAYS_OUT}"
 
     def starts_over(self, records: Sequence[Mapping[str, object]]) -> bool:
         """Whether `records` of checked_records() take the place of settings that made no sample."""
@@ -628,17 +642,22 @@ def record_differences(old: Mapping[str, object], new: Mapping[str, object]) -> 
     for part, word in (("settings", ""), ("stage_versions", "stage version "), ("expert_digests", "inputs of expert ")):
         a, b = dict(old[part]), dict(new[part])  # type: ignore[call-overload]
         names = sorted(set(a) & set(b)) if part == "expert_digests" else sorted(set(a) | set(b))
-        missing = "not set"
-        found += [
-            f"{word}{n}: {a.get(n, missing)} -> {b.get(n, missing)}"
-            for n in names
-            if a.get(n, missing) != b.get(n, missing)
-        ]
+        found += [line for n in names for line in _changes(f"{word}{n}", a.get(n, "not set"), b.get(n, "not set"))]
     for part, word in (("vocabulary_digest", "vocabulary"), ("prepare_digest", "what perturb depends on")):
         if (
             old[part] != new[part]
+            and not any(line.startswith(f"{word}: ") for line in found)
             and UNLISTED not in (old[part], new[part])
             and not (part == "prepare_digest" and found)
         ):
             found.append(f"{word}: {old[part]} -> {new[part]}")
     return found
+
+
+def _changes(name: str, old: object, new: object) -> Iterator[str]:
+    """What differs between two values of a setting, within groups by their keys."""
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        for key in sorted({*old, *new}):
+            yield from _changes(f"{name}.{key}", old.get(key, "not set"), new.get(key, "not set"))
+    elif old != new:
+        yield f"{name}: {old} -> {new}"

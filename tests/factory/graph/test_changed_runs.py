@@ -9,10 +9,10 @@ import pyarrow.compute as pc
 import pytest
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
-from factory.store.samples import Store
+from factory.store.samples import Store, record_differences
 from tests.factory.graph.runs import run
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
-from tests.factory.toy import VERSIONS, ToyWork, ran, refs
+from tests.factory.toy import VERSIONS, ToyWork, executed, ran, refs
 
 
 @pytest.mark.parametrize(
@@ -34,6 +34,25 @@ def test_a_changed_run_stops_and_names_the_difference(
     assert summary.exit_code == BAD_CONFIG
     assert re.search(named, summary.message)
     assert tables_of(tmp_path / "out")[1:] == before[1:]
+
+
+def test_another_data_set_in_an_old_folder_is_told_in_a_short_line(tmp_path: Path, begun: Callable[..., Path]) -> None:
+    begun(rounds=1, n=1)
+    settings = {f"render.{key}": {"on": True, "width": 320} for key in "abcdefgh"}
+    others = [replace(ref, dataset="street") for ref in refs(1)]
+    summary = executed(ToyWork(settings=settings), others, ["recovery"], 1, Store(tmp_path / "out"))
+    shown = "; ".join(f"render.{key}: not set -> {{'on': True, 'width': 320}}" for key in "abc")
+    told = f"{tmp_path}/out holds samples of word0, word1, made with other settings ({shown}; and 5 more): choose another out"
+    assert summary.message == f"{told} for street"
+
+
+def test_a_group_of_settings_is_told_by_what_differs_in_it() -> None:
+    records = [
+        {"settings": {"gate": {"on": on, "width": 9}}, "stage_versions": {}, "expert_digests": {}}
+        | {"vocabulary_digest": "", "prepare_digest": ""}
+        for on in (True, False)
+    ]
+    assert record_differences(*records) == ["gate.on: True -> False"]
 
 
 def test_keep_goes_on_and_records_both(tmp_path: Path, begun: Callable[..., Path]) -> None:
