@@ -150,7 +150,12 @@ def default_runs_folder() -> str:
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
+AS_ANOTHER = "run it as a user who may write there, or on a copy"
 DELTA_ERRNO = re.compile(r"\(os error (\d+)\)")  # how delta-rs says it, in an OSError without a number
+
+
+class DamagedFile(OSError):
+    """A file that a run wrote is missing or cannot be read; the message names it."""
 
 
 class DiskFull(OSError):
@@ -216,7 +221,7 @@ def why_not_written(error: BaseException) -> str:
     while seen is not None:
         number = _number_of(seen)
         if isinstance(seen, NotWritable) or number in REFUSED:
-            return f"{one_line(seen)}; run it as a user who may write there, or on a copy"
+            return f"{one_line(seen)}; {AS_ANOTHER}"
         seen = seen.__cause__ or seen.__context__
     full = why_disk_full(error)
     return full and f"{full}; free disk space"
@@ -341,11 +346,11 @@ def _why_not_local(out: str, path: Path, above: Path) -> str:
             return f"out={out}: {no_links}"
     except OSError as error:
         if isinstance(error, NotWritable):
-            return f"out={out}: {str(error).removeprefix(f'{path}: ')}"
+            return f"out={out}: {str(error).removeprefix(f'{path}: ')}; {AS_ANOTHER}, or with another out="
         if error.errno is None:  # DiskFull, which says it all
             return f"out={out}: {error}"
         why = "no file can be made there" if error.errno == errno.ENOENT else error.strerror or str(error)
-        return f"out={out}: cannot be written: {why}"
+        return f"out={out}: cannot be written: {why}; {AS_ANOTHER}, or with another out="
     finally:
         for place in created:
             if place.is_dir():

@@ -137,7 +137,6 @@ def _run(
     from factory.store.funnel import image_sources_text
     from factory.store.location import BadLocation, Location
     from factory.store.samples import OtherSchema, Store
-    from factory.store.table import DamagedLog
     from factory.views.board.report import write_facts, write_report
     from factory.views.card import write_card
     from factory.views.sample_text import prepared_episode
@@ -145,7 +144,7 @@ def _run(
 
     try:
         store = Store(Location.parse(config.out))
-    except (BadLocation, DamagedLog, OtherSchema) as error:
+    except (BadLocation, OtherSchema) as error:
         raise ConfigError(str(error)) from error
     elsewhere = config.executor == "ray" and "RAY_ADDRESS" in os.environ  # a cluster's nodes compile for themselves
     with nullcontext() if elsewhere else compiling_ahead(needed_kernel_parts(config)):

@@ -1,6 +1,5 @@
 """Commands that keep a run's tables in order: retry, verify, clean, compact."""
 
-import json
 import os
 import re
 import shlex
@@ -65,7 +64,7 @@ def recorded_command(store: "Store", given: Sequence[str] = ()) -> tuple[str, li
     """
     from factory.store.samples import CURRENT_RUN
 
-    document = json.loads(store.location.read(CURRENT_RUN) or b"{}")
+    document = store.document(CURRENT_RUN)
     where = f"{store.location.uri}/{CURRENT_RUN}"
     if document.get("command") is None:
         raise Refused(f"{where} records no settings: run the same command with retry_failed=true")
@@ -213,7 +212,7 @@ def compact(request: FolderRequest) -> None:
     sample changes: readers, trainings and their order are the same before and after. What was merged is left for
     readers that are open; `python -m factory clean` removes it. While a run writes here the command is refused.
     """
-    from factory.store.location import BadLocation, DamagedFile
+    from factory.store.location import BadLocation
     from factory.store.table import AnotherWriter
     from factory.store.verify import RunInProgress, claim_for_upkeep
     from factory.store.verify import compact as merge_shards
@@ -225,5 +224,3 @@ def compact(request: FolderRequest) -> None:
             print(f"{merged.table:<13}{merged.before} files, now {merged.after}")
     except (RunInProgress, AnotherWriter, BadLocation) as error:
         raise Refused(str(error)) from error
-    except DamagedFile as error:
-        raise Refused(f"{error}; python -m factory verify out={request.out} repair=true takes it out") from error

@@ -26,6 +26,7 @@ POSITIONAL = {"argument": "positional"}  # may stand without its key, in order; 
 GIVEN_ALONE = {"shown": "given alone"}  # of RUN_SETTINGS: the others are recorded, or of no use here
 RUN_SETTINGS = {"argument": "settings of a run"}  # it takes every argument that is no field: settings of the run
 INPUT_ERRORS = (ValueError, OSError)  # what settings or files that do not fit raise, where no fault of a stage can
+VERIFY = "python -m factory verify out=<its run> names all damage, repair=true mends what can be"
 Request = TypeVar("Request", bound="DataclassInstance")
 CommandFunction = Callable[[Sequence[str]], int | None]  # arguments -> exit code, none for 0
 
@@ -129,11 +130,13 @@ def _exit_of_error(
     error: Exception, refused: tuple[type[Exception], ...], resumes: bool, elsewhere: str
 ) -> tuple[int, str]:
     """The exit code and the line that an exception ends a command with; COMPLETE for a fault of the program."""
-    from factory.files import DiskFull, machine_fault_of, why_not_written
+    from factory.files import DamagedFile, DiskFull, machine_fault_of, why_not_written
     from factory.wording import one_line
 
     if isinstance(error, Stopped):
         return INTERRUPTED, str(error)
+    if isinstance(error, DamagedFile):
+        return BAD_CONFIG, f"error: {str(error).rstrip('.')}; {VERIFY}"
     if isinstance(error, Failed):
         return COMPLETE_WITH_FAILURES, f"error: {error}"
     if isinstance(error, (Refused, ConfigError, MemoryError, *refused)):

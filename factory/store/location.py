@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pyarrow import fs
 
-from factory.files import atomic_file, in_submitted_job, is_data
+from factory.files import DamagedFile, atomic_file, in_submitted_job, is_data
 from factory.store.schema import TableSpec
 from factory.wording import one_line
 from tasks.caches import Damaged, with_checksum, without_checksum
@@ -178,10 +178,6 @@ def _remote(process: int, uri: str, options: tuple[tuple[str, str], ...]) -> tup
 ROW_GROUP_BYTES = 4 * 2**20  # uncompressed; one sample costs one group, and a group 13 kB of the file's footer
 
 
-class DamagedFile(OSError):
-    """A file of the table cannot be read; the message names it."""
-
-
 @dataclass(frozen=True)
 class Shard:
     """One written, not yet committed file."""
@@ -267,8 +263,10 @@ def raising_damaged_file(path: str) -> Iterator[None]:
     """What is raised while a Parquet file is read, by a damaged page, footer or schema, is a DamagedFile."""
     try:
         yield
-    except (FileNotFoundError, DamagedFile):  # with their file's name
+    except DamagedFile:
         raise
+    except FileNotFoundError as error:  # Arrow says so in three clauses
+        raise DamagedFile(f"{path}: is missing") from error
     except (OSError, pa.ArrowException, ValueError, LookupError, RuntimeError, MemoryError, OverflowError) as error:
         raise DamagedFile(f"{path}: cannot be read: {one_line(error)}") from error
 

@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from factory.files import DamagedFile
 from factory.store.location import ClipCache, Location, Shard, write_shard
 from factory.store.schema import (
     LICENCES_PROPERTY,
@@ -553,14 +554,21 @@ class Store:
                 epoch = table.claim(epoch, above)
 
     def runs(self) -> list[dict[str, Any]]:
-        """The settings the rows were made with, oldest first. Raises ChangedRun for an unreadable run.json."""
+        """The settings the rows were made with, oldest first. Raises DamagedFile for an unreadable run.json."""
         data = self.location.read(RUN_FILE)
         if data is None:
             return []
         try:
             return list(parse_json_with_checksum(data)["runs"])
         except (ValueError, KeyError, TypeError) as error:
-            raise ChangedRun(f"{self.location.uri}/{RUN_FILE}: not readable: {error}") from error
+            raise DamagedFile(f"{self.location.uri}/{RUN_FILE}: not readable: {error}") from error
+
+    def document(self, name: str) -> dict[str, Any]:
+        """A JSON file that runs leave beside the tables, empty where there is none. Raises DamagedFile."""
+        try:
+            return dict(json.loads(self.location.read(name) or b"{}"))
+        except (ValueError, TypeError) as error:
+            raise DamagedFile(f"{self.location.uri}/{name}: not readable: {error}") from error
 
     def last_commit_ms(self) -> int:
         """Of any table, since 1970; 0: nothing was committed."""

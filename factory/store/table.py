@@ -33,7 +33,7 @@ from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundErr
 from deltalake.transaction import AddAction, RemoveAction
 from numpy.typing import NDArray
 
-from factory.files import naming_disk_errors
+from factory.files import DamagedFile, naming_disk_errors
 from factory.store.location import (
     Location,
     Shard,
@@ -406,7 +406,7 @@ class DuplicateKey(RuntimeError):
     """A commit would store a key twice. Nothing was written."""
 
 
-class DamagedLog(OSError):
+class DamagedLog(DamagedFile):
     """A file of the table's log is damaged."""
 
 
@@ -465,7 +465,7 @@ class KeyedTable:
             found = [f"{damage.name} {damage.problem}" for damage in self.copies.damage()]
             if panic or found:
                 said = "; ".join(found) or f"its log cannot be read: {one_line(error)}"
-                raise DamagedLog(f"{self.location.uri}: {said}; python -m factory verify says all") from error
+                raise DamagedLog(f"{self.location.uri}: {said}") from error
             raise
 
     @cached_property

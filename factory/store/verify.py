@@ -20,12 +20,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from factory.files import why_no_hard_links
+from factory.files import DamagedFile, why_no_hard_links
 from factory.store.episodes import EPISODES_FOLDER, check_episode, episode_name
 from factory.store.location import (
     BadCacheFile,
     BadLocation,
-    DamagedFile,
     Location,
     SceneFiles,
     Shard,
@@ -33,7 +32,7 @@ from factory.store.location import (
     raising_damaged_file,
     write_shard,
 )
-from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, QUIET_S, ChangedRun, Store
+from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, QUIET_S, Store
 from factory.store.table import (
     COPIES,
     LOG,
@@ -84,7 +83,7 @@ def verify(store: Store) -> Verdict:
         damage += _duplicate_keys(table, rows if table is store.samples else None)
     try:
         damage += _broken_rows(rows, store)
-    except ChangedRun as error:
+    except DamagedFile as error:
         damage.append(str(error))
     kept += _damaged_episodes(store)
     damage += map(str, kept)

@@ -106,7 +106,7 @@ def _sources_section(samples: pa.Table) -> Iterator[str]:
 
 def _settings_section(store: Store) -> Iterator[str]:
     record = _newest_run_record(store)
-    told = json.loads(store.location.read("report.json") or b"{}").get("facts", {})
+    told = store.document("report.json").get("facts", {})
     command = store.newest_run().current.get("command")
     yield "\n## How it was made\n"
     yield f"driving-data-factory {__version__}, settings `{record['settings_hash']}`."

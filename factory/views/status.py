@@ -47,12 +47,15 @@ def open_store(out: str) -> "Store":
     location = location_of_out(out)
     from deltalake.exceptions import DeltaError
 
+    from factory.files import DamagedFile
     from factory.store.samples import OtherSchema, Store
 
     try:
         store = Store(location)
     except OtherSchema as error:
         raise Refused(str(error)) from error
+    except DamagedFile:
+        raise
     except (OSError, DeltaError) as error:
         raise Refused(f"out={out}: {one_line(error)}") from error
     if store.samples.version is None and store.outcomes.version is None and store.candidates.version is None:

@@ -47,7 +47,7 @@ POLICY = (
 
 def write_report(store: Store, to: str | None = None) -> str:
     """Write the file, into `out` where no other place is named; where it is now. Raises Refused where it cannot be."""
-    extra: dict[str, Any] = json.loads(store.location.read(FACTS) or b"{}")
+    extra: dict[str, Any] = store.document(FACTS)
     shot, pictures = Watch(store).snapshot(), Pictures(store)
     settings = store.runs()[-1]["settings"] if store.runs() else {}
     extra["settings"] = {name: str(value) for name, value in settings.items()}

@@ -238,9 +238,10 @@ def test_a_run_that_nobody_may_write_to_is_read_and_what_would_write_says_so_in_
         "clean": f"{read_only}: {DENIED}; {INSTEAD}",
         "compact": f"{read_only}: {DENIED}; {INSTEAD}",
         "verify repair=true": f"{read_only}/candidates/{COPIES}/{0:020}.json: {DENIED}; {INSTEAD}",
-        "retry": f"out={read_only}: {DENIED}",
-        "run executor=local": f"out={read_only}: {DENIED}",
-        f"import simscale root={read_only}": f"out={read_only}: {DENIED}",
+        **dict.fromkeys(
+            ["retry", "run executor=local", f"import simscale root={read_only}"],
+            f"out={read_only}: {DENIED}; {INSTEAD}, or with another out=",
+        ),
         "export mcap sample=0 to=.": "",
         "status": "",
     }

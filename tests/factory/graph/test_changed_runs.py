@@ -42,8 +42,8 @@ def test_another_data_set_in_an_old_folder_is_told_in_a_short_line(tmp_path: Pat
     others = [replace(ref, dataset="street") for ref in refs(1)]
     summary = executed(ToyWork(settings=settings), others, ["recovery"], 1, Store(tmp_path / "out"))
     shown = "; ".join(f"render.{key}: not set -> {{'on': True, 'width': 320}}" for key in "abc")
-    told = f"{tmp_path}/out holds samples of word0, word1, made with other settings ({shown}; and 5 more): choose another out"
-    assert summary.message == f"{told} for street"
+    told = f"{tmp_path}/out holds samples of word0, word1, made with other settings ({shown}; and 5 more)"
+    assert summary.message == f"{told}: choose another out for street"
 
 
 def test_a_group_of_settings_is_told_by_what_differs_in_it() -> None:

@@ -173,6 +173,35 @@ def test_damage_beside_the_tables_is_named_and_taken_out(
         assert path.is_file() is part.startswith("episodes")  # a clip whose attempts are done is not prepared again
 
 
+@pytest.mark.parametrize(
+    ("part", "commands"),
+    [
+        ("candidates/*.parquet", ["status", "report", "lineage"]),
+        ("plans/*.parquet", ["status", "report"]),
+        ("samples/*/*/*.parquet", ["status", "report", "lineage", "show 0", "export mcap sample=0"]),
+        ("samples/_delta_log/*2.json", ["status", "report", "failed", "retry", "compact", "run executor=local"]),
+        ("run.json", ["status", "report", "lineage", "failed", "retry"]),
+        ("last_run.json", ["status", "report"]),
+        ("current_run.json", ["report"]),
+        ("report.json", ["report"]),
+    ],
+)
+def test_a_command_that_meets_damage_says_which_file_why_and_what_names_and_mends_all(
+    out: Path, part: str, commands: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    sample = SampleTable(out)[0]["attempt_id"]
+    (out / "report.json").write_text("{}")
+    path = files(out, part)[-1]
+    for content in (path.read_bytes()[:-9], None):
+        path.unlink() if content is None else path.write_bytes(content)
+        for name, *words in map(str.split, commands if content or part.endswith("parquet") else []):
+            asked = [*words, f"out={out}", *([f"sample={sample}"] if name == "lineage" else [])]
+            assert COMMANDS[name].load()(asked) == BAD_CONFIG, asked
+            said = capsys.readouterr().err
+            assert said.startswith("error: ") and said.count("\n") == 1 and path.name in said, said
+            assert ("is missing" in said) == (content is None) and "python -m factory verify out=" in said
+
+
 def test_the_reader_refuses_with_the_file_s_name(out: Path) -> None:
     path = files(out, "samples/*/*/*.parquet")[0]
     whole, refused = path.read_bytes(), 0
