@@ -20,6 +20,10 @@ from tasks.stages import TASKS, Rejected
 from tasks.world.vocabulary import Vocabulary
 
 CALIBRATION_CLIPS = 3
+KINEMATIC_LABELS = (
+    "labels: of kinematic trajectories, few of which end where a driver would, so that a planner learns little from "
+    "them: give vocabulary.file=<.npy> of human ones (python -m factory vocabulary makes it), or reward.labels=none"
+)
 # What the paper says of how samples are made; the rest is this project's own, or how much and where.
 WATCHED = (
     "perturb",
@@ -51,6 +55,8 @@ def plan_text(run: Run, refs: Sequence[ClipRef]) -> str:
     lines += [f"  broken log {ref.log_id}: {problem}" for ref, problem in index.broken.items()]
     vocabulary = run.work.vocabulary
     lines.append(f"vocabulary: {len(vocabulary)} trajectories ({vocabulary.source}, {vocabulary.digest})")
+    if config.reward.labels == "vocabulary" and not (config.reward.label_vocabulary or config.vocabulary.file):
+        lines.append(KINEMATIC_LABELS)
     if starts := run.work.starts:
         n_clips = sum(ref.clip_id in starts for ref in refs)
         lines.append(f"starts: {sum(map(len, starts.values()))}; {n_clips} of the {len(refs)} clips have some")

@@ -7,8 +7,13 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import RunConfig, load_config
-from factory.setup.calibrate import differences_from_paper, differences_in_every_preset, paper_deviations_line
-from factory.setup.settings import choose_vocabulary
+from factory.setup.calibrate import (
+    differences_from_paper,
+    differences_in_every_preset,
+    paper_deviations_line,
+    plan_text,
+)
+from factory.setup.settings import assemble, choose_vocabulary
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
 
@@ -42,6 +47,21 @@ def test_what_a_run_has_not_is_not_said_of_it() -> None:
     (walks,) = differences_in_every_preset(paper("render=none", "traffic=navsim"))
     assert walks.startswith("walks that go on")
     assert "the project's own picture gate (unstable" in differences_in_every_preset(load_config([]))[-1]
+
+
+@pytest.mark.parametrize(
+    "more", ["", "reward.labels=none", "vocabulary.file=human.npy", "reward.label_vocabulary=human.npy"]
+)
+def test_labels_of_trajectories_that_nobody_drove_are_remarked(
+    more: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.save("human.npy", kinematic_trajectories(4, seed=1))
+    street = ["clips=custom", "clips._target_=tests.factory.street_reader.StreetReader", "render=none"]
+    run = assemble(load_config([*street, "experts=[human]", "vocabulary.k=4", *more.split()]))
+    said = plan_text(run, run.refs).splitlines()
+    told = [line for line in said if "learns little" in line and "give vocabulary.file=" in line]
+    assert len(told) == (0 if more else 1), said
 
 
 def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:
