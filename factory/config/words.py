@@ -16,6 +16,14 @@ SHOW = ("--cfg", "-c")
 FOLDER = ("--config-dir", "-cd")
 SEVERAL = ("--multirun", "-m")
 HOME = re.compile(r"(?<=[\[{,: ])~[^\s,:\[\]{}'\"]*")  # a path in a list or mapping, which Hydra reads in quotes alone
+FILES = (  # last words of the keys that name files and folders
+    "--config-dir -cd a anchors b benchmark cache cache_dir cameras checkpoint data file files inference_vocabulary "
+    "init_from label_vocabulary like logs made maps maps_root out own_body pictures planner planners pretrained real "
+    "rewards root scene_filter scene_filters sensor_root sensors sim split starts table to transforms val vocabularies "
+    "vocabulary"
+)
+PATHS = frozenset(FILES.split())
+FREE = ("clips.", "expert.", "planner.settings.")  # groups whose keys may be a plug-in's
 NEEDS_READING = "[{'\""  # a value that begins so is a list, a mapping or quoted text, never plain text
 
 
@@ -117,7 +125,7 @@ def as_hydra_override(word: str) -> str:
 def expand_home(value: Any, key: str) -> Any:
     """A value whose texts that begin with `~` or `~user`, in lists and mappings too, are paths in those home folders.
 
-    It goes by the text and not by the key, so that no key that names a file can be forgotten, a plug-in's among them.
+    So of keys that are PATHS; of those that a plug-in may have, `~/` alone. Everything else is text as it stands.
     Raises ConfigError naming the key where there is no such home.
     """
     if isinstance(value, Mapping):
@@ -125,6 +133,9 @@ def expand_home(value: Any, key: str) -> Any:
     if isinstance(value, list | tuple):
         return type(value)(expand_home(inner, key) for inner in value)
     if not isinstance(value, str) or not value.startswith("~"):
+        return value
+    is_path = key.rpartition(".")[2] in PATHS
+    if not is_path and not (key.startswith(FREE) and value.startswith("~/")):
         return value
     path = os.path.expanduser(value)  # a Path would raise, and lose a slash at the end
     if path.startswith("~"):

@@ -3,11 +3,26 @@
 from typing import Any, get_args, get_origin
 
 from factory.config.shapes import setting_keys
+from factory.config.words import FREE, PATHS
+
+# Last words of the keys whose text names no file: a new key is one of these, or of factory.config.words.PATHS.
+TEXTS = (
+    "authors clip column country device email expert experts full host institution map_location name older_than only "
+    "origin parts policy round sample settings tag team_name version"
+)
+NO_PATHS = frozenset(TEXTS.split())
 
 
 def text_keys(shape: type[Any]) -> list[str]:
     """With dots, into groups."""
     return [key for key, hint in setting_keys(shape) if _takes_text(hint)]
+
+
+def led_home(key: str, home: object) -> str:
+    """What `key=~/x` becomes, in a home folder. A key that nobody has sorted fails."""
+    word = key.rpartition(".")[2]
+    assert (word in PATHS) != (word in NO_PATHS), f"{key} names a file, or does not: say so in PATHS or NO_PATHS"
+    return f"{home}/x" if word in PATHS or key.startswith(FREE) else "~/x"
 
 
 def _takes_text(hint: Any) -> bool:

@@ -20,7 +20,7 @@ from planners.models.planner import planner_class
 from planners.models.settings import BUILT_IN
 from planners.published.import_planner import ImportConfig
 from planners.training.train import TrainConfig
-from tests.factory.text_keys import held, text_keys
+from tests.factory.text_keys import held, led_home, text_keys
 
 
 @pytest.mark.parametrize(
@@ -55,14 +55,19 @@ def test_what_is_raised_is_one_line_and_an_exit_code(
         ("replay", ReplaySettings, ("benchmark=x", "clip=x")),
     ],
 )
-def test_a_home_folder_is_one_in_every_key_that_takes_text(
+def test_a_home_folder_is_one_in_every_key_that_names_a_file(
     name: str, shape: type, given: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     choices = {word.partition("=")[0] for word in given if word.startswith("planner=")}
     keys = [key for key in text_keys(shape) if key not in choices and key != "planner"]
     values = compose(name, [*given, *(f"{key}=~/x" for key in keys)], shape)
-    assert keys and {key: held(values, key) for key in keys} == dict.fromkeys(keys, f"{tmp_path}/x")
+    assert keys and {key: held(values, key) for key in keys} == {key: led_home(key, tmp_path) for key in keys}
+
+
+def test_a_secret_of_an_object_store_is_left_as_it_is() -> None:
+    values = compose("train", ["out=x", "data.storage_options.aws_secret_access_key=~a/b"], TrainConfig)
+    assert values["data"]["storage_options"] == {"aws_secret_access_key": "~a/b"}
 
 
 def test_a_planner_of_the_home_folder_is_evaluated_alone_and_in_an_ensemble(

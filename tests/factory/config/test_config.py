@@ -29,7 +29,7 @@ from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.render.settings import RenderMode, RenderSettings, SceneDtype
 from tasks.rollout.simulate import TrafficSettings
 from tests.factory.data_folders import add_companions
-from tests.factory.text_keys import held, text_keys
+from tests.factory.text_keys import held, led_home, text_keys
 
 DENSE = PerturbSources(max_longitudinal_m=8.0, step_longitudinal_m=1.0, interleaved=False, order="spread", at_most=32)
 GROUPS = [
@@ -94,7 +94,7 @@ def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
         ("navsim clips.root=x clips.maps=x", 16),
     ],
 )
-def test_a_home_folder_is_one_in_every_key_that_takes_text(
+def test_a_home_folder_is_one_in_every_key_that_names_a_file(
     choice: str, n_least: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
@@ -105,9 +105,10 @@ def test_a_home_folder_is_one_in_every_key_that_takes_text(
     ]
     assert {"out", "vocabulary.file", "reward.label_vocabulary", "expert.recovery.table"} < set(keys)
     assert len(keys) >= n_least
-    for given, wanted in (("~/x", f"{tmp_path}/x"), ("[~/x,y]", [f"{tmp_path}/x", "y"])):
-        values = compose_run([*words, *(f"{key}={given}" for key in keys)])
-        assert {key: held(values, key) for key in keys} == dict.fromkeys(keys, wanted)
+    alone, listed = (compose_run([*words, *(f"{key}={given}" for key in keys)]) for given in ("~/x", "[~/x,y]"))
+    for key in keys:
+        home = led_home(key, tmp_path)
+        assert (held(alone, key), held(listed, key)) == (home, [home, "y"]), key
 
 
 def test_companions_of_files_of_configuration_are_no_choices(tmp_path: Path) -> None:
@@ -145,9 +146,10 @@ def test_a_plug_in_s_key_is_led_home_too_and_a_stranger_s_home_is_told(
     own = ["clips=custom", "clips._target_=my.Reader"]
     assert compose_run([*own, "clips.logs={a: ~/a}"])["clips"]["logs"] == {"a": f"{tmp_path}/a"}
     assert compose_run([*own, "clips.logs=~root/a"])["clips"]["logs"] == f"{pwd.getpwnam('root').pw_dir}/a"
-    assert compose_run([*own, "clips.logs=a~/b"])["clips"]["logs"] == "a~/b"
-    with pytest.raises(ConfigError, match=r"^clips\.logs\.a=~nobody\.here/a: there is no home folder ~nobody\.here;"):
-        compose_run([*own, "clips.logs={a: ~nobody.here/a}"])
+    others = compose_run([*own, "clips.logs=a~/b", "clips.token=~a/b"])["clips"]
+    assert (others["logs"], others["token"]) == ("a~/b", "~a/b")
+    with pytest.raises(ConfigError, match=r"^clips\.root=~nobody\.here/a: there is no home folder ~nobody\.here;"):
+        compose_run([*own, "clips.root=~nobody.here/a"])
 
 
 @pytest.mark.parametrize(
