@@ -2,7 +2,7 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -82,14 +82,13 @@ def compose(
     OmegaConf.register_new_resolver("runs", default_runs_folder, replace=True)
     groups = {path.name for root in (conf_dir(), *asked.folders) for path in folders_in(root)}
     own = config_groups(name)
+    known = [*own, *(key for key, _ in setting_keys(shape))] if shape is not None else [*own]
     overrides = []  # held against the dataclasses and not against conf/, which says few keys: Hydra takes any
     for word in map(as_hydra_override, asked.overrides):
         plain = word.lstrip("+")
         group = plain.partition("=")[0]
         if word == plain and group in groups and group not in own:
-            where = ", ".join(key for key in own if key.startswith(f"{group}@"))
-            known = [*own, *(key for key, _ in setting_keys(shape) if key != group)] if shape else [*own]
-            raise ConfigError(f"{group}: give {where}" if where else _no_such_setting(group, known))
+            raise ConfigError(_no_such_setting(group, known))
         overrides.append(word if group.partition("@")[0] in groups else f"++{plain}")
     register_plugin_choices(overrides, conf_dir(), asked.folders)
     if asked.folders:
@@ -118,7 +117,7 @@ def compose(
     assert isinstance(resolved, dict)
     values = {str(key): expand_home(value, str(key)) for key, value in resolved.items()}
     if shape is not None:
-        refuse_unknown(shape, values, "", others=own)
+        refuse_unknown(shape, values, "", lambda key: _no_such_setting(key, known))
         values = deep_merge(defaults_of(shape), values)
         values = {**required_keys(shape), **values} if asked.shows else values
     values = completed(values)
@@ -191,25 +190,21 @@ def _message(error: Any) -> str:
 
 
 def refuse_unknown(
-    cls: type[Any],
-    values: Mapping[str, Any],
-    where: str,
-    said: Callable[[str], str] = lambda key: "",
-    others: Iterable[str] = (),
+    cls: type[Any], values: Mapping[str, Any], where: str, said: Callable[[str], str] = lambda key: ""
 ) -> None:
     """Raises ConfigError naming the first key, below `where`, that `cls` does not have, and the nearest that it has.
 
-    said: what else is known of such a key; others: what may stand beside the keys, and is meant at times.
+    said: what else is known of such a key.
     """
     prefix = f"{where}." if where else ""
     known = [key for key, _ in setting_keys(cls, prefix)]
     for key in _dotted_keys(cls, values, prefix):
         if key not in known:
-            raise ConfigError(said(key) or _no_such_setting(key, [*known, *others]))
+            raise ConfigError(said(key) or _no_such_setting(key, known))
 
 
 def _no_such_setting(key: str, known: Sequence[str]) -> str:
-    meant = did_you_mean(key, known)
+    meant = did_you_mean(key, [other for other in known if other != key])
     more = f"{meant.removesuffix('?')}=?" if meant else "; see --help"
     return f"{key}: there is no such setting{more}"
 

@@ -3,7 +3,7 @@
 The package of a folder is light, and says what there is by these names, each of which may be missing:
 
     READERS             class in its module `reader` -> dataclass of the settings of `clips`
-    READS               name that people give to its logs, in small letters -> `clips=` for them, and its page
+    READS               names that people give to its logs, in small letters; the settings for them, and their page
     camera_names        settings of clips -> names of the rig, before a log is read; ValueError where there is no log
     compile_kernels     what `python -m factory warm` compiles beside the kernels of runs
 
@@ -48,9 +48,10 @@ def reader_settings(clips: Mapping[str, Any]) -> type[Any] | None:
 
 def how_to_read(name: str) -> list[str]:
     """What reads logs of that name or one like it, each as READS says it; none where no data set knows them."""
-    ways = [getattr(found, "READS", {}) for found in data_sets().values()]
-    near = get_close_matches(re.sub(r"\W|_", "", name.lower()), {word: 0 for way in ways for word in way}, 1, LIKE)
-    return [way[near[0]] for way in ways if near and near[0] in way]
+    told = [found.READS for found in data_sets().values() if hasattr(found, "READS")]
+    words = " ".join(names for names, _ in told).split()
+    near = get_close_matches(re.sub(r"\W|_", "", name.lower()), words, 1, LIKE)
+    return [way for names, way in told if {*near} & {*names.split()}]
 
 
 def words_of(kind: str) -> dict[str, str]:

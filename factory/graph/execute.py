@@ -131,8 +131,8 @@ class _Run:
     def plan(self) -> RunSummary | None:
         """What is left to do; how the run ends where the tables are another's, or cannot be read."""
         try:
-            data_sets = {ref.dataset for ref in self._refs}
-            self._records = self._store.checked_records(self._identity, self._digests, self._how.on_change, data_sets)
+            names = {ref.dataset for ref in self._refs}
+            self._records = self._store.checked_records(self._identity, self._digests, self._how.on_change, names)
             kept = self._how.on_change == "stop" and self._records[-1]["on_change"] == "keep"
             self._on_change: OnChange = "keep" if kept else self._how.on_change
             plan = self._planned(not self._store.starts_over(self._records))

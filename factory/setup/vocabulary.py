@@ -94,13 +94,8 @@ def build_recovery_table(windows: Sequence[TrainWindows], vocabularies: Sequence
 def _no_train_log(windows: TrainWindows) -> str:
     found = ", ".join(f"{count} {split}" for split, count in sorted(windows.clips_of_split.items()))
     how = ": clips.split=train takes them as such" if windows.takes_split else ""
-    taken = [f"no train log, the clips are {found}{how}"] if found else []
-    others = len(windows.broken) - 1
-    first = [
-        windows.broken[name] + (f" ({others} others cannot be read either)" if others else "")
-        for name in sorted(windows.broken)[:1]
-    ]
-    return "; ".join([*first, *taken]) or "no train log, and no clip"
+    unread = [f"{reason} ({len(windows.broken)} cannot be read)" for reason in windows.broken.values()][:1]
+    return "; ".join([*unread, *([f"no train log, the clips are {found}{how}"] if found else [])]) or "no clip"
 
 
 def load_vocabulary(path: str | Path, first: int | None = None) -> Vocabulary:

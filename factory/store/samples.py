@@ -443,17 +443,13 @@ class Store:
         return ClipCache(self.location.child("cache/prepared"))
 
     def checked_records(
-        self,
-        identity: RunIdentity,
-        expert_digests: Mapping[str, str],
-        on_change: OnChange,
-        data_sets: Collection[str] = (),
+        self, identity: RunIdentity, expert_digests: Mapping[str, str], on_change: OnChange, names: Collection[str] = ()
     ) -> list[dict[str, Any]]:
         """Hold the run against the newest record of run.json; the records as they are to be, with this run's as newest.
 
         A record's on_change says whether rows of older records may stand among its own ("keep"); its expert digests
         are those of all experts so far. Writes nothing. Raises ChangedRun where they differ, on_change is "stop" and
-        there are samples; without one the run starts over. data_sets: of the run's clips, for what it says.
+        there are samples; without one the run starts over. names: of its clips' readers.
         """
         for expert in expert_digests:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", expert):
@@ -482,7 +478,7 @@ class Store:
             if changes and on_change == "stop" and not len(self.samples):
                 return [record]  # nothing stands on the settings that were: they were tried, found wrong and corrected
             if changes and on_change == "stop":
-                raise ChangedRun(self._why_changed(changes, data_sets))
+                raise ChangedRun(self._why_changed(changes, names))
             record["expert_digests"] = records[-1]["expert_digests"] | record["expert_digests"]
             if identity.prepare_digest == UNLISTED:  # lists of earlier runs stay what they are
                 record["prepare_digest"] = records[-1]["prepare_digest"]
@@ -492,13 +488,12 @@ class Store:
                 records = records[:-1]
         return [*records, record]
 
-    def _why_changed(self, changes: Sequence[str], data_sets: Collection[str]) -> str:
-        more = f"; and {len(changes) - SHOWN} more" if len(changes) > SHOWN else ""
-        shown = f"{'; '.join(changes[:SHOWN])}{more}"
-        there = sorted(set(self.samples.read(["dataset"])["dataset"].unique().to_pylist()))
-        if data_sets and set(data_sets).isdisjoint(there):
-            holds = f"{self.location.uri} holds samples of {', '.join(there)}, made with other settings ({shown})"
-            return f"{holds}: choose another out for {', '.join(sorted(data_sets))}"
+    def _why_changed(self, changes: Sequence[str], names: Collection[str]) -> str:
+        more = [f"and {len(changes) - SHOWN} more"] if len(changes) > SHOWN else []
+        shown, there = "; ".join([*changes[:SHOWN], *more]), self.samples.read(["dataset"])["dataset"].to_pylist()
+        if names and set(names).isdisjoint(there):
+            holds = f"holds samples of {', '.join(sorted(set(there)))}, made with other settings ({shown})"
+            return f"{self.location.uri} {holds}: choose another out for {', '.join(sorted(names))}"
         return f"{self.location.uri} was made with other settings: {shown}. {WAYS_OUT}"
 
     def starts_over(self, records: Sequence[Mapping[str, object]]) -> bool:

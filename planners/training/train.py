@@ -192,8 +192,8 @@ def train(config: TrainConfig, process: TrainingProcess, dataset: Dataset | None
     asked = config.training.batch_size
     if rest := asked % (process.size * config.accumulate):
         raise ConfigError(
-            f"planner.training.batch_size={asked} does not divide into {_parts(config, process)}: "
-            f"{asked - rest + process.size * config.accumulate} does"
+            f"planner.training.batch_size={asked} does not divide into {process.size} processes times "
+            f"accumulate={config.accumulate} parts: {asked - rest + process.size * config.accumulate} does"
         )
     config = _with_fitting_batch(config, dataset, process)
     training = config.training
@@ -264,15 +264,11 @@ def _with_fitting_batch(config: TrainConfig, dataset: Dataset, process: Training
     if size != asked and checkpoints(out):
         size = int(read_record(out)["trained"]["planner.training"]["batch_size"])
     if not size or size % parts:
-        few = f"of {len(dataset)} samples no batch can be made that divides"
-        batch = f"a batch of {size} samples, as the training in {out} has, does not divide" if size else few
-        fewer = "lower accumulate" if process.size == 1 else "lower accumulate or take fewer processes"
-        raise ConfigError(f"{batch} into {_parts(config, process)}: {fewer}")
+        raise ConfigError(
+            f"a batch of {size or f'up to {len(dataset)}'} samples does not divide into {process.size} processes times "
+            f"accumulate={config.accumulate} parts: lower accumulate, or take fewer processes"
+        )
     return replace(config, planner=replace(config.planner, training=replace(config.training, batch_size=size)))
-
-
-def _parts(config: TrainConfig, process: TrainingProcess) -> str:
-    return f"{process.size} processes times accumulate={config.accumulate} parts"
 
 
 def _planner(config: TrainConfig, settings: Any, dataset: Dataset) -> Planner:

@@ -8,7 +8,7 @@ from factory.files import folders_in
 from factory.readers.settings import LogClips, Split
 
 READERS = {"AV2Reader": LogClips}
-READS = {"argoverse2": "clips=av2 clips.root=.../sensor/train (docs/tutorials/av2_cameras.md)"}
+READS = "argoverse2", "clips=av2 clips.root=.../sensor/train (docs/tutorials/av2_cameras.md)"
 POSES, ANNOTATIONS = "city_SE3_egovehicle.feather", "annotations.feather"
 INTRINSICS, EXTRINSICS = "calibration/intrinsics.feather", "calibration/egovehicle_SE3_sensor.feather"
 

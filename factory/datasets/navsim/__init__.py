@@ -8,9 +8,7 @@ f51ad64 and `autonomousvision/navsim` @ 0a380a9.
 from factory.datasets.navsim.settings import NavsimClips
 
 READERS = {"NavsimReader": NavsimClips}
-READS = dict.fromkeys(
-    ("nuplan", "openscene"), "clips=navsim clips.root=<OpenScene's logs> clips.maps=<nuPlan's maps> (docs/navsim.md)"
-)
+READS = "nuplan openscene", "clips=navsim clips.root=<OpenScene's logs> clips.maps=<nuPlan's maps> (docs/navsim.md)"
 IMPORTS = {
     "simscale": "factory.datasets.navsim.commands:import_simscale",
     "navhard": "factory.datasets.navsim.commands:import_two_stage_benchmark",

@@ -23,7 +23,4 @@ class Py123dClips(LogClips):
 
 
 READERS = {"Py123dReader": Py123dClips}
-READS = dict.fromkeys(
-    ("argoverse2", "nuscenes", "waymo", "nuplan"),
-    "clips=py123d clips.root=<what 123D converted them to> (docs/configuration.md)",
-)
+READS = "argoverse2 nuscenes waymo nuplan", "clips=py123d clips.root=<123D's conversion> (docs/configuration.md)"

@@ -8,10 +8,7 @@ from typing import Any
 from factory.datasets.scenarionet.settings import ScenarioNetClips
 
 READERS = {"ScenarioNetReader": ScenarioNetClips}
-READS = dict.fromkeys(
-    ("nuscenes", "waymo", "nuplan"),
-    "clips=scenarionet clips.root=<what ScenarioNet converted them to> (docs/tutorials/nuscenes.md)",
-)
+READS = "nuscenes waymo nuplan", "clips=scenarionet clips.root=<ScenarioNet's conversion> (docs/tutorials/nuscenes.md)"
 SIDECARS = {"nuscenes-cameras": "factory.datasets.scenarionet.nuscenes_cameras:import_cameras"}
 
 

@@ -33,7 +33,7 @@ from urllib.parse import parse_qsl, urlsplit
 import pyarrow as pa
 from deltalake.exceptions import DeltaError
 
-from factory.store.samples import ChangedRun, Store
+from factory.store.samples import Store
 from factory.views.board.gallery import BadRequest, NotFound, Pictures, failures, gallery, sample_page
 from factory.views.board.overview import Drives, drives_as_json, overview
 from factory.views.board.watch import LOOK_EVERY_S, Watch
@@ -134,7 +134,7 @@ class Board:
             return _json({"error": str(error)}, 400)
         except NotFound as error:
             return _json({"error": str(error.args[0])}, 404)
-        except (DeltaError, ChangedRun, OSError, pa.ArrowException) as error:
+        except (DeltaError, OSError, pa.ArrowException) as error:
             return _json({"error": f"the tables cannot be read now: {error}"}, 503)
 
     def _answer(self, target: str) -> Answer:

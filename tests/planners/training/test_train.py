@@ -226,7 +226,7 @@ def test_a_training_goes_further_where_it_is_asked_to_and_the_record_says_from_w
         (("planner.name=nowhere:Toy",), "planner.name: nowhere:Toy: there is no module nowhere"),
         (
             ("planner.training.batch_size=100", "accumulate=50"),
-            "no batch can be made that divides into 1 processes times accumulate=50 parts: lower accumulate",
+            "samples does not divide into 1 processes times accumulate=50 parts: lower accumulate",
         ),
         (("accumulate=3",), "does not divide into 1 processes times accumulate=3 parts: 6 does"),
         (("device=cuda",), "device=cuda"),
