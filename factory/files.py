@@ -322,7 +322,7 @@ def why_unusable(out: str) -> str:
     scheme, is_url, _ = out.partition("://")
     if is_url and scheme != "file":
         return _why_not_remote(out, scheme) if scheme in CREDENTIALS else ""  # others are refused by Location
-    path = Path(out.removeprefix("file://")).expanduser().absolute()
+    path = Path(os.path.realpath(Path(out.removeprefix("file://")).expanduser()))  # new/.. is none to be made
     above = nearest_existing(path)
     if not above.is_dir():
         return f"out={out}: {above} is not a folder"

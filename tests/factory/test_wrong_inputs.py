@@ -96,6 +96,7 @@ MISTYPED = [  # told before anything heavy is imported
     run("clips=av2", "clips.root=a_folder", says=["a_folder: no Argoverse 2 sensor log here"]),
     run("out=", says=["out= is empty", "variable"]),
     run("out=a_file", says=["a_file is not a folder"]),
+    run("out=nowhere/../a_file/x", says=["a_file is not a folder"]),
     run("out=/proc/nowhere", says=["out=/proc/nowhere: cannot be written"]),
 ]
 A_SCENE = ("clips=scenarionet", "clips.root=a_scene.pkl")
