@@ -156,6 +156,6 @@ def unknown_choice_text(missing: str, choices: Sequence[str] | None, instead: Se
 
 def did_you_mean(word: str, known: Sequence[str], cutoff: float = 0.6) -> str:
     """`; did you mean x?` where one is near, else nothing. cutoff: 0..1, the likeness that counts as near."""
-    known = {name.lower(): name for name in known}
-    found = get_close_matches(word.lower(), known, n=1, cutoff=cutoff)
-    return f"; did you mean {known[found[0]]}?" if found else ""
+    names = {name.lower(): name for name in known}
+    found = get_close_matches(word.lower(), [*names], n=1, cutoff=cutoff)
+    return f"; did you mean {names[found[0]]}?" if found else ""
