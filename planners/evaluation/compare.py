@@ -136,16 +136,16 @@ def _bounds(one: Interval, nothing: str) -> str:
     return f"{one.low:+.4f} .. {one.high:+.4f}" if np.isfinite(one.low) else nothing
 
 
-def scores_told(found: Mapping[Measure, ByLevel], settings: CompareSettings) -> str:
-    """`told` of the two-stage score, else of one stage's, over the highest level of which there are two clusters."""
+def score_sentence(found: Mapping[Measure, ByLevel], settings: CompareSettings) -> str:
+    """`difference_sentence` of the two-stage score, else of one stage's, over the highest level of which there are two clusters."""
     measure = FINAL if FINAL in found else next(iter(found))
     known = [level for level, one in found[measure].items() if np.isfinite(one.low)] or ["clip"]
     what = "EPDMS" if settings.column == "score" else settings.column.upper()
     words = f"two-stage {what}" if measure == FINAL else what
-    return told(words, found[measure][known[-1]], known[-1], settings.confidence)
+    return difference_sentence(words, found[measure][known[-1]], known[-1], settings.confidence)
 
 
-def told(what: str, one: Interval, level: str, confidence: float, unit: str = "") -> str:
+def difference_sentence(what: str, one: Interval, level: str, confidence: float, unit: str = "") -> str:
     """What both sides have in hundredths, the difference, its interval over clusters of a level, and what that says."""
     said = f"{what} {100 * one.b:.1f}{unit} against {100 * one.a:.1f}{unit}, {100 * one.difference:+.1f}"
     if not np.isfinite(one.low):

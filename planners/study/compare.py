@@ -32,9 +32,9 @@ from planners.evaluation.compare import (
     compare,
     compare_tables,
     comparison_text,
+    difference_sentence,
     read_runs,
-    scores_told,
-    told,
+    score_sentence,
     write_csv,
 )
 from planners.evaluation.score_rows import read_record
@@ -43,8 +43,8 @@ from tasks.reward.aggregate import COLUMNS
 Record = Mapping[str, Any]  # of an evaluated planner
 
 
-def drives_told(drives: str, a: Sequence[Record], b: Sequence[Record], settings: CompareSettings) -> str:
-    """`told` of the routes that both sides drove cleanly. Raises ConfigError where they drove not from equal starts."""
+def drives_sentence(drives: str, a: Sequence[Record], b: Sequence[Record], settings: CompareSettings) -> str:
+    """Of the routes that both sides drove cleanly. Raises ConfigError where they drove not from equal starts."""
     from planners.drive.summary import coarsest_clusters  # with PyTorch
     from planners.drive.work import FACTS, open_drives
     from planners.study.arms import route_without_failure
@@ -71,7 +71,7 @@ def drives_told(drives: str, a: Sequence[Record], b: Sequence[Record], settings:
         draws=settings.draws,
         seed=settings.seed,
     )
-    return told("routes driven cleanly", found, level, settings.confidence, " %")
+    return difference_sentence("routes driven cleanly", found, level, settings.confidence, " %")
 
 
 @command("compare", CompareSettings)
@@ -89,10 +89,10 @@ def main(argv: Sequence[str]) -> None:
         of_a, of_b = read_runs(a), read_runs(b)
         check_same_rules([*a, *b])
         found = compare(of_a, of_b, settings)
-    sentence = scores_told(found, settings)
+    sentence = score_sentence(found, settings)
     if settings.drives is not None:
         first, second = ([read_record(Path(run)) for run in side] for side in (a, b))
-        sentence += f"; {drives_told(settings.drives, first, second, settings)}"
+        sentence += f"; {drives_sentence(settings.drives, first, second, settings)}"
     if settings.out is not None:
         write_csv(Path(settings.out), found)
     print(comparison_text(found, settings.confidence, of_tables))

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from planners.evaluation.compare import main
 from planners.evaluation.navsim import read_table
+from planners.study.compare import main
 from tasks.reward.aggregate import COLUMNS, FrameScores, columns_of, means_over
 from tasks.reward.epdms import Scores
 from tasks.subscores import RECORDS

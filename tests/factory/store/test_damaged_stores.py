@@ -181,8 +181,6 @@ def test_damage_beside_the_tables_is_named_and_taken_out(
         ("samples/*/*/*.parquet", ["status", "report", "lineage", "show 0", "export mcap sample=0"]),
         ("samples/_delta_log/*2.json", ["status", "report", "failed", "retry", "compact", "run executor=local"]),
         ("run.json", ["status", "report", "lineage", "failed", "retry"]),
-        ("last_run.json", ["status", "report"]),
-        ("current_run.json", ["report"]),
         ("report.json", ["report"]),
     ],
 )

@@ -10,7 +10,7 @@ import pytest
 from factory.store.location import Location, write_shard
 from planners.drive.work import DRIVES, SCHEMA, open_drives
 from planners.evaluation.bootstrap import Interval
-from planners.evaluation.compare import told
+from planners.evaluation.compare import difference_sentence
 from planners.evaluation.score_rows import write_record, write_rows
 from planners.study.compare import main
 from tests.planners.made_rows import clip_rows
@@ -20,13 +20,13 @@ TOWNS = 4
 
 def test_a_sentence_says_what_an_interval_says() -> None:
     def said(low: float, high: float) -> str:
-        return told("EPDMS", Interval(0.045, low, high, 0.265, 0.31, n=8), "town", 0.95)
+        return difference_sentence("EPDMS", Interval(0.045, low, high, 0.265, 0.31, n=8), "town", 0.95)
 
     numbers = "EPDMS 31.0 against 26.5, +4.5"
     assert said(-0.023, 0.113) == f"{numbers} (95 % over 8 towns: -2.3 to +11.3), no difference told from zero"
     assert said(0.01, 0.08) == f"{numbers} (95 % over 8 towns: +1.0 to +8.0), better"
     assert said(np.nan, np.nan) == f"{numbers} (no interval)"
-    worse = told("routes", Interval(-0.1, -0.2, -0.05, 0.5, 0.4, n=3), "log", 0.9, " %")
+    worse = difference_sentence("routes", Interval(-0.1, -0.2, -0.05, 0.5, 0.4, n=3), "log", 0.9, " %")
     assert worse == "routes 40.0 % against 50.0 %, -10.0 (90 % over 3 logs: -20.0 to -5.0), worse"
 
 
