@@ -58,12 +58,20 @@ def run_for_exit_code(work: Callable[[], int]) -> int:
     process was begun in `terminal_signals_blocked`.
     """
     ignore_broken_output()
+    noted = list[int]()
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        noted.append(number)
+        raise _Interrupt
+
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
-        signal.signal(signal.SIGINT, _interrupt)
+        signal.signal(signal.SIGINT, interrupt)
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, TERMINAL_SIGNALS)
         return work()
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Exception) as error:
+        if not (noted or isinstance(error, KeyboardInterrupt)):
+            raise  # after a signal it is what an import of compiled modules has made of it
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
 
@@ -71,10 +79,6 @@ def run_for_exit_code(work: Callable[[], int]) -> int:
 class _Interrupt(KeyboardInterrupt):
     """By its exact type: where KeyboardInterrupt itself leaves an exec(), as of a dataclass, Python notes that and ends
     the process by SIGINT, though the exception was caught."""
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise _Interrupt
 
 
 def ignore_terminal_signals() -> None:
@@ -169,7 +173,7 @@ def calling_on_stop_signal(stop: Callable[[], object]) -> Iterator[None]:
             asked.set()
             stop()
         elif number != signal.SIGHUP:
-            _interrupt(number, frame)
+            raise _Interrupt
 
     before = {number: signal.signal(number, handle) for number in stop_signals()}
     try:

@@ -1,6 +1,6 @@
 """`python -m factory.run`: real clips in, committed training samples out.
 
-    python -m factory.run rounds=5                                      the synthetic town
+    python -m factory.run rounds=5                                      a first look: three clips of drawn test data
     python -m factory.run clips=av2 clips.root=<logs> vocabulary.file=<human.npy> rounds=5
     python -m factory.run preset=demo out=runs/demo                     small and quick
     python -m factory.run ... --cfg                                     the settings, resolved
@@ -23,11 +23,20 @@ from factory.config.arguments import command
 from factory.config.compose import ConfigError
 from factory.config.datasets import data_set_of
 from factory.config.plugins import import_target, plugins_by_name
-from factory.config.run import RunConfig, built_in_classes, load_config, photos_alone, refuse_missing_root
+from factory.config.run import (
+    FIRST_LOOK,
+    RunConfig,
+    built_in_classes,
+    is_first_look,
+    load_config,
+    photos_alone,
+    reader_told,
+    refuse_missing_root,
+)
 from factory.config.words import CommandLine, parse_command_line
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, run_program
 from factory.files import why_unusable
-from tasks.render.settings import RenderMode
+from tasks.render.settings import RenderMode, SceneFrom
 
 if TYPE_CHECKING:
     from factory.readers.base import ClipRef
@@ -86,13 +95,33 @@ def run(asked: CommandLine, only_plan: bool) -> int:
 
     A run on Ray, unless this process has joined a cluster already, is a process of its own, which Ray may end.
     """
+    from factory.graph.own_process import check_address_answers, run_in_own_process
+
     config = _checked(asked)
+    if config.executor == "ray" and not only_plan:
+        try:
+            check_address_answers(os.environ.get("RAY_ADDRESS", ""))
+        except ConnectionError as error:
+            raise ConfigError(str(error)) from error
+    print(announcement(config, asked.words), flush=True)
     if config.executor == "local" or only_plan or ("ray" in sys.modules and sys.modules["ray"].is_initialized()):
         return _run(config, asked, only_plan)
-    from factory.graph.own_process import run_in_own_process
-
     work = partial(_run_in_child, tuple(asked.words), time.monotonic())
     return run_in_own_process(work, not os.environ.get("RAY_ADDRESS"), lambda line: print(line, flush=True))
+
+
+def announcement(config: RunConfig, words: Sequence[str]) -> str:
+    """What a run is about to do, as far as its settings tell; and how other clips are chosen, where none were."""
+    render, name = config.render, config.clips["name"]
+    fitted = render.mode is RenderMode.AUTO and render.scene is SceneFrom.FIT
+    how = f"from scenes fitted to the photos, {render.fit.iterations} iterations each" if fitted else f"({render.mode})"
+    drawn = f"pictures of {render.width}x{render.height} {how}" if render.mode is not RenderMode.NONE else "no pictures"
+    told = [reader_told(config), f"rounds={config.rounds}", drawn, f"out={config.out}"]
+    line = f"clips={name}: {'; '.join(filter(None, told))}"
+    if not is_first_look(words):
+        return line
+    others = "|".join(other for other in built_in_classes("clips") if not other.startswith(name))
+    return f"{line}\nno clips= given: this first look is {' '.join(FIRST_LOOK)}; your logs: clips={others}"
 
 
 def _checked(asked: CommandLine) -> RunConfig:
@@ -181,9 +210,11 @@ def _run(
             say,
             begun,
         )
+    if summary.exit_code == BAD_CONFIG:
+        raise ConfigError(summary.message)
     if summary.message:
         print(summary.message, file=sys.stderr)
-    if summary.exit_code == BAD_CONFIG or summary.funnel is None:
+    if summary.funnel is None:
         return summary.exit_code
     print(summary.funnel.text())
     if summary.is_broken:

@@ -21,6 +21,7 @@ from tasks.stages import FRAMES, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
 RECOVERY = "factory.setup.settings.recovery_expert"
+FIRST_LOOK = ("preset=demo", "clips.n_clips=3")  # what a run is that neither clips= nor preset= is given for
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,13 @@ class RunConfig:
 
 def compose_run(words: Sequence[str]) -> dict[str, Any]:
     """The settings of a command line with all defaults, not yet typed. Raises ConfigError, SettingsShown."""
+    words = [*FIRST_LOOK, *words] if is_first_look(words) else words
     return compose("run", words, RunConfig, _with_defaults, settings_classes)
+
+
+def is_first_look(words: Sequence[str]) -> bool:
+    """Whether a command line leaves open what the clips are."""
+    return not any(word.startswith(("clips=", "preset=")) for word in words)
 
 
 def _with_defaults(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -233,6 +240,12 @@ def refuse_missing_root(clips: Mapping[str, Any]) -> None:
     root = clips.get("root")
     if reader_settings(clips) and isinstance(root, str) and not Path(root).exists():
         raise ConfigError(f"clips: {root}: no such folder")
+
+
+def reader_told(config: RunConfig) -> str:
+    """How many clips, as far as the settings of a built-in reader tell; empty for another. Raises ConfigError."""
+    shape = reader_settings(config.clips)
+    return "" if shape is None else str(fill(shape, own_settings(config.clips), "clips").told)
 
 
 def load_config(words: Sequence[str]) -> RunConfig:

@@ -210,12 +210,13 @@ class ClipQueue:
 
 # Results on their way to the tables: gathered by reference, written as shards by tasks, committed in groups.
 #
-# A batch closes when the rows of one partition reach 128 MB or after 30 s; its shards are written by tasks; when all
-# of them stand, the driver commits the whole batch. What is not committed when a run dies is tried again by the next
-# one.
+# A batch closes when the rows of one partition reach 128 MB or after 30 s, a run's first after 2 s; its shards are
+# written by tasks; when all of them stand, the driver commits the whole batch. What is not committed when a run dies is
+# tried again by the next one.
 
 SHARD_BYTES = 128 * 2**20
 SHARD_SECONDS = 30.0
+FIRST_SHARE = 1.0 / 15.0  # of a batch's time after which a run's first rows are written: somebody waits for them
 
 
 class WriteFailed(RuntimeError):
@@ -278,6 +279,7 @@ class CommitQueue:
         self._shard_bytes, self._shard_seconds = shard_bytes, shard_seconds
         self._open = PendingCommit()
         self._written_by: dict[Ticket, PendingCommit] = {}
+        self._has_sent_rows = False
 
     @property
     def n_writing(self) -> int:
@@ -305,12 +307,14 @@ class CommitQueue:
     def send_if_due(self) -> None:
         batch = self._open
         age = time.monotonic() - batch.opened
-        if not batch.is_empty and (batch.largest >= self._shard_bytes or age >= self._shard_seconds):
+        due_s = self._shard_seconds * (FIRST_SHARE if batch.rows and not self._has_sent_rows else 1.0)
+        if not batch.is_empty and (batch.largest >= self._shard_bytes or age >= due_s):
             self.send()
 
     def send(self) -> None:
         """Close the open batch and have its shards written."""
         batch, self._open = self._open, PendingCommit()
+        self._has_sent_rows |= bool(batch.rows)
         for partition in sorted(batch.rows):
             ticket = self._graph.submit("write", *(row.result for row in batch.rows[partition]))
             self._written_by[ticket] = batch

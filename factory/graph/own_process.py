@@ -7,6 +7,7 @@ store of its node gone. The command's own process then says so in a line, and go
 import multiprocessing
 import os
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -19,6 +20,10 @@ from types import FrameType
 from factory.exits import INTERRUPTED, run_for_exit_code, stop_signals, terminal_signals_blocked
 
 AGAIN = "run the same command again to go on"
+ANSWER_S = 10.0  # for a cluster's port to be reached, and to say what it speaks
+GRPC_HELLO = (
+    b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0"  # ends with a frame of kind 4, as the answer begins
+)
 NEW_CLUSTERS = 3  # in one run, for those of its own that die
 BY_RAY = 1  # its exit code of a process whose raylet is gone
 
@@ -61,6 +66,27 @@ def run_in_own_process(run: Run, is_ours: bool, say: Callable[[str], None]) -> i
             return INTERRUPTED
         begun += 1
         say(new_cluster_text("Ray's raylet died", begun))
+
+
+def no_cluster_text(address: str, why: object) -> str:
+    """The line about an address at which there is none."""
+    return f"no Ray cluster answers at RAY_ADDRESS={address} ({why}); unset it to run on this machine alone"
+
+
+def check_address_answers(address: str) -> None:
+    """Raises ConnectionError where no head node listens: at a dashboard's port, say, Ray itself tries for minutes."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if address in ("", "auto", "local"):
+        return  # Ray knows where
+    try:
+        if not (colon and port.isdecimal()):
+            raise OSError("it is neither auto nor a host:port")
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S) as to:
+            to.sendall(GRPC_HELLO)
+            if os.environ.get("RAY_USE_TLS", "0") == "0" and to.recv(4)[3:] != GRPC_HELLO[-6:-5]:
+                raise OSError("what listens there is no head node, whose port `ray start --head` prints")
+    except OSError as error:
+        raise ConnectionError(no_cluster_text(address, error)) from error
 
 
 def new_cluster_text(said: str, number: int) -> str:

@@ -51,6 +51,11 @@ class ReaderSettings:
         """Whether clips may have photos and no lidar."""
         return False
 
+    @property
+    def told(self) -> str:
+        """How many clips these are, and what saw them, for people; empty before they are looked at."""
+        return ""
+
     def rig(self, painted: bool) -> tuple[str, ...]:
         """Names of the cameras, where settings choose them; painted: for pictures by the painter of the data set."""
         return ()

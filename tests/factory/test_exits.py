@@ -109,10 +109,11 @@ def test_a_terminal_that_closes_asks_once_however_often_it_is_told_and_never_und
     assert len(asked) == times
 
 
-def test_an_interrupt_within_code_that_is_made_up_is_the_exit_code_too() -> None:
-    """Python itself ends such a process by the signal."""
+@pytest.mark.parametrize("then", ["", "\nexcept KeyboardInterrupt: raise AttributeError('half imported') from None"])
+def test_an_interrupt_is_one_line_within_code_that_is_made_up_and_where_it_surfaces_as_another_error(then: str) -> None:
+    """Python itself ends the one by the signal; the other is what an import of compiled modules makes of it."""
     code = "import signal\nfrom factory.exits import run_program\nrun_program(lambda _: exec({!r}))"
-    made_up = "signal.raise_signal(signal.SIGINT)"
+    made_up = f"try: signal.raise_signal(signal.SIGINT){then or chr(10) + 'finally: pass'}"
     done = subprocess.run(
         [sys.executable, "-c", code.format(made_up)], cwd=REPOSITORY, capture_output=True, text=True, check=False
     )

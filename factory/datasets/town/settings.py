@@ -80,6 +80,12 @@ class TownClips(TownReaderSettings):
     settings: TownSettings = field(default_factory=TownSettings)
     traversals: int = 0  # other logs' drives through the same place, at most, that a block's scene is made of as well
 
+    @property
+    def told(self) -> str:
+        """How many clips, and the sensors."""
+        seen, lidar = self.settings, ", lidar" if self.settings.lidar_beams else ""
+        return f"{self.n_clips} clips of a drawn town, {len(seen.cameras)} cameras of {seen.width}x{seen.height}{lidar}"
+
     def __post_init__(self) -> None:
         check_traversals(self.traversals)
         if self.n_clips < 1:

@@ -212,6 +212,7 @@ LIDARS = ("up_lidar", "down_lidar")  # Argoverse's two names, which converters l
 STEP_NS = 100_000_000
 FIRST_STAMP_NS = 315_970_000_000_000_000
 LOG_SPACING_NS = 60_000_000_000
+PAINTED_EVERY_S = 5.0  # between two lines that tell how far it is
 STATE_NAMES = {GREEN: "GREEN", YELLOW: "YELLOW", RED: "RED"}
 
 
@@ -229,21 +230,38 @@ def write_town(out: Path, n_clips: int, seed: int, settings: TownSettings, threa
 def write_logs(out: Path, indices: Collection[int], seed: int, settings: TownSettings, threads: int = 2) -> list[Path]:
     """Writes these logs of the seed under `out`; a log's bytes depend on its index, not on the others.
 
-    Logs with sensors take seconds each, so how far it is goes to stderr.
+    Logs with sensors take a minute of a core each, so how far it is goes to stderr.
     """
-    folders, began = [], time.monotonic()
-    for number, i in enumerate(indices, start=1):
-        folders.append(write_log(out / log_name(seed, i), *plan_log(seed, i), settings, i, threads))
-        if settings.cameras or settings.lidar_beams:
-            left = time_text((time.monotonic() - began) / number * (len(indices) - number))
-            print(f"town {seed}: log {number} of {len(indices)} painted  ETA {left}", file=sys.stderr, flush=True)
-    return folders
+    began, said, n = 0.0, 0.0, len(indices)
+
+    def show(logs: float) -> None:
+        nonlocal began, said
+        now = time.monotonic()
+        if not began:  # the first instant may have waited for the painter to be compiled
+            began = said = now
+        elif logs == n or now - said >= PAINTED_EVERY_S:
+            said, left = now, time_text((now - began) / logs * (n - logs))
+            print(f"town {seed}: {100.0 * logs / n:.0f} % painted  ETA {left}", file=sys.stderr, flush=True)
+
+    if settings.cameras or settings.lidar_beams:
+        about = "once for these settings; half a minute more where the painter is compiled first"
+        print(f"painting {n} logs of town {seed}, {about}", file=sys.stderr, flush=True)
+    return [
+        write_log(out / log_name(seed, i), *plan_log(seed, i), settings, i, threads, lambda share, k=k: show(k + share))
+        for k, i in enumerate(indices)
+    ]
 
 
 def write_log(
-    folder: Path, town: Town, drive: TownDrive, settings: TownSettings, number: int = 0, threads: int = 2
+    folder: Path,
+    town: Town,
+    drive: TownDrive,
+    settings: TownSettings,
+    number: int = 0,
+    threads: int = 2,
+    show: Callable[[float], object] = lambda share: None,
 ) -> Path:
-    """Writes one drive as a log folder."""
+    """Writes one drive as a log folder; show: is told which share of its instants is sensed."""
     folder.mkdir(parents=True, exist_ok=True)
     stamps = FIRST_STAMP_NS + number * LOG_SPACING_NS + np.arange(LOG_STEPS, dtype=np.int64) * STEP_NS
     _feather(folder / "city_SE3_egovehicle.feather", _poses(drive, stamps))
@@ -258,7 +276,7 @@ def write_log(
     (folder / "LICENSE").write_text(
         f"{LICENCE}\nMade by the data factory's synthetic town; test data.\n", encoding="utf-8"
     )
-    _sensors(folder, town, drive, rig, settings, stamps, threads)
+    _sensors(folder, town, drive, rig, settings, stamps, threads, show)
     return folder
 
 
@@ -270,6 +288,7 @@ def _sensors(
     settings: TownSettings,
     stamps: Ints,
     threads: int,
+    show: Callable[[float], object],
 ) -> None:
     kinds = [f"cameras/{camera.name}" for camera in rig] + ["lidar"] * bool(settings.lidar_beams)
     if not kinds:
@@ -293,7 +312,9 @@ def _sensors(
             _feather(folder / "sensors" / "lidar" / f"{stamp}.feather", columns)
 
     with ThreadPoolExecutor(max_workers=threads) as pool:
-        list(pool.map(record, sorted({*photographed, *swept})))
+        instants = sorted({*photographed, *swept})
+        for done, _ in enumerate(pool.map(record, instants), start=1):
+            show(done / len(instants))
 
 
 def _feather(path: Path, columns: Mapping[str, Any]) -> None:

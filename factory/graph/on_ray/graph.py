@@ -9,7 +9,7 @@ import os
 import secrets
 import shutil
 import signal
-import socket
+import sys
 import tempfile
 import time
 from collections import deque
@@ -49,13 +49,14 @@ from factory.graph.local import (
     task_name,
     task_note,
 )
+from factory.graph.own_process import check_address_answers, no_cluster_text
 from factory.graph.plan import AttemptBatch
 from factory.graph.progress import METRICS, Metric, Record, Type
 from factory.graph.steps import BatchReport, Failure, NotReady, PreparedClip, Work, attempt, never_stop
 from factory.store.location import BadLocation, Location
 from factory.store.samples import ErrorKind
 from factory.store.schema import Stamp
-from factory.wording import one_line
+from factory.wording import one_line, time_text
 from tasks.stages import ATTEMPT, TASKS
 
 # A Ray cluster joined, or begun on this machine: whether it answers and lives, its nodes, and what they all see.
@@ -64,7 +65,6 @@ from tasks.stages import ATTEMPT, TASKS
 
 VITAL = ("raylet", "gcs_server")
 PROBE_SECONDS = 120.0
-ANSWER_S = 10.0  # for a cluster's port to be reached
 OWN_BYTES = 2**20  # of files of a cluster of our own, before it does anything: less, and another will not begin either
 GPU_WAIT_S = 900.0  # for the first node with one to come
 WORKER_ENV = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -89,8 +89,8 @@ def join_or_start_cluster(workers: int | None) -> bool:
     own: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if where == "local" else {}
     if where == "local":  # Ray warns that a cluster of our own asks for a token, as it should
         logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
+    check_address_answers(named)
     try:
-        check_address_answers(named)
         with terminal_signals_blocked(signal.SIGHUP):  # Ray keeps SIGINT from its processes itself
             ray.init(
                 address=where,
@@ -110,8 +110,7 @@ def join_or_start_cluster(workers: int | None) -> bool:
             raise ClusterDied(f"{said}, where {free:,} bytes are free", True) from error
         if not isinstance(error, ConnectionError):
             raise
-        said = f"no Ray cluster answers at RAY_ADDRESS={named} ({one_line(error)})"
-        raise ConnectionError(f"{said}; unset it to run on this machine alone") from error
+        raise ConnectionError(no_cluster_text(named, one_line(error))) from error
     return where == "local"
 
 
@@ -128,17 +127,6 @@ def dead_ray_process() -> str:
     """
     node = ray._private.worker._global_node
     return next((name for name, _ in node.dead_processes() if name in VITAL), "") if node is not None else ""
-
-
-def check_address_answers(address: str) -> None:
-    """Raises ConnectionError for a host:port, or ray://host:port, at which nothing listens."""
-    host, colon, port = address.removeprefix("ray://").rpartition(":")
-    if not (colon and port.isdecimal()):
-        return  # auto, local: Ray knows where
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S).close()
-    except OSError as error:
-        raise ConnectionError(str(error)) from error
 
 
 def nodes_of_cluster(having: str = "") -> list[str]:
@@ -197,6 +185,8 @@ ILL = (  # what Ray says when it is the machine that failed
     *(exceptions.ObjectStoreFullError, exceptions.OutOfDiskError),
 )
 AHEAD_S = 1.0  # of attempts that one task makes: the driver bears some hundreds of tasks a second
+WARM_S = 90.0  # what kernels usually take on two cores
+SAY_EVERY_S = 10.0  # between two lines about them
 LOOK_S = 1.0  # between two looks at whether a cluster lives
 WARMING = {"key": "warm", "what": "compiling kernels", "run": "", "limited": False}
 
@@ -243,6 +233,8 @@ class RayGraph(Graph):
         DiskFull when there is no space for it.
         """
         self._connected = not ray.is_initialized()
+        if self._connected and not os.environ.get("RAY_ADDRESS"):
+            print("starting Ray on this machine: some 10 s", file=sys.stderr, flush=True)
         self._is_ours = self._connected and join_or_start_cluster(workers)
         self.parallelism = tasks_at_once(workers, self._is_ours)
         self.cores = min(self.parallelism, *(per_node("CPU") or [1]))  # none yet where a cluster grows from nothing
@@ -280,10 +272,15 @@ class RayGraph(Graph):
             _run.options(name="warm", scheduling_strategy=on_node(n)).remote("warm", watch, 1, work, n in draws)[0]
             for n in nodes
         ]
-        waiting = reports
+        waiting, began, said_s = reports, time.monotonic(), 0.0
         while waiting:
             self._check_alive()
             _, waiting = ray.wait(waiting, num_returns=len(waiting), timeout=LOOK_S)
+            spent_s = time.monotonic() - began
+            if waiting and spent_s - said_s >= SAY_EVERY_S:
+                said_s, left = spent_s, time_text(WARM_S - spent_s) if spent_s < WARM_S else "?"
+                told = f"kernels, compiled once for this version: {len(waiting)} of {len(nodes)} nodes wait  ETA {left}"
+                print(told, file=sys.stderr, flush=True)
         for node, report in zip(nodes, reports):
             try:
                 answer, _ = ray.get(report)

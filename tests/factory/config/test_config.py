@@ -49,15 +49,15 @@ GROUPS = [
 @pytest.mark.parametrize(("name", "expected"), GROUPS, ids=[name for name, _ in GROUPS])
 def test_a_choice_is_its_dataclass_with_what_its_file_says(name: str, expected: Any) -> None:
     group, choice = name.split("/")
-    assert getattr(load_config([f"{group}={choice}"]), group) == expected
+    assert getattr(load_config(["preset=none", f"{group}={choice}"]), group) == expected
 
 
 def test_every_setting_has_a_default_and_a_meaning_and_is_shown_with_both() -> None:
     with pytest.raises(SettingsShown) as settings:
-        compose_run(["--cfg"])
+        compose_run(["--cfg", "preset=none"])
     shown = str(settings.value).splitlines()
     assert "  width: 320  # pixels" in shown and "  mode: auto  # auto | map | painter | none; " in "\n".join(shown)
-    assert yaml.safe_load("\n".join(shown)) == compose_run([])
+    assert yaml.safe_load("\n".join(shown)) == compose_run(["preset=none"])
     silent = [line for line in shown if "  # " not in line and not re.search(r"_target_|name: |kind: |^  \w+:$", line)]
     assert [line for line in silent if not re.search(r"_(m|mps|s|mps2|deg)\b", line)] == []
 
@@ -80,7 +80,7 @@ def test_a_plain_run_shows_at_most_120_keys() -> None:
 
 def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
     assert set(compose_run([])) == {field.name for field in dataclasses.fields(RunConfig)}
-    config = load_config([])
+    config = load_config(["preset=none"])
     assert (config.rounds, config.executor, config.limit) == (1, "ray", None)
     assert config.perturb == PerturbSources()
     assert config.reward == RewardSettings()

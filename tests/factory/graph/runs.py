@@ -1,5 +1,6 @@
 """A toy's run in this process, and what the tests of runs take it to be."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,5 +20,5 @@ def run(
     **options: object,
 ) -> RunSummary:
     """options: of Execution."""
-    how = Execution("local", **options)  # type: ignore[arg-type]
+    how = Execution("local", **({"shard_seconds": math.inf} | options))  # type: ignore[arg-type]
     return executed(work or ToyWork(), refs(n), experts, rounds, Store(out), how)

@@ -219,6 +219,16 @@ def test_shards_close_by_size_and_commits_are_groups(tmp_path: Path, plain: Call
     assert_same_tables(tmp_path / "out", plain())
 
 
+def test_the_first_rows_are_in_the_table_long_before_a_batch_is_old(tmp_path: Path) -> None:
+    class Slow(ToyWork):
+        def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
+            time.sleep(0.02)
+            return super().drive(prepared, candidate, expert)
+
+    run(tmp_path / "out", Slow(), shard_seconds=1.5)
+    assert Store(tmp_path / "out").samples.version >= 4, "a group after a tenth of a second, and one at the end"
+
+
 def test_simulated_experts_after_the_log_s_own_drive_leave_what_one_run_leaves(
     tmp_path: Path, plain: Callable[..., Path]
 ) -> None:

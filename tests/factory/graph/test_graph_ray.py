@@ -5,7 +5,9 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
@@ -57,13 +59,21 @@ def test_a_cluster_that_does_not_answer_is_named_at_once(tmp_path: Path, monkeyp
     """Ray's own client tries for minutes."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"127.0.0.1:{server.getsockname()[1]}"
-        graph.check_address_answers(address)
-        graph.check_address_answers(f"ray://{address}")
     graph.check_address_answers("auto")
     monkeypatch.setenv("RAY_ADDRESS", address)
     ended = run(tmp_path / "out", "ray", ToyWork(), 1, 1)
     assert ended.exit_code == BAD_CONFIG and f"RAY_ADDRESS={address}" in ended.message and "unset" in ended.message
     assert not ray.is_initialized()
+
+
+def test_a_head_node_is_told_from_what_else_listens(two_cpus: None) -> None:
+    graph.check_address_answers(ray.get_runtime_context().gcs_address)
+    with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:  # as a dashboard does
+        Thread(target=server.serve_forever, daemon=True).start()
+        for address in (f"127.0.0.1:{server.server_port}", f"ray://127.0.0.1:{server.server_port}", "the head"):
+            with pytest.raises(ConnectionError, match=f"at RAY_ADDRESS={address} .*; unset it"):
+                graph.check_address_answers(address)
+        server.shutdown()
 
 
 def test_local_and_ray_with_one_and_two_workers_make_identical_rows(tmp_path: Path, two_cpus: None) -> None:

@@ -65,7 +65,7 @@ def test_labels_of_trajectories_that_nobody_drove_are_remarked(
 
 
 def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:
-    config = load_config([])
+    config = load_config(["preset=none"])
     found = differences_from_paper(config, choose_vocabulary(config.vocabulary))
     assert found == [
         "vocabulary of 1,024 kinematic trajectories (16,384 human ones)",
