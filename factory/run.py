@@ -24,10 +24,9 @@ from factory.config.compose import ConfigError
 from factory.config.datasets import data_set_of
 from factory.config.plugins import import_target, plugins_by_name
 from factory.config.run import (
-    FIRST_LOOK,
     RunConfig,
     built_in_classes,
-    is_first_look,
+    first_look,
     load_config,
     photos_alone,
     reader_told,
@@ -118,10 +117,10 @@ def announcement(config: RunConfig, words: Sequence[str]) -> str:
     drawn = f"pictures of {render.width}x{render.height} {how}" if render.mode is not RenderMode.NONE else "no pictures"
     told = [reader_told(config), f"rounds={config.rounds}", drawn, f"out={config.out}"]
     line = f"clips={name}: {'; '.join(filter(None, told))}"
-    if not is_first_look(words):
+    if not (first := first_look(words)):
         return line
     others = "|".join(other for other in built_in_classes("clips") if not other.startswith(name))
-    return f"{line}\nno clips= given: this first look is {' '.join(FIRST_LOOK)}; your logs: clips={others}"
+    return f"{line}\nno clips= given, so this is a first look ({' '.join(first)}); your logs: clips={others}"
 
 
 def _checked(asked: CommandLine) -> RunConfig:

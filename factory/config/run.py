@@ -21,7 +21,7 @@ from tasks.stages import FRAMES, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
 RECOVERY = "factory.setup.settings.recovery_expert"
-FIRST_LOOK = ("preset=demo", "clips.n_clips=3")  # what a run is that neither clips= nor preset= is given for
+FIRST_LOOK = ("clips.n_clips=3", "clips.settings.width=256", "clips.settings.height=144", "render=town")
 
 
 @dataclass(frozen=True)
@@ -174,13 +174,13 @@ class RunConfig:
 
 def compose_run(words: Sequence[str]) -> dict[str, Any]:
     """The settings of a command line with all defaults, not yet typed. Raises ConfigError, SettingsShown."""
-    words = [*FIRST_LOOK, *words] if is_first_look(words) else words
-    return compose("run", words, RunConfig, _with_defaults, settings_classes)
+    return compose("run", [*first_look(words), *words], RunConfig, _with_defaults, settings_classes)
 
 
-def is_first_look(words: Sequence[str]) -> bool:
-    """Whether a command line leaves open what the clips are."""
-    return not any(word.startswith(("clips=", "preset=")) for word in words)
+def first_look(words: Sequence[str]) -> list[str]:
+    """What goes before a command line that leaves open which clips: FIRST_LOOK, but for a group that it chooses."""
+    given = {word.partition("=")[0] for word in words}
+    return [] if given & {"clips", "preset"} else [word for word in FIRST_LOOK if word.partition("=")[0] not in given]
 
 
 def _with_defaults(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -22,14 +22,20 @@ sys.exit(factory.run.main(sys.argv[1:]))
 
 def test_without_clips_and_preset_a_run_is_the_first_look_and_every_word_of_it_can_be_said_otherwise() -> None:
     first = compose_run(["rounds=5"])
-    assert first == compose_run([*FIRST_LOOK, "rounds=5"]) != compose_run(["preset=none", "rounds=5"])
-    clips, seen = first["clips"], first["clips"]["settings"]
+    assert (
+        first == compose_run(["clips=synthetic", *FIRST_LOOK, "rounds=5"]) != compose_run(["preset=none", "rounds=5"])
+    )
+    clips, seen, drawn = first["clips"], first["clips"]["settings"], first["render"]
     assert clips["n_clips"] == 3, "of one log: one scene is painted and fitted"
-    assert len(seen["cameras"]) * seen["width"] * seen["height"] <= 3 * 240 * 136
-    assert first["render"]["fit"]["iterations"] <= 800 and first["render"]["fit"]["most_gaussians"] <= 80_000
+    assert len(seen["cameras"]) * seen["width"] * seen["height"] <= 3 * 256 * 144
+    assert (drawn["width"], drawn["height"]) == (seen["width"], seen["height"])
+    assert drawn["fit"]["iterations"] <= 800 and drawn["fit"]["most_gaussians"] <= 80_000
+    assert (
+        compose_run(["clips.n_clips=1", "render=map"])["render"] == compose_run(["preset=none", "render=map"])["render"]
+    )
     assert compose_run(["clips.n_clips=1"])["clips"]["n_clips"] == 1
-    assert compose_run(["clips=synthetic"]) == compose_run(["clips=synthetic", "preset=none"])
-    assert compose_run(["preset=demo"])["clips"]["n_clips"] == 6
+    for words in (["clips=synthetic"], ["preset=demo", "clips.n_clips=12", "rounds=1"]):
+        assert compose_run(words)["clips"]["n_clips"] == 12, "nothing is set where the clips are said"
 
 
 @pytest.mark.parametrize(
@@ -37,9 +43,9 @@ def test_without_clips_and_preset_a_run_is_the_first_look_and_every_word_of_it_c
     [
         (
             ["rounds=5"],
-            r"clips=synthetic: 3 clips of a drawn town, 3 cameras of 240x136, lidar; rounds=5; pictures of 240x136 "
+            r"clips=synthetic: 3 clips of a drawn town, 3 cameras of 256x144, lidar; rounds=5; pictures of 256x144 "
             r"from scenes fitted to the photos, 800 iterations each; out=runs/synthetic\n"
-            r"no clips= given: this first look is preset=demo clips.n_clips=3; your logs: clips=av2\|custom.*\n",
+            rf"no clips= given, so this is a first look \({' '.join(FIRST_LOOK)}\); your logs: clips=av2\|custom.*\n",
         ),
         (
             ["clips=custom", "clips._target_=tests.factory.street_reader.StreetReader", "render=none"],

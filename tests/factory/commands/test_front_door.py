@@ -112,7 +112,7 @@ def test_settings_are_shown_as_they_are_given(
         (planners_main, "drive --cfg planner=human clips.n_clips=3", {"planner": "human", "seconds": 20.0}),
         (planners_main, "train planner=custom -c job steps=7", {"steps": 7, "seed": 0}),
         (main, "run clips=av2 --cfg rounds=5", {"rounds": 5, "executor": "ray"}),
-        (main, "explain --cfg tries=9 traffic=replay", {"clip": "0", "tries": 9, "rounds": 3}),
+        (main, "explain --cfg tries=9 traffic=replay", {"clip": "0", "tries": 9, "rounds": 1}),
         (main, "retry out=runs/a --cfg workers=3", {"out": "runs/a", "workers": 3}),
         (main, "show --cfg 3 film=true", {"out": "???", "sample": "3", "film": True}),
     ):

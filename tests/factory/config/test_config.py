@@ -49,7 +49,7 @@ GROUPS = [
 @pytest.mark.parametrize(("name", "expected"), GROUPS, ids=[name for name, _ in GROUPS])
 def test_a_choice_is_its_dataclass_with_what_its_file_says(name: str, expected: Any) -> None:
     group, choice = name.split("/")
-    assert getattr(load_config(["preset=none", f"{group}={choice}"]), group) == expected
+    assert getattr(load_config([f"{group}={choice}"]), group) == expected
 
 
 def test_every_setting_has_a_default_and_a_meaning_and_is_shown_with_both() -> None:
@@ -80,7 +80,7 @@ def test_a_plain_run_shows_at_most_120_keys() -> None:
 
 def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
     assert set(compose_run([])) == {field.name for field in dataclasses.fields(RunConfig)}
-    config = load_config(["preset=none"])
+    config = load_config([])
     assert (config.rounds, config.executor, config.limit) == (1, "ray", None)
     assert config.perturb == PerturbSources()
     assert config.reward == RewardSettings()
