@@ -23,19 +23,11 @@ from factory.config.arguments import command
 from factory.config.compose import ConfigError
 from factory.config.datasets import data_set_of
 from factory.config.plugins import import_target, plugins_by_name
-from factory.config.run import (
-    RunConfig,
-    built_in_classes,
-    first_look,
-    load_config,
-    photos_alone,
-    reader_told,
-    refuse_missing_root,
-)
+from factory.config.run import RunConfig, announcement, built_in_classes, load_config, photos_alone, refuse_missing_root
 from factory.config.words import CommandLine, parse_command_line
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, run_program
 from factory.files import why_unusable
-from tasks.render.settings import RenderMode, SceneFrom
+from tasks.render.settings import RenderMode
 
 if TYPE_CHECKING:
     from factory.readers.base import ClipRef
@@ -107,20 +99,6 @@ def run(asked: CommandLine, only_plan: bool) -> int:
         return _run(config, asked, only_plan)
     work = partial(_run_in_child, tuple(asked.words), time.monotonic())
     return run_in_own_process(work, not os.environ.get("RAY_ADDRESS"), lambda line: print(line, flush=True))
-
-
-def announcement(config: RunConfig, words: Sequence[str]) -> str:
-    """What a run is about to do, as far as its settings tell; and how other clips are chosen, where none were."""
-    render, name = config.render, config.clips["name"]
-    fitted = render.mode is RenderMode.AUTO and render.scene is SceneFrom.FIT
-    how = f"from scenes fitted to the photos, {render.fit.iterations} iterations each" if fitted else f"({render.mode})"
-    drawn = f"pictures of {render.width}x{render.height} {how}" if render.mode is not RenderMode.NONE else "no pictures"
-    told = [reader_told(config), f"rounds={config.rounds}", drawn, f"out={config.out}"]
-    line = f"clips={name}: {'; '.join(filter(None, told))}"
-    if not (first := first_look(words)):
-        return line
-    others = "|".join(other for other in built_in_classes("clips") if not other.startswith(name))
-    return f"{line}\nno clips= given, so this is a first look ({' '.join(first)}); your logs: clips={others}"
 
 
 def _checked(asked: CommandLine) -> RunConfig:

@@ -15,7 +15,7 @@ from factory.config.plugins import add_installed_experts
 from factory.config.shapes import deep_merge, defaults_of, setting_keys
 from factory.config.words import ConfigError, did_you_mean
 from factory.files import in_submitted_job, matching
-from tasks.render.settings import RenderMode, RenderSettings
+from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
 from tasks.settings import ExpertGate, PdmSettings, PerturbSettings, RecoverySettings, TrafficSettings
 from tasks.stages import FRAMES, TASKS
 
@@ -183,6 +183,22 @@ def first_look(words: Sequence[str]) -> list[str]:
     return [] if given & {"clips", "preset"} else [word for word in FIRST_LOOK if word.partition("=")[0] not in given]
 
 
+def announcement(config: RunConfig, words: Sequence[str]) -> str:
+    """What a run is about to do, as far as its settings tell; and how other clips are chosen, where none were."""
+    render, name, shape = config.render, config.clips["name"], reader_settings(config.clips)
+    fitted = render.mode is RenderMode.AUTO and render.scene is SceneFrom.FIT
+    how = f"from scenes fitted to the photos, {render.fit.iterations} iterations each" if fitted else f"({render.mode})"
+    drawn = f"pictures of {render.width}x{render.height} {how}" if render.mode is not RenderMode.NONE else "no pictures"
+    told = [f"rounds={config.rounds}", drawn, f"out={config.out}"]
+    if shape is not None and (clips := fill(shape, own_settings(config.clips), "clips").told):
+        told.insert(0, clips)
+    line = f"clips={name}: {'; '.join(told)}"
+    if not (first := first_look(words)):
+        return line
+    others = "|".join(other for other in built_in_classes("clips") if not other.startswith(name))
+    return f"{line}\nno clips= given, so this is a first look ({' '.join(first)}); your logs: clips={others}"
+
+
 def _with_defaults(values: Mapping[str, Any]) -> dict[str, Any]:
     """With every installed expert, and the defaults of the chosen reader and of the experts."""
     values = add_installed_experts(values, conf_dir())
@@ -240,12 +256,6 @@ def refuse_missing_root(clips: Mapping[str, Any]) -> None:
     root = clips.get("root")
     if reader_settings(clips) and isinstance(root, str) and not Path(root).exists():
         raise ConfigError(f"clips: {root}: no such folder")
-
-
-def reader_told(config: RunConfig) -> str:
-    """How many clips, as far as the settings of a built-in reader tell; empty for another. Raises ConfigError."""
-    shape = reader_settings(config.clips)
-    return "" if shape is None else str(fill(shape, own_settings(config.clips), "clips").told)
 
 
 def load_config(words: Sequence[str]) -> RunConfig:

@@ -21,9 +21,7 @@ from factory.exits import INTERRUPTED, run_for_exit_code, stop_signals, terminal
 
 AGAIN = "run the same command again to go on"
 ANSWER_S = 10.0  # for a cluster's port to be reached, and to say what it speaks
-GRPC_HELLO = (
-    b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0"  # ends with a frame of kind 4, as the answer begins
-)
+GRPC_HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0"  # ends with a frame of kind 4, as answers begin
 NEW_CLUSTERS = 3  # in one run, for those of its own that die
 BY_RAY = 1  # its exit code of a process whose raylet is gone
 

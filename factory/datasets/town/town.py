@@ -245,7 +245,7 @@ def write_logs(out: Path, indices: Collection[int], seed: int, settings: TownSet
 
     if settings.cameras or settings.lidar_beams:
         about = "once for these settings; half a minute more where the painter is compiled first"
-        print(f"painting {n} logs of town {seed}, {about}", file=sys.stderr, flush=True)
+        print(f"painting town {seed}, logs: {n}, {about}", file=sys.stderr, flush=True)
     return [
         write_log(out / log_name(seed, i), *plan_log(seed, i), settings, i, threads, lambda share, k=k: show(k + share))
         for k, i in enumerate(indices)
