@@ -234,9 +234,9 @@ def write_logs(out: Path, indices: Collection[int], seed: int, settings: TownSet
     """
     began, said, n = 0.0, 0.0, len(indices)
 
-    def show(logs: float) -> None:
+    def show(whole: int, share: float) -> None:
         nonlocal began, said
-        now = time.monotonic()
+        now, logs = time.monotonic(), whole + share
         if not began:  # the first instant may have waited for the painter to be compiled
             began = said = now
         elif logs == n or now - said >= PAINTED_EVERY_S:
@@ -247,7 +247,7 @@ def write_logs(out: Path, indices: Collection[int], seed: int, settings: TownSet
         about = "once for these settings; half a minute more where the painter is compiled first"
         print(f"painting town {seed}, logs: {n}, {about}", file=sys.stderr, flush=True)
     return [
-        write_log(out / log_name(seed, i), *plan_log(seed, i), settings, i, threads, lambda share, k=k: show(k + share))
+        write_log(out / log_name(seed, i), *plan_log(seed, i), settings, i, threads, partial(show, k))
         for k, i in enumerate(indices)
     ]
 
