@@ -190,7 +190,7 @@ def announcement(config: RunConfig, words: Sequence[str]) -> str:
     how = f"from scenes fitted to the photos, {render.fit.iterations} iterations each" if fitted else f"({render.mode})"
     drawn = f"pictures of {render.width}x{render.height} {how}" if render.mode is not RenderMode.NONE else "no pictures"
     told = [f"rounds={config.rounds}", drawn, f"out={config.out}"]
-    if shape is not None and (clips := fill(shape, own_settings(config.clips), "clips").told):
+    if shape is not None and (clips := fill(shape, own_settings(config.clips), "clips").summary):
         told.insert(0, clips)
     line = f"clips={name}: {'; '.join(told)}"
     if not (first := first_look(words)):

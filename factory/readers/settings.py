@@ -52,7 +52,7 @@ class ReaderSettings:
         return False
 
     @property
-    def told(self) -> str:
+    def summary(self) -> str:
         """How many clips these are, and what saw them, for people; empty before they are looked at."""
         return ""
 

@@ -137,7 +137,7 @@ def _bounds(one: Interval, nothing: str) -> str:
 
 
 def score_sentence(found: Mapping[Measure, ByLevel], settings: CompareSettings) -> str:
-    """`difference_sentence` of the two-stage score, else of one stage's, over the highest level of which there are two clusters."""
+    """Of the two-stage score, else of one stage's, over the highest level of which there are two clusters."""
     measure = FINAL if FINAL in found else next(iter(found))
     known = [level for level, one in found[measure].items() if np.isfinite(one.low)] or ["clip"]
     what = "EPDMS" if settings.column == "score" else settings.column.upper()

@@ -81,7 +81,7 @@ class TownClips(TownReaderSettings):
     traversals: int = 0  # other logs' drives through the same place, at most, that a block's scene is made of as well
 
     @property
-    def told(self) -> str:
+    def summary(self) -> str:
         """How many clips, and the sensors."""
         seen, lidar = self.settings, ", lidar" if self.settings.lidar_beams else ""
         return f"{self.n_clips} clips of a drawn town, {len(seen.cameras)} cameras of {seen.width}x{seen.height}{lidar}"
