@@ -5,16 +5,16 @@ Chunked, zstd-compressed, with CRCs and an index, as those tools want it; their 
 
 import hashlib
 import io
-import json
 import zlib
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from google.protobuf.message import Message as Content
 from mcap.records import Footer
 from mcap.stream_reader import MAGIC_SIZE, StreamReader
-from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
@@ -27,11 +27,11 @@ DATA_END_BYTES = len(DATA_END) + 4
 
 @dataclass(frozen=True)
 class Message:
-    """What stands under a topic at a time; a mapping is to be written as JSON."""
+    """What stands under a topic at a time."""
 
     topic: str
     time_ns: int
-    content: Any  # a message of protobuf, or a mapping
+    content: Content
 
 
 def wants_episode(attempt_id: str, every: int) -> bool:
@@ -54,9 +54,9 @@ def episode_bytes(messages: Sequence[Message], metadata: Mapping[str, str]) -> b
     channels: dict[str, int] = {}
     for sequence, message in enumerate(messages):
         if message.topic not in channels:
-            channels[message.topic] = _channel(writer, message)
-        is_json = isinstance(message.content, Mapping)
-        data = json.dumps(message.content, sort_keys=True).encode() if is_json else message.content.SerializeToString()
+            schema = register_schema(writer, type(message.content))
+            channels[message.topic] = writer.register_channel(message.topic, MessageEncoding.Protobuf, schema)
+        data = message.content.SerializeToString()
         writer.add_message(channels[message.topic], message.time_ns, data, message.time_ns, sequence)
     writer.finish()
     return stream.getvalue()
@@ -79,12 +79,3 @@ def check_episode(data: bytes) -> None:
         raise ValueError("its data do not end where they should")
     if zlib.crc32(content) != int.from_bytes(data_end[-4:], "little") or zlib.crc32(summary) != last.summary_crc:
         raise ValueError("its checksum is another")
-
-
-def _channel(writer: Writer, message: Message) -> int:
-    if isinstance(message.content, Mapping):
-        name = message.topic.strip("/").capitalize()
-        schema = writer.register_schema(name, SchemaEncoding.JSONSchema, json.dumps({"type": "object"}).encode())
-        return writer.register_channel(message.topic, MessageEncoding.JSON, schema)
-    schema = register_schema(writer, type(message.content))
-    return writer.register_channel(message.topic, MessageEncoding.Protobuf, schema)

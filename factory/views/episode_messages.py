@@ -1,11 +1,10 @@
-"""A stored sample as messages with Foxglove's schemas, for Foxglove, Lichtblick and Rerun.
+"""A stored sample as messages of protobuf, most of Foxglove's schemas, for Foxglove, Lichtblick and Rerun.
 
 Times are nanoseconds since the log's first instant, from 1.5 s before the sample's now to 4 s after it. Frames: `world`
 is the map's; `now` is the ego at now, in which everything is drawn, since coordinates of a map are too large for the
 float32 of a screen; `ego` moves; each camera's frame hangs on `ego`.
 """
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -20,13 +19,14 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
+from google.protobuf.message_factory import GetMessages
 from google.protobuf.timestamp_pb2 import Timestamp
 from scipy.spatial.transform import Rotation
 
 from factory.store.episodes import Message, episode_bytes
-from factory.store.schema import FIELDS, NOW_INDEX, Column
+from factory.store.schema import FIELDS, NOW_INDEX
 from factory.views.pictures import AGENT_COLOURS, EXPERT, LOGGED, OBJECT, PERTURBED, Colour, ego_poses
-from tasks.subscores import JUDGED, SUBSCORES
 from tasks.world.arrays import Array
 from tasks.world.frames import PACIFICA, to_local
 
@@ -39,6 +39,36 @@ EGO_HEIGHT_M = 1.777  # of the body that PACIFICA is; nothing is scored by it
 LINE_M, TRAJECTORY_M = 0.08, 0.25
 ROAD, LANE, CENTRE, CROSSING, ROUTE = (120, 120, 120), (170, 170, 170), (90, 120, 150), (200, 180, 90), (90, 170, 110)
 OURS: Colour = (60, 120, 220)
+
+FACTS = tuple(  # columns that stand in /sample
+    field
+    for field in FIELDS
+    if (not field.shape and field.dtype != "binary")
+    or field.name in ("ego_status", "candidate_end", "tags", "now_pose")
+)
+PROTOBUF_TYPES = {
+    "string": FieldDescriptorProto.TYPE_STRING,
+    "int32": FieldDescriptorProto.TYPE_INT32,
+    "float32": FieldDescriptorProto.TYPE_FLOAT,
+    "float64": FieldDescriptorProto.TYPE_DOUBLE,
+}
+
+
+def _sample_message() -> type[Any]:
+    """The protobuf class of /sample: FACTS under their own names; a scalar that is null is absent, not zero."""
+    package = "driving_data_factory"
+    file = FileDescriptorProto(name=f"{package}/Sample.proto", package=package, syntax="proto3")
+    message = file.message_type.add(name="Sample")
+    for number, column in enumerate(FACTS, start=1):
+        field = message.field.add(name=column.name, number=number, type=PROTOBUF_TYPES[column.dtype])
+        field.label = FieldDescriptorProto.LABEL_REPEATED if column.shape else FieldDescriptorProto.LABEL_OPTIONAL
+        if column.nullable and not column.shape:  # `optional` of proto3: a oneof of this field alone
+            field.proto3_optional, field.oneof_index = True, len(message.oneof_decl)
+            message.oneof_decl.add(name=f"_{column.name}")
+    return GetMessages([file])[f"{package}.Sample"]
+
+
+SampleMessage = _sample_message()
 
 
 def episode_messages(row: Row, logged: Array | None = None) -> list[Message]:
@@ -53,7 +83,7 @@ def episode_messages(row: Row, logged: Array | None = None) -> list[Message]:
         *_agents(row),
         *_map(row),
         *_trajectories(row, logged),
-        Message("/sample", _time_ns(row, -NOW_INDEX * STEP_S), facts_of(row)),
+        Message("/sample", _time_ns(row, -NOW_INDEX * STEP_S), sample_message(row)),
     ]
     return sorted(found, key=lambda message: message.time_ns)
 
@@ -63,31 +93,14 @@ def episode_of(row: Row, logged: Array | None = None) -> bytes:
     return episode_bytes(episode_messages(row, logged), metadata_of(row))
 
 
-def facts_of(row: Row) -> dict[str, Any]:
-    """Lineage, licence, scores and tags of a row, as JSON has them."""
-
-    def is_small(field: Column) -> bool:
-        small = not field.shape and field.dtype != "binary"
-        return small or field.name in ("ego_status", "candidate_end", "tags", "now_pose")
-
-    facts = {field.name: _plain(row[field.name]) for field in FIELDS if is_small(field)}
-    for stage in ("stage1", "stage2"):
-        facts[stage] = {name: facts.pop(f"{stage}_{name}") for name in (*SUBSCORES, "score")}
-        fails = {name: facts.pop(f"{stage}_{name}_fails_s") for name in JUDGED}
-        facts[stage]["first_failures_s"] = {name: time_s for name, time_s in fails.items() if time_s is not None}
-    facts["stage_versions"] = json.loads(row["stage_versions"])
-    return facts
+def sample_message(row: Row) -> Any:
+    """Lineage, licence, scores and tags of a row."""
+    return SampleMessage(**{column.name: row[column.name] for column in FACTS})
 
 
 def metadata_of(row: Row) -> dict[str, str]:
     """What tells a sample from others, and who may use it."""
     return {name: str(row[name]) for name in IDENTITY}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _time_ns(row: Row, after_now_s: float) -> int:

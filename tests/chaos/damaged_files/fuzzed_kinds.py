@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.navsim.log import read_frames, read_scene_pickle
@@ -72,7 +73,8 @@ def write_all(folder: Path) -> None:
         (folder / f"picture{suffix}").write_bytes(cv2.imencode(suffix, cv2.blur(picture, (5, 5)))[1].tobytes())
     points = np.random.default_rng(0).normal(0.0, 20.0, (50, 4)) + 5.0
     (folder / "sweep.pcd").write_bytes(merged_pcd(points))
-    (folder / "episode.mcap").write_bytes(episode_bytes([Message("/a", k, {"x": k}) for k in range(20)], {"id": "a"}))
+    messages = [Message("/a", k, Timestamp(seconds=k)) for k in range(20)]
+    (folder / "episode.mcap").write_bytes(episode_bytes(messages, {"id": "a"}))
 
 
 def _town(name: str, folder: Path) -> Readable:

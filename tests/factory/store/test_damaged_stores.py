@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from factory.commands.table import COMMANDS
 from factory.exits import BAD_CONFIG, COMPLETE, DAMAGED
@@ -26,7 +27,7 @@ from tests.factory.toy import ToyWork, executed, refs
 check = COMMANDS["verify"].load()
 
 
-EPISODE = episode_bytes([Message("/a", 0, {"x": 1})], {"id": "a"})
+EPISODE = episode_bytes([Message("/a", 0, Timestamp(seconds=1))], {"id": "a"})
 
 
 def run(out: Path, *, clips: int = 3) -> int:
