@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from factory import __version__ as __version__  # imported first: it finds tasks beside it, not in the working folder
 
 if find_spec("torch") is None:
-    _MISSING = 'planners need PyTorch: pip install -e ".[planners]" in the checkout (make install for its CPU build)'
-    if sys.argv[0] == "-m":  # `python -m planners.<command>` imports this package first: one line, no traceback
+    _MISSING = 'planners need PyTorch: pip install "driving-data-factory[planners]", in a checkout make install'
+    if sys.argv[0] == "-m" or sys.argv[0].endswith("/planners"):  # the commands: one line, no traceback
         print(f"error: {_MISSING}", file=sys.stderr)
         sys.exit(2)
     raise ModuleNotFoundError(_MISSING, name="torch")

@@ -39,7 +39,9 @@ def need_run_extra(*modules: str) -> None:
     """Raises ConfigError with the line that installs them where one of these modules is not there."""
     missing = [module for module in modules if find_spec(module) is None]
     if missing:
-        raise ConfigError(f'{", ".join(missing)} not installed: pip install -e ".[run]" in the checkout')
+        raise ConfigError(
+            f'{", ".join(missing)} not installed: pip install "driving-data-factory[run]", in a checkout -e ".[run]"'
+        )
 
 
 def conf_dir() -> Path:

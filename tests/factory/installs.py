@@ -61,6 +61,16 @@ def as_if_installed(extra: str, folder: Path) -> Path:
     return folder
 
 
+def link_closure(extra: str, site: Path) -> None:
+    """All files that an install with that extra brings into site-packages, as links to those installed here."""
+    for name in closure(extra):
+        for file in distribution(name).files or ():
+            link = site / file
+            if ".." not in file.parts and not link.exists():  # a program's script; two distributions' file
+                link.parent.mkdir(parents=True, exist_ok=True)
+                link.symlink_to(file.locate())
+
+
 def _requirements(extra: str) -> Iterator[Requirement]:
     """Those of pyproject.toml; an extra that asks for another of this project is followed."""
     own = PROJECT["optional-dependencies"][extra] if extra else []

@@ -1,7 +1,6 @@
 """What each install brings: nothing undeclared, nothing unused, and without PyTorch and CUDA what needs neither."""
 
 import ast
-import json
 import os
 import re
 import shutil
@@ -15,10 +14,7 @@ import yaml
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from factory.store.samples import Store
-from tests.factory.filmed import FilmedWork
-from tests.factory.installs import PROJECT, REPOSITORY, SMALL, as_if_installed, closure, declared
-from tests.factory.toy import executed, refs
+from tests.factory.installs import PROJECT, REPOSITORY, SMALL, closure, declared
 
 OURS = {"tasks", "factory", "planners"}
 DISTRIBUTIONS = {  # of modules whose distribution has another name
@@ -114,57 +110,6 @@ def test_a_run_brings_neither_pytorch_nor_cuda() -> None:
 def test_the_small_install_has_neither_ray_nor_hydra() -> None:
     small = closure(SMALL)
     assert len(small) < 40 and not small & {"ray", "hydra-core", "omegaconf", "pydantic"}
-
-
-NEED_RUN = (
-    "run preset=demo",
-    "run preset=demo --cfg",
-    "explain preset=demo clip=0",
-    "vocabulary clips=synthetic out=v.npy",
-)
-ASK_ALL = f"""
-import contextlib, io, json
-from factory.__main__ import main
-for words in {NEED_RUN}:
-    with contextlib.redirect_stderr(io.StringIO()) as said:
-        code = main(words.split())
-    print(json.dumps([code, said.getvalue()]))
-"""
-
-
-@pytest.mark.slow
-def test_a_command_that_needs_an_extra_names_the_line_that_installs_it(tmp_path: Path) -> None:
-    hidden = as_if_installed(SMALL, tmp_path / "small")
-    env = os.environ | {"PYTHONPATH": f"{hidden}{os.pathsep}{REPOSITORY}"}
-
-    def python(*words: str) -> "subprocess.CompletedProcess[str]":
-        command = [sys.executable, *words]
-        return subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=100)
-
-    done, trained = python("-c", ASK_ALL), python("-m", "planners.training.train", "planner=ego_mlp_small")
-    told = [json.loads(line) for line in done.stdout.splitlines()]
-    assert len(told) == len(NEED_RUN), done.stderr
-    for code, said, extra in (*((*one, "run") for one in told), (trained.returncode, trained.stderr, "planners")):
-        assert code == 2 and said.startswith("error: ") and said.count("\n") == 1, said
-        assert f'-e ".[{extra}]"' in said, said
-    assert list(tmp_path.iterdir()) == [hidden], "nothing is written"
-
-
-@pytest.mark.slow
-def test_the_small_install_looks_at_a_finished_run(tmp_path: Path) -> None:
-    executed(FilmedWork(), refs(2), ["recovery", "human"], 1, Store(tmp_path / "out"))
-    code = (
-        "from factory.__main__ import main\n"
-        "for words in ('status', 'failed', 'lineage sample=0', 'show sample=0 to=.', 'report', 'verify'):\n"
-        "    name, *rest = words.split()\n"
-        "    assert main([name, 'out=out', *rest]) == 0, words\n"
-        "assert main(['export', 'mcap', 'out=out', 'sample=0']) == 0\n"
-        "assert main(['vocabulary', '--help']) == main(['run', '--help']) == 0\n"
-    )
-    env = os.environ | {"PYTHONPATH": f"{as_if_installed(SMALL, tmp_path / 'small')}{os.pathsep}{REPOSITORY}"}
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert {path.suffix for path in tmp_path.iterdir()} >= {".png", ".mcap"}
 
 
 def test_the_version_stands_in_one_place() -> None:

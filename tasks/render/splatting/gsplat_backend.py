@@ -21,7 +21,7 @@ from tasks.render.splatting.raster import View
 from tasks.world.arrays import F32
 from tasks.world.clip import Pinhole
 
-HOW_TO_FIX = 'install them (pip install -e ".[gpu]" in the checkout), or draw with render.backend=cpu'
+HOW_TO_FIX = 'pip install "driving-data-factory[gpu]", in a checkout -e ".[gpu]", or draw with render.backend=cpu'
 
 
 class BackendMissing(RuntimeError):
