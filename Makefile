@@ -30,7 +30,7 @@ sys.exit(sys.version.split()[0] != sys.argv[1])
 endef
 export FITS IS_WHOLE
 
-.PHONY: install demo first-planner test unit lint format docs chaos mutants bench gpu-check clean
+.PHONY: install demo first-planner test unit lint format docs chaos mutants bench gpu-check dist clean
 
 install: $(VENV)/.installed
 
@@ -116,5 +116,21 @@ $(VENV)/.gpu: $(VENV)/.installed
 gpu-check: $(VENV)/.gpu
 	$(PY) -m tests.bench.gpu_check $(ARGS)
 
+# What a release hands out, into dist/, of the last commit: built and checked, then installed from the built file with
+# its extra [run] into an environment of its own, where it makes the demo's samples. An upload is nobody's but yours.
+dist:
+	rm -rf dist build/release build/tried
+	mkdir -p build/release
+	git archive HEAD | tar x -C build/release
+	$(PYTHON) -m venv build/tools
+	build/tools/bin/pip install -q build twine cffconvert
+	build/tools/bin/cffconvert --validate -i build/release/CITATION.cff
+	build/tools/bin/python -m build -o dist build/release >build/dist.log
+	build/tools/bin/twine check --strict dist/*
+	$(PYTHON) -m venv build/tried
+	build/tried/bin/pip install -q "$$(ls dist/*.whl)[run]"
+	build/tried/bin/pip check
+	cd build/tried && bin/factory run preset=demo out=demo
+
 clean:
-	rm -rf $(VENV) runs build *.egg-info
+	rm -rf $(VENV) runs build dist *.egg-info
