@@ -16,6 +16,10 @@ def test_progress_is_the_distance_driven_and_related_to_the_best_of_the_batch():
     np.testing.assert_allclose(scores.ep, [1.0, 0.25, 0.0], atol=1e-9)
 
 
+def test_progress_counts_for_everybody_where_nobody_gets_beyond_five_metres():
+    assert score(street(), np.concatenate([drive(1.2), drive(0.0)])).ep.tolist() == [1.0, 1.0]
+
+
 def test_an_offender_does_not_set_the_mark_for_progress():
     off_road = drive(10.0, y=-3.0)
     scores = score(street(), np.concatenate([drive(8.0), off_road]))

@@ -64,6 +64,8 @@ def test_a_light_that_falls_off_to_one_side_is_brighter_from_there() -> None:
     scene.sh_rest[:, 2] = 0.4  # -C1 x of the direction from the camera: brighter where one looks towards -x
     ahead, behind = (colours_seen(scene, np.array([x, 0.0, 0.0]), ROWS) for x in (100.0, -100.0))
     assert (ahead > 0.65).all() and (behind < 0.35).all()
+    scene.sh_rest[:, 2] = 4.0
+    assert (colours_seen(scene, np.array([-100.0, 0.0, 0.0]), ROWS) == 0.0).all()  # black, no less
 
 
 @pytest.mark.parametrize("count", sh.COUNTS)
