@@ -49,6 +49,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
+@pytest.mark.slow
 def test_the_reader_and_the_expert_make_samples_of_a_map_of_one_s_own(made: Path) -> None:
     table = SampleTable(made / "out")
     rows = [table[i] for i in range(len(table))]

@@ -75,6 +75,7 @@ def test_a_new_folder_without_hard_links_is_refused_before_anything_is_written(
         assert not (mount / "new").exists()
 
 
+@pytest.mark.slow
 def test_what_was_copied_there_can_be_read_and_is_not_changed(command: Command, made: Path) -> None:
     before = all_in(made)
     assert command("-m", "factory", "status", f"out={made}").returncode == COMPLETE
@@ -85,6 +86,7 @@ def test_what_was_copied_there_can_be_read_and_is_not_changed(command: Command, 
         assert all_in(made) == before
 
 
+@pytest.mark.slow
 def test_a_block_is_built_by_one_process_at_a_time_where_the_file_system_has_no_locks(
     command: Command, mount: Path
 ) -> None:

@@ -193,6 +193,7 @@ def unlike(wrong: Wrong, code: int, said: str) -> list[str]:
     return found + [f"said: {word}" for word in NO_HYDRA if word in said]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", WRONG, ids=[" ".join(wrong.argv) for wrong in WRONG])
 def test_a_wrong_input_ends_with_its_code_and_one_line_and_writes_nothing(
     wrong: Wrong, folder: Path, capfd: pytest.CaptureFixture[str]
@@ -219,6 +220,7 @@ print(json.dumps([name for name in {HEAVY} if name in sys.modules]))
 """
 
 
+@pytest.mark.slow
 def test_a_mistyped_word_is_told_likewise_before_anything_heavy_is_imported(folder: Path) -> None:
     before = contents(folder)
     done = python(folder, "-c", ASK_ALL, json.dumps([whole(wrong) for wrong in MISTYPED]))

@@ -44,6 +44,7 @@ def test_a_block_below_the_gate_is_why_there_are_no_candidates(
     assert "rejected by render: psnr" in told and "candidate -1  accepted" in told
 
 
+@pytest.mark.slow
 def test_a_clip_whose_route_ends_is_told_as_the_run_tells_it(
     logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -93,6 +93,7 @@ for package, door in DOORS.items():
 """
 
 
+@pytest.mark.slow
 def test_every_command_shows_its_settings_and_neither_writes_nor_starts_anything(tmp_path: Path) -> None:
     env = os.environ | {"PYTHONPATH": str(REPOSITORY), "PYTHONDONTWRITEBYTECODE": "1"}
     script = [sys.executable, "-c", SHOW_ALL, "--cfg"]
@@ -230,6 +231,7 @@ for argv in json.loads(sys.argv[1]):
 """
 
 
+@pytest.mark.slow
 def test_a_run_that_nobody_may_write_to_is_read_and_what_would_write_says_so_in_a_line(
     read_only: Path, tmp_path: Path
 ) -> None:

@@ -140,6 +140,7 @@ def test_a_transform_that_is_none_is_named(tmp_path: Path, text: str, capsys: py
     assert "t.json: " in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_without_torch_a_checkpoint_is_refused_and_the_rest_works(stored: Path, tmp_path: Path) -> None:
     code = (
         "import sys; sys.modules['torch'] = None\n"

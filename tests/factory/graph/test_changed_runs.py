@@ -82,6 +82,7 @@ def test_a_redo_of_some_clips_leaves_the_others_to_be_decided(tmp_path: Path, be
     assert_same_tables(tmp_path / "out", tmp_path / "fresh")
 
 
+@pytest.mark.slow
 def test_keep_holds_until_something_else_is_said(tmp_path: Path, begun: Callable[..., Path]) -> None:
     begun(n=4)
     changed = ToyWork(threshold=0.3)
@@ -120,6 +121,7 @@ def test_keep_never_continues_a_walk_on_another_candidate_list(tmp_path: Path, b
     assert_same_rows(tables_of(tmp_path / "out")[0], kept)
 
 
+@pytest.mark.slow
 def test_redo_replaces_every_row_and_is_the_same_as_a_fresh_run(tmp_path: Path, begun: Callable[..., Path]) -> None:
     begun(rounds=3)
     changed = ToyWork(threshold=0.3, prepare_digest="perturb-2", trouble={"log0:0": "standing"})
@@ -142,6 +144,7 @@ def test_redo_replaces_the_rows_of_an_expert_whose_inputs_changed_and_no_others(
     assert_same_tables(tmp_path / "out", tmp_path / "fresh")
 
 
+@pytest.mark.slow
 def test_a_redo_that_fails_midway_keeps_the_old_walk(tmp_path: Path, begun: Callable[..., Path]) -> None:
     begun(rounds=3, n=1)
     old = tables_of(tmp_path / "out")[0]
@@ -194,6 +197,7 @@ def test_a_restored_log_goes_on(tmp_path: Path, begun: Callable[..., Path], plai
     assert_same_tables(tmp_path / "out", plain(rounds=3))
 
 
+@pytest.mark.slow
 def test_redo_tries_again_what_a_bug_stopped_under_other_settings_and_nothing_that_it_stopped_under_these(
     tmp_path: Path,
 ) -> None:
@@ -213,6 +217,7 @@ def test_redo_tries_again_what_a_bug_stopped_under_other_settings_and_nothing_th
     assert_same_tables(out, fresh)
 
 
+@pytest.mark.slow
 def test_redo_reads_a_changed_log_anew_in_spite_of_the_cache(tmp_path: Path, begun: Callable[..., Path]) -> None:
     begun(rounds=2)
     changed = ToyWork(threshold=0.3, content="other")
@@ -232,6 +237,7 @@ def test_redo_refuses_a_changed_log_whose_rows_are_to_stay(tmp_path: Path, begun
     assert candidates == before[2]
 
 
+@pytest.mark.slow
 def test_redo_makes_a_walk_of_mixed_settings_anew(tmp_path: Path, begun: Callable[..., Path]) -> None:
     begun(rounds=1)
     changed = ToyWork(threshold=0.1)

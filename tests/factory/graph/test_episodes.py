@@ -54,6 +54,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_every_sample_has_its_episode_and_none_is_written_unless_asked_for(whole: Path, tmp_path: Path) -> None:
     found = there(whole)
     assert set(found) == asked_for(whole) and len(found) == len(Store(whole).samples) > 6

@@ -40,6 +40,7 @@ def test_the_page_of_concepts_names_every_task() -> None:
     assert re.findall(r"^\| `(\w+)` \|", page, re.M) == [task.name for task in TASKS]
 
 
+@pytest.mark.slow
 def test_stages_as_tasks_of_their_own_make_the_same_rows_in_this_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

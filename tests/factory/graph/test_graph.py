@@ -117,6 +117,7 @@ def test_a_clip_without_candidates_still_gives_its_human_sample(tmp_path: Path) 
     ]
 
 
+@pytest.mark.slow
 def test_broken_input_and_bugs_are_rows_with_a_reason_and_hurt_nobody_else(
     tmp_path: Path, plain: Callable[..., Path]
 ) -> None:
@@ -133,6 +134,7 @@ def test_broken_input_and_bugs_are_rows_with_a_reason_and_hurt_nobody_else(
     assert_same_tables(tmp_path / "out", plain())
 
 
+@pytest.mark.slow
 def test_a_system_failure_is_tried_by_the_next_run_and_quarantined_after_three(
     tmp_path: Path, plain: Callable[..., Path]
 ) -> None:
@@ -171,6 +173,7 @@ def test_nothing_new_begins_once_a_run_is_stopped(tmp_path: Path, monkeypatch: p
     assert walks and len(walks) == len(set(walks)), "what was in hand ends, and no walk tries once more"
 
 
+@pytest.mark.slow
 def test_a_signal_reaches_a_block_that_is_being_built_in_this_process(tmp_path: Path) -> None:
     class Building(ToyWork):
         def reconstruct(self, ref: ClipRef, threads: int, stopped: StopCheck = never_stop) -> BlockReport:
@@ -210,6 +213,7 @@ def test_a_run_that_is_overtaken_stops_and_loses_nothing(tmp_path: Path, plain: 
     assert_same_tables(tmp_path / "out", plain())
 
 
+@pytest.mark.slow
 def test_shards_close_by_size_and_commits_are_groups(tmp_path: Path, plain: Callable[..., Path]) -> None:
     run(tmp_path / "out", shard_bytes=1)
     many, one = Store(tmp_path / "out").samples, Store(plain()).samples
@@ -229,6 +233,7 @@ def test_the_first_rows_are_in_the_table_long_before_a_batch_is_old(tmp_path: Pa
     assert Store(tmp_path / "out").samples.version >= 4, "a group after a tenth of a second, and one at the end"
 
 
+@pytest.mark.slow
 def test_simulated_experts_after_the_log_s_own_drive_leave_what_one_run_leaves(
     tmp_path: Path, plain: Callable[..., Path]
 ) -> None:

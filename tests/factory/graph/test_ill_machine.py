@@ -48,6 +48,7 @@ def test_a_result_that_cannot_be_kept_is_still_a_result(tmp_path: Path, plain: C
     assert_same_tables(out, plain())
 
 
+@pytest.mark.slow
 def test_an_ill_machine_never_counts_against_a_clip(tmp_path: Path, plain: Callable[..., Path]) -> None:
     ill = IllWork(ill=("log0:0:recovery:0", "log1:1000:recovery:0"))
     for _ in range(4):  # one more than would be quarantined
@@ -57,6 +58,7 @@ def test_an_ill_machine_never_counts_against_a_clip(tmp_path: Path, plain: Calla
     assert_same_tables(tmp_path / "out", plain())
 
 
+@pytest.mark.slow
 def test_what_counted_before_an_illness_counts_after_it(tmp_path: Path) -> None:
     ill, dying = IllWork(ill=("log0:0:recovery:0",)), ToyWork(trouble={"log0:0:recovery:0": "disk"})
     seen = []

@@ -74,6 +74,7 @@ def test_what_is_over_its_limits_is_ended_and_says_where_it_stood(
     assert_same_rows(tables_of(tmp_path / "out")[0], tables_of(plain())[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("isolated", [False, True])
 def test_who_leaves_by_sys_exit_or_changes_what_others_are_given_has_a_bug_and_the_run_goes_on(
     tmp_path: Path, plain: Callable[..., Path], isolated: bool

@@ -33,6 +33,7 @@ def hungry(n_bytes: int) -> int:
     return len(bytes(n_bytes))
 
 
+@pytest.mark.slow
 def test_one_process_answers_all_and_another_follows_one_that_died() -> None:
     first = ProcessFunction(pid_of)(0, "a")
     assert first != os.getpid() and [ProcessFunction(doubled)(n, "a") for n in range(3)] == [0, 2, 4]
@@ -43,6 +44,7 @@ def test_one_process_answers_all_and_another_follows_one_that_died() -> None:
     assert ProcessFunction(pid_of)(0, "a") not in (first, os.getpid())
 
 
+@pytest.mark.slow
 def test_what_never_ends_is_given_up_and_what_is_raised_is_raised() -> None:
     with pytest.raises(BadClip, match=r"c: file: reading it was given up after 0\.2 s"):
         ProcessFunction(time.sleep)(60.0, "c", limit_s=0.2)
@@ -62,6 +64,7 @@ class FatalReader(ScenarioNetReader):
         return super().drive(path)
 
 
+@pytest.mark.slow
 def test_a_fatal_log_of_a_folder_is_broken_and_the_others_are_clips(tmp_path: Path) -> None:
     for name in ("sd_a.pkl", "sd_fatal.pkl", "sd_z.pkl"):
         save(nuscenes(), tmp_path, name)

@@ -74,6 +74,7 @@ def read(words: list[str], to: Path) -> bytes:
     return to.read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoil", SPOILED)
 @pytest.mark.parametrize("data_set", READERS)
 def test_links_are_followed_and_companions_passed_over(
@@ -129,6 +130,7 @@ def test_simscale_s_logs_and_rewards_are_found_behind_links_and_among_companions
     assert len(SampleTable(tmp_path / "out")) == 2
 
 
+@pytest.mark.slow
 def test_the_command_follows_a_link_to_a_folder_and_names_one_that_leads_nowhere(tmp_path: Path) -> None:
     words = scenarionet(tmp_path / "real", tmp_path)
     (tmp_path / "root").mkdir()

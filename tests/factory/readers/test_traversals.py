@@ -130,6 +130,7 @@ def clip_and_ref(root: Path, traversals: int):  # type: ignore[no-untyped-def]
     return reader, ref, reader.read(ref)
 
 
+@pytest.mark.slow
 def test_a_block_takes_in_the_log_that_shares_its_street(logs: Path) -> None:
     _, _, alone = clip_and_ref(logs, 0)
     reader, ref, clip = clip_and_ref(logs, 5)
@@ -164,6 +165,7 @@ def test_another_log_that_changes_changes_the_digest(logs: Path, tmp_path: Path)
     assert reader.digest(ref) != before
 
 
+@pytest.mark.slow
 def test_a_scene_of_two_drives_keeps_what_is_of_the_street_and_of_its_own_log(logs: Path, tmp_path: Path) -> None:
     settings = RenderSettings(
         width=64, height=36, scene=SceneFrom.DISCS, psnr_min=0.0, camera_psnr_min=0.0, psnr_gate=PsnrGate.MARK

@@ -84,6 +84,7 @@ def rows_of(store: Store) -> Rows:
     return rows
 
 
+@pytest.mark.slow
 def test_every_clip_has_its_logged_frames_and_complete_pairs(store: Store, refs: Sequence[ClipRef]) -> None:
     rows = rows_of(store)
     for ref in refs[1:]:

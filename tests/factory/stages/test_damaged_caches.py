@@ -80,6 +80,7 @@ def test_a_clip_s_scenes_are_named(tmp_path: Path) -> None:
             files.load("warm")
 
 
+@pytest.mark.slow
 def test_a_city_s_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: Lines) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     write_root(tmp_path, "us-ma-boston", stub_rows())
@@ -120,6 +121,7 @@ def test_a_fit_that_is_half_done(tmp_path: Path, lines: Lines) -> None:
         assert line.startswith(f"{path} is damaged")
 
 
+@pytest.mark.slow
 def test_a_recovery_table_is_made_again_in_the_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: Lines
 ) -> None:

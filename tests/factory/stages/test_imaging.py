@@ -55,6 +55,7 @@ def human_row(root: Path, out: Path, *overrides: str) -> dict[str, object]:
     return dict(human.row)
 
 
+@pytest.mark.slow
 def test_a_human_sample_has_a_photo_of_every_camera_at_every_instant_also_without_lidar(
     town: Path, tmp_path: Path
 ) -> None:

@@ -22,6 +22,7 @@ REPOSITORY = Path(__file__).resolve().parents[3]
 DECORATORS = {"njit", "jit", "kernel", "inlined", "inner_kernel", "hidden_kernel", "numpy_division_kernel"}
 
 
+@pytest.mark.slow
 def test_every_source_that_compiles_something_is_in_the_digest() -> None:
     """Found another way: by the names that the syntax tree imports."""
     listed = set(kernel_sources())

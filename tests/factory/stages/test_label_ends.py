@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from factory.config.run import load_config
 from factory.graph.steps import HUMAN_CANDIDATE, PreparedClip, SampleColumns, run_attempt
 from factory.pipeline import FactoryWork
@@ -41,6 +43,7 @@ def rows_of(funnel: Funnel, expert: str) -> tuple[int, dict[str, int]]:
     return sum(row.accepted for row in own), reasons
 
 
+@pytest.mark.slow
 def test_drives_that_end_beside_the_town_s_route_are_counted_as_such(small_town: Path, tmp_path: Path) -> None:
     town = ["clips=av2", f"clips.root={small_town}", "vocabulary.k=300"]
     work = work_of({"aside": Aside(9.0)}, tmp_path / "on", *town)
@@ -55,6 +58,7 @@ def test_drives_that_end_beside_the_town_s_route_are_counted_as_such(small_town:
     assert rows_of(ran(lenient, tmp_path / "off")[1], "aside") == (2, {})
 
 
+@pytest.mark.slow
 def test_drives_that_end_a_moment_before_a_collision_are_counted_as_such(tmp_path: Path) -> None:
     for name, words in (("on", []), ("off", ["reward.after=false"])):
         work = work_of({"close": Close(), "aside": Aside(2.0)}, tmp_path / name, *STREET, *words)

@@ -125,6 +125,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_whole_run_stores_labels_that_a_planner_can_read(out: Path) -> None:
     table, digest = SampleTable(out), street().work.vocabulary.digest
     assert len(table) == 2

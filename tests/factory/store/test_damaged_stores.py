@@ -60,6 +60,7 @@ def files(out: Path, pattern: str) -> list[Path]:
     return sorted(path for path in out.glob(pattern) if path.is_file())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", ["_delta_log", "_commits"])
 def test_every_damage_of_a_log_is_named_and_put_back(out: Path, folder: str) -> None:
     location = Store(out).location
@@ -114,6 +115,7 @@ def test_a_table_without_copies_is_whole_and_gets_them(out: Path) -> None:
     assert len(files(out, "samples/_commits/*.json")) == len(files(out, "samples/_delta_log/*.json"))
 
 
+@pytest.mark.slow
 def test_checkpoints_are_held_too(out: Path) -> None:
     table = Store(out).samples
     while not files(out, "samples/_delta_log/*.parquet"):
@@ -132,6 +134,7 @@ def test_checkpoints_are_held_too(out: Path) -> None:
     assert not damaged_logs(location) and len(Store(out).samples)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["samples/*/*/*.parquet", "outcomes/*.parquet", "candidates/*.parquet"])
 def test_a_damaged_file_of_a_table_is_taken_out_and_made_again(
     out: Path, golden: Path, part: str, capsys: pytest.CaptureFixture[str]
@@ -154,6 +157,7 @@ def test_a_damaged_file_of_a_table_is_taken_out_and_made_again(
     assert code == DAMAGED and ": is missing" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["episodes/*.mcap", "cache/prepared/*.npz", "run.json", "current_run.json"])
 def test_damage_beside_the_tables_is_named_and_taken_out(
     out: Path, golden: Path, part: str, capsys: pytest.CaptureFixture[str]
@@ -275,6 +279,7 @@ def test_leftovers_go_once_they_are_old(out: Path, golden: Path, capsys: pytest.
     assert "must be a number of days, hours or minutes" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_compacting_merges_files_and_changes_no_sample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, whole = tmp_path / "out", tmp_path / "whole"
     for n in (1, 3, 5):  # three runs, a file each in every round and expert

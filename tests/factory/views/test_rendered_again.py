@@ -59,6 +59,7 @@ def scene(store: Store) -> RenderAsset:
     return found
 
 
+@pytest.mark.slow
 def test_a_row_holds_all_that_its_own_images_were_drawn_from(store: Store) -> None:
     rendered, _ = rows(store)
     agents = agents_in_world(rendered)

@@ -98,6 +98,7 @@ def joined(parts: list[Batch]) -> Batch:
     return Batch(attempt_ids=ids, **tensors)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("windows")
 @pytest.mark.parametrize("ratio", ["natural", 0.3])
 def test_any_number_of_workers_and_ranks_reads_the_same_batches(data: Dataset, ratio: Any) -> None:
@@ -319,6 +320,7 @@ def test_what_is_seen_is_said_in_plain_lines(data: Dataset) -> None:
     assert "a pass over all 64 samples: 8 batches of 8" in Loader(data, Needs(), MixSettings(), BATCH).text()
 
 
+@pytest.mark.slow
 def test_tables_in_a_bucket_and_on_disk_are_mixed(
     s3: Iterator[dict[str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -63,6 +63,7 @@ def test_an_unknown_planner_is_refused(tmp_path: Path, capsys: pytest.CaptureFix
     assert "planner=nobody" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_what_is_driven_is_not_driven_again(
     towns: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -63,6 +63,7 @@ def test_sub_scores_come_back_as_they_went_in_and_progress_up_to_its_unit(labels
     np.testing.assert_array_equal(again.ep_raw_m, back.ep_raw_m)
 
 
+@pytest.mark.slow
 @given(any_labels())
 def test_rounding_moves_progress_by_at_most_its_unit_over_five_metres(labels: VocabularyLabels) -> None:
     back = through_bytes(labels)

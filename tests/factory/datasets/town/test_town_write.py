@@ -52,6 +52,7 @@ def test_the_same_seed_gives_the_same_bytes_with_any_number_of_threads(
     assert shorter.items() <= longer.items()
 
 
+@pytest.mark.slow
 def test_a_log_has_argoverse_2s_files(town: Path) -> None:
     log = sorted(town.glob("*/"))[1]  # the signalised crossroads
     assert (log / "LICENSE").read_text(encoding="utf-8").splitlines()[0] == LICENCE

@@ -38,6 +38,7 @@ def test_every_clip_carries_the_split_and_names_its_town(reader: SyntheticTownsR
     assert clip.content_digest == reader.digest(refs[-1])
 
 
+@pytest.mark.slow
 def test_a_seeds_clips_are_the_same_whatever_other_seeds_are_read(reader: SyntheticTownsReader, folder: Path) -> None:
     alone = reader_of(folder, [9], split="test")
     assert alone.index().refs == reader.index().refs[3:]

@@ -52,6 +52,7 @@ def get(board: Board, target: str, status: int = 200) -> Any:
     return json.loads(answer.body)
 
 
+@pytest.mark.slow
 def test_the_numbers_are_those_of_the_tables(out: Path, board: Board) -> None:
     answer = get(board, "/api/overview")
     assert told(answer) == counted(out)

@@ -51,6 +51,7 @@ def kept(text: str) -> dict[str, Any]:
     return dict(json.loads(found[1]))
 
 
+@pytest.mark.slow
 def test_its_numbers_are_the_tables(out: Path, text: str) -> None:
     assert told(kept(text)["answers"]["/api/overview"]) == counted(out)
 

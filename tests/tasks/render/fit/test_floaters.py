@@ -145,6 +145,7 @@ def slow_floaters(problem: FitProblem, state: FitState) -> list[int]:
     return found
 
 
+@pytest.mark.slow
 def test_they_are_those_found_one_by_one() -> None:
     rng = np.random.default_rng(0)
     problem, state = begun(with_parked(), POST)

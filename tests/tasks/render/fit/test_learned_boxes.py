@@ -70,6 +70,7 @@ def test_the_derivative_by_a_box_is_that_of_where_its_gaussians_come_to_lie() ->
     np.testing.assert_allclose([*shift, turn], measured, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_box_logged_beside_its_vehicle_comes_to_lie_on_it(beside: tuple[FitProblem, FitState]) -> None:
     problem = beside[0]
     as_logged, found = fresh(beside[1]), fresh(beside[1])

@@ -55,6 +55,7 @@ def fresh(state: FitState) -> FitState:
     return FitState.from_arrays(state.arrays())
 
 
+@pytest.mark.slow
 def test_what_of_the_photos_does_not_fit_into_memory_is_made_anew_each_time(
     prepared: tuple[FitProblem, FitState], monkeypatch: pytest.MonkeyPatch
 ) -> None:

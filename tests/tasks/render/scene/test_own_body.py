@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import street
 
 from tasks.render.fit.start import prepare_fit
@@ -34,6 +35,7 @@ def scene(told: bool) -> RenderAsset:
     return replace(build_asset(shown, sweeps, None, SETTINGS), bodies=median_own_bodies(shown))
 
 
+@pytest.mark.slow
 def test_a_new_place_has_the_street_and_the_bonnet_in_front() -> None:
     truth = street.photo(2.5, 0.6, 0.0, with_car=False).rgb
     pose = street.ego_pose(2.5, 0.6)[None]
