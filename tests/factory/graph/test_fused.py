@@ -125,6 +125,7 @@ def two_nodes(cluster: Any) -> dict[str, str]:
     return {node["NodeID"]: "gpu" if node["Resources"].get("GPU") else "cpu" for node in ray.nodes()}
 
 
+@pytest.mark.chaos
 @pytest.mark.ray
 @pytest.mark.slow
 def test_gpu_nodes_draw_and_cpu_nodes_drive(tmp_path: Path, two_nodes: dict[str, str]) -> None:

@@ -110,7 +110,7 @@ LEARNERS: dict[str, Callable[[], tuple[Planner, Batch]]] = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("name", ["ltf", pytest.param("diffusiondrive", marks=pytest.mark.chaos), "gtrs_dense"])
 def test_the_loss_follows_that_of_fp32(tmp_path: Path, name: str) -> None:
     """Within 0.1 % at the start and 6 % behind 30 steps, the first few of which are left out to find the scale."""
     curves = []

@@ -26,7 +26,7 @@ from tests.planners.toy import Toy, ToySettings
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # processes start one after the other
 
-SAMPLES, BATCH, STEPS = 60, 8, 40  # five epochs of 7 batches and a part of the next
+SAMPLES, BATCH, STEPS = 60, 8, 26  # three epochs of 7 batches and a part of the next
 EPOCH = SAMPLES // BATCH
 NUMBERS = (1, 4)  # of two the sum is the same in any order
 NOTES, NAP_S = "TESTS_NOTES", "TESTS_NAP_S"
