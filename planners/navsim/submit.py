@@ -30,7 +30,7 @@ from factory.graph.progress import RateBar
 from factory.readers.base import BadClip
 from factory.stages.sensors import decode_image
 from factory.wording import one_line
-from planners.data.batch import COMMANDS
+from planners.data.batch import one_hot_command
 from planners.navsim.agent import HISTORY
 from planners.navsim.serve import AgentObservation, AgentPlanner, CameraObservation
 from tasks.kernels.compiled import write_whole
@@ -53,8 +53,7 @@ class ObservedScene:
         """What an agent is shown, with these cameras at now, left to right. Raises BadClip."""
         now = self.frames[-1]
         history = to_local(now.pose, np.stack([frame.pose for frame in self.frames]))
-        one_hot = np.array([one == now.command for one in COMMANDS])
-        status = np.concatenate([one_hot, now.dynamic_state])
+        status = np.concatenate([one_hot_command(now.command), now.dynamic_state])
         return AgentObservation(history.astype(np.float32), status.astype(np.float32), self._views(cameras))
 
     def _views(self, names: Sequence[str]) -> tuple[CameraObservation, ...]:
