@@ -398,11 +398,24 @@ class NewestRun:
     """What the newest run set out to do (current_run.json), and what the last that ended did (last_run.json)."""
 
     def __init__(self, current: bytes | None, last: bytes | None) -> None:
-        self.current, self.last = _fields_of(current), _fields_of(last)
+        self.damaged: list[str] = []  # of the two, by name: read as empty, so nothing is known of the run by them
+        self.current, self.last = self._fields_of(CURRENT_RUN, current), self._fields_of(LAST_RUN, last)
+
+    def _fields_of(self, name: str, data: bytes | None) -> dict[str, Any]:
+        try:
+            return dict(json.loads(data or b"{}"))
+        except (ValueError, TypeError):
+            self.damaged.append(name)
+            return {}
 
     @property
     def goes_on(self) -> bool:
-        """It has begun and nothing tells its end: neither its own, nor that of a later one which never began."""
+        """It has begun and nothing tells its end: neither its own, nor that of a later one which never began.
+
+        No, where one of the two is damaged: what repairs a store (and claims its tables first) must not wait for it.
+        """
+        if self.damaged:
+            return False
         began, ended = self.current.get("began_ms", 0), self.last
         stopped_later = not ended.get("began_ms") and ended.get("ended_ms", 0) >= began
         return bool(began) and began != ended.get("began_ms") and not stopped_later
@@ -410,14 +423,6 @@ class NewestRun:
     def heard_s_ago(self, committed_ms: int, now_s: float) -> float:
         """Since it began, last said how far it is, or committed something."""
         return now_s - max(committed_ms, self.current.get("began_ms", 0), self.current.get("said_ms", 0)) / 1e3
-
-
-def _fields_of(data: bytes | None) -> dict[str, Any]:
-    """Of a file for people; none where it is damaged, which verify names."""
-    try:
-        return dict(json.loads(data or b"{}"))
-    except (ValueError, TypeError):
-        return {}
 
 
 class Store:

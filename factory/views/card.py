@@ -194,6 +194,8 @@ def _newest_run_record(store: Store) -> dict[str, Any]:
 def _state(store: Store) -> str:
     """How the newest run ended, in words; one that nothing has ended was killed or still goes on."""
     run = store.newest_run()
+    if run.damaged:
+        return f"of unknown state ({' and '.join(run.damaged)} not readable)"
     if run.goes_on:
         return "not finished: the same command goes on"
     return STATUS.get(run.last.get("exit_code", -1), ("not finished", ""))[0]

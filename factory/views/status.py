@@ -117,9 +117,12 @@ def _long_running_tasks(store: "Store") -> Iterable[str]:
 
 def _last_run(store: "Store") -> Iterable[str]:
     newest = store.newest_run()
+    committed_ms, now_s = store.last_commit_ms(), time.time()
+    word, _ = run_state(newest, committed_ms, now_s)
+    if newest.damaged:
+        yield f"newest run    {word}"
+        return
     if newest.goes_on or not newest.last:
-        committed_ms, now_s = store.last_commit_ms(), time.time()
-        word, _ = run_state(newest, committed_ms, now_s)
         left = time_left_text(newest.current.get("ends_ms"), now_s * 1000)
         heard = f"{word}, last heard of {time_text(newest.heard_s_ago(committed_ms, now_s))} ago"
         yield f"newest run    {heard}: " + (f"ETA {left}" if word == RUNNING else QUIET)
@@ -212,6 +215,8 @@ def run_state(run: "NewestRun", committed_ms: int, now_s: float) -> tuple[str, s
     """Word and tone of the newest run: of one that goes on, or of how the last one ended, never both."""
     from factory.store.samples import QUIET_S
 
+    if run.damaged:
+        return f"run status unknown: {' and '.join(run.damaged)} not readable; factory verify says more", "warn"
     if not run.goes_on:
         return STATUS.get(run.last.get("exit_code", -1), ("run status unknown", "warn"))
     quiet = run.heard_s_ago(committed_ms, now_s) > QUIET_S

@@ -1,6 +1,7 @@
 """The card of a run's data set: valid front matter, the tables' own numbers, and true when a run did not finish."""
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,10 @@ from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph.execute import Execution
 from factory.store.funnel import funnel_of
 from factory.store.samples import Store
+from factory.views.board.overview import overview
+from factory.views.board.watch import Watch
 from factory.views.card import FILE, card, write_card
+from factory.views.status import status_lines
 from tests.factory.toy import ToyWork, executed, refs
 
 report_main = COMMANDS["report"].load()
@@ -77,6 +81,17 @@ def test_a_card_says_that_a_run_was_interrupted_and_the_next_that_it_is_complete
     assert "The run is complete." in (tmp_path / FILE).read_text()
     (tmp_path / "last_run.json").unlink()  # as after a kill
     assert "The run is not finished" in card(store)
+
+
+@pytest.mark.parametrize("name", ["current_run.json", "last_run.json"])
+def test_a_damaged_record_of_the_newest_run_is_no_state_of_it(tmp_path: Path, name: str) -> None:
+    store = Store(tmp_path)
+    executed(ToyWork(), refs(2), ["human"], 1, store)
+    (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-9])
+    assert f"The run is of unknown state ({name} not readable)" in card(store)
+    assert f"newest run    run status unknown: {name} not readable" in "\n".join(status_lines(store))
+    state = overview(Watch(store).snapshot(), "here", time.time())["state"]
+    assert name in state["word"] and not state["live"]
 
 
 def test_files_that_no_commit_names_are_not_offered(tmp_path: Path) -> None:
