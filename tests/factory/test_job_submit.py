@@ -1,7 +1,8 @@
-"""`ray job submit --working-dir .` on a head node of its own: runs, resumes, and leaves the heavy folders at home."""
+"""The commands of docs/tutorials/cluster.md on a head node of its own: runs and jobs find it, resume, and leave
+the heavy folders at home."""
 
 import os
-import secrets
+import re
 import shutil
 import signal
 import socket
@@ -20,11 +21,18 @@ from factory.stages.warm import compile_kernels, part_marker
 from factory.store.reader import SampleTable
 from tasks.caches import without_checksum
 from tasks.kernels.compiled import cache_dir
+from tests.pages import commands
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 RAY = (sys.executable, "-m", "ray.scripts.scripts")
+PAGE = commands("docs/tutorials/cluster.md")
+START_HEAD, STATUS, TOKEN = (
+    next([*RAY, *one.words[1:]] for one in PAGE if one.words[0] == "ray" and words in str(one))
+    for words in ("start --head", "status", "get-auth-token")
+)
+RUN, SUBMIT = ([*one.words] for one in PAGE if "factory.run" in one.words)
 LISTENERS = (
     "--port",
     "--dashboard-port",
@@ -57,11 +65,12 @@ class Head:
     address: str  # of the dashboard
     folder: Path  # of its sessions, and home of its user
     environment: dict[str, str]
+    gcs: str  # host:port that nodes join and drivers connect to
 
     def submit(self, checkout: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """`ray job submit` as the README has it; waits for the job's end."""
-        command = [*RAY, "job", "submit", "--address", self.address, "--working-dir", ".", "--"]
-        command += ["python", "-m", "factory.run", *arguments]
+        """As the page has it, with the job's own arguments; waits for the job's end."""
+        words = SUBMIT[1 : SUBMIT.index("rounds=5")]
+        command = [*RAY, *(self.address if word == "http://<head>:8265" else word for word in words), *arguments]
         return subprocess.run(command, cwd=checkout, env=self.environment, capture_output=True, text=True, timeout=250)
 
 
@@ -83,18 +92,18 @@ def running_head() -> Iterator[Head]:
         "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
         "RAY_USAGE_STATS_ENABLED": "0",
         "RAY_AUTH_MODE": "token",
-        "RAY_AUTH_TOKEN": secrets.token_hex(32),
         "OMP_NUM_THREADS": "1",
     }
     folder = Path(tempfile.mkdtemp(prefix="ray-", dir="/tmp"))  # short: Ray's sockets lie below it
     environment |= {"HOME": str(folder), "XDG_CACHE_HOME": str(folder / "cache")}
     ports = free_ports(len(LISTENERS))
     listeners = [text for flag, port in zip(LISTENERS, ports) for text in (flag, str(port))]
-    command = [*RAY, "start", "--head", "--block", "--node-ip-address=127.0.0.1", "--dashboard-host=127.0.0.1"]
+    subprocess.run(TOKEN, env=environment, check=True, capture_output=True)
+    command = [*START_HEAD, "--block", "--node-ip-address=127.0.0.1", "--dashboard-host=127.0.0.1"]
     command += ["--include-dashboard=true", "--num-cpus=2", f"--temp-dir={folder}", *listeners]
     with open(folder / "head.log", "w") as log:
         process = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT, cwd=folder)
-    head = Head(f"http://127.0.0.1:{ports[1]}", folder, environment)
+    head = Head(f"http://127.0.0.1:{ports[1]}", folder, environment, f"127.0.0.1:{ports[0]}")
     try:
         _wait_until_it_answers(head, process)
         yield head
@@ -177,3 +186,18 @@ def test_the_command_as_it_stands_makes_the_table_from_one_copy_of_the_project_a
     assert lost.returncode != 0
     assert "name an absolute path or a URL" in lost.stdout + lost.stderr
     assert "exit code 2" in lost.stdout + lost.stderr
+
+
+def test_a_run_finds_the_cluster_as_the_page_says(head: Head, tmp_path: Path, shared_root: Path) -> None:
+    give_compiled_kernels(head)
+    environment = head.environment | {"RAY_ADDRESS": head.gcs}
+    status = subprocess.run(STATUS, env=environment, capture_output=True, text=True).stdout
+    assert len(re.findall(r"^ 1 node_[0-9a-f]+$", status, re.M)) == 1 and "/2.0 CPU" in status
+    given = {"clips.root": str(shared_root / "data" / "scenarionet" / "nuscenes"), "out": str(tmp_path / "out")}
+    given |= {"limit": "1", "experts": "[human]"}
+    words = [*(word for word in RUN[1:] if word.partition("=")[0] not in given), *map("=".join, given.items())]
+    ran = subprocess.run(
+        [sys.executable, *words], cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=200
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert len(SampleTable(tmp_path / "out")) == 1
