@@ -1,6 +1,6 @@
 """Commands that keep a run's tables in order: retry, verify, clean, compact."""
 
-import os
+import contextlib
 import re
 import shlex
 import sys
@@ -50,10 +50,11 @@ def retry(request: RetryRequest) -> int:
         raise Refused(f"{store.location.uri} is no run, its rows were imported: {IMPORT_AGAIN.format(source)}")
     folder, recorded = recorded_command(store, request.settings)
     command = [*recorded, *request.settings, f"out={store.location.uri}", "retry_failed=true"]
-    print(f"\nin {folder}: python -m factory run {shlex.join(command)}", flush=True)
-    if Path(folder).is_dir():
-        os.chdir(folder)  # paths among the settings are relative to where the run was started
-    return run(command)
+    there = Path(folder).is_dir()
+    where = folder if there else f"this folder, as {folder} is not on this machine"
+    print(f"\nin {where}: python -m factory run {shlex.join(command)}", flush=True)
+    with contextlib.chdir(folder if there else "."):  # paths among the settings are relative to where it was started
+        return run(command)
 
 
 def recorded_command(store: "Store", given: Sequence[str] = ()) -> tuple[str, list[str]]:
