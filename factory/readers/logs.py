@@ -54,6 +54,7 @@ from tasks.world.clip import (
     SensorFile,
 )
 from tasks.world.frames import VX, VY, X, Y
+from tasks.world.repair.records import Repair, repairs_within
 from tasks.world.road_map import CenterlineFinder, NoRoute, RoadMap, Route, TrafficLights, route_of_log
 
 # Several logs of one place: which other drives lead through a block, and the block with what they saw.
@@ -227,6 +228,7 @@ class WholeLog:
     licence: str
     content_digest: str  # sha256 of everything the clips are computed from, but pixels and points
     split: str | None = field(default=None, kw_only=True)  # the data set's own; None: by the hash of the log's id
+    repairs: tuple[Repair, ...] = field(default=(), kw_only=True)  # what is not as the files have it
 
     @cached_property
     def finder(self) -> CenterlineFinder:
@@ -402,6 +404,7 @@ class LogReader(ABC, Generic[Log]):
             block=None if recorded.block is None else self._with_others(ref, recorded.block),
             licence=log.licence,
             content_digest=self.digest_with_others(ref, log.content_digest),
+            repairs=repairs_within(log.repairs, (start - 0.5) * STEP_S, (stop - 0.5) * STEP_S),
         )
         return validate_clip(clip, log.file)
 

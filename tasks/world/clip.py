@@ -9,6 +9,7 @@ import numpy as np
 
 from tasks.world.arrays import Array, Bools
 from tasks.world.frames import EGO_STATE_SIZE
+from tasks.world.repair.records import Repair
 from tasks.world.road_map import NO_LIGHTS, RoadMap, Route, TrafficLights
 
 # Everything that is tracked around the ego, over time.
@@ -221,6 +222,7 @@ class Clip:
     licence: str = ""
     frame_tokens: tuple[str, str] | None = None  # the log's own names of its frames at T and T+H
     content_digest: str = ""  # of everything the clip was read from, but pixels and points
+    repairs: tuple[Repair, ...] = ()  # in what it was read from, as far as it shows in the clip
 
 
 @dataclass(frozen=True)
