@@ -18,11 +18,16 @@ class Repair:
     time_s: float  # since the log's first annotated instant; NaN: of the whole log
     was: str  # as the file has it, with its unit
     now: str  # as clips have it, or LEFT_OUT
+    until_s: float = -math.inf  # where it lasts longer than an instant
 
 
 def repairs_within(repairs: Iterable[Repair], first_s: float, last_s: float) -> tuple[Repair, ...]:
-    """Those from first_s to last_s, both included, and those of the whole log."""
-    return tuple(repair for repair in repairs if math.isnan(repair.time_s) or first_s <= repair.time_s <= last_s)
+    """Those that show from first_s to last_s, both included, and those of the whole log."""
+    return tuple(
+        repair
+        for repair in repairs
+        if math.isnan(repair.time_s) or (repair.time_s <= last_s and max(repair.time_s, repair.until_s) >= first_s)
+    )
 
 
 def repair_counts(repairs: Iterable[Repair]) -> dict[str, tuple[int, int]]:

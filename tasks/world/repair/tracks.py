@@ -1,0 +1,378 @@
+"""What a log shows of the things around the ego, at its own frames, and the passes that put it right.
+
+Each pass is a function of observations that gives them back with what it did. None of them moves what is whole: a box
+is left out, named anew, turned round or put between its neighbours.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import median_filter
+from scipy.spatial import cKDTree
+
+from tasks.world.arrays import Array, Bools, Ints
+from tasks.world.clip import AgentKind
+from tasks.world.frames import LARGEST, PACIFICA, box_corners, wrap_angle
+from tasks.world.repair.records import LEFT_OUT, Repair
+
+X, Y, Z, HEADING, LENGTH, WIDTH, HEIGHT, VX, VY = range(9)  # columns of a box, [m], [rad], [m/s]
+UNSEEN, TAKEN_OUT, FILLED = -1, -2, -3  # in the place of a row: by the file, by a pass; FILLED is seen
+
+FILLED_GAP_S = 0.5  # between two frames of a thing; what was taken out in between is put on the line between them
+LARGEST_SIZE_M = 100.0  # of a box: a train's
+MOST = 0.5  # of a thing's frames: more than these say what it is
+KNOWN_AFTER_S = 0.6  # a thing unseen for longer may have turned round
+TURNED_RAD = 2.6  # from one frame to the next no car turns so far: it is pi, off by what it really turned
+MOVING_MPS = 2.0  # faster, motion tells which way a thing looks
+SPIKE_FRAMES = 2  # as many that lie elsewhere are a fault of theirs, more of them are another thing
+USUAL_S = 1.1  # around a step, over which a thing's usual speed is taken
+TOP_SPEED_MPS = {  # nobody in traffic is faster; 10 m/s is a sprinter
+    AgentKind.VEHICLE: 70.0,
+    AgentKind.BICYCLE: 70.0,
+    AgentKind.PEDESTRIAN: 10.0,
+    AgentKind.GENERIC_OBJECT: 25.0,
+    AgentKind.TRAFFIC_CONE: 10.0,
+    AgentKind.BARRIER: 10.0,
+    AgentKind.CZONE_SIGN: 10.0,
+}
+LARGEST_ACCEL_MPS2 = 10.0
+NOISE_M = 2.5  # from one frame to the next: boxes are corrected as more of a thing comes into view
+INSIDE = 0.7  # of the smaller box lies in the larger: two things cannot
+
+
+@dataclass(frozen=True)
+class ObservedTracks:
+    """F frames of a log and the N things they show, world frame."""
+
+    times_s: Array  # (F,) increasing
+    track_ids: tuple[str, ...]  # (N,) unique
+    kinds: tuple[AgentKind, ...]  # (N,)
+    boxes: Array  # (F, N, 9) X .. VY above; velocities are 0 where the log has none
+    rows: Ints  # (F, N) number of the box in its frame or file; UNSEEN, TAKEN_OUT, FILLED
+
+    @property
+    def seen(self) -> Bools:
+        """(F, N)"""
+        return (self.rows >= 0) | (self.rows == FILLED)
+
+    def __len__(self) -> int:
+        return len(self.track_ids)
+
+    def frames(self, n: int) -> Ints:
+        """The frames that show thing n."""
+        return np.flatnonzero(self.seen[:, n])
+
+    def without(self, frames: Ints, n: int) -> "ObservedTracks":
+        """With those frames of thing n taken out."""
+        rows = self.rows.copy()
+        rows[frames, n] = TAKEN_OUT
+        return replace(self, rows=rows)
+
+
+Repairs = tuple[Repair, ...]
+Pass = Callable[[ObservedTracks, Array], tuple[ObservedTracks, Repairs]]
+
+
+def repaired(tracks: ObservedTracks, ego_poses: Array) -> tuple[ObservedTracks, Repairs]:
+    """All passes, one after the other, without the things that are then seen nowhere.
+
+    ego_poses: (F, 3) rear axle x, y [m], heading [rad]; NaN where unknown.
+    """
+    done: list[Repair] = []
+    for one in PASSES:
+        tracks, found = one(tracks, ego_poses)
+        done += found
+    return of_things(tracks, np.flatnonzero(tracks.seen.any(axis=0))), tuple(done)
+
+
+def of_things(tracks: ObservedTracks, things: Ints) -> ObservedTracks:
+    """Those things alone, in that order."""
+    return replace(
+        tracks,
+        track_ids=tuple(tracks.track_ids[n] for n in things),
+        kinds=tuple(tracks.kinds[n] for n in things),
+        boxes=tracks.boxes[:, things],
+        rows=tracks.rows[:, things],
+    )
+
+
+def without_impossible_values(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, Repairs]:
+    """Boxes that cannot be are left out; where most of a thing's are, the thing."""
+    sizes, seen = tracks.boxes[..., LENGTH : HEIGHT + 1], tracks.seen
+    possible = np.asarray((np.abs(tracks.boxes) <= LARGEST).all(axis=-1))
+    possible &= ((sizes > 0.0) & (sizes <= LARGEST_SIZE_M)).all(axis=-1)
+    done = []
+    for n in np.flatnonzero((seen & ~possible).any(axis=0)):
+        bad = np.flatnonzero(seen[:, n] & ~possible[:, n])
+        was = [_impossible(box) for box in tracks.boxes[bad, n]]
+        tracks, found = _left_out(tracks, int(n), bad, "impossible", was)
+        done += found
+    return tracks, tuple(done)
+
+
+def with_jumps_apart(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, Repairs]:
+    """An identity that jumps is two things; a frame or two that lie elsewhere, and speeds that nothing has, go."""
+    done: list[Repair] = []
+    for n in range(len(tracks)):
+        frames = tracks.frames(n)
+        apart = np.flatnonzero(_jumps(tracks, n, frames)) + 1
+        if len(apart):
+            tracks, found = _in_pieces(tracks, n, np.split(frames, apart))
+            done += found
+    for n in range(len(tracks)):
+        fast = _too_fast(tracks, n)
+        if len(fast):
+            limit = TOP_SPEED_MPS[tracks.kinds[n]]
+            was = f"{tracks.kinds[n].lower()} faster than {limit:g} m/s"
+            tracks, found = _left_out(tracks, n, fast, "jump", [was] * len(fast))
+            done += found
+    return tracks, tuple(done)
+
+
+def without_the_ego(tracks: ObservedTracks, ego_poses: Array) -> tuple[ObservedTracks, Repairs]:
+    """What is inside the ego for most of its life is the ego."""
+    c, s = np.cos(ego_poses[:, None, 2]), np.sin(ego_poses[:, None, 2])
+    dx, dy = (tracks.boxes[..., axis] - ego_poses[:, None, axis] for axis in (X, Y))
+    along, across = c * dx + s * dy - PACIFICA.rear_axle_to_center, c * dy - s * dx
+    inside = tracks.seen & (np.abs(along) < PACIFICA.half_length) & (np.abs(across) < PACIFICA.half_width)
+    done = []
+    for n in np.flatnonzero(inside.sum(axis=0) > MOST * np.maximum(tracks.seen.sum(axis=0), 1)):
+        frames = tracks.frames(int(n))
+        tracks, found = _left_out(tracks, int(n), frames, "ego", ["inside the ego"] * len(frames))
+        done += found
+    return tracks, tuple(done)
+
+
+def without_doubles(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, Repairs]:
+    """Two things of one kind that are in each other for most of the shorter one's life are the longer one.
+
+    It is also where only the shorter one was seen, next to its own frames.
+    """
+    life = tracks.seen.sum(axis=0)
+    done: list[Repair] = []
+    gone: set[int] = set()
+    for first, second, together in sorted(_pairs_inside(tracks)):
+        kept, double = (first, second) if life[first] >= life[second] else (second, first)
+        if together <= MOST * life[double] or {kept, double} & gone:
+            continue
+        gone.add(double)
+        alone = np.flatnonzero(tracks.seen[:, double] & ~tracks.seen[:, kept])
+        boxes, rows = tracks.boxes.copy(), tracks.rows.copy()
+        boxes[alone, kept], rows[alone, kept] = boxes[alone, double], rows[alone, double]
+        frames = tracks.frames(double)
+        rows[frames, double] = TAKEN_OUT
+        span = tracks.times_s[frames[[0, -1]]].tolist()
+        was = f"in {tracks.track_ids[kept]} in {together} of {life[double]} frames"
+        done.append(Repair("twice", tracks.track_ids[double], span[0], was, LEFT_OUT, span[1]))
+        tracks = replace(tracks, boxes=boxes, rows=rows)
+    return tracks, tuple(done)
+
+
+def with_headings_turned(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, Repairs]:
+    """Headings of vehicles and bicycles that are off by pi in some frames, as motion or else most frames say it."""
+    boxes, done = tracks.boxes, list[Repair]()
+    for n, kind in enumerate(tracks.kinds):
+        if kind not in (AgentKind.VEHICLE, AgentKind.BICYCLE):
+            continue
+        frames = tracks.frames(n)
+        for run in np.split(frames, np.flatnonzero(np.diff(tracks.times_s[frames]) > KNOWN_AFTER_S) + 1):
+            wrong = run[_turned_round(tracks, n, run)] if len(run) > 1 else run[:0]
+            if len(wrong):
+                boxes = boxes.copy() if boxes is tracks.boxes else boxes
+                was = boxes[wrong, n, HEADING]
+                boxes[wrong, n, HEADING] = wrap_angle(was + np.pi)
+                done += [
+                    Repair("heading", tracks.track_ids[n], t, f"{a:.2f} rad", f"{b:.2f} rad")
+                    for t, a, b in zip(tracks.times_s[wrong].tolist(), was, boxes[wrong, n, HEADING])
+                ]
+    return replace(tracks, boxes=boxes), tuple(done)
+
+
+def with_gaps_filled(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, Repairs]:
+    """Frames of a thing that were taken out between two at most FILLED_GAP_S apart are on the line between these."""
+    boxes, rows, done = tracks.boxes.copy(), tracks.rows.copy(), list[Repair]()
+    for n in np.flatnonzero((rows == TAKEN_OUT).any(axis=0)):
+        frames = tracks.frames(int(n))
+        out = np.flatnonzero(rows[:, n] == TAKEN_OUT)
+        after = np.searchsorted(frames, out)
+        between = (after > 0) & (after < len(frames))
+        out, after = out[between], after[between]
+        before, behind = frames[after - 1], frames[after]
+        short = tracks.times_s[behind] - tracks.times_s[before] <= FILLED_GAP_S + 1e-6
+        for f, a, b in zip(out[short], before[short], behind[short]):
+            boxes[f, n], rows[f, n] = _between(tracks, int(n), int(f), int(a), int(b)), FILLED
+            where = f"between its frames at {tracks.times_s[a]:.1f} and {tracks.times_s[b]:.1f} s"
+            done.append(Repair("gap", tracks.track_ids[n], float(tracks.times_s[f]), "no frame", where))
+    return replace(tracks, boxes=boxes, rows=rows), tuple(done)
+
+
+PASSES: Sequence[Pass] = (
+    without_impossible_values,
+    with_jumps_apart,
+    without_the_ego,
+    without_doubles,
+    with_headings_turned,
+    with_gaps_filled,
+)
+
+
+def _left_out(
+    tracks: ObservedTracks, n: int, bad: Ints, what: str, was: Sequence[str]
+) -> tuple[ObservedTracks, list[Repair]]:
+    """Those frames of thing n left out, each with what it was; where they are most of its frames, all of it."""
+    frames, name, times_s = tracks.frames(n), tracks.track_ids[n], tracks.times_s
+    if len(bad) > MOST * len(frames):
+        whole = Repair(what, name, float(times_s[frames[0]]), was[0], LEFT_OUT, float(times_s[frames[-1]]))
+        return tracks.without(frames, n), [whole]
+    return tracks.without(bad, n), [Repair(what, name, float(times_s[f]), w, LEFT_OUT) for f, w in zip(bad, was)]
+
+
+def _impossible(box: Array) -> str:
+    """Which of a box's values cannot be."""
+    names = ("x", "y", "z", "heading", "length", "width", "height", "vx", "vy")
+    wrong = ~(np.abs(box) <= LARGEST)
+    wrong[LENGTH : HEIGHT + 1] |= ~((box[LENGTH : HEIGHT + 1] > 0.0) & (box[LENGTH : HEIGHT + 1] <= LARGEST_SIZE_M))
+    return ", ".join(f"{name} {value:g}" for name, value, bad in zip(names, box, wrong) if bad)
+
+
+def _jumps(tracks: ObservedTracks, n: int, frames: Ints) -> Bools:
+    """(K - 1,) whether thing n cannot have gone from one of its K frames to the next."""
+    if len(frames) < 2:
+        return np.zeros(0, bool)
+    dt = np.diff(tracks.times_s[frames])
+    moved = np.diff(tracks.boxes[frames, n, :2], axis=0)
+    jumps = np.hypot(*moved.T) > TOP_SPEED_MPS[tracks.kinds[n]] * dt + NOISE_M
+    steps = max(3, 2 * round(USUAL_S / float(np.median(dt)) / 2.0) + 1)
+    if len(dt) >= steps:
+        usual = np.stack([median_filter(v, steps, mode="nearest") for v in (moved / dt[:, None]).T], axis=1)
+        off = np.hypot(*(moved - usual * dt[:, None]).T)
+        jumps |= (off > NOISE_M + LARGEST_ACCEL_MPS2 * dt**2) & (dt <= KNOWN_AFTER_S)
+    return jumps
+
+
+def _in_pieces(tracks: ObservedTracks, n: int, pieces: Sequence[Ints]) -> tuple[ObservedTracks, list[Repair]]:
+    """Thing n, which jumps between the pieces (frames each), as several, and without frames that lie elsewhere."""
+    name, done = tracks.track_ids[n], list[Repair]()
+    things: list[Ints] = []
+    for i, piece in enumerate(pieces):
+        last = i + 1 == len(pieces)
+        spike = len(piece) <= SPIKE_FRAMES and (last or not things or _goes_on(tracks, n, things[-1], pieces[i + 1]))
+        if spike:
+            for f in piece:
+                done.append(Repair("jump", name, float(tracks.times_s[f]), "away from its other frames", LEFT_OUT))
+            tracks = tracks.without(piece, n)
+        elif things and _goes_on(tracks, n, things[-1], piece):
+            things[-1] = np.concatenate([things[-1], piece])
+        else:
+            things.append(piece)
+    for later in things[1:]:
+        tracks, renamed = _named_anew(tracks, n, later)
+        span = tracks.times_s[later[[0, -1]]].tolist()
+        done.append(Repair("jump", name, span[0], name, renamed, span[1]))
+    return tracks, done
+
+
+def _goes_on(tracks: ObservedTracks, n: int, before: Ints, after: Ints) -> bool:
+    """Whether thing n can have gone from the last of some frames to the first of others, at the speed it has there."""
+    t, xy = tracks.times_s, tracks.boxes[:, n, :2]
+    near = [
+        frames[np.abs(t[frames] - t[at]) <= USUAL_S / 2.0] for frames, at in ((before, before[-1]), (after, after[0]))
+    ]
+    ends = [(xy[part[-1]] - xy[part[0]]) / (t[part[-1]] - t[part[0]]) for part in near if len(part) > 1]
+    dt, moved = float(t[after[0]] - t[before[-1]]), xy[after[0]] - xy[before[-1]]
+    if np.hypot(*moved) > TOP_SPEED_MPS[tracks.kinds[n]] * dt + NOISE_M:
+        return False
+    usual = np.mean(ends, axis=0) if ends else np.zeros(2)
+    return bool(not ends or np.hypot(*(moved - usual * dt)) <= NOISE_M + LARGEST_ACCEL_MPS2 * dt**2)
+
+
+def _named_anew(tracks: ObservedTracks, n: int, frames: Ints) -> tuple[ObservedTracks, str]:
+    """Those frames of thing n as a thing of their own, behind the others; and its name."""
+    taken, k = set(tracks.track_ids), 2
+    while (name := f"{tracks.track_ids[n]}#{k}") in taken:
+        k += 1
+    rows, column = tracks.rows.copy(), np.full(len(tracks.rows), UNSEEN)
+    column[frames] = rows[frames, n]
+    rows[frames, n] = UNSEEN
+    return (
+        replace(
+            tracks,
+            track_ids=(*tracks.track_ids, name),
+            kinds=(*tracks.kinds, tracks.kinds[n]),
+            boxes=np.concatenate([tracks.boxes, tracks.boxes[:, [n]]], axis=1),
+            rows=np.column_stack([rows, column]),
+        ),
+        name,
+    )
+
+
+def _too_fast(tracks: ObservedTracks, n: int) -> Ints:
+    """The frames of thing n that lie within some second in which it went farther than its kind can."""
+    frames = tracks.frames(n)
+    times_s, xy = tracks.times_s[frames], tracks.boxes[frames, n, :2]
+    until = np.searchsorted(times_s, times_s + 1.0 + 1e-6) - 1
+    took = times_s[until] - times_s
+    far = np.hypot(*(xy[until] - xy).T) > TOP_SPEED_MPS[tracks.kinds[n]] * took
+    out = np.zeros(len(frames), bool)
+    for k in np.flatnonzero(far & (took >= 0.5)):
+        out[k : until[k] + 1] = True
+    return frames[out]
+
+
+def _pairs_inside(tracks: ObservedTracks) -> Iterable[tuple[int, int, int]]:
+    """(n, m, frames) of all things n < m of one kind of which one is in the other in some frames."""
+    import shapely  # here alone: workers that drive do not need it
+
+    counts: dict[tuple[int, int], int] = {}
+    corners = np.nan_to_num(box_corners(tracks.boxes[..., [X, Y, HEADING, LENGTH, WIDTH]]))
+    reach = float(np.nanmax(np.where(tracks.seen, tracks.boxes[..., LENGTH], np.nan), initial=0.0)) / 2.0
+    kinds = np.array([list(AgentKind).index(kind) for kind in tracks.kinds], int)
+    for frame, seen in enumerate(tracks.seen):
+        here = np.flatnonzero(seen)
+        if len(here) < 2:
+            continue
+        pairs = here[cKDTree(tracks.boxes[frame, here, :2]).query_pairs(reach, output_type="ndarray")]
+        pairs = pairs[kinds[pairs[:, 0]] == kinds[pairs[:, 1]]]
+        pairs = pairs[_center_inside(tracks.boxes[frame], pairs)]
+        if len(pairs):
+            one, other = (shapely.polygons(corners[frame, pairs[:, i]]) for i in (0, 1))
+            smaller = np.minimum(shapely.area(one), shapely.area(other))
+            for n, m in pairs[shapely.area(shapely.intersection(one, other)) >= INSIDE * smaller].tolist():
+                counts[min(n, m), max(n, m)] = counts.get((min(n, m), max(n, m)), 0) + 1
+    return [(n, m, together) for (n, m), together in counts.items()]
+
+
+def _center_inside(boxes: Array, pairs: Ints) -> Bools:
+    """(P,) whether the centre of the smaller box is in the larger; without it less than half of the smaller can be."""
+    area = boxes[:, LENGTH] * boxes[:, WIDTH]
+    large, small = pairs.T
+    large, small = np.where(area[large] >= area[small], (large, small), (small, large))
+    dx, dy = boxes[small, X] - boxes[large, X], boxes[small, Y] - boxes[large, Y]
+    c, s = np.cos(boxes[large, HEADING]), np.sin(boxes[large, HEADING])
+    along, across = np.abs(c * dx + s * dy), np.abs(c * dy - s * dx)
+    return np.asarray((along <= boxes[large, LENGTH] / 2.0) & (across <= boxes[large, WIDTH] / 2.0))
+
+
+def _turned_round(tracks: ObservedTracks, n: int, run: Ints) -> Bools:
+    """(K,) of K frames of thing n in a row: which look the other way."""
+    heading = tracks.boxes[run, n, HEADING]
+    turned = np.cumsum(np.abs(wrap_angle(np.diff(heading, prepend=heading[0]))) > TURNED_RAD) % 2 == 1
+    if not turned.any():
+        return turned
+    moved = np.gradient(tracks.boxes[run, n, :2], tracks.times_s[run], axis=0)
+    forward = np.cos(heading) * moved[:, 0] + np.sin(heading) * moved[:, 1]
+    forward[np.hypot(*moved.T) < MOVING_MPS] = 0.0
+    forward[turned] *= -1.0
+    first_is_right = forward.sum() > 0.0 if forward.any() else turned.mean() <= MOST
+    return turned if first_is_right else ~turned
+
+
+def _between(tracks: ObservedTracks, n: int, frame: int, before: int, after: int) -> Array:
+    """(9,) the box of thing n at a frame, linear between two others."""
+    t = tracks.times_s
+    share = (t[frame] - t[before]) / (t[after] - t[before])
+    first, last = tracks.boxes[before, n], tracks.boxes[after, n]
+    box = first + share * (last - first)
+    box[HEADING] = wrap_angle(first[HEADING] + share * wrap_angle(last[HEADING] - first[HEADING]))
+    return np.asarray(box)
