@@ -213,6 +213,7 @@ class LoggedDrive:
     agents: AgentTracks  # S steps
     segment: Ints  # (S,) number of the unbroken stretch a step belongs to, -1: none; no window leaves it
     earliest: int = 0  # step before which no window begins
+    repairs: tuple[Repair, ...] = ()
 
 
 @dataclass(frozen=True)

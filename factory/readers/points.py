@@ -109,8 +109,11 @@ def read_points(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
 # Feather files: columns of numbers and texts, as Argoverse 2 has them.
 
 
-def read_feather(path: Path, columns: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
-    """Named columns as writable arrays; numbers are checked to be finite. Raises BadClip."""
+def read_feather(path: Path, columns: tuple[str, ...], whole: bool = True) -> dict[str, NDArray[np.generic]]:
+    """Named columns as writable arrays; whole: nulls, NaN and infinity are refused, else they are NaN and None.
+
+    Raises BadClip.
+    """
     try:
         table = pyarrow.feather.read_table(path)
         table.validate(full=True)
@@ -124,9 +127,9 @@ def read_feather(path: Path, columns: tuple[str, ...]) -> dict[str, NDArray[np.g
     for name in columns:
         if name not in table.column_names:
             raise BadClip(str(path), name, "column is missing")
-        if table[name].null_count:
+        if whole and table[name].null_count:
             raise BadClip(str(path), name, "holds nulls")
         out[name] = np.array(table[name].to_numpy())
-        if out[name].dtype.kind == "f" and not np.isfinite(out[name]).all():
+        if whole and out[name].dtype.kind == "f" and not np.isfinite(out[name]).all():
             raise BadClip(str(path), name, "holds NaN or infinity")
     return out

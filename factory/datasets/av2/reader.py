@@ -34,6 +34,8 @@ from factory.readers.points import read_feather
 from tasks.world.arrays import Array, Bools, Indices, Ints
 from tasks.world.clip import MOVING_KINDS, STEP_S, AgentKind, AgentTracks, Camera, SensorFile
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, X, Y, wrap_angle
+from tasks.world.repair.records import Repair
+from tasks.world.repair.tracks import EGO, FILLED_S, MOST, clock_repairs, observed, repaired, whole_frames
 from tasks.world.road_map import (
     Lane,
     LightState,
@@ -64,6 +66,7 @@ VELOCITY_HALF_WINDOW_S = 0.55
 STANDING_SPEED_MPS = 0.1  # slower is standing: velocity (and the ego's acceleration) exactly 0
 SAME_FRAME_S = STEP_S / 2  # a step sees the annotated frame that is at most this far away
 ROUNDING_S = 1e-9
+UNIT_SLACK = 1e-3  # of a quaternion's length
 MAX_LOG_S = 86_400.0  # longer is a broken stamp, and would ask for any amount of steps
 
 _CATEGORIES = {
@@ -103,7 +106,8 @@ class LogMotion:
     rotations: Rotation  # P rotations, city from ego
     yaws: Array  # (P,) unwrapped [rad]
     tracks: tuple[BoxTrack, ...]  # ordered by track id
-    fill_s: float = 0.0  # two frames of a track at most this far apart hold the steps between them too
+    fill_s: float = FILLED_S  # two frames of a track at most this far apart hold the steps between them too
+    repairs: tuple[Repair, ...] = ()
 
     @property
     def n_steps(self) -> int:
@@ -141,28 +145,36 @@ def stamps(path: Path, table: Mapping[str, NDArray[np.generic]]) -> Ints:
 
 def rotations(path: Path, poses: Array) -> Rotation:
     """Rotations of poses (n, 7) = qw, qx, qy, qz, ...; raises BadClip where a quaternion is not of unit length."""
-    if np.abs(np.linalg.norm(poses[:, :4], axis=1) - 1.0).max() > 1e-3:
+    if not is_rotation(poses).all():
         raise BadClip(str(path), "qw qx qy qz", "a quaternion is not of unit length")
     return Rotation.from_quat(poses[:, [1, 2, 3, 0]])
+
+
+def headings_of(poses: Array, world_from_frame: Rotation | None = None) -> Array:
+    """(n,) headings [rad] of poses (n, >= 4) = qw, qx, qy, qz, ... given in n frames; NaN where one is no rotation."""
+    turned = is_rotation(poses)
+    rotation = Rotation.from_quat(np.where(turned[:, None], poses[:, [1, 2, 3, 0]], [0.0, 0.0, 0.0, 1.0]))
+    return np.where(turned, yaw_of(rotation if world_from_frame is None else world_from_frame * rotation), np.nan)
 
 
 def read_motion(folder: Path) -> LogMotion:
     """Poses and annotations of the log in `folder`. Raises BadClip."""
     path, pose_path = folder / ANNOTATIONS, folder / POSES
-    boxes = read_feather(path, ("timestamp_ns", "track_uuid", "category", *SIZE_COLUMNS, *POSE_COLUMNS))
+    boxes = read_feather(path, ("timestamp_ns", "track_uuid", "category", *SIZE_COLUMNS, *POSE_COLUMNS), whole=False)
     box_stamps = stamps(path, boxes)
     start_ns = int(box_stamps.min())
-    poses = read_feather(pose_path, ("timestamp_ns", *POSE_COLUMNS))
+    poses = read_feather(pose_path, ("timestamp_ns", *POSE_COLUMNS), whole=False)
     pose_stamps = stamps(pose_path, poses)
-    if (np.diff(pose_stamps) < 0).any():
-        raise BadClip(str(pose_path), "timestamp_ns", "time runs backwards")
-    keep = distinct_time_indices(seconds_since(start_ns, pose_stamps))
-    pose_values = numbers(pose_path, poses, POSE_COLUMNS)[keep]
-    pose_times = seconds_since(start_ns, pose_stamps[keep])
     frame_times = seconds_since(start_ns, np.unique(box_stamps))
+    pose_times, pose_values, ego_repairs = whole_poses(
+        pose_path, seconds_since(start_ns, pose_stamps), numbers(pose_path, poses, POSE_COLUMNS)
+    )
     if pose_times[0] > MIN_POSE_SPACING_S or pose_times[-1] < frame_times[-1] - SAME_FRAME_S:
         raise BadClip(str(pose_path), "timestamp_ns", "the poses do not span the annotated frames")
     city_from_ego = rotations(pose_path, pose_values)
+    tracks, repairs = _tracks(
+        path, boxes, seconds_since(start_ns, box_stamps), frame_times, pose_times, pose_values[:, 4:], city_from_ego
+    )
     return LogMotion(
         folder=folder,
         start_ns=start_ns,
@@ -171,15 +183,43 @@ def read_motion(folder: Path) -> LogMotion:
         positions=pose_values[:, 4:],
         rotations=city_from_ego,
         yaws=np.unwrap(yaw_of(city_from_ego)),
-        tracks=_tracks(path, boxes, seconds_since(start_ns, box_stamps), pose_times, pose_values[:, 4:], city_from_ego),
+        tracks=tracks,
+        repairs=(*clock_repairs(frame_times), *ego_repairs, *repairs),
     )
+
+
+def whole_poses(path: Path, times_s: Array, poses: Array) -> tuple[Array, Array, tuple[Repair, ...]]:
+    """The ego's poses (P,), (P, 7) in time order, without those that cannot be or lie elsewhere, 1 ms apart or more.
+
+    Raises BadClip where most of them cannot be.
+    """
+    done: list[Repair] = []
+    if (np.diff(times_s) < 0.0).any():
+        late = times_s < np.maximum.accumulate(times_s)
+        was = f"{late.sum()} poses out of order"
+        done.append(Repair("clock", EGO, float(times_s[late][0]), was, "by their stamps"))
+        order = np.argsort(times_s, kind="stable")
+        times_s, poses = times_s[order], poses[order]
+    keep = distinct_time_indices(times_s)
+    times_s, poses = times_s[keep], poses[keep]
+    boxes = np.ones((len(poses), 9))
+    boxes[:, :3], boxes[:, 3] = poses[:, 4:], headings_of(poses)
+    left, repairs = whole_frames(times_s, boxes)
+    if left.sum() <= MOST * len(left):
+        raise BadClip(str(path), " ".join(POSE_COLUMNS), f"{(~left).sum()} of {len(left)} poses cannot be")
+    return times_s[left], poses[left], (*done, *repairs)
+
+
+def is_rotation(poses: Array) -> Bools:
+    """(n,) of poses (n, 7) = qw, qx, qy, qz, ...: whether the quaternion is of unit length."""
+    return np.asarray(np.abs(np.linalg.norm(poses[:, :4], axis=1) - 1.0) <= UNIT_SLACK)
 
 
 def ego_states_at(motion: LogMotion, times_s: Array) -> Array:
     """Ego states (S, 11) at times (S,): pose by linear interpolation, velocity and acceleration by a quadratic fit.
 
-    The fit takes the poses within +-0.3 s; steering and rates are 0; slower than 0.1 m/s is standing. Raises BadClip
-    where the poses are too sparse to fit.
+    The fit takes the poses within +-0.3 s; steering and rates are 0; slower than 0.1 m/s is standing. NaN where there
+    are fewer than four of them.
     """
     states = np.zeros((len(times_s), EGO_STATE_SIZE))
     for column, known in ((X, motion.positions[:, 0]), (Y, motion.positions[:, 1]), (HEADING, motion.yaws)):
@@ -189,7 +229,8 @@ def ego_states_at(motion: LogMotion, times_s: Array) -> Array:
         offset = motion.pose_times_s - time
         near = np.abs(offset) <= EGO_FIT_HALF_WINDOW_S + ROUNDING_S
         if near.sum() < 4:
-            raise BadClip(str(motion.folder / POSES), "timestamp_ns", f"fewer than 4 poses around {time:.1f} s")
+            state[:] = np.nan
+            continue
         basis = np.vander(offset[near], 3, increasing=True)
         fit = np.linalg.lstsq(basis, motion.positions[near, :2] - state[[X, Y]], rcond=None)[0]
         velocity, acceleration = fit[1], 2.0 * fit[2]
@@ -273,54 +314,48 @@ def _tracks(
     path: Path,
     table: Mapping[str, NDArray[np.generic]],
     times_s: Array,
+    frame_times_s: Array,
     pose_times_s: Array,
     positions: Array,
     city_from_ego: Rotation,
-) -> tuple[BoxTrack, ...]:
-    """Annotated boxes, given in the ego frame of their stamp, as tracks in the city frame."""
-    unknown = set(table["category"].astype(str).tolist()) - KIND_OF_CATEGORY.keys()
-    if unknown:
+) -> tuple[tuple[BoxTrack, ...], tuple[Repair, ...]]:
+    """Annotated boxes, given in the ego frame of their stamp, as tracks in the city frame, repaired."""
+    kinds = [KIND_OF_CATEGORY.get(str(name)) for name in table["category"]]
+    unknown = {str(name) for name, kind in zip(table["category"], kinds) if kind is None}
+    if kinds.count(None) > MOST * len(kinds):
         raise BadClip(str(path), "category", f"unknown class {sorted(unknown)}")
-    sizes = numbers(path, table, SIZE_COLUMNS)
-    if (sizes <= 0.0).any():
-        raise BadClip(str(path), " ".join(SIZE_COLUMNS), "a box has a size that is not positive")
     poses = numbers(path, table, POSE_COLUMNS)
     ego = _nearest(pose_times_s, times_s)
-    centers = city_from_ego[ego].apply(poses[:, 4:]) + positions[ego]
-    headings = yaw_of(city_from_ego[ego] * rotations(path, poses))
+    boxes = np.zeros((len(times_s), 9))
+    boxes[:, :3] = city_from_ego[ego].apply(poses[:, 4:]) + positions[ego]
+    boxes[:, 3] = headings_of(poses, city_from_ego[ego])
+    boxes[:, 4:7] = numbers(path, table, SIZE_COLUMNS)
+    ids = [id_text(name) for name in table["track_uuid"].tolist()]
+    at = _nearest(pose_times_s, frame_times_s)
+    ego_poses = np.column_stack([positions[at, :2], yaw_of(city_from_ego[at])])
+    return repaired_tracks(frame_times_s, times_s, ids, kinds, boxes, ego_poses)
 
-    kinds = [KIND_OF_CATEGORY[str(name)] for name in table["category"]]
-    return tracks_of(path, "track_uuid", table["track_uuid"].astype(str), kinds, times_s, centers, headings, sizes)
 
-
-def tracks_of(
-    path: Path,
-    field: str,
-    ids: NDArray[np.str_],
-    kinds: Sequence[AgentKind],
+def repaired_tracks(
+    frame_times_s: Array,
     times_s: Array,
-    centers: Array,
-    headings: Array,
-    sizes: Array,
-) -> tuple[BoxTrack, ...]:
-    """n boxes, in any order, as tracks ordered by id; a track is of its first box's kind.
+    ids: Sequence[str | None],
+    kinds: Sequence[AgentKind | None],
+    boxes: Array,
+    ego_poses: Array,
+) -> tuple[tuple[BoxTrack, ...], tuple[Repair, ...]]:
+    """n boxes as tracks ordered by id, and what was repaired; arguments as of tasks.world.repair.tracks.observed.
 
-    ids: (n,), named `field` in errors; centers, sizes: (n, 3). Raises BadClip where a track stands twice in one frame.
+    ego_poses: (F, 3) at the frames.
     """
-    if len(ids) == 0:
-        return ()
-    order = np.lexsort((times_s, ids))
-    groups = np.split(order, np.flatnonzero(ids[order][1:] != ids[order][:-1]) + 1)
+    seen, unnamed = observed(frame_times_s, times_s, ids, kinds, boxes)
+    seen, repairs = repaired(seen, ego_poses)
     tracks = []
-    for rows in groups:
-        track_id = str(ids[rows[0]])
-        if not track_id.strip():
-            raise BadClip(str(path), field, f"a box at {times_s[rows[0]]:.1f} s has an empty one")
-        if (np.diff(times_s[rows]) <= 0.0).any():
-            raise BadClip(str(path), field, f"track {track_id} stands twice in one frame")
-        kind = kinds[rows[0]]
-        tracks.append(BoxTrack(track_id, kind, times_s[rows], centers[rows], np.unwrap(headings[rows]), sizes[rows]))
-    return tuple(tracks)
+    for n, (track_id, kind) in enumerate(zip(seen.track_ids, seen.kinds)):
+        frames = seen.frames(n)
+        box = seen.boxes[frames, n]
+        tracks.append(BoxTrack(track_id, kind, frame_times_s[frames], box[:, :3], np.unwrap(box[:, 3]), box[:, 4:7]))
+    return tuple(tracks), (*unnamed, *repairs)
 
 
 def _track_velocities(track: BoxTrack, half_window_s: float) -> Array:
@@ -470,8 +505,9 @@ class AV2Reader(LogReader[AV2Log]):
         map_file(path)
         motion = read_motion(path)
         times_s = step_times(0, motion.n_steps)
-        segment = np.where(observed_at(motion, times_s), 0, -1)
-        return LoggedDrive(ego_states_at(motion, times_s), agents_at(motion, times_s), segment)
+        states = ego_states_at(motion, times_s)
+        segment = np.where(observed_at(motion, times_s) & np.isfinite(states).all(axis=1), 0, -1)
+        return LoggedDrive(states, agents_at(motion, times_s), segment)
 
     def load(self, path: Path) -> AV2Log:
         """The log in this folder. Raises BadClip."""
@@ -526,7 +562,7 @@ def read_log(folder: Path) -> AV2Log:
         ego_states=ego_states,
         agents=agents_at(motion, times_s),
         road_map=road_map,
-        route=route_of_drive(road_map, ego_states[:, :3], str(vector_map), "lane_segments"),
+        route=route_of_drive(road_map, ego_states[np.isfinite(ego_states[:, X]), :3], str(vector_map), "lane_segments"),
         lights=read_lights(folder, road_map, motion, times_s),
         cameras=cameras,
         images=tuple(chain(*(_stamped(motion, c.name, sensors / "cameras" / c.name, ".jpg") for c in cameras))),
@@ -534,6 +570,7 @@ def read_log(folder: Path) -> AV2Log:
         licence=_licence(folder),
         content_digest=content_digest(folder),
         split=folder_split(folder),
+        repairs=motion.repairs,
     )
 
 

@@ -5,9 +5,8 @@ navsim/common/dataclasses.py); keys it does not read are not looked at. The pick
 (`factory.readers.pickles`).
 """
 
-from collections.abc import Mapping, Sequence, Sized
+from collections.abc import Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,8 @@ from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.clip import AgentKind
 from tasks.world.frames import to_local, wrap_angle
+from tasks.world.repair.records import LEFT_OUT, Repair
+from tasks.world.repair.tracks import MOST
 
 # Values out of a pickled dict, checked one by one: what is wrong names file, frame and key.
 
@@ -68,8 +69,8 @@ class CheckedValues:
             raise self.bad(key, f"is {shown(value)}, expected a whole number")
         return int(value)
 
-    def numbers(self, key: str, shape: tuple[int | None, ...]) -> Array:
-        """A list or an array of finite numbers as float64, never a view of another's; None: any length.
+    def numbers(self, key: str, shape: tuple[int | None, ...], whole: bool = True) -> Array:
+        """A list or an array of numbers as float64, never a view of another's; None: any length; whole: finite ones.
 
         Raises BadClip.
         """
@@ -82,15 +83,20 @@ class CheckedValues:
             array = array.reshape(0, *(n or 0 for n in shape[1:]))
         if array.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, array.shape)):
             raise self.bad(key, f"shape {array.shape}, expected ({', '.join(str(n or 'N') for n in shape)})")
-        if not np.isfinite(array).all():
+        if whole and not np.isfinite(array).all():
             raise self.bad(key, "holds NaN or infinity")
         return array
 
-    def texts(self, key: str) -> tuple[str, ...]:
-        """A list, tuple or array of text. Raises BadClip."""
+    def items_of(self, key: str) -> tuple[Any, ...]:
+        """What a list, tuple or array holds. Raises BadClip."""
         value = self.get(key)
         if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray):
             raise self.bad(key, f"is a {type(value).__name__}, expected a list of text")
+        return tuple(value)
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        """A list, tuple or array of text. Raises BadClip."""
+        value = self.items_of(key)
         for item in value:
             if not isinstance(item, str):
                 raise self.bad(key, f"holds {shown(item)}, expected text")
@@ -102,6 +108,7 @@ COMMANDS = ("left", "straight", "right", "unknown")  # the one-hot's order; NAVS
 KIND_OF_NAME = {kind.value.lower(): kind for kind in AgentKind}  # vehicle, pedestrian, ..., generic_object
 LOCATION_OF_ALIAS = {"las_vegas": "us-nv-las-vegas-strip"}
 UNIT_SLACK = 1e-3  # of a quaternion's length
+FRAME_US = 500_000
 
 
 @dataclass(frozen=True)
@@ -143,51 +150,85 @@ class Frame:
     cameras: tuple[FrameCamera, ...]  # in the order of CAMERA_NAMES; those that the log gives a picture of
     lidar_path: str | None  # of the merged sweep below the folder of sensor blobs
     boxes: FrameBoxes | None  # None: nobody annotated the frame
+    repairs: tuple[Repair, ...] = ()  # of its boxes, at time 0
 
 
 @dataclass(frozen=True)
 class LogFrames:
-    """The frames of one log in time order, timestamps strictly increasing."""
+    """The frames of one log in time order, timestamps strictly increasing.
+
+    One that cannot be read stands as a frame that nobody annotated, which no clip holds.
+    """
 
     file: str
     name: str
     frames: tuple[Frame, ...]  # one or more
 
 
-def read_frames(path: Path) -> LogFrames:
-    """The log in this pickle. Raises BadClip, naming frame and key."""
-    return parse_frames(load_plain(bytes_of(path), str(path)), path)
+def read_frames(path: Path, whole: bool = True) -> LogFrames:
+    """The log in this pickle; whole: as of parse_frames. Raises BadClip, naming frame and key."""
+    return parse_frames(load_plain(bytes_of(path), str(path)), path, whole)
 
 
-def parse_frames(value: Any, path: Path) -> LogFrames:
-    """What a log's pickle holds, checked. Raises BadClip."""
+def parse_frames(value: Any, path: Path, whole: bool = True) -> LogFrames:
+    """What a log's pickle holds, checked. Raises BadClip.
+
+    whole: every frame and box has to be right. Else boxes and frames that are not are left out, and the log is refused
+    where that is most of its frames.
+    """
     file = str(path)
     if not isinstance(value, list) or not value:
         raise BadClip(file, "frames", f"holds a {type(value).__name__}, expected a list of frames, one or more")
-    frames = tuple(parse_frame(item, file, f"frames[{i}].") for i, item in enumerate(value))
-    for i, (before, frame) in enumerate(pairwise(frames), 1):
-        if frame.timestamp_us <= before.timestamp_us:
-            raise BadClip(file, f"frames[{i}].timestamp", "time does not go on")
-    for i, frame in enumerate(frames):
-        if frame.log_name != path.stem:  # NAVSIM finds logs by the one and scenes by the other
-            problem = f"is {shown(frame.log_name)}, but the file is named {path.stem!r}: rename the file"
-            raise BadClip(file, f"frames[{i}].log_name", problem)
-    if len({frame.map_location for frame in frames}) > 1:
+    frames: dict[int, Frame] = {}
+    wrong: dict[int, BadClip] = {}
+    for i, item in enumerate(value):
+        try:
+            frames[i] = parse_frame(item, file, f"frames[{i}].", whole)
+        except BadClip as error:
+            wrong[i] = error
+    for i, problem in _out_of_place(frames, path):
+        wrong[i] = problem
+        frames.pop(i, None)
+    if wrong and (whole or len(wrong) > MOST * len(value)):
+        raise wrong[min(wrong)]
+    if len({frame.map_location for frame in frames.values()}) > 1:
         raise BadClip(file, "map_location", "changes within the log")
-    tokens = [frame.token for frame in frames]
-    if len(set(tokens)) < len(tokens):
-        raise BadClip(file, "token", f"{next(t for t in tokens if tokens.count(t) > 1)} stands twice")
-    return LogFrames(file, path.stem, frames)
+    known = np.array(sorted(frames))
+    for i in sorted(wrong):
+        near = frames[int(known[np.argmin(np.abs(known - i))])]
+        stamp = near.timestamp_us + FRAME_US * (i - int(known[np.argmin(np.abs(known - i))]))
+        frames[i] = replace(near, token=f"unreadable-{i}", timestamp_us=stamp, cameras=(), lidar_path=None, boxes=None)
+    return LogFrames(file, path.stem, tuple(frames[i] for i in range(len(value))))
 
 
-def parse_frame(item: Any, file: str, place: str) -> Frame:
-    """One frame's dict, checked; `place` names it in errors. Raises BadClip."""
+def _out_of_place(frames: Mapping[int, Frame], path: Path) -> Iterator[tuple[int, BadClip]]:
+    """The frames that do not belong where they stand, and why."""
+    file = str(path)
+    last: Frame | None = None
+    seen: set[str] = set()
+    for i in sorted(frames):
+        frame = frames[i]
+        if last is not None and frame.timestamp_us <= last.timestamp_us:
+            yield i, BadClip(file, f"frames[{i}].timestamp", "time does not go on")
+        elif frame.log_name != path.stem:  # NAVSIM finds logs by the one and scenes by the other
+            problem = f"is {shown(frame.log_name)}, but the file is named {path.stem!r}: rename the file"
+            yield i, BadClip(file, f"frames[{i}].log_name", problem)
+        elif frame.token in seen:
+            yield i, BadClip(file, "token", f"{frame.token} stands twice")
+        else:
+            last = frame
+            seen.add(frame.token)
+
+
+def parse_frame(item: Any, file: str, place: str, whole: bool = True) -> Frame:
+    """One frame's dict, checked; `place` names it in errors; whole: as of parse_frames. Raises BadClip."""
     if not isinstance(item, Mapping):
         raise BadClip(file, place.rstrip("."), f"is a {type(item).__name__}, expected a dict")
     values = CheckedValues(item, file, place)
     translation = values.numbers("ego2global_translation", (3,))
     pose, world_from_ego = parse_pose(values, "ego2global_rotation", translation)
     location, lidar_path = values.text("map_location"), values.get("lidar_path")  # None or empty: no lidar
+    boxes, repairs = parse_boxes(values.inner("anns"), whole=whole) if item.get("anns") is not None else (None, ())
     return Frame(
         token=values.text("token"),
         timestamp_us=values.integer("timestamp"),
@@ -202,7 +243,8 @@ def parse_frame(item: Any, file: str, place: str) -> Frame:
         command=parse_command(values),
         cameras=parse_cameras(values.inner("cams")),
         lidar_path=None if lidar_path is None else values.text("lidar_path", may_be_empty=True) or None,
-        boxes=parse_boxes(values.inner("anns")) if item.get("anns") is not None else None,
+        boxes=boxes,
+        repairs=repairs,
     )
 
 
@@ -273,30 +315,49 @@ def parse_cameras(cams: CheckedValues) -> tuple[FrameCamera, ...]:
     return tuple(found)
 
 
-def parse_boxes(anns: CheckedValues, names: Mapping[str, str] | None = None) -> FrameBoxes:
-    """`anns`: five keys of equal length. Raises BadClip.
+def parse_boxes(
+    anns: CheckedValues, names: Mapping[str, str] | None = None, whole: bool = True
+) -> tuple[FrameBoxes, tuple[Repair, ...]]:
+    """`anns`: five keys of equal length, and what was left out; whole: nothing is. Raises BadClip.
 
-    names: other names of the five keys, as those of NAVSIM's own `Annotations`.
+    names: other names of the five keys, as those of NAVSIM's own `Annotations`. Without `whole` values may be NaN or
+    impossible, and boxes without a token, of no known class, or with the token of another are left out.
     """
     key = {name: (names or {}).get(name, name) for name in ("gt_boxes", "gt_names", "gt_velocity_3d")}
-    boxes = anns.numbers(key["gt_boxes"], (None, 7))
+    boxes = anns.numbers(key["gt_boxes"], (None, 7), whole)
     n = len(boxes)
-    velocities = anns.numbers(key["gt_velocity_3d"], (None, 3))
-    kinds = anns.texts(key["gt_names"]) if n else ()
-    tracks, instances = anns.texts("track_tokens"), anns.texts("instance_tokens")
-    rows: dict[str, Sized] = {key["gt_velocity_3d"]: velocities, key["gt_names"]: kinds, "track_tokens": tracks}
+    velocities = anns.numbers(key["gt_velocity_3d"], (None, 3), whole)
+    classes = anns.items_of(key["gt_names"]) if n else ()
+    texts = anns.texts if whole else anns.items_of
+    tokens, instances = texts("track_tokens"), texts("instance_tokens")
+    rows: dict[str, Sized] = {key["gt_velocity_3d"]: velocities, key["gt_names"]: classes, "track_tokens": tokens}
     for name, column in {**rows, "instance_tokens": instances}.items():
         if len(column) != n:
             raise anns.bad(name, f"{len(column)} entries, but {n} boxes")
-    if unknown := sorted(set(kinds) - KIND_OF_NAME.keys()):
-        raise anns.bad(key["gt_names"], f"unknown class {', '.join(unknown)}; known: {', '.join(KIND_OF_NAME)}")
-    if not all(track.strip() for track in tracks):
-        raise anns.bad("track_tokens", "holds an empty token, which tells no objects apart")
-    if len(set(tracks)) < n:
-        raise anns.bad("track_tokens", f"{next(t for t in tracks if tracks.count(t) > 1)} stands twice in one frame")
-    if (boxes[:, 3:6] <= 0.0).any():
+    if whole and (boxes[:, 3:6] <= 0.0).any():
         raise anns.bad(key["gt_boxes"], "a box has a size that is not positive")
-    return FrameBoxes(boxes, tuple(KIND_OF_NAME[kind] for kind in kinds), velocities, tracks)
+    left: dict[str, int] = {}
+    repairs: list[Repair] = []
+    for row, (token, kind) in enumerate(zip(tokens, classes)):
+        known = ", ".join(KIND_OF_NAME)
+        if not isinstance(token, str) or not token.strip():
+            repairs.append(Repair("token", f"box {row}", 0.0, f"the token {shown(token)}", LEFT_OUT))
+            problem = "track_tokens", "holds an empty token, which tells no objects apart"
+        elif not isinstance(kind, str) or kind not in KIND_OF_NAME:
+            repairs.append(Repair("class", token, 0.0, f"the class {shown(kind)}", LEFT_OUT))
+            problem = key["gt_names"], f"unknown class {kind if isinstance(kind, str) else shown(kind)}; known: {known}"
+        elif token in left:
+            repairs.append(Repair("twice", token, 0.0, "two boxes of one frame", "the first of them"))
+            problem = "track_tokens", f"{token} stands twice in one frame"
+        else:
+            left[str(token)] = row
+            continue
+        if whole:
+            raise anns.bad(*problem)
+    at = list(left.values())
+    return FrameBoxes(boxes[at], tuple(KIND_OF_NAME[classes[i]] for i in at), velocities[at], tuple(left)), tuple(
+        repairs
+    )
 
 
 # A scene of NAVSIM's second stage: the pickle that `Scene.save_to_disk` writes, read without nuPlan's devkit.
@@ -306,7 +367,6 @@ def parse_boxes(anns: CheckedValues, names: Mapping[str, str] | None = None) -> 
 # no class is imported, and one that is not listed here is refused.
 
 HISTORY_FRAMES, FUTURE_FRAMES = 4, 8
-FRAME_US = 500_000
 PATHS = ("pathlib PosixPath", "pathlib PurePosixPath", "pathlib._local PosixPath")
 CLASSES = (
     *PATHS,
@@ -409,7 +469,7 @@ def _frame(values: CheckedValues, about: CheckedValues, *, as_shown: bool) -> Fr
             CheckedValues(_paths_as_text(values.get("camera_dict")), values.file, f"{values.place}camera_dict.")
         ),
         lidar_path=None,
-        boxes=None if as_shown else parse_boxes(values.inner("annotations"), ANNOTATIONS),
+        boxes=None if as_shown else parse_boxes(values.inner("annotations"), ANNOTATIONS)[0],
     )
 
 

@@ -29,6 +29,7 @@ from factory.datasets.navsim.window import (
     WINDOW_FRAMES,
     cameras_with_pictures,
     ego_states,
+    repaired_frames,
     road_around,
     sensor_files,
     stretch_agents,
@@ -64,6 +65,7 @@ from tasks.caches import user_cache, with_checksum, without_checksum
 from tasks.kernels.compiled import write_whole
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import NOW, Block, Camera, Clip, SensorFile
+from tasks.world.repair.records import later
 
 # NAVSIM's scene filters and splits: the YAML files that name which windows of which logs count.
 #
@@ -239,7 +241,7 @@ def _texts(value: object, where: str) -> tuple[str, ...]:
 # A log of OpenScene takes a second to open, and navtrain names 1,192 of them. So what the choice needs is kept, a
 # small table a log, in the user's cache; it is made again where the log's size or time of change is another.
 
-TABLE_VERSION = 4  # of the tables kept
+TABLE_VERSION = 5  # of the tables kept
 FRAME_S, SLACK_S = 0.5, 0.05  # between two frames; more or less is a gap
 GAP, SHORT_HISTORY, SHORT_FUTURE = "gap_in_frames", "short_history", "short_future"
 NO_ROUTE, NO_BOXES, STANDING, ABSENT = "no_route", "not_annotated", "ego_standing", "absent_token"
@@ -333,7 +335,7 @@ def cached_or_read_table(path: Path) -> FrameTable:
 
 def read_and_cache_table(path: Path, cache_dir: Path) -> FrameTable:
     """The table of the log at `path`, read and kept. Raises BadClip."""
-    table = frame_table(read_frames(path))
+    table = frame_table(read_frames(path, whole=False))
     cache_table(table, path, cache_dir)
     return table
 
@@ -529,6 +531,7 @@ class NavsimReader:
         window, now = frames[start : start + WINDOW_FRAMES], start + FRAMES_BEFORE
         if any(frame.boxes is None for frame in window):
             raise BadClip(opened.log.file, f"frames[{start}].anns", "missing: nobody annotated the window")
+        window, repairs = repaired_frames(window)
         states = ego_states(window)
         road = road_around(self.maps, frames[now], states[:, :2], states[NOW, :3], opened.log.file, now)
         images: tuple[SensorFile, ...] = ()
@@ -563,6 +566,7 @@ class NavsimReader:
             licence=LICENCE,
             frame_tokens=(frames[now].token, frames[now + HORIZON_FRAMES].token),
             content_digest=digest_with(opened.content_digest, self._others(ref), self._log_digest),
+            repairs=tuple(later(repair, ref.start_ms / 1000) for repair in repairs),
         )
         return validate_clip(clip, opened.log.file)
 
@@ -646,7 +650,7 @@ class NavsimReader:
         if ref.log_id not in self._logs:
             path = self._path_of(ref)
             data = bytes_of(path)
-            log = parse_frames(load_plain(data, str(path)), path)
+            log = parse_frames(load_plain(data, str(path)), path, whole=False)
             table = frame_table(log)
             opened = OpenLog(log, table, _digest(data, map_file(self.maps, table.location)))
             self._logs = dict([*self._logs.items(), (ref.log_id, opened)][-(CACHED_LOGS + self.traversals) :])
@@ -694,7 +698,11 @@ class NavsimReader:
             blobs = sensor_files(frames, self.sensors)
             if blobs.images or blobs.sweeps:
                 cameras = cameras_with_pictures(frames[len(frames) // 2], blobs.images, opened.log.file)
-                others.append(OtherDrive(other.log_id, stretch_agents(frames), cameras, blobs.images, blobs.sweeps))
+                others.append(
+                    OtherDrive(
+                        other.log_id, stretch_agents(repaired_frames(frames)[0]), cameras, blobs.images, blobs.sweeps
+                    )
+                )
         return with_other_drives(block, others) if others else block
 
     def _block(self, opened: OpenLog, start: int) -> Block:
@@ -704,7 +712,7 @@ class NavsimReader:
         frames = opened.log.frames[first:stop]
         blobs = sensor_files(frames, self.sensors)
         start_s = float(opened.table.start_ms[first]) / 1000
-        return Block(start_s, stretch_agents(frames), blobs.images, blobs.sweeps)
+        return Block(start_s, stretch_agents(repaired_frames(frames)[0]), blobs.images, blobs.sweeps)
 
 
 def log_files(root: Path) -> dict[str, Path]:

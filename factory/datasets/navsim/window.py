@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from factory.datasets.navsim.log import Frame
+from factory.datasets.navsim.log import Frame, FrameBoxes
 from factory.datasets.navsim.maps import open_city
 from factory.datasets.navsim.settings import FRAME_STEPS
 from factory.readers.base import BadClip
@@ -30,6 +30,7 @@ from tasks.world.clip import (
     HISTORY_STEPS,
     HORIZON_STEPS,
     MOVING_KINDS,
+    STEP_S,
     AgentKind,
     AgentTracks,
     Camera,
@@ -37,6 +38,8 @@ from tasks.world.clip import (
 )
 from tasks.world.frames import AX, EGO_STATE_SIZE, HEADING, PACIFICA, VX, X, wrap_angle
 from tasks.world.geometry import ego_boxes, touching
+from tasks.world.repair.tracks import HEADING as BOX_HEADING
+from tasks.world.repair.tracks import Repairs, observed, repaired
 from tasks.world.road_map import CenterlineFinder, LightState, NoRoute, RoadMap, Route, TrafficLights
 from tasks.world.roadblocks import corrected_roadblocks, route_of_roadblocks
 
@@ -59,6 +62,41 @@ class SeenBoxes:
     def valid(self) -> Bools:
         """(F, N)"""
         return np.isfinite(self.linear[..., 0])
+
+
+def repaired_frames(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], Repairs]:
+    """Frames 0.5 s apart with their boxes repaired, and what was done, timed since the first of them."""
+    times_s = np.arange(len(frames), dtype=np.float64) * (STEP_S * FRAME_STEPS)
+    boxes, ids, kinds = [np.zeros((0, 9))], list[str](), list[AgentKind]()
+    counts = [0 if frame.boxes is None else len(frame.boxes.kinds) for frame in frames]
+    for frame in frames:
+        if frame.boxes is not None:
+            linear = _in_world(frame)
+            boxes.append(
+                np.column_stack([linear[:, [0, 1, HEIGHT_AT, 2]], frame.boxes.boxes[:, 3:6], linear[:, VELOCITY]])
+            )
+            ids += frame.boxes.track_tokens
+            kinds += frame.boxes.kinds
+    seen, _ = observed(times_s, times_s[np.repeat(np.arange(len(frames)), counts)], ids, kinds, np.concatenate(boxes))
+    seen, repairs = repaired(seen, np.array([frame.pose for frame in frames]))
+    at_parse = (replace(one, time_s=float(t)) for frame, t in zip(frames, times_s) for one in frame.repairs)
+    first = np.cumsum([0, *counts])
+    out = []
+    for i, frame in enumerate(frames):
+        if frame.boxes is None:
+            out.append(frame)
+            continue
+        rows = seen.rows[i]
+        here = np.flatnonzero(rows >= 0)
+        here = here[np.argsort(rows[here])]
+        at = rows[here] - first[i]
+        own = frame.boxes.boxes[at]
+        turned = np.cos(seen.boxes[i, here, BOX_HEADING] - frame.pose[2] - own[:, 6]) < 0.0
+        own[turned, 6] = wrap_angle(own[turned, 6] + np.pi)
+        tokens = tuple(seen.track_ids[n] for n in here)
+        kept = FrameBoxes(own, tuple(seen.kinds[n] for n in here), frame.boxes.velocities[at], tokens)
+        out.append(replace(frame, boxes=kept))
+    return tuple(out), (*at_parse, *repairs)
 
 
 def n_steps(n_frames: int) -> int:

@@ -44,9 +44,9 @@ class ArrowFile:
             raise BadClip(str(self.path), "timestamp_us", f"expected int64, found {column.type}")
         return np.asarray(column, np.int64) * US_NS
 
-    def rows(self, name: str, width: int) -> Array:
-        """(n, width) of a column of lists of `width` numbers. Raises BadClip."""
-        return number_lists(self.path, name, self.column(name), width)
+    def rows(self, name: str, width: int, whole: bool = True) -> Array:
+        """(n, width) of a column of lists of `width` numbers; whole: finite ones. Raises BadClip."""
+        return number_lists(self.path, name, self.column(name), width, whole)
 
     def lists(self, name: str) -> tuple[Indices, pa.Array]:
         """(m,) the row of each of the m items that a column of lists holds, and the items. Raises BadClip."""
@@ -113,15 +113,15 @@ def column_without_nulls(path: Path, table: pa.Table, name: str) -> pa.Array:
     return column
 
 
-def number_lists(path: Path, name: str, lists: pa.Array, width: int) -> Array:
-    """(n, width) of n lists of `width` finite numbers. Raises BadClip."""
+def number_lists(path: Path, name: str, lists: pa.Array, width: int, whole: bool = True) -> Array:
+    """(n, width) of n lists of `width` numbers; whole: finite ones. Raises BadClip."""
     if not pa.types.is_fixed_size_list(lists.type) or lists.type.list_size != width or lists.null_count:
         raise BadClip(str(path), name, f"expected lists of {width} numbers, found {lists.type}")
     values = lists.flatten()
     if values.null_count or not pa.types.is_floating(values.type):
         raise BadClip(str(path), name, "holds nulls or no numbers")
     out = np.asarray(values, np.float64).reshape(-1, width)
-    if not np.isfinite(out).all():
+    if whole and not np.isfinite(out).all():
         raise BadClip(str(path), name, "holds NaN or infinity")
     return out
 

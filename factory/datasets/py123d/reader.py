@@ -15,20 +15,23 @@ from factory.datasets.av2.reader import (
     BLOCK_STEPS,
     BLOCK_STRIDE_STEPS,
     EGO_FIT_HALF_WINDOW_S,
+    FILLED_S,
     MIN_POSE_SPACING_S,
     ROUNDING_S,
     SAME_FRAME_S,
     BoxTrack,
     LogMotion,
     agents_at,
-    distinct_time_indices,
+    clock_repairs,
     ego_states_at,
+    headings_of,
     observed_at,
+    repaired_tracks,
     rotations,
     seconds_since,
     seen_at,
     step_times,
-    tracks_of,
+    whole_poses,
     world_from_ego_at,
     yaw_of,
 )
@@ -60,6 +63,8 @@ from factory.wording import shown
 from tasks.world.arrays import Array, Indices
 from tasks.world.clip import STEP_S, AgentKind, Camera, SensorFile
 from tasks.world.frames import EGO_STATE_SIZE
+from tasks.world.repair.records import Repair
+from tasks.world.repair.tracks import MOST
 from tasks.world.road_map import LightState, RoadMap, TrafficLights
 
 # What moves in a log of 123D, at steps of 0.1 s: rear-axle poses, boxes, lights.
@@ -99,18 +104,21 @@ def read_motion(folder: Path) -> LogMotion:
     start_ns = int(frame_stamps[row[boxed[0]]])
     times_s = seconds_since(start_ns, frame_stamps)
     frames = np.unique(times_s[row[boxed[0]] : row[boxed[-1]] + 1])
-    keep = distinct_time_indices(seconds_since(start_ns, pose_stamps))
-    world_from_rear, positions = _rear_axle(ego)
+    pose_times, world_from_rear, positions, ego_repairs = _rear_axle(ego, seconds_since(start_ns, pose_stamps))
+    at = np.clip(np.searchsorted(pose_times, frames), 0, len(pose_times) - 1)
+    ego_poses = np.column_stack([positions[at, :2], yaw_of(world_from_rear[at])])
+    tracks, repairs = _tracks(boxes, row, values, boxed, times_s, frames, ego_poses)
     return LogMotion(
         folder=folder,
         start_ns=start_ns,
         frame_times_s=frames,
-        pose_times_s=seconds_since(start_ns, pose_stamps[keep]),
-        positions=positions[keep],
-        rotations=world_from_rear[keep],
-        yaws=np.unwrap(yaw_of(world_from_rear[keep])),
-        tracks=_tracks(boxes, row, values, boxed, times_s),
+        pose_times_s=pose_times,
+        positions=positions,
+        rotations=world_from_rear,
+        yaws=np.unwrap(yaw_of(world_from_rear)),
+        tracks=tracks,
         fill_s=_max_filled_gap_s(boxes, frames),
+        repairs=(*clock_repairs(frames), *ego_repairs, *repairs),
     )
 
 
@@ -183,52 +191,58 @@ def pose_matrices(path: Path, poses: Array) -> Array:
     return out
 
 
-def _rear_axle(ego: ArrowFile) -> tuple[Rotation, Array]:
-    """Rotations and positions (n, 3) of the rear axle from the IMU's. Raises BadClip."""
-    poses, mount = ego.rows("imu_se3", 7), ego.vector("rear_axle_to_imu_se3", 7)
-    world_from_imu = rotations(ego.path, poses[:, 3:])
+def _rear_axle(ego: ArrowFile, times_s: Array) -> tuple[Array, Rotation, Array, tuple[Repair, ...]]:
+    """Times (P,), rotations and positions (P, 3) of the rear axle from the IMU's, repaired. Raises BadClip."""
+    poses, mount = ego.rows("imu_se3", 7, whole=False), ego.vector("rear_axle_to_imu_se3", 7)
+    times_s, poses, repairs = whole_poses(ego.path, times_s, poses[:, [3, 4, 5, 6, 0, 1, 2]])
+    world_from_imu = rotations(ego.path, poses)
     turned = rotations(ego.path, mount[None, 3:])[0]
-    return world_from_imu * turned, world_from_imu.apply(mount[:3]) + poses[:, :3]
+    return times_s, world_from_imu * turned, world_from_imu.apply(mount[:3]) + poses[:, 4:], repairs
 
 
-def _tracks(boxes: ArrowFile, row: Indices, values: pa.Array, boxed: Indices, times_s: Array) -> tuple[BoxTrack, ...]:
+def _tracks(
+    boxes: ArrowFile,
+    row: Indices,
+    values: pa.Array,
+    boxed: Indices,
+    times_s: Array,
+    frame_times_s: Array,
+    ego_poses: Array,
+) -> tuple[tuple[BoxTrack, ...], tuple[Repair, ...]]:
     """Tracks of the boxes numbered `boxed`; row: (m,) the frame of each box, times_s: of the frames."""
     path = boxes.path
     (id_row, ids), (kind_row, labels) = boxes.lists("track_token"), boxes.lists("label")
-    if not (np.array_equal(row, id_row) and np.array_equal(row, kind_row)) or ids.null_count or labels.null_count:
+    if not (np.array_equal(row, id_row) and np.array_equal(row, kind_row)):
         raise BadClip(str(path), "track_token label", "not one of each for every box")
-    box = number_lists(path, "bounding_box_se3", values, 10)[boxed]
-    if (box[:, 7:] <= 0.0).any():
-        raise BadClip(str(path), "bounding_box_se3", "a box has a size that is not positive")
+    box = number_lists(path, "bounding_box_se3", values, 10, whole=False)[boxed]
     named = [id_text(token) for token in ids.to_pylist()]
-    if None in named:
-        frame = int(row[named.index(None)])
-        raise BadClip(str(path), "track_token", f"frame {frame} has a box that no token names: it is empty or no text")
-    tokens = np.array(named, dtype=np.str_)[boxed]
-    kinds = _kinds(boxes, np.asarray(labels, np.int64)[boxed])
-    headings = yaw_of(rotations(path, box[:, 3:7]))
-    return tracks_of(path, "track_token", tokens, kinds, times_s[row[boxed]], box[:, :3], headings, box[:, 7:])
+    kinds = _kinds(boxes, labels)
+    of_frames = np.zeros((len(boxed), 9))
+    of_frames[:, :3], of_frames[:, 3], of_frames[:, 4:7] = box[:, :3], headings_of(box[:, 3:7]), box[:, 7:]
+    chosen = [named[i] for i in boxed], [kinds[i] for i in boxed]
+    return repaired_tracks(frame_times_s, times_s[row[boxed]], *chosen, of_frames, ego_poses)
 
 
-def _kinds(boxes: ArrowFile, labels: Indices) -> list[AgentKind]:
+def _kinds(boxes: ArrowFile, labels: pa.Array) -> list[AgentKind | None]:
     name = str(boxes.value("box_detection_label_class", str)).rpartition(".")[2]
     if name not in KINDS_OF_LABELS:
         known = ", ".join(KINDS_OF_LABELS)
         raise BadClip(str(boxes.path), "metadata.box_detection_label_class", f"unknown labels {name}; known: {known}")
     kinds = KINDS_OF_LABELS[name]
-    if labels.max() >= len(kinds):
-        raise BadClip(str(boxes.path), "label", f"{labels.max()}: {name} has {len(kinds)}")
-    return [kinds[label] for label in labels.tolist()]
+    found = [kinds[label] if label is not None and label < len(kinds) else None for label in labels.to_pylist()]
+    if found.count(None) > MOST * len(found):
+        raise BadClip(str(boxes.path), "label", f"most are above {len(kinds) - 1}, the last one of {name}")
+    return found
 
 
 def _max_filled_gap_s(boxes: ArrowFile, frames_s: Array) -> float:
-    """The largest gap between two frames that is filled in; 0: none."""
+    """The largest gap between two frames that is filled in."""
     usual_s = float(np.median(np.diff(frames_s))) if len(frames_s) > 1 else 0.0
     if usual_s > MAX_GAP_S:
         raise BadClip(
             str(boxes.path), "timestamp_us", f"frames {usual_s:.2f} s apart; over {MAX_GAP_S} s is too few for 10 Hz"
         )
-    return 0.0 if usual_s <= DENSE_S else FILLED_SPACINGS * usual_s
+    return FILLED_S if usual_s <= DENSE_S else max(FILLED_S, FILLED_SPACINGS * usual_s)
 
 
 # Cameras of a log of 123D, and where its photos lie.
@@ -388,6 +402,7 @@ class Py123dReader(LogReader[Py123dLog]):
             licence=source.licence,
             content_digest=content_digest(header, map_path),
             split=split if split in SPLITS else None,
+            repairs=motion.repairs,
         )
 
     def digest(self, ref: ClipRef) -> str:

@@ -56,6 +56,8 @@ from factory.wording import shown
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import CLIP_STEPS, STEP_S, AgentKind, AgentTracks
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY, X, Y, planar_matrices, wrap_angle
+from tasks.world.repair.records import LEFT_OUT, Repair
+from tasks.world.repair.tracks import EGO, MOST, UNSEEN, ObservedTracks, clock_repairs, repaired, whole_frames
 from tasks.world.road_map import TrafficLights
 
 # ScenarioNet's tracks as 10 Hz arrays: a smooth ego at its rear axle, agents with velocities derived again.
@@ -179,7 +181,12 @@ class LoggedTrack:
     position: Array  # (T, 3)
     heading: Array  # (T,)
     valid: Bools  # (T,)
-    size: Array  # (3,) length, width, height, median over the valid frames; NaN where none is stored
+    sizes: Array  # (T, 3) length, width, height; NaN where none is stored
+
+    @property
+    def size(self) -> Array:
+        """(3,) median over the valid frames; NaN where none is stored."""
+        return np.median(self.sizes[self.valid], axis=0) if self.valid.any() else np.full(3, np.nan)
 
 
 def frame_times(metadata: Mapping[str, Any], n_frames: int, file: str) -> Array:
@@ -207,7 +214,7 @@ def fractional_frame_indices(times: Array) -> Array:
 
 
 def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, file: str) -> LoggedTrack:
-    """One checked track. Raises BadClip naming the field that is missing, misshapen or not finite where valid."""
+    """One track, with what is impossible in its file. Raises BadClip naming what is missing or misshapen."""
     field = f"tracks[{track_id}].state"
     state = tracks[track_id].get("state") if isinstance(tracks[track_id], dict) else None
     if not isinstance(state, dict):
@@ -222,14 +229,11 @@ def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, fi
     if position.shape[1] == 2:
         position = np.column_stack([position, np.zeros(n_frames)])
     heading = _numbers(state["heading"], (n_frames,), file, f"{field}.heading")
-    for name, array in (("position", position), ("heading", heading)):
-        if not np.isfinite(array[valid]).all():
-            raise BadClip(file, f"{field}.{name}", "NaN pose at a valid frame")
-    size = np.full(3, np.nan)
+    sizes = np.full((n_frames, 3), np.nan)
     for column, name in enumerate(("length", "width", "height")):
-        if name in state and valid.any():
-            size[column] = np.median(_numbers(state[name], (n_frames,), file, f"{field}.{name}")[valid])
-    return LoggedTrack(position, heading, valid, size)
+        if name in state:
+            sizes[:, column] = _numbers(state[name], (n_frames,), file, f"{field}.{name}")
+    return LoggedTrack(position, heading, valid, sizes)
 
 
 def ground_height(ego: LoggedTrack, at: Array, file: str) -> Array:
@@ -241,45 +245,68 @@ def ground_height(ego: LoggedTrack, at: Array, file: str) -> Array:
     return resampled(ego, at)[0][:, 2] - ego.size[2] / 2.0
 
 
-def agent_tracks(
-    tracks: Mapping[Any, Any], sdc_id: str, at: Array, n_frames: int, ground: Array, file: str
-) -> AgentTracks:
-    """All tracks but the ego at the fractional frames `at` (S,), heights above `ground` (S,). Raises BadClip."""
-    ids, kinds, rows = [], [], []
+def observed_agents(
+    tracks: Mapping[Any, Any], sdc_id: str, times_s: Array, file: str
+) -> tuple[ObservedTracks, tuple[Repair, ...]]:
+    """All tracks but the ego at the log's frames (T,); those that name no id, no class or no states are left out.
+
+    Raises BadClip where that is most of them.
+    """
+    found: list[tuple[str, AgentKind, LoggedTrack]] = []
+    done: list[Repair] = []
+    wrong: list[BadClip] = []
     for track_id in tracks:
         name = id_text(track_id)
-        if name is None:
-            raise BadClip(file, f"tracks[{shown(track_id)}]", "is no id of a track, expected text or a number")
         if name == sdc_id:
             continue
         kind = tracks[track_id].get("type") if isinstance(tracks[track_id], dict) else None
-        if not isinstance(kind, str) or kind not in KINDS:
-            raise BadClip(file, f"tracks[{name}].type", f"unknown class {shown(kind)}")
-        track = read_track(tracks, track_id, n_frames, file)
-        if not track.valid.any():
+        try:
+            if name is None:
+                raise BadClip(file, f"tracks[{shown(track_id)}]", "is no id of a track, expected text or a number")
+            if not isinstance(kind, str) or kind not in KINDS:
+                raise BadClip(file, f"tracks[{name}].type", f"unknown class {shown(kind)}")
+            track = read_track(tracks, track_id, len(times_s), file)
+        except BadClip as error:
+            what = "token" if name is None else "class" if error.field.endswith(".type") else "impossible"
+            done.append(Repair(what, name or shown(track_id), np.nan, error.problem, LEFT_OUT))
+            wrong.append(error)
             continue
-        if not (np.isfinite(track.size).all() and (track.size[:2] > 0.0).all()):
-            raise BadClip(file, f"tracks[{name}].state", f"length, width, height are {track.size.tolist()}")
-        ids.append(name)
-        kinds.append(KINDS[kind])
-        rows.append(track)
-    valid = np.zeros((len(at), len(rows)), bool)
+        if track.valid.any():
+            found.append((name, KINDS[kind], track))
+    if len(wrong) > MOST * max(len(tracks) - 1, 1):
+        raise wrong[0]
+    boxes = np.zeros((len(times_s), len(found), 9))
+    rows = np.full(boxes.shape[:2], UNSEEN)
+    for n, (_, _, track) in enumerate(found):
+        boxes[:, n, :3], boxes[:, n, 3], boxes[:, n, 4:7] = track.position, track.heading, track.sizes
+        rows[track.valid, n] = n
+    ids, kinds = tuple(name for name, _, _ in found), tuple(kind for _, kind, _ in found)
+    return ObservedTracks(times_s, ids, kinds, boxes, rows), tuple(done)
+
+
+def agent_tracks(seen: ObservedTracks, at: Array, ground: Array) -> AgentTracks:
+    """Tracks at the fractional frames `at` (S,), heights above `ground` (S,)."""
+    valid = np.zeros((len(at), len(seen)), bool)
     boxes, z = np.full((*valid.shape, 5), np.nan), np.full(valid.shape, np.nan)
-    for column, track in enumerate(rows):
-        position, heading, seen = resampled(track, at)
+    heights = np.zeros(len(seen))
+    for n in range(len(seen)):
+        box = seen.boxes[:, n]
+        track = LoggedTrack(box[:, :3], box[:, 3], seen.seen[:, n], box[:, 4:7])
+        position, heading, here = resampled(track, at)
         flat = not track.position[track.valid, 2].any()  # nuPlan stores no height: the box stands on the ground
-        valid[:, column] = seen
-        boxes[seen, column, :2], boxes[seen, column, 2] = position[seen, :2], heading[seen]
-        boxes[seen, column, 3:] = track.size[:2]
-        z[seen, column] = track.size[2] / 2.0 if flat else (position[:, 2] - ground)[seen]
+        valid[:, n] = here
+        boxes[here, n, :2], boxes[here, n, 2] = position[here, :2], heading[here]
+        boxes[here, n, 3:] = track.size[:2]
+        heights[n] = track.size[2]
+        z[here, n] = heights[n] / 2.0 if flat else (position[:, 2] - ground)[here]
     return AgentTracks(
-        track_ids=tuple(ids),
-        kinds=tuple(kinds),
+        track_ids=seen.track_ids,
+        kinds=seen.kinds,
         boxes=boxes,
         velocities=fitted_velocities(boxes[..., :2], valid),
         valid=valid,
         center_z=z,
-        heights=np.array([track.size[2] for track in rows]),
+        heights=heights,
     )
 
 
@@ -611,11 +638,43 @@ def read_motion(scenario: Mapping[str, Any], file: str) -> LoggedDrive:
     named = id_text(sdc_id)
     if named is None or sdc_id not in tracks:
         raise BadClip(file, "metadata.sdc_id", f"missing, or names no track: {shown(sdc_id)}")
-    at = fractional_frame_indices(frame_times(scenario["metadata"], n_frames, file))
-    ego = read_track(tracks, sdc_id, n_frames, file)
+    times_s = frame_times(scenario["metadata"], n_frames, file)
+    at = fractional_frame_indices(times_s)
+    ego, of_ego = whole_ego(read_track(tracks, sdc_id, n_frames, file), times_s, file)
     states, segment = ego_segments(ego, source, at)
     ground = ground_height(ego, at, file)
-    return LoggedDrive(states, agent_tracks(tracks, named, at, n_frames, ground, file), segment)
+    seen, left_out = observed_agents(tracks, named, times_s, file)
+    poses = np.column_stack([ego.position[:, :2], ego.heading])
+    poses[:, :2] -= source.origin_to_rear_axle_m * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
+    poses[~ego.valid] = np.nan
+    seen, repairs = repaired(seen, poses)
+    repairs = (*clock_repairs(times_s), *of_ego, *left_out, *repairs)
+    return LoggedDrive(states, agent_tracks(seen, at, ground), segment, repairs=repairs)
+
+
+def whole_ego(ego: LoggedTrack, times_s: Array, file: str) -> tuple[LoggedTrack, tuple[Repair, ...]]:
+    """The ego without frames that cannot be or lie elsewhere, and with those between two close ones.
+
+    Raises BadClip where most of its frames cannot be.
+    """
+    frames = np.flatnonzero(ego.valid)
+    boxes = np.ones((len(frames), 9))
+    boxes[:, :3], boxes[:, 3] = ego.position[frames], ego.heading[frames]
+    left, repairs = whole_frames(times_s[frames], boxes)
+    if left.sum() <= MOST * len(left):
+        raise BadClip(file, "tracks[sdc].state", f"{(~left).sum()} of {len(left)} poses of the ego cannot be")
+    known = frames[left]
+    valid = np.isin(np.arange(len(times_s)), known)
+    for before, after in pairwise(known.tolist()):
+        if after - before > 1 and times_s[after] - times_s[before] <= MAX_GAP_S:
+            valid[before:after] = True
+            was = f"no pose for {times_s[after] - times_s[before]:.2f} s"
+            repairs += (Repair("gap", EGO, float(times_s[before]), was, "filled in"),)
+    if np.array_equal(valid, ego.valid) and left.all():
+        return ego, repairs
+    heading = np.interp(times_s, times_s[known], np.unwrap(ego.heading[known]))
+    position = np.stack([np.interp(times_s, times_s[known], axis) for axis in ego.position[known].T], axis=1)
+    return replace(ego, position=position, heading=heading, valid=valid), repairs
 
 
 def read_log(path: Path) -> ScenarioLog:
@@ -641,4 +700,5 @@ def read_log(path: Path) -> ScenarioLog:
         licence=source.licence,
         content_digest=digest,
         split=folder_split(path) or nuscenes_split(path.stem) or waymo_split(metadata.get("source_file")),
+        repairs=motion.repairs,
     )

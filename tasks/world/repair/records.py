@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 LEFT_OUT: Final = "left out"
@@ -28,6 +28,11 @@ def repairs_within(repairs: Iterable[Repair], first_s: float, last_s: float) -> 
         for repair in repairs
         if math.isnan(repair.time_s) or (repair.time_s <= last_s and max(repair.time_s, repair.until_s) >= first_s)
     )
+
+
+def later(repair: Repair, seconds: float) -> Repair:
+    """The same, on a clock that begins so much earlier."""
+    return replace(repair, time_s=repair.time_s + seconds, until_s=repair.until_s + seconds)
 
 
 def repair_counts(repairs: Iterable[Repair]) -> dict[str, tuple[int, int]]:

@@ -12,14 +12,18 @@ from scipy.ndimage import median_filter
 from scipy.spatial import cKDTree
 
 from tasks.world.arrays import Array, Bools, Ints
-from tasks.world.clip import AgentKind
+from tasks.world.clip import STEP_S, AgentKind
 from tasks.world.frames import LARGEST, PACIFICA, box_corners, wrap_angle
 from tasks.world.repair.records import LEFT_OUT, Repair
 
 X, Y, Z, HEADING, LENGTH, WIDTH, HEIGHT, VX, VY = range(9)  # columns of a box, [m], [rad], [m/s]
 UNSEEN, TAKEN_OUT, FILLED = -1, -2, -3  # in the place of a row: by the file, by a pass; FILLED is seen
 
+EGO = "ego"  # in repairs
+FILLED_S = 0.55  # between two frames of a log, at 2 Hz or where some are missing: boxes are linear in between
+SLOW_CLOCK = 0.005  # of 0.1 s between frames: more is said
 FILLED_GAP_S = 0.5  # between two frames of a thing; what was taken out in between is put on the line between them
+LEAST_SIZE_M = (1e-3, 1e-3, 0.0)  # some data sets have no heights of flat things
 LARGEST_SIZE_M = 100.0  # of a box: a train's
 MOST = 0.5  # of a thing's frames: more than these say what it is
 KNOWN_AFTER_S = 0.6  # a thing unseen for longer may have turned round
@@ -38,7 +42,7 @@ TOP_SPEED_MPS = {  # nobody in traffic is faster; 10 m/s is a sprinter
 }
 LARGEST_ACCEL_MPS2 = 10.0
 NOISE_M = 2.5  # from one frame to the next: boxes are corrected as more of a thing comes into view
-INSIDE = 0.7  # of the smaller box lies in the larger: two things cannot
+ONE_PLACE = 0.5  # of what two boxes cover together both cover: two things cannot, but one listed twice
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,40 @@ class ObservedTracks:
 
 
 Repairs = tuple[Repair, ...]
+
+
+def observed(
+    frame_times_s: Array, times_s: Array, ids: Sequence[str | None], kinds: Sequence[AgentKind | None], boxes: Array
+) -> tuple[ObservedTracks, Repairs]:
+    """n boxes in any order as tracks ordered by id, each of the kind of its first box.
+
+    times_s: (n,) of the frames frame_times_s (F,); boxes: (n, 9). What no id names or is of no known kind (None) is
+    left out, and what has the id of another box of its frame.
+    """
+    done: list[Repair] = []
+    frame_of = np.searchsorted(frame_times_s, times_s)
+    whole = np.array([i is not None and k is not None for i, k in zip(ids, kinds)], bool)
+    for row in np.flatnonzero(~whole).tolist():
+        what, was = ("token", "no id") if ids[row] is None else ("class", "of no known class")
+        done.append(Repair(what, ids[row] or f"box {row}", float(times_s[row]), was, LEFT_OUT))
+    names = sorted({str(ids[row]) for row in np.flatnonzero(whole).tolist()})
+    column = {name: n for n, name in enumerate(names)}
+    rows = np.full((len(frame_times_s), len(names)), UNSEEN)
+    placed = np.zeros((*rows.shape, 9))
+    kind_of: dict[str, AgentKind] = {}
+    for row in np.flatnonzero(whole)[np.argsort(times_s[whole], kind="stable")].tolist():
+        name, kind = str(ids[row]), kinds[row]
+        assert kind is not None
+        place = frame_of[row], column[name]
+        if rows[place] != UNSEEN:
+            done.append(Repair("twice", name, float(times_s[row]), "two boxes of one frame", "the first of them"))
+            continue
+        kind_of.setdefault(name, kind)
+        rows[place], placed[place] = row, boxes[row]
+    of_kinds = tuple(kind_of[name] for name in names)
+    return ObservedTracks(frame_times_s, tuple(names), of_kinds, placed, rows), tuple(done)
+
+
 Pass = Callable[[ObservedTracks, Array], tuple[ObservedTracks, Repairs]]
 
 
@@ -83,11 +121,11 @@ def repaired(tracks: ObservedTracks, ego_poses: Array) -> tuple[ObservedTracks, 
     for one in PASSES:
         tracks, found = one(tracks, ego_poses)
         done += found
-    return of_things(tracks, np.flatnonzero(tracks.seen.any(axis=0))), tuple(done)
+    things = sorted(np.flatnonzero(tracks.seen.any(axis=0)), key=lambda n: tracks.track_ids[n])
+    return _of_things(tracks, np.array(things, int)), tuple(done)
 
 
-def of_things(tracks: ObservedTracks, things: Ints) -> ObservedTracks:
-    """Those things alone, in that order."""
+def _of_things(tracks: ObservedTracks, things: Ints) -> ObservedTracks:
     return replace(
         tracks,
         track_ids=tuple(tracks.track_ids[n] for n in things),
@@ -101,7 +139,7 @@ def without_impossible_values(tracks: ObservedTracks, _: Array) -> tuple[Observe
     """Boxes that cannot be are left out; where most of a thing's are, the thing."""
     sizes, seen = tracks.boxes[..., LENGTH : HEIGHT + 1], tracks.seen
     possible = np.asarray((np.abs(tracks.boxes) <= LARGEST).all(axis=-1))
-    possible &= ((sizes > 0.0) & (sizes <= LARGEST_SIZE_M)).all(axis=-1)
+    possible &= ((sizes >= LEAST_SIZE_M) & (sizes <= LARGEST_SIZE_M)).all(axis=-1)
     done = []
     for n in np.flatnonzero((seen & ~possible).any(axis=0)):
         bad = np.flatnonzero(seen[:, n] & ~possible[:, n])
@@ -145,7 +183,7 @@ def without_the_ego(tracks: ObservedTracks, ego_poses: Array) -> tuple[ObservedT
 
 
 def without_doubles(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, Repairs]:
-    """Two things of one kind that are in each other for most of the shorter one's life are the longer one.
+    """Two things of one kind that are in one place for most of the shorter one's life are the longer one.
 
     It is also where only the shorter one was seen, next to its own frames.
     """
@@ -163,7 +201,7 @@ def without_doubles(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, R
         frames = tracks.frames(double)
         rows[frames, double] = TAKEN_OUT
         span = tracks.times_s[frames[[0, -1]]].tolist()
-        was = f"in {tracks.track_ids[kept]} in {together} of {life[double]} frames"
+        was = f"where {tracks.track_ids[kept]} is in {together} of {life[double]} frames"
         done.append(Repair("twice", tracks.track_ids[double], span[0], was, LEFT_OUT, span[1]))
         tracks = replace(tracks, boxes=boxes, rows=rows)
     return tracks, tuple(done)
@@ -207,6 +245,38 @@ def with_gaps_filled(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, 
     return replace(tracks, boxes=boxes, rows=rows), tuple(done)
 
 
+def clock_repairs(frame_times_s: Array) -> tuple[Repair, ...]:
+    """What is said of frames (F,) that do not come every 0.1 s: of all of them, and of single gaps."""
+    if len(frame_times_s) < 2:
+        return ()
+    steps = np.diff(frame_times_s)
+    usual = float(np.median(steps))
+    done = []
+    if not abs(usual - STEP_S) <= SLOW_CLOCK * STEP_S:
+        done.append(Repair("clock", "", np.nan, f"a frame every {usual:.4f} s", f"every {STEP_S} s"))
+    for k in np.flatnonzero((steps > 1.5 * usual) & (steps <= FILLED_S + 1e-6)):
+        done.append(Repair("gap", "", float(frame_times_s[k]), f"no frame for {steps[k]:.2f} s", "filled in"))
+    return tuple(done)
+
+
+def whole_frames(times_s: Array, boxes: Array) -> tuple[Bools, Repairs]:
+    """(F,) which of F boxes (F, 9) of the ego can be and do not lie away from those around them; what is left out.
+
+    A jump at the end stays: some converters go on with another clock there, and their readers know it.
+    """
+    seen, repairs = observed(times_s, times_s, [EGO] * len(boxes), [AgentKind.VEHICLE] * len(boxes), boxes)
+    seen, impossible = without_impossible_values(seen, boxes[:, :3])
+    possible = np.flatnonzero(seen.seen.any(axis=1))
+    seen, jumped = with_jumps_apart(seen, boxes[:, :3])
+    left = np.asarray(seen.seen.any(axis=1))
+    inner = np.flatnonzero(left)
+    ends = possible[(possible < inner[0]) | (possible > inner[-1])] if len(inner) else possible
+    left[ends] = True
+    at_ends = set(times_s[ends].tolist())
+    jumped = tuple(repair for repair in jumped if repair.now == LEFT_OUT and repair.time_s not in at_ends)
+    return left, (*repairs, *impossible, *jumped)
+
+
 PASSES: Sequence[Pass] = (
     without_impossible_values,
     with_jumps_apart,
@@ -232,7 +302,8 @@ def _impossible(box: Array) -> str:
     """Which of a box's values cannot be."""
     names = ("x", "y", "z", "heading", "length", "width", "height", "vx", "vy")
     wrong = ~(np.abs(box) <= LARGEST)
-    wrong[LENGTH : HEIGHT + 1] |= ~((box[LENGTH : HEIGHT + 1] > 0.0) & (box[LENGTH : HEIGHT + 1] <= LARGEST_SIZE_M))
+    sizes = box[LENGTH : HEIGHT + 1]
+    wrong[LENGTH : HEIGHT + 1] |= ~((sizes >= LEAST_SIZE_M) & (sizes <= LARGEST_SIZE_M))
     return ", ".join(f"{name} {value:g}" for name, value, bad in zip(names, box, wrong) if bad)
 
 
@@ -321,7 +392,7 @@ def _too_fast(tracks: ObservedTracks, n: int) -> Ints:
 
 
 def _pairs_inside(tracks: ObservedTracks) -> Iterable[tuple[int, int, int]]:
-    """(n, m, frames) of all things n < m of one kind of which one is in the other in some frames."""
+    """(n, m, frames) of all things n < m of one kind that are in one place in some frames."""
     import shapely  # here alone: workers that drive do not need it
 
     counts: dict[tuple[int, int], int] = {}
@@ -337,14 +408,15 @@ def _pairs_inside(tracks: ObservedTracks) -> Iterable[tuple[int, int, int]]:
         pairs = pairs[_center_inside(tracks.boxes[frame], pairs)]
         if len(pairs):
             one, other = (shapely.polygons(corners[frame, pairs[:, i]]) for i in (0, 1))
-            smaller = np.minimum(shapely.area(one), shapely.area(other))
-            for n, m in pairs[shapely.area(shapely.intersection(one, other)) >= INSIDE * smaller].tolist():
+            shared = shapely.area(shapely.intersection(one, other))
+            both = shapely.area(one) + shapely.area(other) - shared
+            for n, m in pairs[shared >= ONE_PLACE * both].tolist():
                 counts[min(n, m), max(n, m)] = counts.get((min(n, m), max(n, m)), 0) + 1
     return [(n, m, together) for (n, m), together in counts.items()]
 
 
 def _center_inside(boxes: Array, pairs: Ints) -> Bools:
-    """(P,) whether the centre of the smaller box is in the larger; without it less than half of the smaller can be."""
+    """(P,) whether the centre of the smaller box is in the larger, as in one place it has to be."""
     area = boxes[:, LENGTH] * boxes[:, WIDTH]
     large, small = pairs.T
     large, small = np.where(area[large] >= area[small], (large, small), (small, large))
