@@ -187,7 +187,8 @@ def announcement(config: RunConfig, words: Sequence[str]) -> str:
     """What a run is about to do, as far as its settings tell; and how other clips are chosen, where none were."""
     render, name, shape = config.render, config.clips["name"], reader_settings(config.clips)
     fitted = render.mode is RenderMode.AUTO and render.scene is SceneFrom.FIT
-    how = f"from scenes fitted to the photos, {render.fit.iterations} iterations each" if fitted else f"({render.mode})"
+    fit = f"where there are photos, from scenes fitted in {render.fit.iterations} iterations"
+    how = fit if fitted else f"({render.mode})"
     drawn = f"pictures of {render.width}x{render.height} {how}" if render.mode is not RenderMode.NONE else "no pictures"
     told = [f"rounds={config.rounds}", drawn, f"out={config.out}"]
     if shape is not None and (clips := fill(shape, own_settings(config.clips), "clips").summary):
