@@ -58,8 +58,9 @@ def open_store(out: str) -> "Store":
         raise
     except (OSError, DeltaError) as error:
         raise Refused(f"out={out}: {one_line(error)}") from error
-    if store.samples.version is None and store.outcomes.version is None and store.candidates.version is None:
-        raise Refused(f"no store at {store.location.uri}: give the out= of a run of python -m factory.run")
+    if all(table.version is None for table in store.tables):
+        begins = "give the out= of a run of python -m factory.run, of one that has just begun once it says its clips"
+        raise Refused(f"no store at {store.location.uri}: {begins}")
     return store
 
 

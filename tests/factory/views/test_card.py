@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from factory.commands.table import COMMANDS
+from factory.config.arguments import Refused
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph.execute import Execution
 from factory.store.funnel import funnel_of
@@ -16,7 +17,7 @@ from factory.store.samples import Store
 from factory.views.board.overview import overview
 from factory.views.board.watch import Watch
 from factory.views.card import FILE, card, write_card
-from factory.views.status import status_lines
+from factory.views.status import open_store, status_lines
 from tests.factory.toy import ToyWork, executed, refs
 
 report_main = COMMANDS["report"].load()
@@ -92,6 +93,17 @@ def test_a_damaged_record_of_the_newest_run_is_no_state_of_it(tmp_path: Path, na
     assert f"newest run    run status unknown: {name} not readable" in "\n".join(status_lines(store))
     state = overview(Watch(store).snapshot(), "here", time.time())["state"]
     assert name in state["word"] and not state["live"]
+
+
+def test_a_run_is_shown_from_its_plan_on(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    with pytest.raises(Refused, match="no store at"):
+        open_store(str(tmp_path))
+    store.record_plan({"human": 2}, ["c0"])
+    planned = open_store(str(tmp_path))
+    assert "plans       1 rows" in "\n".join(status_lines(planned))
+    shown = overview(Watch(planned).snapshot(), "here", time.time())
+    assert (shown["planned"]["planned"], shown["planned"]["pending"], shown["counts"]["samples"]) == (2, 2, 0)
 
 
 def test_files_that_no_commit_names_are_not_offered(tmp_path: Path) -> None:
