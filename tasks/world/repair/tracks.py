@@ -6,6 +6,7 @@ is left out, named anew, turned round or put between its neighbours.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -55,7 +56,7 @@ class ObservedTracks:
     boxes: Array  # (F, N, 9) X .. VY above; velocities are 0 where the log has none
     rows: Ints  # (F, N) number of the box in its frame or file; UNSEEN, TAKEN_OUT, FILLED
 
-    @property
+    @cached_property
     def seen(self) -> Bools:
         """(F, N)"""
         return (self.rows >= 0) | (self.rows == FILLED)
@@ -86,27 +87,22 @@ def observed(
     left out, and what has the id of another box of its frame.
     """
     done: list[Repair] = []
-    frame_of = np.searchsorted(frame_times_s, times_s)
     whole = np.array([i is not None and k is not None for i, k in zip(ids, kinds)], bool)
     for row in np.flatnonzero(~whole).tolist():
         what, was = ("token", "no id") if ids[row] is None else ("class", "of no known class")
         done.append(Repair(what, ids[row] or f"box {row}", float(times_s[row]), was, LEFT_OUT))
-    names = sorted({str(ids[row]) for row in np.flatnonzero(whole).tolist()})
-    column = {name: n for n, name in enumerate(names)}
+    order = np.flatnonzero(whole)[np.argsort(times_s[whole], kind="stable")]
+    names, first, column = np.unique([str(ids[row]) for row in order], return_index=True, return_inverse=True)
+    frame_of = np.searchsorted(frame_times_s, times_s[order])
+    placed, at = np.unique(frame_of * len(names) + column, return_index=True)
+    for k in np.setdiff1d(np.arange(len(order)), at).tolist():
+        name, time_s = str(names[column[k]]), float(times_s[order[k]])
+        done.append(Repair("twice", name, time_s, "two boxes of one frame", "the first of them"))
     rows = np.full((len(frame_times_s), len(names)), UNSEEN)
-    placed = np.zeros((*rows.shape, 9))
-    kind_of: dict[str, AgentKind] = {}
-    for row in np.flatnonzero(whole)[np.argsort(times_s[whole], kind="stable")].tolist():
-        name, kind = str(ids[row]), kinds[row]
-        assert kind is not None
-        place = frame_of[row], column[name]
-        if rows[place] != UNSEEN:
-            done.append(Repair("twice", name, float(times_s[row]), "two boxes of one frame", "the first of them"))
-            continue
-        kind_of.setdefault(name, kind)
-        rows[place], placed[place] = row, boxes[row]
-    of_kinds = tuple(kind_of[name] for name in names)
-    return ObservedTracks(frame_times_s, tuple(names), of_kinds, placed, rows), tuple(done)
+    of_things = np.zeros((*rows.shape, 9))
+    rows.ravel()[placed], of_things.reshape(-1, 9)[placed] = order[at], boxes[order[at]]
+    of_kinds = tuple(kind for k in order[first] if (kind := kinds[k]) is not None)
+    return ObservedTracks(frame_times_s, tuple(names.tolist()), of_kinds, of_things, rows), tuple(done)
 
 
 Pass = Callable[[ObservedTracks, Array], tuple[ObservedTracks, Repairs]]
@@ -314,6 +310,8 @@ def _jumps(tracks: ObservedTracks, n: int, frames: Ints) -> Bools:
     dt = np.diff(tracks.times_s[frames])
     moved = np.diff(tracks.boxes[frames, n, :2], axis=0)
     jumps = np.hypot(*moved.T) > TOP_SPEED_MPS[tracks.kinds[n]] * dt + NOISE_M
+    if float(np.hypot(*np.ptp(moved / dt[:, None], axis=0)) * dt.max()) <= NOISE_M:
+        return jumps  # nothing is farther from the usual than the fastest from the slowest
     steps = max(3, 2 * round(USUAL_S / float(np.median(dt)) / 2.0) + 1)
     if len(dt) >= steps:
         usual = np.stack([median_filter(v, steps, mode="nearest") for v in (moved / dt[:, None]).T], axis=1)
