@@ -25,7 +25,7 @@ from factory.readers.base import BadClip, ClipReader, ClipRef, Unreadable, paint
 from factory.stages.assets import running_fits
 from factory.stages.imaging import Imaging, scene_cache_counts
 from factory.stages.rows import label_columns, sample_row
-from factory.store.samples import CandidateRow
+from factory.store.samples import MOST_RECORDS, CandidateRow
 from factory.store.schema import UNLISTED, RunIdentity
 from tasks.attempt import ExpertGate, Judged, Timed, attempt, drive_under_log_replay, has_route, perturbed_scene
 from tasks.experts.pdm_closed import PdmSettings
@@ -42,6 +42,7 @@ from tasks.subscores import OF_ONE_PLAN
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, random_stream, scene_of_clip
 from tasks.world.frames import HEADING
+from tasks.world.repair.records import first_repairs, repair_counts
 from tasks.world.vocabulary import Vocabulary
 
 
@@ -165,8 +166,16 @@ class FactoryWork:
         clip = self._read(ref, watch)
         if isinstance(clip, Rejected):
             return clip
-        payload = PerturbedClip(ref, without_sensors(clip), ())
-        return PreparedClip(clip.clip_id, clip.content_digest, (), {}, payload, seconds=watch.seconds)
+        return PreparedClip(
+            clip_id=clip.clip_id,
+            content_digest=clip.content_digest,
+            candidates=(),
+            gate_counts={},
+            payload=PerturbedClip(ref, without_sensors(clip), ()),
+            seconds=watch.seconds,
+            repairs=repair_counts(clip.repairs),
+            repair_records=first_repairs(clip.repairs, MOST_RECORDS),
+        )
 
     def read_and_perturb(self, ref: ClipRef) -> WholeClip | Rejected:
         """All that `prepare` decides, and every gated trajectory's fate. Rejected: for every expert. Raises BadClip."""
@@ -204,6 +213,8 @@ class FactoryWork:
             payload=PerturbedClip(ref, clip, made.candidates),
             dropped=found if isinstance(found, Rejected) else None,
             seconds=made.seconds,
+            repairs=repair_counts(clip.repairs),
+            repair_records=first_repairs(clip.repairs, MOST_RECORDS),
         )
 
     # A candidate is driven, an expert drives on from there, and the reward judges it.

@@ -37,13 +37,13 @@ END_FAULTS = ("off_route", "after")  # of a drive that reaches every sub-score: 
 PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred", "unlike_photos")  # tasks.render.gate
 
 STAGES: tuple[Stage, ...] = (
-    Stage("clip", 4, "clip", ("ego_standing", "broken_tracks", "route_ended", "no_earlier_frame")),
+    Stage("clip", 5, "clip", ("ego_standing", "broken_tracks", "route_ended", "no_earlier_frame")),
     Stage("perturb", 2, "clip", ("no_gated_candidate", "no_good_candidate")),
     Stage("rollout", 3, "attempt", ("route_ended",)),
     Stage("expert", 1, "attempt", ("no_plan",)),
     Stage("reward", 1, "attempt", (*SUBSCORES, *END_FAULTS)),
     Stage("render", 12, "attempt", ("psnr", *PICTURE_FAULTS)),
-    Stage("write", 3, "attempt", ()),
+    Stage("write", 4, "attempt", ()),
 )
 
 

@@ -171,12 +171,15 @@ class ExplainRequest:
     settings: tuple[str, ...] = field(default=(), metadata=RUN_SETTINGS)
 
 
+MOST_REPAIRS = 20  # one by one, the others are counted
+
+
 def explain(request: ExplainRequest) -> int:
     """`python -m factory explain clip=... expert=...`: why one clip gives the samples it gives.
 
-    Runs ONE clip in this process: the candidates over the grid and why each fell, every attempt of the walk with its
-    sub-scores, and the last attempt's two rollouts as a picture and a film. Takes the settings of
-    `python -m factory.run`.
+    Runs ONE clip in this process: what was repaired in its log, the candidates over the grid and why each fell, every
+    attempt of the walk with its sub-scores, and the last attempt's two rollouts as a picture and a film. Takes the
+    settings of `python -m factory.run`.
 
         python -m factory explain clips=av2 clips.root=<logs> clip=0 expert=recovery
         python -m factory explain preset=demo clip=3fa9 tries=20 to=looks    an id, its beginning or a place in the list
@@ -212,6 +215,7 @@ def _explain_clip(request: ExplainRequest) -> None:
     from factory.views.pictures import attempt_picture, candidates_picture, rollout_film, write_mp4
     from tasks.stages import Rejected
     from tasks.subscores import OF_ONE_PLAN
+    from tasks.world.repair.records import counts_text, repair_counts, repair_lines
 
     expert, to = request.expert, Path(request.to)
     config = typed_run_config(compose_run(request.settings) | {"experts": [expert]})
@@ -228,6 +232,9 @@ def _explain_clip(request: ExplainRequest) -> None:
     print(
         f"clip {ref.clip_id}: log {ref.log_id} at {ref.start_ms / 1000:.1f} s, {clip.split}, {len(clip.agents)} tracks"
     )
+    if clip.repairs:
+        print(f"repaired: {counts_text(repair_counts(clip.repairs))}")
+        print("\n".join(f"  {line}" for line in repair_lines(clip.repairs, MOST_REPAIRS)))
     to.mkdir(parents=True, exist_ok=True)
     stem = to / f"{ref.clip_id}_{expert}"
 

@@ -20,6 +20,7 @@ from tasks.settings import ExpertGate, PdmSettings, PerturbSettings, RecoverySet
 from tasks.stages import FRAMES, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
+Repairs = Literal["make", "refuse"]
 RECOVERY = "factory.setup.settings.recovery_expert"
 FIRST_LOOK = ("clips.n_clips=3", "clips.settings.width=256", "clips.settings.height=144", "render=town")
 
@@ -128,6 +129,7 @@ class RunConfig:
     graph: GraphChoice = field(default_factory=GraphChoice)
     limit: int | None = None  # read this many clips only
     seed: int = 0  # of every random draw
+    repairs: Repairs = "make"  # refuse: a clip of which anything had to be repaired or left out fails
     on_change: Literal["stop", "keep", "redo"] = "stop"  # when settings or stage versions differ from the table's
     retry_failed: bool = False  # run attempts again that failed on their input or by a bug
     minutes: float | None = None  # after which nothing new is begun (exit code 4); the same command goes on

@@ -380,8 +380,8 @@ class RunRecords:
         identity, dropped = self.identity, clip.dropped or Rejected("", "")
         read = (ref.clip_id, ref.dataset, ref.log_id, clip.content_digest)
         under = (identity.prepare_digest, identity.vocabulary_digest)
-        gates = dict(clip.gate_counts)
-        return ClipCandidates(*read, *under, gates, clip.candidates, dropped.stage, dropped.reason)
+        why_none, repaired = (dropped.stage, dropped.reason), (clip.repairs, clip.repair_records)
+        return ClipCandidates(*read, *under, dict(clip.gate_counts), clip.candidates, *why_none, *repaired)
 
 
 def past_from_outcome(outcome: Outcome) -> PastAttempt:

@@ -24,6 +24,7 @@ from factory.store.samples import CandidateRow, ErrorKind
 from factory.store.schema import SAMPLES, RunIdentity, Stamp, sample_rows_to_table
 from factory.wording import one_line
 from tasks.stages import ATTEMPT, Rejected
+from tasks.world.repair.records import Repair, RepairCount
 
 if TYPE_CHECKING:
     from tasks.hard_scenes import BenchmarkClip
@@ -64,6 +65,8 @@ class PreparedClip:
     dropped: Rejected | None = None  # why there are no candidates; the human row is scored all the same
     seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
     scenes: "BenchmarkClip | None" = None  # to be kept beside the tables before any row of the clip is
+    repairs: tuple[RepairCount, ...] = ()  # in what it was read from
+    repair_records: tuple[Repair, ...] = ()  # the same one by one, factory.store.samples.MOST_RECORDS at most
 
 
 @dataclass(frozen=True)
@@ -330,6 +333,8 @@ def prepare(
         stored, note = None, f"cache file {key}: {error}; prepared again"
     except OSError as error:
         stored, note = None, f"cache file {key}: cannot be read: {one_line(error)}; prepared again"
+    if isinstance(stored, PreparedClip) and stored.repairs and work.identity.settings.get("repairs") == "refuse":
+        stored = None  # kept by a run that made them; this one reads the clip, and refuses it
     found = work.content_digest(ref) if stored is not None or wanted_content is not None else None
     _refuse_changed(ref, found, wanted_content)
     if isinstance(stored, PreparedClip) and found not in (None, stored.content_digest):

@@ -16,6 +16,7 @@ from factory.wording import one_line, shown
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import CLIP_STEPS, AgentKind, AgentTracks, Camera, Clip
 from tasks.world.frames import EGO_STATE_SIZE, LARGEST
+from tasks.world.repair.records import Repair, first_repairs, repair_text
 from tasks.world.road_map import Lane, LightState, MapLayer, RoadMap, Route, TrafficLights
 
 SPLITS = ("train", "val", "test")
@@ -213,7 +214,7 @@ MAPS_REMEMBERED = 4  # clips of a log share its map, and a reader keeps the last
 
 def read_clip(reader: ClipReader, ref: ClipRef) -> Clip:
     """The reader's clip, looked at. Raises BadClip naming the clip and the field."""
-    where = f"clip {ref.clip_id} ({ref.dataset} {ref.log_id} at {ref.start_ms / 1000:g} s)"
+    where = _clip_text(ref)
     with failures_as_bad_clip(where):
         clip = reader.read(ref)
     if not isinstance(clip, Clip):
@@ -222,6 +223,42 @@ def read_clip(reader: ClipReader, ref: ClipRef) -> Clip:
         if getattr(clip, name) != getattr(ref, name):
             raise BadClip(where, name, f"is {shown(getattr(clip, name))}, expected the ref's {getattr(ref, name)!r}")
     return validate_clip(clip, where)
+
+
+@dataclass(frozen=True)
+class RefusesRepairs:
+    """The reader, to which a clip of which anything had to be repaired or left out is a bad clip (repairs=refuse)."""
+
+    reader: ClipReader
+
+    def __getattr__(self, name: str) -> Any:
+        """What readers may have beside: digest, block, painter."""
+        if name == "reader" or name.startswith("__"):  # not there while it is unpickled
+            raise AttributeError(name)
+        return getattr(self.reader, name)
+
+    @property
+    def name(self) -> str:
+        """The reader's."""
+        return self.reader.name
+
+    def index(self) -> ClipIndex:
+        """The reader's."""
+        return self.reader.index()
+
+    def read(self, ref: ClipRef) -> Clip:
+        """The reader's clip. Raises BadClip."""
+        clip = self.reader.read(ref)
+        if not clip.repairs:
+            return clip
+        n, first = len(clip.repairs), first_repairs(clip.repairs, 1)[0]
+        told = f"{n} repairs, the first" if n > 1 else "1 repair"
+        how = "put it right in the log, or read the clip with repairs=make, the default"
+        raise BadClip(_clip_text(ref), "repairs", f"{told} ({first.what}): {repair_text(first)}; {how}")
+
+
+def _clip_text(ref: ClipRef) -> str:
+    return f"clip {ref.clip_id} ({ref.dataset} {ref.log_id} at {ref.start_ms / 1000:g} s)"
 
 
 def validate_clip(clip: Clip, file: str) -> Clip:
@@ -250,6 +287,8 @@ def _faults(clip: Clip) -> Iterator[Fault]:
     yield from _polyline("centerline", clip.centerline)
     yield from _light_faults(clip)
     yield from _sensor_faults(clip)
+    if any(not isinstance(repair, Repair) for repair in clip.repairs):
+        yield "repairs", "expected tasks.world.repair.records.Repair"
 
 
 def _agent_faults(clip: Clip) -> Iterator[Fault]:

@@ -13,10 +13,10 @@ from typing import Any
 
 from factory.config.compose import ConfigError, build, fill
 from factory.config.plugins import import_target
-from factory.config.run import RecoverySources, RunConfig, VocabularyChoice, photos_alone, refuse_relative_root
+from factory.config.run import RecoverySources, Repairs, RunConfig, VocabularyChoice, photos_alone, refuse_relative_root
 from factory.files import machine_fault_of
 from factory.pipeline import BenchmarkWork, FactoryWork
-from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef, read_clip
+from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef, RefusesRepairs, read_clip
 from factory.setup.vocabulary import (
     StartTrajectories,
     build_recovery_table,
@@ -73,10 +73,12 @@ class RunContext:
         return self.config.pdm
 
 
-def open_reader(clips: Mapping[str, Any]) -> tuple[ClipReader, ClipIndex]:
+def open_reader(clips: Mapping[str, Any], repairs: Repairs = "make") -> tuple[ClipReader, ClipIndex]:
     """The reader of the chosen clips, and what its root holds. Raises ConfigError where that is nothing."""
     reader: ClipReader = build(clips, "clips")
     _must_have(reader, ("name", "index", "read"), "clips", "a reader (factory.readers.base.ClipReader)")
+    if repairs == "refuse":
+        reader = RefusesRepairs(reader)
     try:
         index = reader.index()
     except (ValueError, OSError) as error:
@@ -109,7 +111,7 @@ def assemble(config: RunConfig) -> Run:
 
     @cache
     def opened() -> tuple[ClipReader, ClipIndex]:
-        found = open_reader(config.clips)
+        found = open_reader(config.clips, config.repairs)
         refuse_unknown_cameras(config, *found)
         return found
 
@@ -239,7 +241,7 @@ def run_identity(
         "reward": config.reward,
         "render": config.render,
     }
-    settings: dict[str, object] = {"seed": config.seed, "vocabulary": vocabulary.digest}
+    settings: dict[str, object] = {"seed": config.seed, "repairs": config.repairs, "vocabulary": vocabulary.digest}
     for group, value in science.items():
         settings |= {f"{group}.{key}": plain for key, plain in dataclasses.asdict(value).items()}
     settings |= {f"traffic.{key}": plain for key, plain in traffic_record(config.traffic).items()}
@@ -302,7 +304,7 @@ def _recovery_table(run: RunContext, vocabularies: Sequence[str]) -> RecoveryTab
     if digests is None:
         return build_recovery_table([train_windows(reader)], loaded)
     chosen = dict(run.config.clips)  # where logs lie, and what splits them, decides which are train
-    made_of = [stage_versions()["clip"], chosen, digests, sorted(ref.clip_id for ref in index.refs)]
+    made_of = [stage_versions()["clip"], run.config.repairs, chosen, digests, sorted(ref.clip_id for ref in index.refs)]
     made_of.append([vocabulary.digest for vocabulary in loaded])
     key = hashlib.sha256(canonical_json(made_of).encode()).hexdigest()[:16]
     cached = user_cache() / "tables" / f"recovery-{key}.npz"

@@ -13,6 +13,7 @@ from tasks.subscores import OF_ONE_PLAN, SUBSCORES
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Clip, Scene
 from tasks.world.frames import AX, AY, HEADING, VX, VY, points_to_local, pose_on_ground, to_local
+from tasks.world.repair.records import repair_counts
 from tasks.world.road_map import driving_command
 
 NEAR_M = 30.0  # for the tags
@@ -58,6 +59,7 @@ def scene_columns(scene: Scene, agents: AgentTracks, world_from_ego: Array, comm
         "content_digest": clip.content_digest,
         "licence": clip.licence,
         "frame_tokens": None if clip.frame_tokens is None else list(clip.frame_tokens),
+        "repairs": [vars(count) for count in repair_counts(clip.repairs)],
         "now_pose": pose,
         "world_from_ego": world_from_ego,
         "ego_history_10hz": to_local(pose, history),

@@ -16,6 +16,7 @@ from rich.table import Table
 from factory.store.samples import MADE_UNDER, Kind, Store, plans_of, run_number_lookup
 from factory.store.table import Codes, Ints, distinct_texts, text_codes
 from tasks.stages import ATTEMPT, STAGES, TASKS
+from tasks.world.repair.records import RepairCount, counts_text
 
 # All attempts of a store as columns of integers: what counts over millions of rows is drawn from.
 #
@@ -302,7 +303,7 @@ def _places(clips: NDArray[np.object_], column: pa.ChunkedArray) -> Ints:
 # as one random draw a round would be. Clips: those with at least r+1 accepted samples, of those with at least r and of
 # all.
 
-LIST_COLUMNS = ["clip_id", "n_candidates", "gate_counts", "stage", "reason"]
+LIST_COLUMNS = ["clip_id", "n_candidates", "gate_counts", "stage", "reason", "repairs"]
 
 
 @dataclass(frozen=True)
@@ -345,6 +346,22 @@ class FunnelRow:
 
 
 @dataclass(frozen=True)
+class Repaired:
+    """What was put right or left out in the logs of the prepared clips; a thing counts in each clip that it is in."""
+
+    clips: int  # in which anything was
+    counts: tuple[RepairCount, ...]  # by name of the pass, all clips
+
+    @property
+    def text(self) -> str:
+        """One line, `12 objects in 7 clips repaired, 3 left out: gaps filled 12, listed twice 3 (left out)`."""
+        made, left = sum(count.repaired for count in self.counts), sum(count.left_out for count in self.counts)
+        objects, clips = "object" if made == 1 else "objects", "clip" if self.clips == 1 else "clips"
+        summary = f"{made:,} {objects} in {self.clips:,} {clips} repaired, {left:,} left out"
+        return f"{summary}: {counts_text(self.counts)}" if self.clips else ""
+
+
+@dataclass(frozen=True)
 class Funnel:
     """All rows, and what happened before any attempt."""
 
@@ -356,6 +373,7 @@ class Funnel:
     candidates: int
     exhausted: Mapping[str, int]  # expert -> walks that came to the end of their list
     balance: BalanceSheet  # of what was planned
+    repaired: Repaired
 
     def text(self, width: int = 120) -> str:
         """The funnel as a table for a terminal."""
@@ -368,6 +386,8 @@ class Funnel:
         ):
             if counts:
                 head += f"\n{title}: " + ", ".join(f"{name} {n}" for name, n in counts.items())
+        if self.repaired.clips:
+            head += f"\n{self.repaired.text}"
         table = Table(
             "expert", "round", "tried", "accepted", "attempts %", "1st try %", "clips", "clips %", "of all %", "why not"
         )
@@ -430,6 +450,7 @@ def funnel_of_tables(
         candidates=pc.sum(lists["n_candidates"]).as_py() or 0,
         exhausted={name: n for name, n in zip(attempts.experts, exhausted.tolist()) if n},
         balance=balance_sheet(plans, attempts, lists),
+        repaired=_repaired(lists["repairs"]),
     )
 
 
@@ -476,6 +497,17 @@ def _gates(column: pa.ChunkedArray) -> dict[str, int]:
         return {}
     sums = pa.concat_tables(flat).group_by("gate", use_threads=False).aggregate([("n", "sum")])
     return dict(zip(sums["gate"].to_pylist(), sums["n_sum"].to_pylist()))
+
+
+def _repaired(column: pa.ChunkedArray) -> Repaired:
+    """Sums by pass over a column of lists of counts."""
+    clips = int(pc.sum(pc.greater(pc.list_value_length(column), 0)).as_py() or 0)
+    flat = [pa.Table.from_struct_array(pc.list_flatten(chunk)) for chunk in column.chunks]
+    if not clips:
+        return Repaired(0, ())
+    sums = pa.concat_tables(flat).group_by("what").aggregate([("repaired", "sum"), ("left_out", "sum")])
+    rows = sums.select(["what", "repaired_sum", "left_out_sum"]).sort_by("what").to_pylist()
+    return Repaired(clips, tuple(RepairCount(*row.values()) for row in rows))
 
 
 def _sorted_counts(counts: Mapping[str, int]) -> dict[str, int]:

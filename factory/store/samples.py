@@ -33,6 +33,7 @@ from factory.store.schema import (
 )
 from factory.store.table import Bytes, Codes, Ints, KeyedTable, distinct_rows, fixed_bytes, text_codes
 from tasks.caches import MEMBER, json_with_checksum, parse_json_with_checksum
+from tasks.world.repair.records import Repair, RepairCount
 
 # What became of attempts: the tables `outcomes`, `candidates` and `plans`, and the history that a run goes on from.
 
@@ -98,7 +99,8 @@ def outcomes_table(outcomes: Sequence[Outcome]) -> pa.Table:
     return pa.Table.from_arrays(columns, schema=OUTCOME_SCHEMA)
 
 
-# The table `candidates`: one row per prepared clip with its ordered candidate list and what each gate dropped.
+# The table `candidates`: one row per prepared clip with its ordered candidate list, what each gate dropped and what was
+# repaired in its log.
 
 
 @dataclass(frozen=True)
@@ -130,6 +132,11 @@ class ClipCandidates:
     candidates: tuple[CandidateRow, ...]
     stage: str = ""  # why there are none
     reason: str = ""
+    repairs: tuple[RepairCount, ...] = ()  # as in the clip's samples; here also of a clip that has none
+    repair_records: tuple[Repair, ...] = ()  # one by one, the first MOST_RECORDS
+
+
+MOST_RECORDS = 200  # of a clip; some 10 kB
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,9 +156,12 @@ CANDIDATES = TableSpec("candidates", CANDIDATE_SCHEMA, "clip_id")
 
 
 def candidates_table(rows: Sequence[ClipCandidates]) -> pa.Table:
+    nested = ("candidates", "repairs", "repair_records")
     return pa.Table.from_pylist(
         [
-            vars(row) | {"candidates": [vars(each) for each in row.candidates], "n_candidates": len(row.candidates)}
+            vars(row)
+            | {name: [vars(each) for each in getattr(row, name)] for name in nested}
+            | {"n_candidates": len(row.candidates)}
             for row in rows
         ],
         schema=CANDIDATE_SCHEMA,

@@ -266,7 +266,7 @@ def attempt_id(clip_id: str, candidate: int, vocabulary_digest: str, expert: str
 # `now` is T+H for simulated rows and T for `human` rows. Ego poses are rear-axle. Timings are not here: a row's bytes
 # do not depend on when or where it was made.
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 MAP_RADIUS_M = 64.0
 AGENT_STEPS = 56  # -1.5 .. 4.0 s at 10 Hz; index 15 is now
 NOW_INDEX = 15
@@ -276,6 +276,11 @@ STATE = "x [m], y [m], heading [rad], vx, vy [m/s], ax, ay [m/s2], steering [rad
 
 
 def _lineage() -> tuple[Column, ...]:
+    repairs = (
+        Column("what", "string", about="name of the pass (docs/repairs.md)"),
+        Column("repaired", "int32", about="things of the log that it put right"),
+        Column("left_out", "int32", about="things that it left out, for a frame or as a whole"),
+    )
     return (
         Column("attempt_id", "string", about="unique: hash of clip, candidate, vocabulary, expert and its inputs"),
         Column("clip_id", "string", about="hash of data set, log, start time and window"),
@@ -300,6 +305,7 @@ def _lineage() -> tuple[Column, ...]:
         Column("content_digest", "string", about="of what the clip was read from, but pixels and points"),
         Column("licence", "string", about="of the source log"),
         Column("frame_tokens", "string", (2,), about="the log's own names of its frames at T and T+H", nullable=True),
+        Column("repairs", "struct", ("F",), about="in the files of its log, by pass", members=repairs),
         Column("parent_states", "float64", (2, 11), STATE, WORLD, "logged ego at T and at T+H"),
     )
 

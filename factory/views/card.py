@@ -123,6 +123,8 @@ def _settings_section(store: Store) -> Iterator[str]:
 def _acceptance_section(funnel: Funnel) -> Iterator[str]:
     yield "\n## Acceptance\n"
     yield f"{funnel.clips_prepared:,} clips prepared, {funnel.candidates:,} candidates.\n"
+    if funnel.repaired.clips:
+        yield f"In their logs: {_plain(funnel.repaired.text)}.\n"
     head = ("expert", "round", "tried", "accepted", "of attempts", "clips", "why not")
     rows = []
     for r in funnel.rows:

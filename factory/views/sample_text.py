@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from factory.config.arguments import Refused
 from factory.views.status import outcome_text, rows_where, side_text, turn_text
+from tasks.world.repair.records import RepairCount, counts_text
 
 if TYPE_CHECKING:
     from factory.graph.steps import PreparedClip
@@ -119,6 +120,8 @@ def sample_facts(row: Mapping[str, Any]) -> dict[str, str]:
     facts["world"] = f"{len(row['agent_ids'])} agents, {len(row['lane_ids'])} lanes; tags {tags}"
     images = row["images"] or ()
     cameras = ", ".join(dict.fromkeys(image["camera"] for image in images))
+    if row["repairs"]:
+        facts["repaired"] = counts_text(RepairCount(**count) for count in row["repairs"])
     facts["images"] = f"{len(images)} from source {row['image_source']}" + (f": {cameras}" if cameras else "")
     if row["psnr"] is not None:
         facts["block"] = f"{row['psnr']:.2f} dB"
@@ -228,6 +231,7 @@ def _clip_facts(store: "Store", row: Row, clip: Row) -> list[tuple[str, object]]
         ("split, licence", f"{row['split']}, {row['licence']}" if "split" in row else ""),
         ("content digest", row.get("content_digest") or clip.get("content_digest")),
         ("candidates", f"{clip['n_candidates']}, in candidates/{clip['file']}" if clip else "none listed"),
+        ("repaired", counts_text(RepairCount(**count) for count in clip.get("repairs", ()))),
         ("prepared under", clip.get("prepare_digest")),
         ("prepared clip", cached if cached and store.location.has(cached) else ""),
     ]

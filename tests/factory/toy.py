@@ -33,7 +33,7 @@ from tasks.stages import Rejected
 
 VERSIONS = {"clip": 1, "perturb": 1, "rollout": 1, "expert": 1, "reward": 1, "render": 1, "write": 1}
 PICTURES = ("cameras", "images", "image_source")
-RAGGED = {"B": 2, "N": 3, "L": 4, "P": 5, "D": 2, "X": 1, "S": 1, "R": 2, "C": 1, "I": 2, "T": 1}
+RAGGED = {"F": 2, "B": 2, "N": 3, "L": 4, "P": 5, "D": 2, "X": 1, "S": 1, "R": 2, "C": 1, "I": 2, "T": 1}
 
 
 def executed(

@@ -17,7 +17,7 @@ class Golden:
 
 GOLDEN: dict[str, Golden] = {
     "clip": Golden(
-        4,
+        5,
         {
             "av2 ego": (4608.74131, -0.406116227),
             "av2 boxes": (9813.0011, -0.413924597),
@@ -26,8 +26,8 @@ GOLDEN: dict[str, Golden] = {
             "av2 rings": (3609.34453, 188.613004),
             "av2 route": (20210.675, 45.3735891),
             "nuscenes ego": (189.807079, -0.501655347),
-            "nuscenes boxes": (825.141528, -1.09938311),
-            "nuscenes velocities": (31.7078466, 0.136608281),
+            "nuscenes boxes": (825.141528, -1.407639),
+            "nuscenes velocities": (31.7078466, -0.0746650518),
             "nuscenes lanes": (3383.77301, -4.39364063),
             "nuscenes rings": (2578.08352, 0.740293166),
             "nuscenes route": (1892.07311, -3.42528001),
@@ -108,16 +108,16 @@ GOLDEN: dict[str, Golden] = {
         tolerance=1e-3,
     ),
     "write": Golden(
-        3,
+        4,
         {
             "simulated": (492.175951, 17.1899041),
-            "simulated text": (3008.15481, -2.11722917),
+            "simulated text": (3020.38459, -13.6826604),
             "human": (652.576569, -14.5853737),
-            "human text": (2539.58184, -1.48495039),
+            "human text": (2554.0555, -2.12202577),
             "label_subscores": (549.77183, 63.7185064),
             "label_progress": (478.196993, -18.9944372),
             "labels text": (947.357383, -11.9462762),
-            "schema": (5466.55809, -12.7329856),
+            "schema": (5522.20223, -4.701735),
         },
     ),
 }

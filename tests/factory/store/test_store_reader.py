@@ -64,7 +64,7 @@ def test_the_tables_metadata_names_version_and_licences_those_of_later_commits_t
     properties = Store(tmp_path).samples.properties
     named = set(properties["factory.licences"].split("; "))
     assert named == set(SampleTable(tmp_path).table(["licence"])["licence"].to_pylist()) and len(named) > 1
-    assert properties["factory.schema_version"] == "4"
+    assert properties["factory.schema_version"] == "5"
 
 
 def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_tables_of_another_version_are_refused_in_one_line_and_left_as_they_are(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], is_sealed: bool
 ) -> None:
     executed(ToyWork(), refs(1), ["human"], 1, Store(tmp_path))
-    record = {"schema_version": 3, "runs": json.loads((tmp_path / "run.json").read_text())["runs"]}
+    record = {"schema_version": 4, "runs": json.loads((tmp_path / "run.json").read_text())["runs"]}
     (tmp_path / "run.json").write_text(json_with_checksum(record) if is_sealed else json.dumps(record))
     shutil.rmtree(tmp_path / "samples" / "_commits")  # a repair would make them again
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
@@ -92,7 +92,7 @@ def test_tables_of_another_version_are_refused_in_one_line_and_left_as_they_are(
         assert dispatch([name, where, *more], COMMANDS, "") == BAD_CONFIG, name
         (line,) = capsys.readouterr().err.splitlines()
         assert line == (
-            f"error: {tmp_path}: schema_version 3, this version reads and writes 4: make the tables again, "
+            f"error: {tmp_path}: schema_version 4, this version reads and writes 5: make the tables again, "
             "by the command that made them with another out="
         )
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
