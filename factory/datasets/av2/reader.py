@@ -35,6 +35,15 @@ from tasks.world.arrays import Array, Bools, Indices, Ints
 from tasks.world.clip import MOVING_KINDS, STEP_S, AgentKind, AgentTracks, Camera, SensorFile
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, X, Y, wrap_angle
 from tasks.world.repair.records import Repair
+from tasks.world.repair.road import (
+    LaneSides,
+    crossing_between,
+    left_out_lanes,
+    lights_on_map,
+    map_repair,
+    simple_area,
+    sound_lanes,
+)
 from tasks.world.repair.tracks import EGO, FILLED_S, MOST, clock_repairs, observed, repaired, whole_frames
 from tasks.world.road_map import (
     Lane,
@@ -46,7 +55,6 @@ from tasks.world.road_map import (
     centerline_from_boundaries,
     ring_from_boundaries,
     roadblocks_of,
-    valid_ring,
 )
 
 # What moves in an Argoverse 2 sensor log: ego poses and annotated boxes, resampled to steps of 0.1 s.
@@ -387,26 +395,31 @@ def map_file(log_folder: Path) -> Path:
     return found[0]
 
 
-def read_map(path: Path) -> RoadMap:
-    """The log's map, lanes in file order, roadblocks named. Raises BadClip naming the lane or area at fault."""
+def read_map(path: Path) -> tuple[RoadMap, tuple[Repair, ...]]:
+    """The log's map, lanes in file order, roadblocks named; and what is not as the file has it.
+
+    Raises BadClip naming the lane at fault, and where no lane for cars is left.
+    """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise BadClip(str(path), "json", f"cannot be read: {error}") from error
-    segments = _section(path, content, "lane_segments")
-    lanes = {str(key): _lane(path, str(key), value) for key, value in segments.items()}
+    segments = {str(key): value for key, value in _section(path, content, "lane_segments").items()}
+    sides, repairs = sound_lanes({key: _sides(path, key, raw) for key, raw in segments.items()})
+    lanes = {key: _lane(path, key, segments[key], lane) for key, lane in sides.items()}
     if not any(lane.drives_cars for lane in lanes.values()):
-        raise BadClip(str(path), "lane_segments", "the map has no VEHICLE or BUS lane")
-    areas = tuple(
-        MapPolygon(f"da_{key}", MapLayer.DRIVABLE_AREA, _area_ring(path, f"drivable_areas[{key}]", value))
-        for key, value in _section(path, content, "drivable_areas").items()
+        raise BadClip(str(path), "lane_segments", f"the map has no VEHICLE or BUS lane{left_out_lanes(repairs)}")
+    areas = {key: _area(key, raw) for key, raw in _section(path, content, "drivable_areas").items()}
+    crossings = [_crossing(key, raw) for key, raw in _section(path, content, "pedestrian_crossings").items()]
+    rings = {key: ring for key, (ring, _) in areas.items() if ring is not None}
+    road_map = RoadMap(
+        lanes=lanes,
+        drivable_areas=tuple(MapPolygon(f"da_{key}", MapLayer.DRIVABLE_AREA, ring) for key, ring in rings.items()),
+        crossings=tuple(ring for ring, _ in crossings if ring is not None),
+        roadblock_of=roadblocks_of(lanes),
+        location=path.stem.partition("____")[2],  # e.g. PIT_city_47896
     )
-    crossings = tuple(
-        _crossing_ring(path, f"pedestrian_crossings[{key}]", value)
-        for key, value in _section(path, content, "pedestrian_crossings").items()
-    )
-    location = path.stem.partition("____")[2]  # e.g. PIT_city_47896
-    return RoadMap(lanes, areas, crossings, roadblocks_of(lanes), location)
+    return road_map, (*repairs, *chain(*(found for _, found in (*areas.values(), *crossings))))
 
 
 def _section(path: Path, content: Any, name: str) -> dict[str, Any]:
@@ -416,24 +429,45 @@ def _section(path: Path, content: Any, name: str) -> dict[str, Any]:
     return section
 
 
-def _lane(path: Path, key: str, raw: Any) -> Lane:
+def _sides(path: Path, key: str, raw: Any) -> LaneSides:
+    """The boundaries and links of a lane segment, as they are listed."""
+    field = f"lane_segments[{key}]"
+    try:
+        return LaneSides(
+            _boundary(path, f"{field}.left_lane_boundary", raw["left_lane_boundary"]),
+            _boundary(path, f"{field}.right_lane_boundary", raw["right_lane_boundary"]),
+            tuple(lane for lane in map(id_text, raw["predecessors"]) if lane is not None),
+            tuple(lane for lane in map(id_text, raw["successors"]) if lane is not None),
+        )
+    except KeyError as error:
+        raise BadClip(str(path), field, f"missing key {error}") from error
+    except TypeError as error:
+        raise BadClip(str(path), field, str(error)) from error
+
+
+def _boundary(path: Path, field: str, raw: Any) -> Array:
+    try:
+        return _points(raw)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise BadClip(str(path), field, f"not a list of x, y, z points ({error})") from error
+
+
+def _lane(path: Path, key: str, raw: Mapping[str, Any], sides: LaneSides) -> Lane:
     field = f"lane_segments[{key}]"
     try:
         beside = [id_text(raw["left_neighbor_id"]), id_text(raw["right_neighbor_id"])]
-        left = _points(path, f"{field}.left_lane_boundary", raw["left_lane_boundary"])
-        right = _points(path, f"{field}.right_lane_boundary", raw["right_lane_boundary"])
         return Lane(
             lane_id=key,
-            ring=ring_from_boundaries(left, right),
-            centerline=centerline_from_boundaries(left, right),
+            ring=ring_from_boundaries(sides.left, sides.right),
+            centerline=centerline_from_boundaries(sides.left, sides.right),
             is_intersection=bool(raw["is_intersection"]),
             drives_cars=CAR_LANE_TYPES[raw["lane_type"]],
-            successors=tuple(lane for lane in map(id_text, raw["successors"]) if lane is not None),
-            predecessors=tuple(lane for lane in map(id_text, raw["predecessors"]) if lane is not None),
+            successors=sides.successors,
+            predecessors=sides.predecessors,
             left_neighbor=beside[0],
             right_neighbor=beside[1],
-            left_boundary=left,
-            right_boundary=right,
+            left_boundary=sides.left,
+            right_boundary=sides.right,
             left_mark=str(raw["left_lane_mark_type"]),
             right_mark=str(raw["right_lane_mark_type"]),
         )
@@ -443,34 +477,28 @@ def _lane(path: Path, key: str, raw: Any) -> Lane:
         raise BadClip(str(path), field, str(error)) from error
 
 
-def _points(path: Path, field: str, raw: Any) -> Array:
-    """(B, 3) x, y, z [m], B >= 2."""
+def _points(raw: Any) -> Array:
+    """(B, 3) x, y, z [m]. Raises KeyError, TypeError, ValueError, OverflowError where it is no list of points."""
+    points = np.array([[point["x"], point["y"], point["z"]] for point in raw], dtype=np.float64)
+    return points.reshape(-1, 3)
+
+
+def _area(key: str, raw: Any) -> tuple[Array | None, tuple[Repair, ...]]:
+    """The ring (M, 2) of a drivable area; None where it is left out."""
     try:
-        points = np.array([[point["x"], point["y"], point["z"]] for point in raw], dtype=np.float64)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise BadClip(str(path), field, f"not a list of x, y, z points ({error})") from error
-    if len(points) < 2 or not np.isfinite(points).all():
-        raise BadClip(str(path), field, "needs at least two finite points")
-    return points
+        outline = _points(raw["area_boundary"])
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return None, (map_repair("area", str(key), "no area_boundary of x, y, z points"),)
+    return simple_area(outline[:, :2], str(key))
 
 
-def _closed(points: Array) -> Array:
-    return points if np.array_equal(points[0], points[-1]) else np.concatenate([points, points[:1]])
-
-
-def _area_ring(path: Path, field: str, raw: Any) -> Array:
+def _crossing(key: str, raw: Any) -> tuple[Array | None, tuple[Repair, ...]]:
+    """The ring (M, 2) of a pedestrian crossing; None where it is left out."""
     try:
-        return valid_ring(_closed(_points(path, f"{field}.area_boundary", raw["area_boundary"])[:, :2]))
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise BadClip(str(path), f"{field}.area_boundary", f"not a polygon ({error})") from error
-
-
-def _crossing_ring(path: Path, field: str, raw: Any) -> Array:
-    try:
-        edges = [_points(path, f"{field}.{name}", raw[name])[:, :2] for name in ("edge1", "edge2")]
-    except (KeyError, TypeError) as error:
-        raise BadClip(str(path), field, f"needs edge1 and edge2 ({error})") from error
-    return _closed(np.concatenate([edges[0], edges[1][::-1]]))
+        edge1, edge2 = _points(raw["edge1"])[:, :2], _points(raw["edge2"])[:, :2]
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return None, (map_repair("crossing", str(key), "no edge1 and edge2 of x, y, z points"),)
+    return crossing_between(edge1, edge2, str(key))
 
 
 LICENCE = "CC BY-NC-SA 4.0 (Argoverse 2)"
@@ -554,7 +582,8 @@ def read_log(folder: Path) -> AV2Log:
     times_s = step_times(0, motion.n_steps)
     ego_states = ego_states_at(motion, times_s)
     vector_map = map_file(folder)
-    road_map = read_map(vector_map)
+    road_map, map_repairs = read_map(vector_map)
+    lights, light_repairs = lights_on_map(read_lights(folder, motion, times_s), road_map.lanes)
     cameras, sensors = read_cameras(folder), folder / "sensors"
     return AV2Log(
         file=str(folder),
@@ -563,14 +592,14 @@ def read_log(folder: Path) -> AV2Log:
         agents=agents_at(motion, times_s),
         road_map=road_map,
         route=route_of_drive(road_map, ego_states[np.isfinite(ego_states[:, X]), :3], str(vector_map), "lane_segments"),
-        lights=read_lights(folder, road_map, motion, times_s),
+        lights=lights,
         cameras=cameras,
         images=tuple(chain(*(_stamped(motion, c.name, sensors / "cameras" / c.name, ".jpg") for c in cameras))),
         sweeps=tuple(_stamped(motion, "lidar", sensors / "lidar", ".feather")),
         licence=_licence(folder),
         content_digest=content_digest(folder),
         split=folder_split(folder),
-        repairs=motion.repairs,
+        repairs=(*motion.repairs, *map_repairs, *light_repairs),
     )
 
 
@@ -603,16 +632,13 @@ def read_cameras(folder: Path) -> tuple[Camera, ...]:
     return tuple(cameras)
 
 
-def read_lights(folder: Path, road_map: RoadMap, motion: LogMotion, times_s: Array) -> TrafficLights:
-    """Light phases at times (S,); no lanes where the log has none. Raises BadClip."""
+def read_lights(folder: Path, motion: LogMotion, times_s: Array) -> TrafficLights:
+    """Light phases at times (S,), of all lanes that are named; no lanes where the log has none. Raises BadClip."""
     path = folder / LIGHTS
     if not path.exists():
         return TrafficLights((), np.zeros((len(times_s), 0), np.int8))
     table = read_feather(path, ("timestamp_ns", "lane_id", "state"))
     lanes, names = table["lane_id"].astype(str), table["state"].astype(str)
-    strangers = set(lanes.tolist()) - road_map.lanes.keys()
-    if strangers:
-        raise BadClip(str(path), "lane_id", f"not on the map: {sorted(strangers)}")
     unknown = set(names.tolist()) - LightState.__members__.keys()
     if unknown:
         raise BadClip(str(path), "state", f"unknown state {sorted(unknown)}")

@@ -64,8 +64,9 @@ from tasks.world.arrays import Array, Indices
 from tasks.world.clip import STEP_S, AgentKind, Camera, SensorFile
 from tasks.world.frames import EGO_STATE_SIZE
 from tasks.world.repair.records import Repair
+from tasks.world.repair.road import lights_on_map
 from tasks.world.repair.tracks import MOST
-from tasks.world.road_map import LightState, RoadMap, TrafficLights
+from tasks.world.road_map import LightState, TrafficLights
 
 # What moves in a log of 123D, at steps of 0.1 s: rear-axle poses, boxes, lights.
 #
@@ -154,8 +155,8 @@ def resampled_ego_states(motion: LogMotion, times_s: Array) -> Array:
     return states
 
 
-def lights_at(motion: LogMotion, road_map: RoadMap, times_s: Array) -> TrafficLights:
-    """Phases at times (S,) of the lanes on the map: of the latest frame, where one is at most 0.55 s old.
+def lights_at(motion: LogMotion, times_s: Array) -> TrafficLights:
+    """Phases at times (S,) of all lanes that are named: of the latest frame, where one is at most 0.55 s old.
 
     Two lights of one lane count as the more restrictive. No lanes where the log has no lights. Raises BadClip.
     """
@@ -172,15 +173,12 @@ def lights_at(motion: LogMotion, road_map: RoadMap, times_s: Array) -> TrafficLi
     if len(status) and int(np.max(status)) >= len(STATES):
         raise BadClip(str(path), "status", f"unknown status {int(np.max(status))}")
     names = np.array([str(number) for number in lane.to_pylist()], dtype=np.str_)
-    lane_ids = tuple(sorted(set(names.tolist()) & road_map.lanes.keys()))
+    lane_ids, column = np.unique(names, return_inverse=True)
     states = np.full((len(changed_at) + 1, len(lane_ids)), LightState.UNKNOWN, np.int8)  # the last: of no frame
-    for column, lane_id in enumerate(lane_ids):
-        of_lane = np.flatnonzero(names == lane_id)
-        phases = np.array(STATES, np.int8)[np.asarray(status, np.int64)[of_lane]]
-        np.maximum.at(states[:, column], row[of_lane], phases)
+    np.maximum.at(states, (row, column), np.array(STATES, np.int8)[np.asarray(status, np.int64)])
     latest = np.searchsorted(changed_at, times_s + SAME_FRAME_S) - 1
     fresh = (latest >= 0) & (times_s - np.append(changed_at, np.inf)[latest] <= MAX_GAP_S)
-    return TrafficLights(lane_ids, states[np.where(fresh, latest, -1)])
+    return TrafficLights(tuple(lane_ids.tolist()), states[np.where(fresh, latest, -1)])
 
 
 def pose_matrices(path: Path, poses: Array) -> Array:
@@ -387,22 +385,24 @@ class Py123dReader(LogReader[Py123dLog]):
         driven = drive.ego_states[drive.segment >= 0, :3]
         if not len(driven):
             raise BadClip(str(path / EGO), "imu_se3", "no continuous drive")
-        road_map = read_map(map_path, source, driven[:, :2])
+        around = read_map(map_path, source, driven[:, :2])
+        every_light = lights_at(motion, step_times(0, motion.n_steps))
+        lights, light_repairs = lights_on_map(every_light, around.road_map.lanes, around.far_lanes)
         rig, split = read_rig(path), header.value("split", str).rpartition("_")[2]  # <data set>_<split>
         return Py123dLog(
             file=str(path),
             motion=motion,
             ego_states=drive.ego_states,
             agents=drive.agents,
-            road_map=road_map,
-            route=route_of_drive(road_map, driven, str(map_path), "lanes"),
-            lights=lights_at(motion, road_map, step_times(0, motion.n_steps)),
+            road_map=around.road_map,
+            route=route_of_drive(around.road_map, driven, str(map_path), "lanes"),
+            lights=lights,
             cameras=tuple(rig.values()),
             images=recorded_photos(motion, rig, self.sensor_root) if self.sensor_root else (),
             licence=source.licence,
             content_digest=content_digest(header, map_path),
             split=split if split in SPLITS else None,
-            repairs=motion.repairs,
+            repairs=(*motion.repairs, *around.repairs, *light_repairs),
         )
 
     def digest(self, ref: ClipRef) -> str:

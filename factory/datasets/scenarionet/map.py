@@ -1,8 +1,9 @@
 """From ScenarioNet's map features to a RoadMap: lane graph, neighbours, drivable area, crossings, lights."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,15 @@ from shapely.geometry import LineString, Polygon
 from factory.readers.base import BadClip, id_text
 from factory.wording import shown
 from tasks.world.arrays import Array
+from tasks.world.repair.records import Repair
+from tasks.world.repair.road import (
+    finite_points,
+    left_out_lanes,
+    line_fault,
+    map_repair,
+    simple_area,
+    simple_crossing,
+)
 from tasks.world.road_map import (
     Lane,
     LightState,
@@ -68,9 +78,14 @@ class RawLane:
     speed_limit_mps: float | None
 
 
-def raw_lanes(features: Mapping[str, Any], source: str, file: str) -> dict[str, RawLane]:
-    """All LANE_* features by id, in file order. Raises BadClip for an unknown kind, a lane without a line, or none."""
+def raw_lanes(features: Mapping[str, Any], source: str, file: str) -> tuple[dict[str, RawLane], tuple[Repair, ...]]:
+    """All LANE_* features by id, in file order; and what is not as the file has it.
+
+    Doubled points of a centreline are no repair: it is resampled, and they change nothing. Raises BadClip for an
+    unknown kind, a lane without a polyline, and where no lane for cars is left.
+    """
     lanes: dict[str, RawLane] = {}
+    repairs: list[Repair] = []
     for key, feature in features.items():
         lane_id = id_text(key)
         field = f"map_features[{shown(key) if lane_id is None else lane_id}]"
@@ -83,10 +98,14 @@ def raw_lanes(features: Mapping[str, Any], source: str, file: str) -> dict[str, 
             raise BadClip(file, field, "is no id of a lane, expected text or a number")
         if kind not in LANE_KINDS:
             raise BadClip(file, f"{field}.type", f"unknown lane class {shown(kind)}")
-        line = resampled_line(points(feature, "polyline", file, field), file, f"{field}.polyline")
-        if line is None:  # a lane shorter than a centimetre leads nowhere
+        finite, lost = finite_points(points(feature, "polyline", file, field), "lane", lane_id, "polyline")
+        try:
+            line = resampled_line(finite)
+        except ValueError as error:
+            repairs.append(map_repair("lane", lane_id, str(error)))
             continue
-        ring = _ring(feature, line, kind, file, field)
+        ring, of_ring = _ring(feature, line, lane_id, kind, file, field)
+        repairs += (*lost, *of_ring)
         lanes[lane_id] = RawLane(
             lane_id=lane_id,
             kind=kind,
@@ -101,22 +120,22 @@ def raw_lanes(features: Mapping[str, Any], source: str, file: str) -> dict[str, 
             speed_limit_mps=_speed_limit(feature, source),
         )
     if not any(lane.kind in CAR_LANE_KINDS for lane in lanes.values()):
-        raise BadClip(file, "map_features", "the map is empty: no lane for cars")
-    return lanes
+        raise BadClip(file, "map_features", f"the map is empty: no lane for cars{left_out_lanes(repairs)}")
+    return lanes, tuple(repairs)
 
 
 def points(feature: Mapping[str, Any], name: str, file: str, field: str) -> Array:
-    """(N, 2) finite points of a polyline or polygon. Raises BadClip."""
+    """(N, 2) points of a polyline or polygon. Raises BadClip."""
     if name not in feature:
         raise BadClip(file, f"{field}.{name}", "missing")
     try:
         array = np.asarray(feature[name], dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise BadClip(file, f"{field}.{name}", f"not an array of points ({error})") from error
-    if array.ndim != 2 or array.shape[1] < 2 or len(array) == 0:
+    if array.size == 0:
+        return np.empty((0, 2))
+    if array.ndim != 2 or array.shape[1] < 2:
         raise BadClip(file, f"{field}.{name}", f"shape {array.shape}, expected (N, 2) or (N, 3)")
-    if not np.isfinite(array[:, :2]).all():
-        raise BadClip(file, f"{field}.{name}", "NaN or infinite coordinate")
     return array[:, :2]
 
 
@@ -167,13 +186,18 @@ def _forking_merging_crossing(lanes: Mapping[str, RawLane]) -> set[str]:
     return found | {ids[k] for k in crossing}
 
 
-def _ring(feature: Mapping[str, Any], line: Array, kind: str, file: str, field: str) -> Array:
-    if "polygon" in feature:
-        ring = closed_ring(points(feature, "polygon", file, field))
-        if ring is not None:
-            return ring
+def _ring(
+    feature: Mapping[str, Any], line: Array, lane_id: str, kind: str, file: str, field: str
+) -> tuple[Array, tuple[Repair, ...]]:
     half = BIKE_HALF_WIDTH_M if kind == "LANE_BIKE_LANE" else _half_width(feature, file, field)
-    return np.asarray(LineString(line).buffer(half, cap_style="flat").exterior.coords)
+    found: tuple[Repair, ...] = ()
+    if "polygon" in feature:
+        outline, found = finite_points(points(feature, "polygon", file, field), "lane", lane_id, "polygon")
+        ring = closed_ring(outline)
+        if ring is not None:
+            return ring, found
+        found = (map_repair("lane", lane_id, "polygon of no area", f"{2.0 * half:g} m wide along its centreline"),)
+    return np.asarray(LineString(line).buffer(half, cap_style="flat").exterior.coords), found
 
 
 def _half_width(feature: Mapping[str, Any], file: str, field: str) -> float:
@@ -185,16 +209,12 @@ def _half_width(feature: Mapping[str, Any], file: str, field: str) -> float:
     return float(np.median(measured)) if len(measured) else HALF_WIDTH_M
 
 
-def resampled_line(line: Array, file: str, field: str) -> Array | None:
-    """The line (P, 2) at uniform arc length, <= 0.75 m apart; None when it has no length. Raises BadClip over 20 km."""
-    line = line[np.concatenate([[True], np.hypot(*np.diff(line, axis=0).T) > 1e-6])]
-    length = arc_lengths(line)[-1]
-    if length < 0.01:
-        return None
-    try:
-        return resample(line, n_spaced(length))
-    except ValueError as error:
-        raise BadClip(file, field, str(error)) from error
+def resampled_line(line: Array) -> Array:
+    """The line (N, 2) at uniform arc length, <= 0.75 m apart: (P, 2). Raises ValueError where it is no lane's."""
+    line = line[np.concatenate([[True], np.hypot(*np.diff(line, axis=0).T) > 1e-6])[: len(line)]]
+    if fault := line_fault(line):
+        raise ValueError(fault)
+    return resample(line, n_spaced(arc_lengths(line)[-1]))
 
 
 def _ids(value: object) -> tuple[str, ...] | None:
@@ -259,9 +279,11 @@ _LIGHTS = {
 LIGHT_STATES: dict[object, LightState] = {name: state for state, names in _LIGHTS.items() for name in names}
 
 
-def road_map(features: Mapping[str, Any], lit_lanes: tuple[str, ...], source: str, location: str, file: str) -> RoadMap:
-    """The vector map of one scenario. Raises BadClip naming the feature that is broken."""
-    raw = raw_lanes(features, source, file)
+def road_map(
+    features: Mapping[str, Any], lit_lanes: tuple[str, ...], source: str, location: str, file: str
+) -> tuple[RoadMap, tuple[Repair, ...]]:
+    """The vector map of one scenario, and what is not as the file has it. Raises BadClip naming the broken feature."""
+    raw, repairs = raw_lanes(features, source, file)
     connectors = connector_ids(raw, frozenset(lit_lanes))
     successors = lane_graph(raw)
     predecessors: dict[str, list[str]] = {lane_id: [] for lane_id in raw}
@@ -284,13 +306,9 @@ def road_map(features: Mapping[str, Any], lit_lanes: tuple[str, ...], source: st
         )
         for lane_id, lane in raw.items()
     }
-    return RoadMap(
-        lanes=lanes,
-        drivable_areas=_drivable_areas(features, raw, file),
-        crossings=_crossings(features, file),
-        roadblock_of=roadblocks_of(lanes),
-        location=location,
-    )
+    areas, of_areas = _drivable_areas(features, raw, file)
+    crossings, of_crossings = _crossings(features, file)
+    return RoadMap(lanes, areas, crossings, roadblocks_of(lanes), location), (*repairs, *of_areas, *of_crossings)
 
 
 def lane_graph(raw: Mapping[str, RawLane]) -> dict[str, tuple[str, ...]]:
@@ -375,7 +393,9 @@ def traffic_lights(states: Mapping[str, Any], n_steps: int, file: str) -> Traffi
     return TrafficLights(tuple(of_lane), np.stack(columns, axis=1) if columns else np.zeros((n_steps, 0), np.int8))
 
 
-def _drivable_areas(features: Mapping[str, Any], raw: Mapping[str, RawLane], file: str) -> tuple[MapPolygon, ...]:
+def _drivable_areas(
+    features: Mapping[str, Any], raw: Mapping[str, RawLane], file: str
+) -> tuple[tuple[MapPolygon, ...], tuple[Repair, ...]]:
     """Union of all car lanes, connectors buffered, and of the drivable surface where the file has its outline.
 
     nuScenes' and nuPlan's converters write that outline as closed `boundary_<i>` rings, islands and outer rings alike:
@@ -384,17 +404,43 @@ def _drivable_areas(features: Mapping[str, Any], raw: Mapping[str, RawLane], fil
     kilometres beyond the lanes of the file: what is further than 50 m from their convex hull is left out.
     """
     shapes = [Polygon(lane.ring) for lane in raw.values() if lane.kind in CAR_LANE_KINDS]
-    outline = [
-        points(feature, "polyline", file, f"map_features[{key}]")
+    named = [
+        (str(key), feature)
         for key, feature in features.items()
         if str(key).startswith("boundary_") and isinstance(feature, dict) and "polyline" in feature
     ]
-    if outline and all(len(ring) > 3 and np.allclose(ring[0], ring[-1]) for ring in outline):
-        rings = [ring for ring in map(closed_ring, outline) if ring is not None]
+    outline, repairs = _outlines(named, "polyline", "area", file)
+    if outline and all(len(line) > 3 and _ends_meet(line) for line in outline.values()):
+        found = [simple_area(line, key) for key, line in outline.items()]
+        rings = [ring for ring, _ in found if ring is not None]
+        repairs = (*repairs, *chain(*(of_ring for _, of_ring in found)))
         surface = reduce(shapely.symmetric_difference, [Polygon(ring) for ring in rings], Polygon())
         near = shapely.convex_hull(shapely.MultiPolygon(shapes)).buffer(SURFACE_MARGIN_M)
         shapes.append(shapely.intersection(surface, near))
-    return paved_areas(shapes)
+    return paved_areas(shapes), repairs
+
+
+def _ends_meet(line: Array) -> bool:
+    """Whether a line is closed, as far as the points at its ends are finite."""
+    return not np.isfinite(line[[0, -1]]).all() or np.allclose(line[0], line[-1])
+
+
+def _outlines(
+    named: Iterable[tuple[str, Mapping[str, Any]]], part: str, what: str, file: str
+) -> tuple[dict[str, Array], tuple[Repair, ...]]:
+    """The points (N, 2) of some features by name; those that have none are left out."""
+    outlines, found = dict[str, Array](), list[Repair]()
+    for key, feature in named:
+        try:
+            outline = points(feature, part, file, key)
+        except BadClip as error:
+            found.append(map_repair(what, key, f"{part}: {error.problem}"))
+            continue
+        if len(outline):
+            outlines[key] = outline
+        else:
+            found.append(map_repair(what, key, f"{part} without a point"))
+    return outlines, tuple(found)
 
 
 def paved_areas(shapes: Sequence[Polygon]) -> tuple[MapPolygon, ...]:
@@ -428,10 +474,9 @@ def pieces(polygon: Polygon) -> list[Polygon]:
     return [piece for part in found if part.geom_type == "Polygon" for piece in pieces(part)]
 
 
-def _crossings(features: Mapping[str, Any], file: str) -> tuple[Array, ...]:
-    rings = (
-        closed_ring(points(feature, "polygon", file, f"map_features[{key}]"))
-        for key, feature in features.items()
-        if feature["type"] == "CROSSWALK"
-    )
-    return tuple(ring for ring in rings if ring is not None)
+def _crossings(features: Mapping[str, Any], file: str) -> tuple[tuple[Array, ...], tuple[Repair, ...]]:
+    named = ((str(key), feature) for key, feature in features.items() if feature["type"] == "CROSSWALK")
+    outlines, repairs = _outlines(named, "polygon", "crossing", file)
+    found = [simple_crossing(outline, key) for key, outline in outlines.items()]
+    rings = tuple(ring for ring, _ in found if ring is not None)
+    return rings, (*repairs, *chain(*(of_ring for _, of_ring in found)))

@@ -57,6 +57,7 @@ from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import CLIP_STEPS, STEP_S, AgentKind, AgentTracks
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY, X, Y, planar_matrices, wrap_angle
 from tasks.world.repair.records import LEFT_OUT, Repair
+from tasks.world.repair.road import lights_on_map
 from tasks.world.repair.tracks import EGO, MOST, UNSEEN, ObservedTracks, clock_repairs, repaired, whole_frames
 from tasks.world.road_map import TrafficLights
 
@@ -684,11 +685,12 @@ def read_log(path: Path) -> ScenarioLog:
     motion = read_motion(scenario, file)
     name, source = _source(scenario, file)
     n_frames, metadata = int(scenario["length"]), scenario["metadata"]
-    lights = traffic_lights(scenario["dynamic_map_states"], n_frames, file)
-    lanes = road_map(scenario["map_features"], lights.lane_ids, name, id_text(metadata.get("map")) or "", file)
+    every_light = traffic_lights(scenario["dynamic_map_states"], n_frames, file)
+    location = id_text(metadata.get("map")) or ""
+    lanes, map_repairs = road_map(scenario["map_features"], every_light.lane_ids, name, location, file)
+    lights, light_repairs = lights_on_map(every_light, lanes.lanes)
     route = route_of_drive(lanes, motion.ego_states[motion.segment >= 0, :3], file, "map_features")
     frames = np.floor(fractional_frame_indices(frame_times(metadata, n_frames, file)) + 1e-9).astype(int)
-    known = [column for column, lane_id in enumerate(lights.lane_ids) if lane_id in lanes.lanes]
     return ScenarioLog(
         file=file,
         motion=motion,
@@ -696,9 +698,9 @@ def read_log(path: Path) -> ScenarioLog:
         agents=motion.agents,
         road_map=lanes,
         route=route,
-        lights=TrafficLights(tuple(lights.lane_ids[c] for c in known), lights.states[frames][:, known]),
+        lights=TrafficLights(lights.lane_ids, lights.states[frames]),
         licence=source.licence,
         content_digest=digest,
         split=folder_split(path) or nuscenes_split(path.stem) or waymo_split(metadata.get("source_file")),
-        repairs=motion.repairs,
+        repairs=(*motion.repairs, *map_repairs, *light_repairs),
     )

@@ -95,7 +95,7 @@ def write_log(folder: Path, seconds: float = 11.6, speed: float = SPEED) -> Path
             "2": lane(60, 300, predecessors=[1], is_intersection=True),
         },
         "drivable_areas": {"9": {"area_boundary": boundary(-20, 300, 4.0) + boundary(300, -20, -4.0), "id": 9}},
-        "pedestrian_crossings": {"5": {"edge1": boundary(50, 50, 0.0), "edge2": boundary(53, 53, 0.0), "id": 5}},
+        "pedestrian_crossings": {"5": {"edge1": boundary(50, 53, 2.0), "edge2": boundary(50, 53, -2.0), "id": 5}},
     }
     (folder / "map" / f"log_map_archive_{folder.name}____TWN_city_1.json").write_text(json.dumps(content))
     return folder

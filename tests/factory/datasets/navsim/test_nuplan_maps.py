@@ -27,7 +27,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> RoadMap:
     built, drive = plan_log(0, 0)
     file = tmp_path_factory.mktemp("town") / "log_map_archive_x____SYN.json"
     file.write_text(json.dumps(_vector_map(built.streets, drive)))
-    return read_map(file)
+    return read_map(file)[0]
 
 
 @pytest.fixture(scope="session")

@@ -88,7 +88,7 @@ def convert(log: Path, root: Path, made: Made | None = None, objects: Sequence[M
     shared = root / "maps" / made.dataset / f"{made.dataset}_{made.location}.arrow"
     path = folder / "map.arrow" if made.map_is_per_log else shared
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_map(path, objects_of(read_map(map_file(log))) if objects is None else objects, told)
+    write_map(path, objects_of(read_map(map_file(log))[0]) if objects is None else objects, told)
     return folder
 
 
