@@ -92,7 +92,7 @@ def _log_on_the_road(maps: Path, poses: np.ndarray) -> WholeLog:
     nobody = np.zeros((len(poses), 0))
     boxes, velocities = np.zeros((len(poses), 0, 5)), np.zeros((len(poses), 0, 2))
     agents = AgentTracks((), (), boxes, velocities, nobody.astype(bool), nobody, np.zeros(0))
-    road_map = open_city(maps, CITY).road_map(states[:, :2], 100.0)
+    road_map = open_city(maps, CITY).road_map(states[:, :2], 100.0)[0]
     route = route_of_roadblocks(road_map, ["31", "33", "32"], states[NOW, :3])
     return WholeLog("photos", states, agents, road_map, route, TrafficLights((), nobody.astype(np.int8)), "", "")
 

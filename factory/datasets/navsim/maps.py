@@ -20,6 +20,8 @@ from factory.readers.base import BadClip
 from tasks.caches import Damaged, user_cache, verify_checksum, with_checksum
 from tasks.kernels.compiled import write_whole
 from tasks.world.arrays import Array, Ints
+from tasks.world.repair.records import Repair
+from tasks.world.repair.road import map_repair, simple_crossing
 from tasks.world.road_map import Lane, MapLayer, MapPolygon, RoadMap
 from tasks.world.roadblocks import Roadblocks
 
@@ -52,6 +54,7 @@ NUMBERS: Mapping[str, tuple[str, ...]] = {  # columns where NULL is NaN
     "lane_connectors": ("speed_limit_mps",),
     "baseline_paths": ("lane_fid", "lane_connector_fid"),
 }
+MADE: Mapping[str, tuple[str, ...]] = {"crosswalks": ("was_m2",)}  # [m2] of an outline that crossed itself; NaN
 LINES = {"baseline_paths", "boundaries", "lane_connectors"}
 ONE_PART = {"lanes_polygons", "gen_lane_connectors_scaled_width_polygons"}  # of several parts the largest is kept
 
@@ -167,6 +170,8 @@ def _table(path: Path, layer: str, target: str) -> LayerTable:
         else:
             columns[name] = numbers
     shapes = _projected(path, layer, meta["crs"], target, fids, wkb)
+    if "was_m2" in MADE.get(layer, ()):
+        shapes, columns["was_m2"] = _ordered(shapes)
     rows, parts = _parts(path, layer, fids, shapes)
     kept = {name: column[rows] for name, column in columns.items()}
     if not len(rows):
@@ -197,6 +202,17 @@ def _projected(path: Path, layer: str, source: str | None, target: str, fids: In
     if wild.size:
         raise BadClip(str(path), f"layer {layer}, column geom, fid {fids[owner[wild[0]]]}", "lies outside the UTM zone")
     return np.asarray(moved, dtype=object)
+
+
+def _ordered(shapes: NDArray[np.object_]) -> tuple[NDArray[np.object_], Array]:
+    """Crossings, with a simple outline where theirs crosses itself; and the area [m2] (N,) of theirs, else NaN."""
+    out, was_m2 = shapes.copy(), np.full(len(shapes), np.nan)
+    plain = (shapely.get_type_id(shapes) == 3) & (shapely.get_num_interior_rings(shapes) == 0)
+    for i in np.flatnonzero(plain & ~shapely.is_valid(shapes)).tolist():
+        ring, _ = simple_crossing(shapely.get_coordinates(shapes[i]), "")
+        if ring is not None:
+            out[i], was_m2[i] = shapely.Polygon(ring), shapely.make_valid(shapes[i]).area
+    return out, was_m2
 
 
 def _parts(path: Path, layer: str, fids: Ints, shapes: NDArray[np.object_]) -> tuple[Ints, NDArray[np.object_]]:
@@ -230,7 +246,7 @@ def _parts(path: Path, layer: str, fids: Ints, shapes: NDArray[np.object_]) -> t
 
 # A city's tables on disk, in the user's cache: read from the GeoPackage once, then within a fraction of a second.
 
-FORMAT = 3  # raise by hand whenever a GeoPackage gives other tables, or they are kept otherwise
+FORMAT = 4  # raise by hand whenever a GeoPackage gives other tables, or they are kept otherwise
 
 
 def cached_tables_path(path: Path) -> Path:
@@ -263,7 +279,8 @@ def cached_tables(path: Path) -> dict[str, LayerTable]:
 
 
 def _kept_table(stored: np.lib.npyio.NpzFile, layer: str) -> LayerTable:
-    columns = {name: stored[f"{layer}.{name}"] for name in (*KEYS[layer], *NUMBERS.get(layer, ()))}
+    names = (*KEYS[layer], *NUMBERS.get(layer, ()), *MADE.get(layer, ()))
+    columns = {name: stored[f"{layer}.{name}"] for name in names}
     offsets = tuple(stored[f"{layer}.offsets{i}"] for i in range(1 if layer in LINES else 2))
     return LayerTable(stored[f"{layer}.fid"], columns, stored[f"{layer}.xy"], offsets)
 
@@ -323,14 +340,17 @@ class City:
         self._lanes: dict[int, Lane] = {}
         self._areas: dict[tuple[str, int], MapPolygon] = {}
 
-    def road_map(self, along_xy: Array, radius_m: float, lane_ids: Collection[str] = ()) -> RoadMap:
+    def road_map(
+        self, along_xy: Array, radius_m: float, lane_ids: Collection[str] = ()
+    ) -> tuple[RoadMap, tuple[Repair, ...]]:
         """All within `radius_m` [m] of any of the points (S, 2), in file order: lanes, then connectors.
 
         lane_ids: further lanes, wherever they are, as those of a route. Raises KeyError for one that is none.
 
         Lane ids are nuPlan's fids; neighbours and successors may name lanes outside the map. Centrelines are the
         baselines' own points, as nuPlan's `discrete_path`. Drivable are lane groups and car parks, and intersections:
-        generic drivable areas are what the public metric never loads.
+        generic drivable areas are what the public metric never loads. With it comes what is not as the file has it:
+        crossings alone, which no metric looks at; of all else the public reward takes what is there.
         """
         around = shapely.multipoints(np.asarray(along_xy, dtype=np.float64).reshape(-1, 2))
         rows = {*_near(self._tree, around, radius_m), *(self._index_of[lane_id] for lane_id in lane_ids)}
@@ -339,15 +359,31 @@ class City:
             layer: [self._area(layer, row) for row in _near(self._area_trees[layer], around, radius_m)]
             for layer in AREAS
         }
-        crossings = self.tables["crosswalks"]
-        return RoadMap(
+        crossings, near = self.tables["crosswalks"], _near(self._area_trees["crosswalks"], around, radius_m)
+        found = RoadMap(
             lanes=lanes,
             drivable_areas=(*areas[GROUPS], *areas["carpark_areas"]),
-            crossings=tuple(crossings.outline(i) for i in _near(self._area_trees["crosswalks"], around, radius_m)),
+            crossings=tuple(crossings.outline(i) for i in near),
             roadblock_of={lane_id: str(self._blocks[self._index_of[lane_id]]) for lane_id in lanes},
             location=self.location,
             intersections=tuple(areas["intersections"]),
         )
+        repairs = (
+            map_repair(
+                "crossing",
+                str(crossings.fid[i]),
+                f"crosses itself, {crossings.columns['was_m2'][i]:.1f} m2",
+                f"a simple outline, {crossings.shapes[i].area:.1f} m2",
+            )
+            for i in near
+            if np.isfinite(crossings.columns["was_m2"][i])
+        )
+        return found, tuple(repairs)
+
+    @property
+    def lane_ids(self) -> Collection[str]:
+        """Of every lane and connector of the city."""
+        return self._index_of.keys()
 
     @cached_property
     def roadblocks(self) -> Roadblocks:

@@ -66,6 +66,7 @@ from tasks.kernels.compiled import write_whole
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import NOW, Block, Camera, Clip, SensorFile
 from tasks.world.repair.records import later
+from tasks.world.repair.road import lights_on_map
 
 # NAVSIM's scene filters and splits: the YAML files that name which windows of which logs count.
 #
@@ -534,6 +535,7 @@ class NavsimReader:
         window, repairs = repaired_frames(window)
         states = ego_states(window)
         road = road_around(self.maps, frames[now], states[:, :2], states[NOW, :3], opened.log.file, now)
+        lights, light_repairs = lights_on_map(traffic_lights(window), road.road_map.lanes, road.city_lanes)
         images: tuple[SensorFile, ...] = ()
         sweeps: tuple[SensorFile, ...] = ()
         cameras: tuple[Camera, ...] = ()
@@ -558,7 +560,7 @@ class NavsimReader:
             road_map=road.road_map,
             route=road.route,
             centerline=road.centerline,
-            lights=traffic_lights(window, tuple(road.road_map.lanes)),
+            lights=lights,
             cameras=cameras,
             images=images,
             sweeps=sweeps,
@@ -566,7 +568,11 @@ class NavsimReader:
             licence=LICENCE,
             frame_tokens=(frames[now].token, frames[now + HORIZON_FRAMES].token),
             content_digest=digest_with(opened.content_digest, self._others(ref), self._log_digest),
-            repairs=tuple(later(repair, ref.start_ms / 1000) for repair in repairs),
+            repairs=(
+                *road.repairs,
+                *light_repairs,
+                *(later(repair, ref.start_ms / 1000) for repair in repairs),
+            ),
         )
         return validate_clip(clip, opened.log.file)
 

@@ -12,7 +12,7 @@ public log replay drops it. A light holds its state until the next frame.
 Between frames the ego's pose, velocity and acceleration are linear too. Steering and rates are 0, as there.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -38,6 +38,7 @@ from tasks.world.clip import (
 )
 from tasks.world.frames import AX, EGO_STATE_SIZE, HEADING, PACIFICA, VX, X, wrap_angle
 from tasks.world.geometry import ego_boxes, touching
+from tasks.world.repair.records import Repair
 from tasks.world.repair.tracks import HEADING as BOX_HEADING
 from tasks.world.repair.tracks import Repairs, observed, repaired
 from tasks.world.road_map import CenterlineFinder, LightState, NoRoute, RoadMap, Route, TrafficLights
@@ -126,10 +127,11 @@ def world_from_ego(frames: Sequence[Frame]) -> Array:
     return poses
 
 
-def traffic_lights(frames: Sequence[Frame], lane_ids: Sequence[str]) -> TrafficLights:
-    """The lights (S, L) of those `lane_ids` that any frame names; unknown in frames that do not name them."""
-    wanted = frozenset(lane_ids)
-    named = sorted({lane_id for frame in frames for lane_id, _ in frame.lights if lane_id in wanted})
+def traffic_lights(frames: Sequence[Frame], lane_ids: Collection[str] | None = None) -> TrafficLights:
+    """The lights (S, L) that any frame names, unknown in frames that do not; lane_ids: of these alone, None: of all."""
+    wanted = None if lane_ids is None else frozenset(lane_ids)
+    of_frames = {lane_id for frame in frames for lane_id, _ in frame.lights}
+    named = sorted(of_frames if wanted is None else of_frames & wanted)
     column = {lane_id: i for i, lane_id in enumerate(named)}
     known = np.full((len(frames), len(named)), LightState.UNKNOWN, np.int8)
     for row, frame in zip(known, frames):
@@ -268,6 +270,8 @@ class RoadAhead:
     road_map: RoadMap
     route: Route
     centerline: Array  # (P, 3) from the lane of the pose at T along the route
+    city_lanes: Collection[str] = ()  # ids of all lanes of the city
+    repairs: tuple[Repair, ...] = ()  # what of the map is not as its file has it
 
 
 def road_around(maps: Path, frame: Frame, along_xy: Array, pose: Array, file: str, number: int) -> RoadAhead:
@@ -284,9 +288,10 @@ def road_around(maps: Path, frame: Frame, along_xy: Array, pose: Array, file: st
         own = [block for block in frame.roadblock_ids if block in blocks.lanes_of]
         lit = frozenset(lane_id for block in own for lane_id in blocks.lanes_of[block])
         along = [lane_id for block in passed for lane_id in blocks.lanes_of.get(block, ())]
-        road_map = city.road_map(along_xy, MAP_RADIUS_M, along)
+        road_map, repairs = city.road_map(along_xy, MAP_RADIUS_M, along)
         route = replace(route_of_roadblocks(road_map, frame.roadblock_ids, pose, blocks), lit_lane_ids=lit)
-        return RoadAhead(road_map, route, CenterlineFinder(road_map, route).centerline_from(pose))
+        centerline = CenterlineFinder(road_map, route).centerline_from(pose)
+        return RoadAhead(road_map, route, centerline, city.lane_ids, repairs)
     except NoRoute as error:
         raise BadClip(file, f"frames[{number}].roadblock_ids", str(error)) from error
 

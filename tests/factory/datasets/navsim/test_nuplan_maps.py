@@ -48,7 +48,7 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def whole(city: City) -> RoadMap:
-    return city.road_map(ORIGIN[None], 50_000.0)
+    return city.road_map(ORIGIN[None], 50_000.0)[0]
 
 
 def same(one: np.ndarray, other: np.ndarray) -> bool:
@@ -98,7 +98,7 @@ def test_a_road_map_holds_what_lies_within_the_radius_of_any_point(root: Path) -
     city = open_city(root, CITY)
     lanes = whole(city).lanes
     along = np.array([lane.centerline[0, :2] for lane in list(lanes.values())[:2]]) + 5.0
-    found = city.road_map(along, 40.0)
+    found, _ = city.road_map(along, 40.0)
     distance = {k: shapely.Polygon(v.ring).distance(shapely.MultiPoint(along)) for k, v in lanes.items()}
     assert list(found.lanes) == [k for k, d in distance.items() if d <= 40.0]
     assert 0 < len(found.lanes) < len(lanes)
