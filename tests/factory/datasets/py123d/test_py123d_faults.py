@@ -52,11 +52,11 @@ def told(name: str, **metadata: Any) -> Callable[[Path], None]:
     return lambda log: rewrite(log / name, **metadata)
 
 
-def lights(log: Path, status: int, lanes: int = 1) -> None:
+def lights(log: Path, status: int, lanes: int = 1, lane_id: int = 2) -> None:
     key = "traffic_light_detections"
     columns = {
         f"{key}.timestamp_us": pa.array([0]),
-        f"{key}.lane_id": pa.array([[2] * lanes], pa.list_(pa.int32())),
+        f"{key}.lane_id": pa.array([[lane_id] * lanes], pa.list_(pa.int32())),
         f"{key}.status": pa.array([[status]], pa.list_(pa.uint8())),
     }
     write(log / LIGHTS, columns, {})
