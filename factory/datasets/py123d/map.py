@@ -165,7 +165,8 @@ def _objects(path: Path, drive: Array) -> tuple[MapObjects, tuple[Repair, ...]]:
         column_without_nulls(path, file.table, name) for name in ("object_id", "map_layer", "features", "wkb")
     )
     try:
-        shapes = np.asarray(shapely.from_wkb(wkb.to_pylist()), object)
+        with np.errstate(invalid="ignore"):  # NaN is looked for later
+            shapes = np.asarray(shapely.from_wkb(wkb.to_pylist()), object)
         numbers = np.asarray(layers, np.int64)
     except (shapely.errors.GEOSException, TypeError, ValueError, pa.ArrowException) as error:
         raise BadClip(str(path), "wkb map_layer", f"no shapes or no layers ({error})") from error
@@ -188,7 +189,7 @@ def _objects(path: Path, drive: Array) -> tuple[MapObjects, tuple[Repair, ...]]:
 
 
 def _finite(shapes: NDArray[np.object_]) -> NDArray[np.object_]:
-    """The shapes; of those that hold NaN or infinity the other points."""
+    """The shapes; of those that hold NaN or infinity, near to which nothing is, the other points."""
     points, owner = shapely.get_coordinates(shapes, return_index=True)
     finite = np.isfinite(points).all(axis=1)
     out = shapes.copy()
