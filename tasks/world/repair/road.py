@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from tasks.world.arrays import Array
+from tasks.world.frames import LARGEST
 from tasks.world.repair.records import LEFT_OUT, Repair
 from tasks.world.road_map import MAX_LANE_M, TrafficLights, arc_lengths, valid_ring
 
@@ -46,9 +47,9 @@ def left_out_lanes(repairs: Iterable[Repair]) -> str:
 
 
 def finite_points(points: Array, what: str, thing: str, part: str = "") -> tuple[Array, tuple[Repair, ...]]:
-    """Points (N, C) without those that are not finite."""
-    kept = points[np.isfinite(points).all(axis=1)]
-    return _kept(points, kept, what, thing, part, "not finite")
+    """Points (N, C) without those that are NaN, infinite or beyond LARGEST."""
+    kept = points[(np.abs(points) <= LARGEST).all(axis=1)]
+    return _kept(points, kept, what, thing, part, f"not finite or beyond {LARGEST:g} m")
 
 
 def distinct_points(points: Array, what: str, thing: str, part: str = "") -> tuple[Array, tuple[Repair, ...]]:
@@ -67,8 +68,10 @@ def _kept(points: Array, kept: Array, what: str, thing: str, part: str, fault: s
 
 
 def line_fault(line: Array) -> str:
-    """Why a line (P, 2+) of distinct finite points is no lane's: fewer than two, shorter than a centimetre, longer than
-    MAX_LANE_M; "" where it may be one's."""
+    """Why a line (P, 2+) of distinct finite points is no lane's; "" where it may be one's.
+
+    It has fewer than two points, or is shorter than a centimetre or longer than MAX_LANE_M.
+    """
     if len(line) < 2:
         return "1 distinct point" if len(line) == 1 else "no point"
     return _length_fault(arc_lengths(line)[-1])

@@ -165,12 +165,12 @@ def test_a_sound_outline_is_the_very_same_array() -> None:
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(st.sampled_from([0.0, 1.0, 2.0, float("nan"), float("inf")]), max_size=12))
+@given(st.lists(st.sampled_from([0.0, 1.0, 2.0, 3e8, float("nan"), float("inf")]), max_size=12))
 def test_points_are_kept_as_one_that_walks_along_them_would(xs: list[float]) -> None:
     points = np.array([[x, 0.0, float(k)] for k, x in enumerate(xs)]).reshape(-1, 3)
     walked: list[Array] = []
     for point in points:
-        if np.isfinite(point).all() and not (walked and walked[-1][0] == point[0]):
+        if (abs(point) < 1e8).all() and not (walked and walked[-1][0] == point[0]):
             walked.append(point)
     kept, repairs = distinct_points(points, "boundary", "1", "left")
     assert np.array_equal(kept, np.array(walked).reshape(-1, 3))
@@ -257,7 +257,7 @@ def test_lanes_that_are_none_are_left_out_and_their_links_hurt_nobody() -> None:
         replace(middle, left=np.full((3, 3), np.nan)),
         replace(middle, right=middle.left),
         replace(middle, left=middle.left * 1e-5, right=middle.right * 1e-5),
-        replace(middle, left=middle.left * [1e7, 1.0, 1.0]),
+        replace(middle, left=middle.left * [1e5, 1.0, 1.0]),
     ):
         found, repairs = sound_lanes(lanes | {"1": broken})
         assert list(found) == ["0", "2"] and all(same_lines(found[k], lanes[k]) for k in found)
