@@ -1,7 +1,7 @@
 """This machine's files: what lies in a folder, who works on a file alone, where results lie, what a disk refuses.
 
 Of folders of somebody's data this is the one place that looks, so that all that read see the same. Links are followed.
-What macOS and Windows leave beside the files they copy is no data: it is passed over.
+What systems and programs leave beside the files they copy is no data: it is passed over.
 """
 
 import errno
@@ -15,7 +15,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from fnmatch import fnmatchcase
 from functools import cache, lru_cache
@@ -26,20 +26,67 @@ from factory.wording import one_line
 
 log = logging.getLogger(__name__)
 
-LEFT_BESIDE = frozenset({".ds_store", "__macosx", "desktop.ini", "thumbs.db"})  # and AppleDouble's ._<name>
+LEFT_BY_MACOS = (".ds_store", ".appledouble", "__macosx")  # and AppleDouble's ._<name>
+LEFT_BY_WINDOWS = ("desktop.ini", "thumbs.db", "$recycle.bin", "system volume information")
+LEFT_BY_DISKS = ("@eadir", "#recycle", "#snapshot", "@recycle", "@recently-snapshot", "lost+found")  # of file servers
+LEFT_BESIDE = frozenset((*LEFT_BY_MACOS, *LEFT_BY_WINDOWS, *LEFT_BY_DISKS))
+
+
+def is_companion(name: str) -> bool:
+    """Whether a system or a file server leaves files or folders of this name beside others'."""
+    return name.startswith("._") or name.lower() in LEFT_BESIDE
 
 
 def is_data(name: str) -> bool:
-    """Whether a file or folder of this name is more than a companion of others."""
-    return not name.startswith("._") and name.lower() not in LEFT_BESIDE
+    """Whether a file or folder of this name in somebody's data is data.
+
+    What is hidden is none: locks, drafts of rsync and NFS (`.<name>.<letters>`, `.nfs<digits>`), a server's snapshots
+    and an editor's copies, which would be read as the same logs again. Unfinished downloads and backups (.part,
+    .crdownload, ~) have other suffixes than what is looked for.
+    """
+    return not (name.startswith((".", "~$")) or is_companion(name))
 
 
 def matching(folder: Path, pattern: str) -> list[Path]:
     """What matches a glob pattern without `**`, such as *.pkl or v1.0-*/scene.json, sorted; none in what is no folder.
 
-    A link that leads nowhere is among them: it is a file that cannot be read.
+    A suffix may be in upper case. A link that leads nowhere is among them: it is a file that cannot be read. A folder
+    that cannot be entered is named in the log.
     """
-    return sorted(path for path in folder.glob(pattern) if all(map(is_data, path.relative_to(folder).parts)))
+    found = [folder]
+    for part in pattern.split("/"):
+        found = [place / entry.name for place in found for entry in _data_in(place) if _matches(entry.name, part)]
+    return sorted(found)
+
+
+def _matches(name: str, pattern: str) -> bool:
+    stem, suffix = os.path.splitext(name)
+    return fnmatchcase(stem + suffix.lower(), pattern)
+
+
+def _data_in(folder: Path) -> list[os.DirEntry[str]]:
+    if broken := broken_link(folder):
+        _warn_skipped_once(folder, broken)
+    try:
+        return [entry for entry in os.scandir(folder) if is_data(entry.name)] if folder.is_dir() else []
+    except OSError as error:
+        _warn_skipped_once(folder, error.strerror or str(error))
+        return []
+
+
+def broken_link(path: str | os.PathLike[str]) -> str:
+    """Of a path that is not there: which link that it leads through leads nowhere; empty where none does."""
+    path = Path(path)
+    link = next((place for place in (path, *path.parents) if place.is_symlink()), None)
+    if link is None or os.path.exists(link):
+        return ""
+    named = "the link" if link == path else f"the link {link}"
+    return f"{named} leads to {os.readlink(link)}, which is not there"
+
+
+def why_unread(path: str | os.PathLike[str], error: OSError) -> str:
+    """What the system said of a file that cannot be read, and which link to it is broken."""
+    return broken_link(path) or error.strerror or str(error)
 
 
 def matching_below(folder: Path, pattern: str) -> list[Path]:
@@ -58,12 +105,11 @@ def matching_below(folder: Path, pattern: str) -> list[Path]:
             if (of.st_dev, of.st_ino) in entered:
                 continue
             entered.add((of.st_dev, of.st_ino))
-            entries = [entry for entry in os.scandir(here) if is_data(entry.name)]
         except OSError as error:
             _warn_skipped_once(here, error.strerror or str(error))
             continue
-        for entry in entries:
-            if matches := fnmatchcase(entry.name, pattern):
+        for entry in _data_in(here):
+            if matches := _matches(entry.name, pattern):
                 found.append(here / entry.name)
             if entry.is_dir(follow_symlinks=False):
                 folders.append(here / entry.name)
@@ -75,18 +121,29 @@ def matching_below(folder: Path, pattern: str) -> list[Path]:
 
 def folders_in(folder: Path) -> list[Path]:
     """The folders in a folder, sorted; none in what is none. A link that leads nowhere is named in the log."""
-    entries = [entry for entry in os.scandir(folder) if is_data(entry.name)] if folder.is_dir() else []
     return sorted(
-        folder / entry.name for entry in entries if entry.is_dir(follow_symlinks=False) or _leads_to_folder(entry)
+        folder / entry.name
+        for entry in _data_in(folder)
+        if entry.is_dir(follow_symlinks=False) or _leads_to_folder(entry)
     )
+
+
+def named_once(root: Path, found: Iterable[tuple[str, Path]]) -> dict[str, Path]:
+    """Log id -> its file or folder, sorted by id. Raises ValueError where two have one id."""
+    paths: dict[str, Path] = {}
+    for name, path in found:
+        if name in paths:
+            raise ValueError(f"{root}: {name} stands twice, {paths[name]} and {path}: keep one of them")
+        paths[name] = path
+    return dict(sorted(paths.items()))
 
 
 def _leads_to_folder(entry: os.DirEntry[str], warn: bool = True) -> bool:
     """Whether it is a link to a folder; warn: one that leads nowhere, or where nobody may look, is named in the log."""
     if not entry.is_symlink() or os.path.isdir(entry):
         return entry.is_symlink()
-    if warn and not os.path.exists(entry):
-        _warn_skipped_once(entry.path, f"the link leads to {os.readlink(entry)}, which is not there")
+    if warn and (broken := broken_link(entry)):
+        _warn_skipped_once(entry.path, broken)
     return False
 
 

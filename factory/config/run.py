@@ -14,7 +14,7 @@ from factory.config.datasets import reader_settings
 from factory.config.plugins import add_installed_experts
 from factory.config.shapes import deep_merge, defaults_of, setting_keys
 from factory.config.words import ConfigError, did_you_mean
-from factory.files import in_submitted_job, matching
+from factory.files import broken_link, in_submitted_job, matching
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
 from tasks.settings import ExpertGate, PdmSettings, PerturbSettings, RecoverySettings, TrafficSettings
 from tasks.stages import FRAMES, TASKS
@@ -258,7 +258,7 @@ def refuse_missing_root(clips: Mapping[str, Any]) -> None:
     refuse_relative_root(clips)
     root = clips.get("root")
     if reader_settings(clips) and isinstance(root, str) and not Path(root).exists():
-        raise ConfigError(f"clips: {root}: no such folder")
+        raise ConfigError(f"clips: {root}: {broken_link(root) or 'no such folder'}")
 
 
 def load_config(words: Sequence[str]) -> RunConfig:

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from factory.files import why_unread
 from factory.wording import one_line, shown
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import CLIP_STEPS, AgentKind, AgentTracks, Camera, Clip
@@ -74,7 +75,7 @@ def bytes_of(path: Path) -> bytes:
             raise BadClip(str(path), "size", f"more than {MAX_FILE_BYTES} bytes")
         return path.read_bytes()
     except OSError as error:
-        raise BadClip(str(path), "file", f"cannot be read: {error.strerror}") from error
+        raise BadClip(str(path), "file", f"cannot be read: {why_unread(path, error)}") from error
 
 
 @dataclass(frozen=True, order=True)
@@ -180,8 +181,11 @@ NUSCENES_VAL = {"v1.0-trainval": _scenes(_NUSCENES_VAL), "v1.0-mini": _scenes(_N
 
 
 def folder_split(log: Path) -> str | None:
-    """The split after which the folder of a log is named, as in Argoverse's `sensor/val/<log>`."""
-    return FOLDERS.get(log.parent.name)
+    """The split after which the folder of a log is named, as in Argoverse's `sensor/val/<log>`.
+
+    Of a log that links lead to: the folder by which it is found, else the one where it lies.
+    """
+    return FOLDERS.get(log.parent.name) or FOLDERS.get(log.resolve().parent.name)
 
 
 def nuscenes_split(scenario: str) -> str | None:

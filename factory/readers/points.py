@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.feather
 from numpy.typing import NDArray
 
+from factory.files import broken_link
 from factory.readers.base import BadClip, bytes_of
 
 KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
@@ -118,7 +119,7 @@ def read_feather(path: Path, columns: tuple[str, ...], whole: bool = True) -> di
         table = pyarrow.feather.read_table(path)
         table.validate(full=True)
     except FileNotFoundError as error:
-        raise BadClip(str(path), "file", "missing") from error
+        raise BadClip(str(path), "file", broken_link(path) or "missing") from error
     except (pa.ArrowException, OSError, ValueError) as error:  # a name that is no text
         raise BadClip(str(path), "file", f"cannot be read as feather, truncated? {error}") from error
     if table.num_rows == 0:

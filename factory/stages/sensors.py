@@ -9,7 +9,7 @@ from types import MappingProxyType
 import cv2
 import numpy as np
 
-from factory.files import matching
+from factory.files import matching, why_unread
 from factory.readers.base import BadClip
 from factory.readers.pictures import BadPicture, decode_grey, decode_rgb, file_and_frame, video_frames
 from factory.readers.points import read_feather, read_pcd, read_points
@@ -193,7 +193,7 @@ def _opened(files: Sequence[SensorFile], took: Mapping[str, Camera]) -> Iterator
             try:
                 data = path.read_bytes()
             except OSError as error:
-                raise BadClip(file.uri, "image", f"cannot be read: {error.strerror}") from error
+                raise BadClip(file.uri, "image", f"cannot be read: {why_unread(path, error)}") from error
             yield row, decode_image(data, file.uri, took[file.sensor])
         else:
             filmed.setdefault((path, file.sensor), {})[frame] = row

@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pyarrow import fs
 
-from factory.files import DamagedFile, atomic_file, in_submitted_job, is_data
+from factory.files import DamagedFile, atomic_file, in_submitted_job, is_companion
 from factory.store.schema import TableSpec
 from factory.wording import one_line
 from tasks.caches import Damaged, with_checksum, without_checksum
@@ -143,7 +143,7 @@ def _local_files(folder: Path) -> Iterator[Path]:
     Other processes make and remove folders there: one that is gone before it is opened has no files.
     """
     try:
-        entries = [entry for entry in os.scandir(folder) if is_data(entry.name)]
+        entries = [entry for entry in os.scandir(folder) if not is_companion(entry.name)]
     except FileNotFoundError:
         return
     for entry in entries:

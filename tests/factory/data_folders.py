@@ -1,4 +1,4 @@
-"""A folder of data as other systems leave it: with companions of macOS and Windows, or with links in it."""
+"""A folder of data as systems and programs leave it: with companions of theirs, or with links in it."""
 
 import os
 import shutil
@@ -7,15 +7,32 @@ from pathlib import Path
 APPLE_DOUBLE = b"\0\5\026\7\0\2\0\0Mac OS X        " + bytes(4)
 
 
+IN_FOLDERS = (".DS_Store", "Thumbs.db", "desktop.ini", ".nfs0000000000c0ffee")
+BESIDE_FILES = ("._{}", ".{}.aB3xYz", ".~lock.{}#", "~${}", "{}.part", "{}.crdownload", "{}~")
+WITH_COPIES = (".snapshot", "#recycle", "$RECYCLE.BIN", ".ipynb_checkpoints", "@eaDir", ".AppleDouble")
+
+
 def add_companions(root: Path) -> None:
-    """Beside every file and folder what macOS leaves on exFAT and SMB, in every folder what Finder and Explorer do."""
-    for folder, folders, names in list(os.walk(root)):
+    """Beside every file and folder what macOS leaves on exFAT and SMB, in every folder what Finder and Explorer do, a
+    server's snapshots and bins with whole copies of the data, and what editors, rsync and browsers have begun.
+    """
+    data = [(Path(folder), folders, names) for folder, folders, names in os.walk(root)]
+    for folder, folders, names in data:
         for name in (*folders, *names):
-            Path(folder, f"._{name}").write_bytes(APPLE_DOUBLE)
-        for name in (".DS_Store", "Thumbs.db"):
-            Path(folder, name).write_bytes(APPLE_DOUBLE)
+            for beside in BESIDE_FILES:
+                (folder / beside.format(name)).write_bytes(APPLE_DOUBLE)
+        for name in IN_FOLDERS:
+            (folder / name).write_bytes(APPLE_DOUBLE)
     in_archives = root / "__MACOSX" / root.name  # a tree of the same names with companions alone
     shutil.copytree(root, in_archives, ignore=_all_but_companions)
+    for folder, _, names in data:
+        for copies in WITH_COPIES:
+            for name in names:
+                (folder / copies).mkdir(exist_ok=True)
+                shutil.copy(folder / name, folder / copies / name)
+    for copies in WITH_COPIES:
+        for name in data[0][1]:
+            shutil.copytree(root / name, root / copies / name)
 
 
 def _all_but_companions(folder: str, names: list[str]) -> list[str]:

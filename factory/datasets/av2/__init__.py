@@ -1,10 +1,11 @@
 """Argoverse 2 sensor logs: where they lie, and the names of their cameras. Numpy is loaded where one is opened."""
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
-from factory.files import folders_in
+from factory.files import folders_in, named_once
 from factory.readers.settings import LogClips, Split
 
 READERS = {"AV2Reader": LogClips}
@@ -21,16 +22,17 @@ def log_folders(root: Path) -> dict[str, Path]:
         raise ValueError(f"{root}: no such folder")
     there = folders_in(root)
     parents = [root / split for split in get_args(Split) if root / split in there] or [root]
-    folders = {folder.name: folder for parent in parents for folder in folders_in(parent) if _is_log(folder)}
+    found = ((folder.name, folder) for parent in parents for folder in folders_in(parent) if _is_log(folder))
+    folders = named_once(root, found)
     if not folders:
         raise ValueError(
             f"{root}: no Argoverse 2 sensor log here; expected .../sensor, its train, val or test folder, or one log"
         )
-    return dict(sorted(folders.items()))
+    return folders
 
 
 def _is_log(folder: Path) -> bool:
-    return any((folder / name).exists() for name in (ANNOTATIONS, POSES))
+    return any(os.path.lexists(folder / name) for name in (ANNOTATIONS, POSES))
 
 
 def camera_names(clips: Mapping[str, Any]) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ YELLOW | RED; a state holds until the lane's next row), which the synthetic town
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -528,7 +529,7 @@ class AV2Reader(LogReader[AV2Log]):
 
     def drive(self, path: Path) -> LoggedDrive | str:
         """Ego and agents of the log in this folder. A log whose frames nobody annotated is skipped. Raises BadClip."""
-        if not (path / ANNOTATIONS).is_file():
+        if not os.path.lexists(path / ANNOTATIONS):
             return f"no {ANNOTATIONS}"
         map_file(path)
         motion = read_motion(path)
@@ -610,7 +611,7 @@ def read_cameras(folder: Path) -> tuple[Camera, ...]:
     av2.geometry.camera). k1, k2 and k3 of the same file tell what the lens was like, and are not read.
     """
     path, pose_path = folder / INTRINSICS, folder / EXTRINSICS
-    if not path.exists() and not pose_path.exists():
+    if not os.path.lexists(path) and not os.path.lexists(pose_path):
         return ()
     columns = ("fx_px", "fy_px", "cx_px", "cy_px", "height_px", "width_px")
     table = read_feather(path, ("sensor_name", *columns))
@@ -635,7 +636,7 @@ def read_cameras(folder: Path) -> tuple[Camera, ...]:
 def read_lights(folder: Path, motion: LogMotion, times_s: Array) -> TrafficLights:
     """Light phases at times (S,), of all lanes that are named; no lanes where the log has none. Raises BadClip."""
     path = folder / LIGHTS
-    if not path.exists():
+    if not os.path.lexists(path):
         return TrafficLights((), np.zeros((len(times_s), 0), np.int8))
     table = read_feather(path, ("timestamp_ns", "lane_id", "state"))
     lanes, names = table["lane_id"].astype(str), table["state"].astype(str)
@@ -673,9 +674,11 @@ def _licence(folder: Path) -> str:
 def _stamped(motion: LogMotion, sensor: str, folder: Path, suffix: str) -> list[SensorFile]:
     """Files named <timestamp_ns><suffix>, in time order. Raises BadClip for any other name."""
     files = matching(folder, f"*{suffix}")
-    for path in files:
+    for before, path in zip((None, *files), files):
         if not path.stem.isdecimal():
             raise BadClip(str(path), "name", f"expected <timestamp_ns>{suffix}")
+        if before is not None and before.stem == path.stem:
+            raise BadClip(str(path), "name", f"a second file of this instant, beside {before.name}: remove one")
     times_s = seconds_since(motion.start_ns, np.array([int(path.stem) for path in files], dtype=np.int64))
     order = np.argsort(times_s, kind="stable")
     poses = world_from_ego_at(motion, times_s[order]) if files else ()

@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import logging
+import os
 from collections import defaultdict
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from factory.files import matching
+from factory.files import broken_link, matching
 from factory.readers.base import BadClip
 from tasks.caches import Damaged, user_cache, verify_checksum, with_checksum
 from tasks.kernels.compiled import write_whole
@@ -92,9 +93,9 @@ def map_file(maps_root: Path, location: str) -> Path:
     """<maps_root>/<location>/<version>/map.gpkg. Raises BadClip."""
     folder, index = maps_root / location, maps_root / INDEX
     if not folder.is_dir():
-        problem = "no such folder; the maps' root holds one for each city"
+        problem = f"{broken_link(folder) or 'no such folder'}; the maps' root holds one for each city"
         raise BadClip(str(folder), "location", f"{problem}: {DOWNLOAD}")
-    if index.is_file():
+    if os.path.lexists(index):
         try:
             version = str(json.loads(index.read_text(encoding="utf-8"))[location]["version"])
         except (OSError, ValueError, KeyError, TypeError) as error:
@@ -106,7 +107,7 @@ def map_file(maps_root: Path, location: str) -> Path:
         version = versions[0]
     path = folder / version / "map.gpkg"
     if not path.is_file():
-        raise BadClip(str(path), "map.gpkg", f"no such file; {DOWNLOAD}")
+        raise BadClip(str(path), "map.gpkg", f"{broken_link(path) or 'no such file'}; {DOWNLOAD}")
     return path
 
 

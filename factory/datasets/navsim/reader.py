@@ -37,7 +37,7 @@ from factory.datasets.navsim.window import (
     window_agents,
     world_from_ego,
 )
-from factory.files import file_digest, matching
+from factory.files import file_digest, matching, named_once, why_unread
 from factory.readers.apart import ProcessFunction
 from factory.readers.base import (
     SPLITS,
@@ -358,7 +358,7 @@ def _kept(path: Path, cache_dir: Path) -> Path:
     try:
         stat = path.stat()
     except OSError as error:
-        raise BadClip(str(path), "file", f"cannot be read: {error.strerror}") from error
+        raise BadClip(str(path), "file", f"cannot be read: {why_unread(path, error)}") from error
     key = f"{TABLE_VERSION}\x1f{path}\x1f{stat.st_size}\x1f{stat.st_mtime_ns}"
     return cache_dir / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.npy"
 
@@ -589,12 +589,15 @@ class NavsimReader:
         return f"{ref.log_id}@{table.start_ms[first] / 1000:g}s"
 
     def split_of(self, log_id: str) -> str:
-        """train, val or test: as the settings say, else by the filter's name, the folder's, the log's hash."""
+        """train, val or test: as the settings say, else by the name of the filter, of the folder, of the one that links
+        lead to; else by the log's hash.
+        """
         if self.split is not None:
             return self.split
-        folder = self.root.parent if self.root.suffix == ".pkl" else self.root
+        places = self.root, self.root.resolve()
+        folders = [place.parent if place.suffix.lower() == ".pkl" else place for place in places]
         names = [self.selection.name] if self.selection else []
-        for name in (*names, folder.name):
+        for name in (*names, *(folder.name for folder in folders)):
             for begins, split in SPLIT_OF.items():
                 if name.startswith(begins):
                     return split
@@ -723,11 +726,11 @@ class NavsimReader:
 
 def log_files(root: Path) -> dict[str, Path]:
     """Log id -> pickle, sorted by id: of one log, or of a folder of them. Raises ValueError where there is none."""
-    if root.is_file() and root.suffix == ".pkl":
+    if root.is_file() and root.suffix.lower() == ".pkl":
         return {root.stem: root}
     if not root.is_dir():
         raise ValueError(f"{root}: no such folder or .pkl file; clips.root is navsim_logs/<split>, or one log of it")
-    files = {path.stem: path for path in matching(root, "*.pkl")}
+    files = named_once(root, ((path.stem, path) for path in matching(root, "*.pkl")))
     if not files:
         splits = [path.parent.name for path in matching(root, "*/*.pkl")]
         hint = f"; its folders {', '.join(dict.fromkeys(splits))} have some" if splits else ""

@@ -12,6 +12,7 @@ public log replay drops it. A light holds its state until the next frame.
 Between frames the ego's pose, velocity and acceleration are linear too. Steering and rates are 0, as there.
 """
 
+import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from factory.datasets.navsim.log import Frame, FrameBoxes
 from factory.datasets.navsim.maps import open_city
 from factory.datasets.navsim.settings import FRAME_STEPS
+from factory.files import why_unread
 from factory.readers.base import BadClip
 from factory.readers.pictures import BadPicture, Size, jpeg_size
 from tasks.world.arrays import Array, Bools
@@ -322,12 +324,12 @@ def sensor_files(frames: Sequence[Frame], folder: Path) -> Blobs:
     sweeps: list[SensorFile] = []
     for k, frame in enumerate(frames):
         files = {camera.name: _below(folder, camera.path) for camera in frame.cameras}
-        there = {name: path for name, path in files.items() if path.is_file()}
+        there = {name: path for name, path in files.items() if os.path.lexists(path)}  # a broken link is named later
         if there and (missing := [path for name, path in files.items() if name not in there]):
             problem = f"missing, though {len(there)} of the frame's {len(files)} pictures are there"
             raise BadClip(str(missing[0]), "image", f"{problem}: restore it, or remove them all")
         images += [SensorFile(name, str(path), FRAME_S * k, frame.world_from_ego) for name, path in there.items()]
-        if frame.lidar_path is not None and (sweep := _below(folder, frame.lidar_path)).is_file():
+        if frame.lidar_path is not None and os.path.lexists(sweep := _below(folder, frame.lidar_path)):
             sweeps.append(SensorFile(LIDAR, str(sweep), FRAME_S * k, frame.world_from_ego))
     return Blobs(tuple(images), tuple(sweeps))
 
@@ -356,7 +358,7 @@ def read_jpeg(path: Path) -> tuple[bytes, Size]:
         data = path.read_bytes()
         return data, jpeg_size(data)
     except OSError as error:
-        raise BadClip(str(path), "image", f"cannot be read: {error.strerror}") from error
+        raise BadClip(str(path), "image", f"cannot be read: {why_unread(path, error)}") from error
     except BadPicture as error:
         raise BadClip(str(path), error.field, str(error)) from error
 

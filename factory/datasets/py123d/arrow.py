@@ -16,6 +16,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from factory.datasets.av2.reader import KIND_OF_CATEGORY
+from factory.files import broken_link
 from factory.readers.base import BadClip
 from factory.wording import shown
 from tasks.world.arrays import Array, Indices, Ints
@@ -84,7 +85,7 @@ def open_file(path: Path, rows: bool = True) -> ArrowFile:
             table = file.read_all() if rows else file.schema.empty_table()
         table.validate(full=True)
     except FileNotFoundError as error:
-        raise BadClip(str(path), "file", "missing") from error
+        raise BadClip(str(path), "file", broken_link(path) or "missing") from error
     except (pa.ArrowException, OSError, ValueError) as error:  # a name that is no text
         raise BadClip(str(path), "file", f"cannot be read as an Arrow file, truncated? {error}") from error
     packed = (table.schema.metadata or {}).get(b"metadata")

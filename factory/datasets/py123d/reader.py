@@ -1,6 +1,7 @@
 """Reads what 123D converted as clips, without 123D: what moves, what the sensors recorded, whole logs."""
 
 import hashlib
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -47,7 +48,7 @@ from factory.datasets.py123d.arrow import (
 )
 from factory.datasets.py123d.map import read_map
 from factory.datasets.scenarionet.reader import FIT_STEPS, MAX_GAP_S, smooth_drive
-from factory.files import file_digest, matching, matching_below
+from factory.files import file_digest, matching, matching_below, named_once
 from factory.readers.base import SPLITS, BadClip, ClipRef, id_text
 from factory.readers.logs import (
     STEP_MS,
@@ -369,7 +370,7 @@ class Py123dReader(LogReader[Py123dLog]):
         header = read_header(path)
         converted_set_of(header)
         for name in (EGO, BOXES):
-            if not (path / name).is_file():
+            if not os.path.lexists(path / name):
                 return f"no {name}"
         if header.metadata.get("map_metadata") is None:
             return "converted without a map"
@@ -454,7 +455,7 @@ class Py123dReader(LogReader[Py123dLog]):
                 raise BadClip(str(header.path), "metadata.map_metadata", f"names an impossible file {shown(name)}")
             roots = [self.maps_root] if self.maps_root else [parent / "maps" for parent in folder.parents[1:4]]
             paths = [root / about["dataset"] / name for root in roots]
-        found = next((path for path in paths if path.is_file()), None)
+        found = next((path for path in paths if os.path.lexists(path)), None)
         if found is None:
             raise BadClip(str(paths[0]), "file", "the log's map is missing: convert it too, or give clips.maps_root")
         return found
@@ -465,17 +466,10 @@ def log_folders(root: Path) -> dict[str, Path]:
     if not root.is_dir():
         raise ValueError(f"{root}: no such folder")
     above = root / "logs" if (root / "logs").is_dir() else root
-    folders: dict[str, Path] = {}
-    for folder in sorted(found.parent for found in matching_below(above, SYNC)):
-        if folder.name in folders:
-            raise ValueError(
-                f"{root}: log {folder.name} stands in {folders[folder.name].parent.name} and {folder.parent.name}: "
-                "give one split's folder as clips.root"
-            )
-        folders[folder.name] = folder
+    folders = named_once(root, ((found.parent.name, found.parent) for found in matching_below(above, SYNC)))
     if not folders:
         raise ValueError(f"{root}: no log of 123D here (a folder with {SYNC}); expected its data root, logs or a split")
-    return dict(sorted(folders.items()))
+    return folders
 
 
 def read_header(folder: Path) -> ArrowFile:

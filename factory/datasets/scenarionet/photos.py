@@ -1,6 +1,7 @@
 """Photos and sweeps beside a ScenarioNet log, which has none itself: what its sidecar says, checked. docs/photos.md."""
 
 import json
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from factory.files import why_unread
 from factory.readers.base import BadClip
 from factory.readers.pictures import frame_uri
 from factory.wording import shown
@@ -30,7 +32,7 @@ def sidecars_of(cameras: Path, log_ids: Iterable[str]) -> dict[str, Path]:
     """
     ids, said = list(log_ids), f"clips.cameras={cameras}"
     alone = cameras if cameras.is_file() else cameras / NAME
-    if alone.is_file():
+    if os.path.lexists(alone):  # a broken link is named where it is read
         if len(ids) != 1:
             raise ValueError(
                 f"{said}: one log's sidecar, and {len(ids)} logs are read: name it by clips.only=[...], "
@@ -42,7 +44,7 @@ def sidecars_of(cameras: Path, log_ids: Iterable[str]) -> dict[str, Path]:
     found = {}
     for log_id in ids:
         places = (cameras / name / NAME for name in (log_id, log_id.rpartition("_")[2]))
-        if there := [place for place in places if place.is_file()]:
+        if there := [place for place in places if os.path.lexists(place)]:
             found[log_id] = there[0]
     if not found:
         raise ValueError(f"{said}: no {NAME} here, nor in <log id>/ of any log that is read: {', '.join(ids[:3])}")
@@ -58,7 +60,7 @@ def load_sidecar(path: Path) -> tuple[dict[str, Any], bytes]:
         data = path.read_bytes()
         content = json.loads(data)
     except OSError as error:
-        raise BadClip(file, "file", f"cannot be read: {error.strerror}") from error
+        raise BadClip(file, "file", f"cannot be read: {why_unread(path, error)}") from error
     except (ValueError, RecursionError) as error:
         raise BadClip(file, "file", f"is no JSON: {error}") from error
     if not isinstance(content, dict):

@@ -7,6 +7,7 @@ to the database).
 """
 
 import hashlib
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,7 +30,7 @@ from factory.datasets.scenarionet.photos import (
     start_step_nearest_photos,
 )
 from factory.datasets.scenarionet.settings import ScenarioNetClips
-from factory.files import matching_below
+from factory.files import matching_below, named_once
 from factory.readers.apart import ProcessFunction
 from factory.readers.base import (
     BadClip,
@@ -555,18 +556,16 @@ def scenario_files(root: Path) -> dict[str, Path]:
 
     A database's own list counts, with files that are missing; a plain folder is searched for sd_*.pkl in all depths.
     """
-    if root.is_file() and root.suffix == ".pkl":
+    if root.is_file() and root.suffix.lower() == ".pkl":
         return {root.stem: root}
     if not root.is_dir():
         raise ValueError(f"{root}: no such folder or .pkl file")
-    files: dict[str, Path] = {}
-    for path in _listed(root) if (root / SUMMARY).is_file() else matching_below(root, "sd_*.pkl"):
-        if path.stem in files:
-            raise ValueError(f"{root}: {path.name} stands in two folders, {files[path.stem].parent} and {path.parent}")
-        files[path.stem] = path
+    listed = os.path.lexists(root / SUMMARY)
+    paths = _listed(root) if listed else matching_below(root, "sd_*.pkl")
+    files = named_once(root, ((path.stem, path) for path in paths))
     if not files:
         raise ValueError(f"{root}: no scenario here; expected sd_*.pkl files, a database with {SUMMARY}, or one .pkl")
-    return dict(sorted(files.items()))
+    return files
 
 
 def _listed(root: Path) -> list[Path]:
@@ -577,7 +576,7 @@ def _listed(root: Path) -> list[Path]:
     summary, mapped = root / SUMMARY, root / MAPPING
     try:
         names = ProcessFunction(_names)(summary, str(summary))
-        folders = ProcessFunction(_folders)(mapped, str(mapped)) if mapped.is_file() else {}
+        folders = ProcessFunction(_folders)(mapped, str(mapped)) if os.path.lexists(mapped) else {}
     except BadClip as error:
         raise ValueError(str(error)) from error
     return [root / folders.get(name, "") / name for name in names]

@@ -1,7 +1,7 @@
 """Folders of data with links in them, or with what macOS and Windows leave beside files, are read as without."""
 
 import os
-import re
+import pickle
 import shutil
 import subprocess
 import sys
@@ -11,55 +11,84 @@ from pathlib import Path
 
 import pytest
 
+from examples import csv_logs
 from factory.__main__ import main as factory
 from factory.config.run import load_config
 from factory.datasets.navsim.reader import NavsimReader
+from factory.datasets.scenarionet.reader import MAPPING, SUMMARY
 from factory.datasets.town.town import SUMS, repair_folder, write_once
 from factory.exits import COMPLETE
-from factory.files import folders_in, matching_below
-from factory.readers.base import BadClip, ClipRef
+from factory.files import file_digest, folders_in, matching_below
+from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef
 from factory.readers.logs import LogReader
+from factory.readers.pictures import file_and_frame
 from factory.setup.settings import open_reader
 from factory.store.reader import SampleTable
 from tests.factory.data_folders import add_companions, put_behind_links
 from tests.factory.datasets.navsim import simscale_writer
 from tests.factory.datasets.navsim.small import road_frames, write_blobs, write_city, write_log
 from tests.factory.datasets.py123d.py123d_logs import convert
-from tests.factory.datasets.scenarionet import scenarionet_scenarios
+from tests.factory.datasets.scenarionet import scenarionet_scenarios, test_photos
 from tests.pages import REPOSITORY
 
+Make = Callable[[Path, Path], None]  # writes a data set below a root; some from a log of the town
+Kind = Callable[[Path], str]  # changes how a root comes; then the text that names it
 SIMULATED = "synthetic_reaction_pdm_v1.0-0"
 
 
-def av2(root: Path, street: Path) -> list[str]:
+def av2(root: Path, street: Path) -> None:
     shutil.copytree(street, root / "train" / street.name)
-    return ["clips=av2", f"clips.root={root}"]
 
 
-def scenarionet(root: Path, street: Path) -> list[str]:
-    (root / "part").mkdir(parents=True)
+def scenarionet(root: Path, street: Path) -> None:
     scenarionet_scenarios.save(scenarionet_scenarios.nuscenes(), root / "part")
-    return ["clips=scenarionet", f"clips.root={root}"]
 
 
-def py123d(root: Path, street: Path) -> list[str]:
-    convert(street, root)
-    return ["clips=py123d", f"clips.root={root}"]
+def database(root: Path, street: Path) -> None:
+    """Merged of another that lies beside it."""
+    path = scenarionet_scenarios.save(scenarionet_scenarios.nuscenes(), root / "other", "scene.pkl")
+    for name, content in ((SUMMARY, {path.name: {}}), (MAPPING, {path.name: "../other"})):
+        (root / "merged").mkdir(exist_ok=True)
+        (root / "merged" / name).write_bytes(pickle.dumps(content))
 
 
-def navsim(root: Path, street: Path) -> list[str]:
+def sidecar(root: Path, street: Path) -> None:
+    path = scenarionet_scenarios.save(scenarionet_scenarios.nuscenes(), root / "logs", "sd_nuscenes_x_scene-0001.pkl")
+    test_photos.write(root / "photos" / path.stem, test_photos.sidecar())
+
+
+def py123d(root: Path, street: Path) -> None:
+    convert(street, root / "converted")
+    shutil.copytree(street, root / "sensor" / street.parent.name / street.name)
+
+
+def navsim(root: Path, street: Path) -> None:
     frames = road_frames()
     write_city(root)
     write_log(root, frames)
     write_blobs(root, frames)
-    folders = {"root": "navsim_logs/mini", "maps": "maps", "sensors": "sensor_blobs/mini", "cache_dir": "../kept"}
-    return ["clips=navsim", *(f"clips.{key}={root / path}" for key, path in folders.items())]
 
 
-READERS = {make.__name__: make for make in (av2, scenarionet, py123d, navsim)}
-SPOILED: dict[str, Callable[[Path], None]] = {
-    "companions": add_companions,
-    "links": lambda root: put_behind_links(root, root.parent / "elsewhere"),
+def town(root: Path, street: Path) -> None:
+    shutil.copytree(street.parent, root / street.parent.name)
+
+
+def csv(root: Path, street: Path) -> None:
+    csv_logs.write_log(root / "street")
+
+
+CAMERAS = "clips.settings.cameras=[ring_front_center] clips.settings.width=64 clips.settings.height=36"
+READERS: dict[Make, str] = {
+    av2: "clips=av2 clips.root={root}",
+    scenarionet: "clips=scenarionet clips.root={root}",
+    database: "clips=scenarionet clips.root={root}/merged",
+    sidecar: "clips=scenarionet clips.root={root}/logs clips.cameras={root}/photos",
+    py123d: "clips=py123d clips.root={root}/converted clips.sensor_root={root}/sensor",
+    navsim: "clips=navsim clips.root={root}/navsim_logs/mini clips.maps={root}/maps "
+    "clips.sensors={root}/sensor_blobs/mini clips.cache_dir={root}/../kept",
+    town: f"clips=synthetic clips.cache_dir={{root}} clips.n_clips=1 {CAMERAS} clips.settings.lidar_beams=32 "
+    "clips.settings.lidar_azimuths=300 clips.settings.steps_per_photo=5",
+    csv: "clips=custom clips._target_=examples.csv_logs.CsvReader +clips.root={root}",
 }
 
 
@@ -68,46 +97,100 @@ def street(small_town: Path) -> Path:
     return folders_in(small_town)[0]
 
 
-def read(words: list[str], to: Path) -> bytes:
-    """The windows of all clips, as a table that the vocabulary command makes of them."""
-    assert factory(["vocabulary", f"table={to}", "clips.split=train", *words]) == COMPLETE
-    return to.read_bytes()
+def opened(make: Make, root: str) -> tuple[ClipReader, ClipIndex]:
+    """As by a command."""
+    words = [word.format(root=root) for word in READERS[make].split()]
+    return open_reader(load_config([*words, "out=nowhere"]).clips)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("spoil", SPOILED)
-@pytest.mark.parametrize("data_set", READERS)
-def test_links_are_followed_and_companions_passed_over(
-    data_set: str, spoil: str, street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def clips_of(make: Make, root: str) -> list[object]:
+    """What a run would find under this root, to the last byte of a photo."""
+    reader, index = opened(make, root)
+    assert index.refs and not index.broken and not index.skipped_logs
+    found: list[object] = []
+    for clip in map(reader.read, index.refs):
+        files = [(f.sensor, f.time_s, file_digest(file_and_frame(f.uri)[0])) for f in (*clip.images, *clip.sweeps)]
+        found.append((clip.clip_id, clip.split, clip.content_digest, clip.ego_states.tobytes(), files))
+    return found
+
+
+def behind_a_link(root: Path) -> str:
+    root.rename(root.parent / "elsewhere")
+    root.symlink_to("elsewhere")
+    return str(root)
+
+
+def among_companions(root: Path) -> str:
+    add_companions(root)
+    return str(root)
+
+
+def all_behind_links(root: Path) -> str:
+    put_behind_links(root, root.parent / "elsewhere")
+    return str(root)
+
+
+def with_a_slash(root: Path) -> str:
+    return f"{root}/"
+
+
+def at_home(root: Path) -> str:
+    os.environ["HOME"] = str(root.parent)
+    return "~/root"
+
+
+def relative(root: Path) -> str:
+    os.chdir(root.parent)
+    return "./root/../root"
+
+
+def odd_name(root: Path) -> str:
+    odd = root.with_name("a b=c,d [e] (f) {g} 'h' \"i\" #j %k $l ü~")
+    root.rename(odd)
+    return str(odd)
+
+
+def upper_case(root: Path) -> str:
+    """What is looked for by its suffix."""
+    for pattern in ("*/sd_*.pkl", "navsim_logs/*/*.pkl", "train/*/sensors/cameras/*/*.jpg"):
+        for path in list(root.glob(pattern)):
+            path.rename(path.with_suffix(path.suffix.upper()))
+    return str(root)
+
+
+KINDS = (among_companions, all_behind_links, behind_a_link, with_a_slash, at_home, relative, odd_name, upper_case)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("make", READERS)
+def test_the_same_clips_are_found_however_their_folder_comes(
+    make: Make,
+    kind: Kind,
+    street: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    words = READERS[data_set](tmp_path / "root", street)
-    known = read(words, tmp_path / "known.npz")
-    SPOILED[spoil](tmp_path / "root")
-    assert read(words, tmp_path / "found.npz") == known
-    said = capsys.readouterr().out
-    assert re.findall(r"\d+ of them from \d+ train logs", said).count(f"{windows(said)} of them from 1 train logs") == 2
-    assert "unreadable" not in said
-
-
-def windows(said: str) -> str:
-    found = re.search(r"(\d+) of them", said)
-    assert found is not None and int(found[1]) > 0
-    return found[1]
+    root = tmp_path / "root"
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    make(root, street)
+    known = clips_of(make, str(root))
+    assert clips_of(make, kind(root)) == known
 
 
 OF_LOGS = {  # files that clips are computed from; a city's map is no part of a log
-    "av2": ("train/*/map/log_map_archive_*.json",),
-    "scenarionet": ("part/*.pkl",),
-    "py123d": ("logs/*/*/map.arrow",),
-    "navsim": ("navsim_logs/mini/*.pkl", "maps/*/*/map.gpkg"),
+    av2: ("train/*/map/log_map_archive_*.json",),
+    scenarionet: ("part/*.pkl",),
+    py123d: ("converted/logs/*/*/map.arrow",),
+    navsim: ("navsim_logs/mini/*.pkl", "maps/*/*/map.gpkg"),
 }
 
 
-@pytest.mark.parametrize(("data_set", "file"), [(name, file) for name, files in OF_LOGS.items() for file in files])
-def test_the_digest_is_the_clip_s_and_follows_the_log(data_set: str, file: str, street: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("make", "file"), [(make, file) for make, files in OF_LOGS.items() for file in files])
+def test_the_digest_is_the_clip_s_and_follows_the_log(make: Make, file: str, street: Path, tmp_path: Path) -> None:
     """Told without reading a clip."""
-    words = READERS[data_set](tmp_path / "root", street)
-    reader, index = open_reader(load_config([*words, "out=nowhere"]).clips)
+    make(tmp_path / "root", street)
+    reader, index = opened(make, str(tmp_path / "root"))
     (path,), ref = (tmp_path / "root").glob(file), index.refs[0]
     assert isinstance(reader, LogReader | NavsimReader)
     before = reader.digest(ref)
@@ -121,22 +204,22 @@ def test_the_digest_is_the_clip_s_and_follows_the_log(data_set: str, file: str, 
         reader.digest(ClipRef(reader.name, "gone", 0))
 
 
-@pytest.mark.parametrize("spoil", SPOILED)
-def test_simscale_s_logs_and_rewards_are_found_behind_links_and_among_companions(spoil: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", KINDS[:2])
+def test_simscale_s_logs_and_rewards_are_found_behind_links_and_among_companions(kind: Kind, tmp_path: Path) -> None:
     for number in (1, 2):
         simscale_writer.write_log(tmp_path / "root", SIMULATED, number, 0)
-    SPOILED[spoil](tmp_path / "root")
+    kind(tmp_path / "root")
     assert factory(["import", "simscale", f"root={tmp_path / 'root'}", f"out={tmp_path / 'out'}"]) == COMPLETE
     assert len(SampleTable(tmp_path / "out")) == 2
 
 
 @pytest.mark.slow
 def test_the_command_follows_a_link_to_a_folder_and_names_one_that_leads_nowhere(tmp_path: Path) -> None:
-    words = scenarionet(tmp_path / "real", tmp_path)
+    scenarionet(tmp_path / "real", tmp_path)
     (tmp_path / "root").mkdir()
     (tmp_path / "root" / "part").symlink_to("../real/part")
     (tmp_path / "root" / "gone").symlink_to("/unmounted/part")
-    words[-1] = f"clips.root={tmp_path / 'root'}"
+    words = [word.format(root=tmp_path / "root") for word in READERS[scenarionet].split()]
     command = [sys.executable, "-m", "factory", "vocabulary", f"table={tmp_path / 'found.npz'}", "clips.split=train"]
     done = subprocess.run([*command, *words], cwd=REPOSITORY, capture_output=True, text=True, timeout=250)
     assert (done.returncode, "from 1 train logs" in done.stdout) == (0, True), done.stderr

@@ -146,5 +146,5 @@ def test_a_root_without_scenarios_or_with_one_twice_is_refused(tmp_path):
         ScenarioNetReader(tmp_path).index()
     town.save(town.nuscenes(), tmp_path / "a")
     town.save(town.nuscenes(), tmp_path / "b")
-    with pytest.raises(ValueError, match="stands in two folders"):
+    with pytest.raises(ValueError, match="stands twice"):
         ScenarioNetReader(tmp_path).index()
