@@ -84,6 +84,11 @@ def broken_link(path: str | os.PathLike[str]) -> str:
     return f"{named} leads to {os.readlink(link)}, which is not there"
 
 
+def is_named(path: str | os.PathLike[str]) -> bool:
+    """Whether a file that need not be there is there, or a link says that it should be: reading it tells which."""
+    return os.path.lexists(path) or broken_link(path) != ""
+
+
 def why_unread(path: str | os.PathLike[str], error: OSError) -> str:
     """What the system said of a file that cannot be read, and which link to it is broken."""
     return broken_link(path) or error.strerror or str(error)

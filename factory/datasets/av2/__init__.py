@@ -1,11 +1,10 @@
 """Argoverse 2 sensor logs: where they lie, and the names of their cameras. Numpy is loaded where one is opened."""
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
-from factory.files import folders_in, named_once
+from factory.files import broken_link, folders_in, is_named, named_once
 from factory.readers.settings import LogClips, Split
 
 READERS = {"AV2Reader": LogClips}
@@ -19,7 +18,7 @@ def log_folders(root: Path) -> dict[str, Path]:
     if _is_log(root):
         return {root.name: root}
     if not root.is_dir():
-        raise ValueError(f"{root}: no such folder")
+        raise ValueError(f"{root}: {broken_link(root) or 'no such folder'}")
     there = folders_in(root)
     parents = [root / split for split in get_args(Split) if root / split in there] or [root]
     found = ((folder.name, folder) for parent in parents for folder in folders_in(parent) if _is_log(folder))
@@ -32,7 +31,7 @@ def log_folders(root: Path) -> dict[str, Path]:
 
 
 def _is_log(folder: Path) -> bool:
-    return any(os.path.lexists(folder / name) for name in (ANNOTATIONS, POSES))
+    return any(is_named(folder / name) for name in (ANNOTATIONS, POSES))
 
 
 def camera_names(clips: Mapping[str, Any]) -> tuple[str, ...]:

@@ -6,7 +6,6 @@ YELLOW | RED; a state holds until the lane's next row), which the synthetic town
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from factory.datasets.av2 import ANNOTATIONS, EXTRINSICS, INTRINSICS, POSES, log_folders
-from factory.files import matching
+from factory.files import broken_link, is_named, matching, why_unread
 from factory.readers.base import BadClip, ClipRef, folder_split, id_text
 from factory.readers.logs import (
     STEP_MS,
@@ -390,9 +389,11 @@ CAR_LANE_TYPES = {"VEHICLE": True, "BUS": True, "BIKE": False}
 
 def map_file(log_folder: Path) -> Path:
     """The one vector map of a log. Raises BadClip."""
-    found = matching(log_folder / "map", "log_map_archive_*.json")
+    folder = log_folder / "map"
+    found = matching(folder, "log_map_archive_*.json")
     if len(found) != 1:
-        raise BadClip(str(log_folder / "map"), "log_map_archive_*.json", f"expected one vector map, found {len(found)}")
+        problem = broken_link(folder) or f"expected one vector map, found {len(found)}"
+        raise BadClip(str(folder), "log_map_archive_*.json", problem)
     return found[0]
 
 
@@ -404,7 +405,8 @@ def read_map(path: Path) -> tuple[RoadMap, tuple[Repair, ...]]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise BadClip(str(path), "json", f"cannot be read: {error}") from error
+        why = why_unread(path, error) if isinstance(error, OSError) else error
+        raise BadClip(str(path), "json", f"cannot be read: {why}") from error
     segments = {str(key): value for key, value in _section(path, content, "lane_segments").items()}
     sides, repairs = sound_lanes({key: _sides(path, key, raw) for key, raw in segments.items()})
     lanes = {key: _lane(path, key, segments[key], lane) for key, lane in sides.items()}
@@ -529,7 +531,7 @@ class AV2Reader(LogReader[AV2Log]):
 
     def drive(self, path: Path) -> LoggedDrive | str:
         """Ego and agents of the log in this folder. A log whose frames nobody annotated is skipped. Raises BadClip."""
-        if not os.path.lexists(path / ANNOTATIONS):
+        if not is_named(path / ANNOTATIONS):
             return f"no {ANNOTATIONS}"
         map_file(path)
         motion = read_motion(path)
@@ -611,7 +613,7 @@ def read_cameras(folder: Path) -> tuple[Camera, ...]:
     av2.geometry.camera). k1, k2 and k3 of the same file tell what the lens was like, and are not read.
     """
     path, pose_path = folder / INTRINSICS, folder / EXTRINSICS
-    if not os.path.lexists(path) and not os.path.lexists(pose_path):
+    if not is_named(path) and not is_named(pose_path):
         return ()
     columns = ("fx_px", "fy_px", "cx_px", "cy_px", "height_px", "width_px")
     table = read_feather(path, ("sensor_name", *columns))
@@ -636,7 +638,7 @@ def read_cameras(folder: Path) -> tuple[Camera, ...]:
 def read_lights(folder: Path, motion: LogMotion, times_s: Array) -> TrafficLights:
     """Light phases at times (S,), of all lanes that are named; no lanes where the log has none. Raises BadClip."""
     path = folder / LIGHTS
-    if not os.path.lexists(path):
+    if not is_named(path):
         return TrafficLights((), np.zeros((len(times_s), 0), np.int8))
     table = read_feather(path, ("timestamp_ns", "lane_id", "state"))
     lanes, names = table["lane_id"].astype(str), table["state"].astype(str)
@@ -673,6 +675,8 @@ def _licence(folder: Path) -> str:
 
 def _stamped(motion: LogMotion, sensor: str, folder: Path, suffix: str) -> list[SensorFile]:
     """Files named <timestamp_ns><suffix>, in time order. Raises BadClip for any other name."""
+    if broken := broken_link(folder):
+        raise BadClip(str(folder), "folder", broken)
     files = matching(folder, f"*{suffix}")
     for before, path in zip((None, *files), files):
         if not path.stem.isdecimal():

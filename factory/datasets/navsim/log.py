@@ -146,11 +146,16 @@ class Frame:
     world_from_ego: Array  # (4, 4) the same in space
     dynamic_state: Array  # (4,) vx, vy [m/s], ax, ay [m/s2] of the rear axle along the ego's axes
     lights: tuple[tuple[str, bool], ...]  # lane connector, whether it is red; yellow and unknown are not
-    command: str  # of COMMANDS
+    ego_status: CheckedValues  # with the log's own driving_command, which clips do not use: looked at when it is
     cameras: tuple[FrameCamera, ...]  # in the order of CAMERA_NAMES; those that the log gives a picture of
     lidar_path: str | None  # of the merged sweep below the folder of sensor blobs
     boxes: FrameBoxes | None  # None: nobody annotated the frame
     repairs: tuple[Repair, ...] = ()  # of its boxes, at time 0
+
+    @property
+    def command(self) -> str:
+        """The log's own, of COMMANDS. Raises BadClip."""
+        return parse_command(self.ego_status)
 
 
 @dataclass(frozen=True)
@@ -240,7 +245,7 @@ def parse_frame(item: Any, file: str, place: str, whole: bool = True) -> Frame:
         world_from_ego=world_from_ego,
         dynamic_state=values.numbers("ego_dynamic_state", (4,)).astype(np.float32).astype(np.float64),  # as NAVSIM does
         lights=parse_lights(values),
-        command=parse_command(values),
+        ego_status=only_command(values),
         cameras=parse_cameras(values.inner("cams")),
         lidar_path=None if lidar_path is None else values.text("lidar_path", may_be_empty=True) or None,
         boxes=boxes,
@@ -281,12 +286,22 @@ def parse_lights(values: CheckedValues) -> tuple[tuple[str, bool], ...]:
     return tuple(out)
 
 
+def only_command(values: CheckedValues) -> CheckedValues:
+    """The same without what is not the driving command."""
+    return replace(values, items={key: value for key, value in values.items.items() if key == "driving_command"})
+
+
 def parse_command(values: CheckedValues) -> str:
-    """`driving_command`, the one-hot of left, forward, right, unknown. Raises BadClip."""
-    one_hot = values.numbers("driving_command", (len(COMMANDS),))
-    if sorted(one_hot.tolist()) != [0.0, 0.0, 0.0, 1.0]:
-        raise values.bad("driving_command", f"{one_hot.tolist()} is no one-hot of left, forward, right, unknown")
-    return COMMANDS[int(np.argmax(one_hot))]
+    """`driving_command`, the one-hot of left, forward, right, unknown (OpenDriveLab/OpenScene @ 7286074,
+    DriveEngine/process_data/helpers/driving_command.py:57, 91-97). Raises BadClip.
+
+    Of three places it lacks the last: unknown is a route that cannot be followed (ibid., 66-69), which NAVSIM's own
+    page does not know ("left, straight or right", autonomousvision/navsim @ 51cecd5, v0.1, docs/agents.md:13).
+    """
+    one_hot = values.numbers("driving_command", (None,)).tolist()
+    if len(one_hot) not in (3, 4) or sorted(one_hot) != [*[0.0] * (len(one_hot) - 1), 1.0]:
+        raise values.bad("driving_command", f"{one_hot} is no one-hot of left, forward, right, unknown")
+    return COMMANDS[one_hot.index(1.0)]
 
 
 def parse_cameras(cams: CheckedValues) -> tuple[FrameCamera, ...]:
@@ -464,7 +479,7 @@ def _frame(values: CheckedValues, about: CheckedValues, *, as_shown: bool) -> Fr
         world_from_ego=_level(*pose),
         dynamic_state=np.concatenate(motion),
         lights=parse_lights(values),
-        command=parse_command(ego),
+        ego_status=only_command(ego),
         cameras=parse_cameras(
             CheckedValues(_paths_as_text(values.get("camera_dict")), values.file, f"{values.place}camera_dict.")
         ),

@@ -4,7 +4,6 @@ import hashlib
 import io
 import json
 import logging
-import os
 from collections import defaultdict
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from factory.files import broken_link, matching
+from factory.files import broken_link, is_named, matching
 from factory.readers.base import BadClip
 from tasks.caches import Damaged, user_cache, verify_checksum, with_checksum
 from tasks.kernels.compiled import write_whole
@@ -95,7 +94,7 @@ def map_file(maps_root: Path, location: str) -> Path:
     if not folder.is_dir():
         problem = f"{broken_link(folder) or 'no such folder'}; the maps' root holds one for each city"
         raise BadClip(str(folder), "location", f"{problem}: {DOWNLOAD}")
-    if os.path.lexists(index):
+    if is_named(index):
         try:
             version = str(json.loads(index.read_text(encoding="utf-8"))[location]["version"])
         except (OSError, ValueError, KeyError, TypeError) as error:

@@ -37,7 +37,7 @@ from factory.datasets.navsim.window import (
     window_agents,
     world_from_ego,
 )
-from factory.files import file_digest, matching, named_once, why_unread
+from factory.files import broken_link, file_digest, matching, named_once, why_unread
 from factory.readers.apart import ProcessFunction
 from factory.readers.base import (
     SPLITS,
@@ -481,9 +481,11 @@ class NavsimReader:
     def index(self) -> ClipIndex:
         """All windows that are clips, by log and time. Raises ValueError where the folders are not what they should."""
         if not self.maps.is_dir():
-            raise ValueError(f"{self.maps}: no such folder; clips.maps has one folder a city: {DOWNLOAD}")
+            missing = broken_link(self.maps) or "no such folder"
+            raise ValueError(f"{self.maps}: {missing}; clips.maps has one folder a city: {DOWNLOAD}")
         if self.sensors is not None and not self.sensors.is_dir():
-            raise ValueError(f"{self.sensors}: no such folder; clips.sensors=null reads clips without pictures")
+            missing = broken_link(self.sensors) or "no such folder"
+            raise ValueError(f"{self.sensors}: {missing}; clips.sensors=null reads clips without pictures")
         scenes = self.choice.scene_filter
         tokens = None if scenes is None or scenes.tokens is None else frozenset(scenes.tokens)
         if self.traversals:
@@ -729,7 +731,8 @@ def log_files(root: Path) -> dict[str, Path]:
     if root.is_file() and root.suffix.lower() == ".pkl":
         return {root.stem: root}
     if not root.is_dir():
-        raise ValueError(f"{root}: no such folder or .pkl file; clips.root is navsim_logs/<split>, or one log of it")
+        missing = broken_link(root) or "no such folder or .pkl file"
+        raise ValueError(f"{root}: {missing}; clips.root is navsim_logs/<split>, or one log of it")
     files = named_once(root, ((path.stem, path) for path in matching(root, "*.pkl")))
     if not files:
         splits = [path.parent.name for path in matching(root, "*/*.pkl")]

@@ -12,7 +12,6 @@ public log replay drops it. A light holds its state until the next frame.
 Between frames the ego's pose, velocity and acceleration are linear too. Steering and rates are 0, as there.
 """
 
-import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from factory.datasets.navsim.log import Frame, FrameBoxes
 from factory.datasets.navsim.maps import open_city
 from factory.datasets.navsim.settings import FRAME_STEPS
-from factory.files import why_unread
+from factory.files import is_named, why_unread
 from factory.readers.base import BadClip
 from factory.readers.pictures import BadPicture, Size, jpeg_size
 from tasks.world.arrays import Array, Bools
@@ -324,12 +323,12 @@ def sensor_files(frames: Sequence[Frame], folder: Path) -> Blobs:
     sweeps: list[SensorFile] = []
     for k, frame in enumerate(frames):
         files = {camera.name: _below(folder, camera.path) for camera in frame.cameras}
-        there = {name: path for name, path in files.items() if os.path.lexists(path)}  # a broken link is named later
+        there = {name: path for name, path in files.items() if is_named(path)}  # a broken link is named later
         if there and (missing := [path for name, path in files.items() if name not in there]):
             problem = f"missing, though {len(there)} of the frame's {len(files)} pictures are there"
             raise BadClip(str(missing[0]), "image", f"{problem}: restore it, or remove them all")
         images += [SensorFile(name, str(path), FRAME_S * k, frame.world_from_ego) for name, path in there.items()]
-        if frame.lidar_path is not None and os.path.lexists(sweep := _below(folder, frame.lidar_path)):
+        if frame.lidar_path is not None and is_named(sweep := _below(folder, frame.lidar_path)):
             sweeps.append(SensorFile(LIDAR, str(sweep), FRAME_S * k, frame.world_from_ego))
     return Blobs(tuple(images), tuple(sweeps))
 

@@ -1,7 +1,6 @@
 """Reads what 123D converted as clips, without 123D: what moves, what the sensors recorded, whole logs."""
 
 import hashlib
-import os
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -48,7 +47,7 @@ from factory.datasets.py123d.arrow import (
 )
 from factory.datasets.py123d.map import read_map
 from factory.datasets.scenarionet.reader import FIT_STEPS, MAX_GAP_S, smooth_drive
-from factory.files import file_digest, matching, matching_below, named_once
+from factory.files import broken_link, file_digest, is_named, matching, matching_below, named_once
 from factory.readers.base import SPLITS, BadClip, ClipRef, id_text
 from factory.readers.logs import (
     STEP_MS,
@@ -162,7 +161,7 @@ def lights_at(motion: LogMotion, times_s: Array) -> TrafficLights:
     Two lights of one lane count as the more restrictive. No lanes where the log has no lights. Raises BadClip.
     """
     path = motion.folder / LIGHTS
-    if not path.exists():
+    if not is_named(path):
         return TrafficLights((), np.zeros((len(times_s), 0), np.int8))
     file = open_file(path)
     changed_at = seconds_since(motion.start_ns, file.stamps_ns())
@@ -355,7 +354,9 @@ class Py123dReader(LogReader[Py123dLog]):
             None if folder is None else Path(folder).expanduser().absolute() for folder in (maps_root, sensor_root)
         )
         if self.sensor_root is not None and not self.sensor_root.is_dir():
-            raise ValueError(f"clips.sensor_root={self.sensor_root}: no such folder")
+            raise ValueError(
+                f"clips.sensor_root={self.sensor_root}: {broken_link(self.sensor_root) or 'no such folder'}"
+            )
 
     @cached_property
     def _folders(self) -> dict[str, Path]:
@@ -370,7 +371,7 @@ class Py123dReader(LogReader[Py123dLog]):
         header = read_header(path)
         converted_set_of(header)
         for name in (EGO, BOXES):
-            if not os.path.lexists(path / name):
+            if not is_named(path / name):
                 return f"no {name}"
         if header.metadata.get("map_metadata") is None:
             return "converted without a map"
@@ -455,7 +456,7 @@ class Py123dReader(LogReader[Py123dLog]):
                 raise BadClip(str(header.path), "metadata.map_metadata", f"names an impossible file {shown(name)}")
             roots = [self.maps_root] if self.maps_root else [parent / "maps" for parent in folder.parents[1:4]]
             paths = [root / about["dataset"] / name for root in roots]
-        found = next((path for path in paths if os.path.lexists(path)), None)
+        found = next((path for path in paths if is_named(path)), None)
         if found is None:
             raise BadClip(str(paths[0]), "file", "the log's map is missing: convert it too, or give clips.maps_root")
         return found
@@ -464,7 +465,7 @@ class Py123dReader(LogReader[Py123dLog]):
 def log_folders(root: Path) -> dict[str, Path]:
     """Log id -> folder, sorted by id. Raises ValueError where the root holds no log of 123D, or one name twice."""
     if not root.is_dir():
-        raise ValueError(f"{root}: no such folder")
+        raise ValueError(f"{root}: {broken_link(root) or 'no such folder'}")
     above = root / "logs" if (root / "logs").is_dir() else root
     folders = named_once(root, ((found.parent.name, found.parent) for found in matching_below(above, SYNC)))
     if not folders:

@@ -1,7 +1,6 @@
 """Photos and sweeps beside a ScenarioNet log, which has none itself: what its sidecar says, checked. docs/photos.md."""
 
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from factory.files import why_unread
+from factory.files import broken_link, is_named, why_unread
 from factory.readers.base import BadClip
 from factory.readers.pictures import frame_uri
 from factory.wording import shown
@@ -32,7 +31,7 @@ def sidecars_of(cameras: Path, log_ids: Iterable[str]) -> dict[str, Path]:
     """
     ids, said = list(log_ids), f"clips.cameras={cameras}"
     alone = cameras if cameras.is_file() else cameras / NAME
-    if os.path.lexists(alone):  # a broken link is named where it is read
+    if is_named(alone):  # a broken link is named where it is read
         if len(ids) != 1:
             raise ValueError(
                 f"{said}: one log's sidecar, and {len(ids)} logs are read: name it by clips.only=[...], "
@@ -40,11 +39,11 @@ def sidecars_of(cameras: Path, log_ids: Iterable[str]) -> dict[str, Path]:
             )
         return {ids[0]: alone}
     if not cameras.is_dir():
-        raise ValueError(f"{said}: no such file or folder")
+        raise ValueError(f"{said}: {broken_link(cameras) or 'no such file or folder'}")
     found = {}
     for log_id in ids:
         places = (cameras / name / NAME for name in (log_id, log_id.rpartition("_")[2]))
-        if there := [place for place in places if os.path.lexists(place)]:
+        if there := [place for place in places if is_named(place)]:
             found[log_id] = there[0]
     if not found:
         raise ValueError(f"{said}: no {NAME} here, nor in <log id>/ of any log that is read: {', '.join(ids[:3])}")

@@ -7,7 +7,6 @@ to the database).
 """
 
 import hashlib
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -30,7 +29,7 @@ from factory.datasets.scenarionet.photos import (
     start_step_nearest_photos,
 )
 from factory.datasets.scenarionet.settings import ScenarioNetClips
-from factory.files import matching_below, named_once
+from factory.files import broken_link, is_named, matching_below, named_once
 from factory.readers.apart import ProcessFunction
 from factory.readers.base import (
     BadClip,
@@ -468,7 +467,9 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
             None if path is None else Path(path).expanduser().absolute() for path in (cameras, sensor_root)
         )
         if self.sensor_root is not None and not self.sensor_root.is_dir():
-            raise ValueError(f"clips.sensor_root={self.sensor_root}: no such folder")
+            raise ValueError(
+                f"clips.sensor_root={self.sensor_root}: {broken_link(self.sensor_root) or 'no such folder'}"
+            )
         if self.sensor_root is not None and self.cameras is None:
             raise ValueError("clips.sensor_root goes with clips.cameras, which says what the photos below it show")
 
@@ -559,8 +560,8 @@ def scenario_files(root: Path) -> dict[str, Path]:
     if root.is_file() and root.suffix.lower() == ".pkl":
         return {root.stem: root}
     if not root.is_dir():
-        raise ValueError(f"{root}: no such folder or .pkl file")
-    listed = os.path.lexists(root / SUMMARY)
+        raise ValueError(f"{root}: {broken_link(root) or 'no such folder or .pkl file'}")
+    listed = is_named(root / SUMMARY)
     paths = _listed(root) if listed else matching_below(root, "sd_*.pkl")
     files = named_once(root, ((path.stem, path) for path in paths))
     if not files:
@@ -576,7 +577,7 @@ def _listed(root: Path) -> list[Path]:
     summary, mapped = root / SUMMARY, root / MAPPING
     try:
         names = ProcessFunction(_names)(summary, str(summary))
-        folders = ProcessFunction(_folders)(mapped, str(mapped)) if os.path.lexists(mapped) else {}
+        folders = ProcessFunction(_folders)(mapped, str(mapped)) if is_named(mapped) else {}
     except BadClip as error:
         raise ValueError(str(error)) from error
     return [root / folders.get(name, "") / name for name in names]

@@ -14,6 +14,7 @@ import pytest
 from examples import csv_logs
 from factory.__main__ import main as factory
 from factory.config.run import load_config
+from factory.config.words import ConfigError
 from factory.datasets.navsim.reader import NavsimReader
 from factory.datasets.scenarionet.reader import MAPPING, SUMMARY
 from factory.datasets.town.town import SUMS, repair_folder, write_once
@@ -106,7 +107,7 @@ def opened(make: Make, root: str) -> tuple[ClipReader, ClipIndex]:
 def clips_of(make: Make, root: str) -> list[object]:
     """What a run would find under this root, to the last byte of a photo."""
     reader, index = opened(make, root)
-    assert index.refs and not index.broken and not index.skipped_logs
+    assert index.refs and not index.broken and not index.skipped_logs, index.broken
     found: list[object] = []
     for clip in map(reader.read, index.refs):
         files = [(f.sensor, f.time_s, file_digest(file_and_frame(f.uri)[0])) for f in (*clip.images, *clip.sweeps)]
@@ -161,6 +162,7 @@ def upper_case(root: Path) -> str:
 KINDS = (among_companions, all_behind_links, behind_a_link, with_a_slash, at_home, relative, odd_name, upper_case)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("make", READERS)
 def test_the_same_clips_are_found_however_their_folder_comes(
@@ -176,6 +178,35 @@ def test_the_same_clips_are_found_however_their_folder_comes(
     make(root, street)
     known = clips_of(make, str(root))
     assert clips_of(make, kind(root)) == known
+
+
+LINKED = {  # what a clip is made of, were it there
+    av2: ("train", "*/*/*.feather", "*/*/calibration", "*/*/map", "*/*/map/*.json", "*/*/sensors", "*/*/sensors/lidar"),
+    scenarionet: ("part", "part/*.pkl"),
+    database: ("merged", "merged/*.pkl", "other", "other/*.pkl"),
+    sidecar: ("logs", "logs/*.pkl", "photos", "photos/*", "photos/*/*.json"),
+    py123d: ("converted", "*/logs", "*/logs/*", "*/logs/*/*", "*/logs/*/*/*.arrow", "sensor"),
+    navsim: ("*", "*/*", "maps/*/*", "maps/*/*/*", "navsim_logs/*/*.pkl", "sensor_blobs/*/*"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", LINKED)
+def test_a_link_that_leads_nowhere_is_named_where_it_lies(
+    make: Make, street: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """By the reader's error, or by a line in the log where the reader says what it expected."""
+    root = tmp_path / "root"
+    make(root, street)
+    for path in sorted(path for pattern in LINKED[make] for path in root.glob(pattern)):
+        path.rename(tmp_path / "away")
+        path.symlink_to("/unmounted/data")
+        caplog.clear()
+        with pytest.raises((BadClip, ConfigError, AssertionError)) as error:
+            clips_of(make, str(root))
+        assert "leads to /unmounted/data, which is not there" in f"{error.value} {caplog.text}", path
+        path.unlink()
+        (tmp_path / "away").rename(path)
 
 
 OF_LOGS = {  # files that clips are computed from; a city's map is no part of a log

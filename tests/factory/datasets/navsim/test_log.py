@@ -66,6 +66,21 @@ def test_other_spellings_of_the_same_values_are_read(tmp_path: Path) -> None:
     assert read.lights == (("21", True), ("22", False)) and read.command == "unknown" and read.roadblock_ids == ()
 
 
+def test_a_command_of_three_places_has_no_unknown() -> None:
+    """As the first logs have it."""
+    for place, command in enumerate(("left", "straight", "right", "unknown")):
+        assert parse_frame(frame(0, driving_command=np.eye(4)[place]), "f", "").command == command
+        assert place == 3 or parse_frame(frame(0, driving_command=np.eye(3)[place]), "f", "").command == command
+
+
+@pytest.mark.parametrize("given", [[0, 1, 1, 0], [0, 0, 0], [1], [0, 0, 0, 0, 1], [[0, 1, 0, 0]], "left", None, np.nan])
+def test_a_command_that_is_none_is_refused_where_it_is_used_and_there_alone(given: Any) -> None:
+    read = parse_frame(frame(0, driving_command=given), "f", "frames[0].")
+    assert read.token
+    with pytest.raises(BadClip, match=r"frames\[0\]\.driving_command: "):
+        _ = read.command
+
+
 def test_a_test_set_s_log_has_no_boxes() -> None:
     without = frame(0)
     del without["anns"]
@@ -106,7 +121,6 @@ def _anns(**other: Any) -> dict[str, Any]:
         ({"traffic_lights": [("", True)]}, "traffic_lights", "lane connector id"),
         ({"traffic_lights": {21: True}}, "traffic_lights", "expected a list"),
         ({"traffic_lights": [(21, True, 3)]}, "traffic_lights", "is_red"),
-        ({"driving_command": [0, 1, 1, 0]}, "driving_command", "no one-hot"),
         ({"cams": {}}, "cams.CAM_F0", "all eight cameras"),
         ({"cams": {**frame(1)["cams"], "CAM_B0": {"data_path": "a.jpg"}}}, "cams.CAM_B0.sensor2lidar_rotation", "miss"),
         ({"lidar_path": 5}, "lidar_path", "expected text"),
