@@ -14,7 +14,6 @@ import secrets
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from fnmatch import fnmatchcase
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from factory.wording import one_line
+from tasks.caches import private_folder
 
 log = logging.getLogger(__name__)
 
@@ -181,12 +181,7 @@ def locked(file: IO[Any]) -> Iterator[None]:
 
 
 def _stand_in(name: str) -> Path:
-    """In a folder of this user's own, as others may write to the temporary one."""
-    folder = Path(tempfile.gettempdir(), f"driving-data-factory-locks-{os.getuid()}")
-    folder.mkdir(mode=0o700, exist_ok=True)
-    if folder.is_symlink() or folder.stat().st_uid != os.getuid():
-        raise PermissionError(errno.EPERM, "belongs to another user", str(folder))
-    return folder / f"{hashlib.sha256(os.path.realpath(name).encode()).hexdigest()[:32]}.lock"
+    return private_folder("locks") / f"{hashlib.sha256(os.path.realpath(name).encode()).hexdigest()[:32]}.lock"
 
 
 # What differs inside a submitted Ray job: the working directory is a copy that Ray throws away.

@@ -8,17 +8,50 @@ themselves, such as npz, stay readable with it. JSON carries its own in a member
 keep out who writes into the folder.
 """
 
+import errno
 import hashlib
 import json
+import logging
 import os
+import tempfile
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+log = logging.getLogger(__name__)
+NAME = "driving-data-factory"
+
 
 def user_cache() -> Path:
-    """The project's folder in the user's cache (XDG base directories); everything in it can be made again."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "driving-data-factory"
+    """The project's folder in the user's cache (XDG base directories); everything in it can be made again.
+
+    Where none is named and the home folder cannot be written to, as in containers, it lies in the temporary folder.
+    Raises PermissionError where another user has taken that place.
+    """
+    if named := os.environ.get("XDG_CACHE_HOME"):
+        return Path(named) / NAME
+    folder = Path(os.path.expanduser("~/.cache"), NAME)
+    there = next((place for place in (folder, *folder.parents) if place.exists()), None)
+    if folder.is_absolute() and there is not None and os.access(there, os.W_OK | os.X_OK):
+        return folder
+    instead = private_folder("cache")
+    _warn_of_other_place(folder, instead)
+    return instead
+
+
+@cache
+def _warn_of_other_place(folder: Path, instead: Path) -> None:
+    log.warning("%s cannot be written to, so %s stands for it: name a folder in XDG_CACHE_HOME", folder, instead)
+
+
+def private_folder(name: str) -> Path:
+    """A folder of this user's own in the temporary one, to which others may write. Raises PermissionError."""
+    folder = Path(tempfile.gettempdir(), f"{NAME}-{name}-{os.getuid()}")
+    folder.mkdir(mode=0o700, exist_ok=True)
+    if folder.is_symlink() or folder.stat().st_uid != os.getuid():
+        raise PermissionError(errno.EPERM, "belongs to another user", str(folder))
+    return folder
 
 
 SEAL = b"\nsha256\n"

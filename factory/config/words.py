@@ -115,11 +115,17 @@ def as_hydra_override(word: str) -> str:
             raise ConfigError(
                 f"{word}: cannot be read; a list is {key}=[a,b], all of it in quotes for the shell"
             ) from (error)
-        escaped = value.replace("\\", "\\\\").replace("'", "\\'")
-        return f"{key}='{escaped}'"
+        return f"{key}={_quoted(value)}"
     if parsed.is_sweep_override():
+        if key.rpartition(".")[2] in PATHS and os.path.exists(os.path.expanduser(value)):  # a name with commas
+            return f"{key}={_quoted(value)}"
         raise ConfigError(f"{word}: one value, or a list: {key}=[{value}]; several runs are several commands")
     return word
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{escaped}'"
 
 
 def expand_home(value: Any, key: str) -> Any:

@@ -145,10 +145,13 @@ def relative(root: Path) -> str:
     return "./root/../root"
 
 
+def commas(root: Path) -> str:
+    return str(root.rename(root.with_name("a,b")))
+
+
 def odd_name(root: Path) -> str:
     odd = root.with_name("a b=c,d [e] (f) {g} 'h' \"i\" #j %k $l ü~")
-    root.rename(odd)
-    return str(odd)
+    return str(root.rename(odd))
 
 
 def upper_case(root: Path) -> str:
@@ -159,7 +162,17 @@ def upper_case(root: Path) -> str:
     return str(root)
 
 
-KINDS = (among_companions, all_behind_links, behind_a_link, with_a_slash, at_home, relative, odd_name, upper_case)
+KINDS = (
+    among_companions,
+    all_behind_links,
+    behind_a_link,
+    with_a_slash,
+    at_home,
+    relative,
+    commas,
+    odd_name,
+    upper_case,
+)
 
 
 @pytest.mark.slow
