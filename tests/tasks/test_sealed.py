@@ -1,5 +1,6 @@
 """A seal finds every damage of what it stands behind, and of itself."""
 
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -9,12 +10,30 @@ from tasks.caches import (
     append_checksum,
     json_with_checksum,
     parse_json_with_checksum,
+    user_cache,
     verify_checksum,
     with_checksum,
     without_checksum,
 )
 
 CONTENT = bytes(range(90))
+
+
+def test_caches_lie_elsewhere_where_the_home_folder_cannot_be_written_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert user_cache() == tmp_path / "home" / ".cache" / "driving-data-factory"
+    (tmp_path / "home").touch()  # no folder can be made in it, by root neither
+    found = user_cache()
+    assert found.parent == tmp_path and found.stat().st_mode & 0o777 == 0o700
+    assert f"{found} stands for it: name a folder in XDG_CACHE_HOME" in caplog.text
+    found.rmdir()
+    found.symlink_to(tmp_path)
+    with pytest.raises(PermissionError, match="another user"):
+        user_cache()
 
 
 def damaged(whole: bytes) -> list[bytes]:
