@@ -38,7 +38,7 @@ from tasks.render.views import MAP_RIG
 from tasks.rollout.simulate import traffic_record
 from tasks.settings import PdmSettings
 from tasks.stages import FRAMES, stage_versions
-from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary, kinematic_trajectories, refuse_other_meaning
 
 KINEMATIC_K = 1024
 RIGS_LOOKED_AT = 3  # clips, for the names of their cameras
@@ -291,7 +291,9 @@ def recovery_expert(run: RunContext, **settings: Any) -> RecoveryExpert:
         raise ConfigError(f"{where}.table={sources.table}: there is no such file")
     if sources.vocabularies:
         raise ConfigError(f"{where}: give table or vocabularies; a finished table takes no more trajectories")
-    return RecoveryExpert(load_recovery_table(sources.table), chosen)
+    table = load_recovery_table(sources.table)
+    refuse_other_meaning(table.trajectories, sources.table)
+    return RecoveryExpert(table, chosen)
 
 
 def _recovery_table(run: RunContext, vocabularies: Sequence[str]) -> RecoveryTable:

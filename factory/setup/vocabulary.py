@@ -21,7 +21,14 @@ from tasks.caches import append_checksum
 from tasks.experts.recovery import RecoveryTable
 from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, STEP_S
-from tasks.world.vocabulary import Vocabulary, checked_trajectories, cluster, human_windows, trajectories_digest
+from tasks.world.vocabulary import (
+    Vocabulary,
+    checked_trajectories,
+    cluster,
+    human_windows,
+    refuse_other_meaning,
+    trajectories_digest,
+)
 
 STEP_MS = round(STEP_S * 1000)
 TABLE_KEYS = ("trajectories", "digest")
@@ -99,13 +106,18 @@ def _no_train_log(windows: TrainWindows) -> str:
 
 
 def load_vocabulary(path: str | Path, first: int | None = None) -> Vocabulary:
-    """The vocabulary in a .npy file (K, 40, 3), or its first entries. Raises ValueError that names the file."""
+    """The vocabulary in a .npy file (K, 40, 3), or its first entries. Raises ValueError that names the file.
+
+    What another meaning of the numbers gives away is refused too (`refuse_other_meaning`).
+    """
     values = _load(path)
     if not isinstance(values, np.ndarray):
         raise ValueError(f"{path}: expected one .npy array (K, {HORIZON_STEPS}, 3), found an archive of several")
     if first is not None and not 1 <= first <= len(values):
         raise ValueError(f"{path}: the first {first} of {len(values)} trajectories were asked for")
-    return Vocabulary(values[:first], source=str(path))
+    vocabulary = Vocabulary(values, source=str(path))
+    refuse_other_meaning(vocabulary.trajectories, vocabulary.source)  # of all: the first few may tell nothing
+    return vocabulary if first is None else Vocabulary(vocabulary.trajectories[:first], source=str(path))
 
 
 @dataclass(frozen=True)
@@ -138,6 +150,7 @@ def load_start_trajectories(path: str) -> StartTrajectories:
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: every trajectory must be {HORIZON_STEPS} times x, y, heading") from error
     trajectories, of_clip = checked_trajectories(values, where), dict[str, list[Array]]()
+    refuse_other_meaning(trajectories, where, human=False)
     for clip_id, trajectory in zip(rows["clip_id"], trajectories, strict=True):
         of_clip.setdefault(clip_id, []).append(trajectory)
     found = {clip_id: np.array(of_clip[clip_id]) for clip_id in sorted(of_clip)}

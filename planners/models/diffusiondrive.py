@@ -43,6 +43,7 @@ from planners.models.layers import (
 from planners.models.planner import Planner, TrainingData, evaluating, read_array
 from planners.models.settings import DiffusionDriveSettings
 from tasks.world.arrays import FloatArray
+from tasks.world.vocabulary import refuse_other_meaning
 
 WAYPOINTS = 8  # 0.5 .. 4.0 s
 
@@ -333,9 +334,11 @@ class DiffusionDrive(Planner):
 
     @classmethod
     def fixed_arrays(cls, settings: DiffusionDriveSettings, data: TrainingData) -> dict[str, FloatArray]:
-        """`anchors`. Raises ValueError for an unfit file, or fewer distinct plans than anchors."""
+        """`anchors`. Raises ValueError for an unfit file, one of another meaning, or fewer distinct plans than anchors."""
         if settings.anchors is not None:
-            return {"anchors": checked_anchors(read_array(settings.anchors, "anchors"), settings.anchors)}
+            anchors = checked_anchors(read_array(settings.anchors, "anchors"), settings.anchors)
+            refuse_other_meaning(anchors, settings.anchors)
+            return {"anchors": anchors}
         return {"anchors": cluster_anchors(data.labels_2hz(), settings.n_anchors, ANCHORS_SEED)}
 
     @property

@@ -28,7 +28,7 @@ from planners.models.planner import Planner, TrainingData, evaluating, read_arra
 from planners.models.settings import STRIDES, BackboneSettings, FusionSettings, GtrsDenseSettings, WeightingName
 from tasks.subscores import HALVES
 from tasks.world.arrays import FloatArray
-from tasks.world.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary, refuse_other_meaning
 
 IMITATION = "imitation"
 
@@ -185,7 +185,7 @@ class GtrsDense(Planner):
             raise ValueError("gtrs_dense learns from labels of a vocabulary and these samples carry none")
         if settings.vocabulary is None:
             raise ValueError(f"vocabulary: give the .npy file of trajectories with digest {labelled}, the labels' own")
-        vocabulary = Vocabulary(read_array(settings.vocabulary, "vocabulary"), settings.vocabulary)
+        vocabulary = _read_vocabulary(settings.vocabulary, "vocabulary")
         if vocabulary.digest != labelled:
             raise ValueError(
                 f"vocabulary={settings.vocabulary} has digest {vocabulary.digest}, "
@@ -264,7 +264,14 @@ def inference_arrays(settings: GtrsDenseSettings) -> dict[str, FloatArray]:
     file = settings.inference_vocabulary
     if file is None:
         return {}
-    return {"inference_vocabulary": Vocabulary(read_array(file, "inference_vocabulary"), file).trajectories}
+    return {"inference_vocabulary": _read_vocabulary(file, "inference_vocabulary").trajectories}
+
+
+def _read_vocabulary(file: str, setting: str) -> Vocabulary:
+    """Raises ValueError where the file is missing or unfit, or its numbers mean something else."""
+    vocabulary = Vocabulary(read_array(file, setting), file)
+    refuse_other_meaning(vocabulary.trajectories, file)
+    return vocabulary
 
 
 def _choices(settings: GtrsDenseSettings, arrays: Mapping[str, FloatArray], vocabulary: Vocabulary) -> Vocabulary:

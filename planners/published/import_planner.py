@@ -30,6 +30,7 @@ from planners.training.checkpoint import FOLDER, put_weights, save_checkpoint
 from planners.training.train import PlannerEntry
 from tasks.subscores import RECORDS
 from tasks.world.arrays import FloatArray
+from tasks.world.vocabulary import refuse_other_meaning
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -335,7 +336,10 @@ def config_of(argv: Sequence[str]) -> ImportConfig:
 
 
 def import_to(config: ImportConfig) -> Path:
-    """Write the checkpoint's planner under `out` and say what became of every weight. Raises ConfigError."""
+    """Write the checkpoint's planner under `out` and say what became of every weight.
+
+    Raises ConfigError, and ValueError where the numbers of its vocabulary or anchors mean something else.
+    """
     out, path = Path(config.out).absolute(), Path(config.checkpoint)
     if (out / FOLDER).exists():
         raise ConfigError(f"out={config.out} holds a training already: choose another folder")
@@ -343,6 +347,8 @@ def import_to(config: ImportConfig) -> Path:
         raise ConfigError(f"checkpoint={config.checkpoint}: there is no such file")
     public = read_public_weights(path)
     found = import_weights(config.planner, public, str(path))
+    for name, trajectories in found.planner.arrays.items():
+        refuse_other_meaning(trajectories, f"{path}: {name}")
     source = f"{path.name} {file_digest(path)}"
     record = {
         "trained": {"imported": source},

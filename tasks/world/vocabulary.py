@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tasks.world.arrays import Array, Indices
 from tasks.world.clip import HORIZON_STEPS, STEP_S
-from tasks.world.frames import HEADING, to_local
+from tasks.world.frames import HEADING, to_local, wrap_angle
 
 OF_LOG = -1  # stands for the log itself where a trajectory has its row in the vocabulary
 FIRST_START = -2  # for the first of a clip's own start states; -3 for the second ...
@@ -34,6 +34,124 @@ def checked_trajectories(values: NDArray[np.generic], source: str) -> Array:
     if len(broken):
         raise ValueError(f"{source}: {len(broken)} trajectories hold NaN or infinity, the first is number {broken[0]}")
     return trajectories
+
+
+# What a file of another meaning is given away by: it has the same shape, and its numbers are finite.
+#
+# Each sign is a median or a quantile over the trajectories that move, so that single odd ones (a car that reverses, a
+# tracker's jump) refuse no file. The numbers beside the limits are those of three sets, from the least to the most:
+# 8,192 clustered human trajectories (GTRS), 2,000 kinematic ones, the windows of nine logs (Argoverse 2, nuScenes).
+# No sign tells a set that is mirrored together with its headings, 2 s in 40 rows, and one that never moves a metre.
+
+MOVING_MPS = 1.0
+MOVING_SHARE = 0.25  # of the rows of a trajectory that says anything
+FIRST_STEP = (0.5, 1.5)  # over the mean of the three after it; 1.0
+SIDEWAYS_RAD = 0.8  # from x to where motion begins; 0.0
+TURN_RAD = 0.2  # of the motion over a trajectory that tells how headings turn
+LEAST_TURNING = 3  # trajectories; else all that move are looked at
+OFF_MOTION_RAD = 0.15  # of headings, where trajectories turn; 0 to 0.05
+TOP_SPEED_MPS = 40.0  # of a tenth of them; 11 to 17
+VELOCITY_S = 0.5  # over which a velocity is taken
+CHANGE_MPS = 3.0  # of the velocity within a second, of a tenth of them; 1.6 to 2.0, and 5.9 where 40 rows hold 8 s
+LEAST_DRIVES = 20  # whose tenth says anything of how people drive
+
+
+def refuse_other_meaning(trajectories: Array, source: str, human: bool = True) -> None:
+    """Raises ValueError that names `source`, what gives away that its numbers mean something else, and what helps.
+
+    trajectories: finite (K, N, 3) x [m], y [m], heading [rad] at 4 s / N .. 4 s, or (K, N, 2) without headings.
+    human: they are driven as people drive, and are no states of anybody's choice.
+    """
+    step_s = HORIZON_STEPS * STEP_S / trajectories.shape[1]
+    places = np.pad(trajectories[..., :2], ((0, 0), (1, 0), (0, 0)))  # from the start
+    moved = np.diff(places, axis=1)
+    moves = np.hypot(moved[..., 0], moved[..., 1]) > MOVING_MPS * step_s
+    moves[:, 0] = False  # the step from the start may be the very fault
+    drives = moves.mean(axis=1) >= MOVING_SHARE
+    if not drives.any():
+        return
+    places, moved, moves = places[drives], moved[drives], moves[drives]
+    sign = _first_row_sign(places, moved, step_s) or _start_sign(moved, moves)
+    if not sign and trajectories.shape[2] == 3:
+        sign = _heading_sign(trajectories[drives, :, 2], moved[:, 1:], moves[:, 1:])
+    if sign := sign or _speed_sign(places, step_s, human):
+        raise ValueError(f"{source}: {sign}")
+
+
+def _first_row_sign(places: Array, moved: Array, step_s: float) -> str | None:
+    lengths = np.hypot(moved[..., 0], moved[..., 1])
+    after = lengths[:, 1:4].mean(axis=1)
+    begins = after > MOVING_MPS * step_s
+    if not begins.any():
+        return None
+    share = float(np.median(lengths[begins, 0] / after[begins]))
+    if FIRST_STEP[0] <= share <= FIRST_STEP[1]:
+        return None
+    first_m, last_m = (float(np.median(np.hypot(*places[begins, row].T))) for row in (1, -1))
+    said = f"the first row lies {first_m:,.2f} m from the start, {share:,.1f} times as far as rows after it lie apart"
+    rows = f"Rows are {step_s:.1f} .. 4.0 s"
+    if share < FIRST_STEP[0]:
+        return f"{said}: it is the row of now. {rows}: leave it out and add the one of 4.0 s"
+    if last_m < min(first_m, FIRST_STEP[1] * float(np.median(lengths[begins, -3:]))):
+        return f"{said}, and the last one {last_m:,.2f} m: time runs backwards. {rows}: turn their order"
+    return f"{said}. {rows} from the start, in the ego's own frame there, not the world's (x = y = heading = 0 at 0 s)"
+
+
+def _start_sign(moved: Array, moves: Array) -> str | None:
+    x, y = moved[np.arange(len(moved)), np.argmax(moves, axis=1)].T
+    off = float(np.median(np.abs(np.arctan2(y, x))))
+    if off <= SIDEWAYS_RAD:
+        return None
+    how = "does x point backwards?" if off > np.pi * 0.75 else "are x and y swapped?"
+    return f"motion begins {np.degrees(off):.0f} deg off x, which is forward, and y is left: {how}"
+
+
+def _heading_sign(headings: Array, moved: Array, moves: Array) -> str | None:
+    """headings (K, N), moved (K, N - 1, 2) and moves (K, N - 1) between their rows."""
+    along, each = np.arctan2(moved[..., 1], moved[..., 0]), np.arange(len(moved))
+    first, last = np.argmax(moves, axis=1), moves.shape[1] - 1 - np.argmax(moves[:, ::-1], axis=1)
+    turns = np.abs(wrap_angle(along[each, last] - along[each, first])) > TURN_RAD
+    if turns.sum() < LEAST_TURNING:
+        turns[:] = True
+    headings, along, moves = headings[turns], along[turns], moves[turns]
+
+    def off_motion(read: Array) -> float:
+        between = read[:, :-1] + wrap_angle(np.diff(read, axis=1)) / 2.0
+        off = np.where(moves, np.abs(wrap_angle(along - between)), np.nan)
+        return float(np.median(np.nanmedian(off, axis=1)))
+
+    as_given = off_motion(headings)
+    if as_given <= OFF_MOTION_RAD:
+        return None
+    readings = {
+        "they are in degrees": np.radians(headings),
+        "they turn the wrong way: clockwise, or y is to the right": -headings,
+        "they point backwards": headings + np.pi,
+        "they count clockwise from y": np.pi / 2.0 - headings,
+        "they count from y": headings + np.pi / 2.0,
+        "they are the world's, not those from the start": headings - headings[:, :1],
+    }
+    best = min(readings, key=lambda reading: off_motion(readings[reading]))
+    why = f": {best}" if off_motion(readings[best]) < as_given / 3.0 else ""
+    said = f"headings are {np.degrees(as_given):.0f} deg off the direction of motion (median, where it turns){why}"
+    return f"{said}. Expected radians from x, which is forward, counter-clockwise to y, which is left"
+
+
+def _speed_sign(places: Array, step_s: float, human: bool) -> str | None:
+    steps, second = round(VELOCITY_S / step_s), round(1.0 / step_s)
+    velocities = (places[:, steps:] - places[:, :-steps]) / VELOCITY_S
+    expected = f"Expected metres, in rows {step_s:.1f} s apart"
+    speed = float(np.quantile(np.hypot(velocities[..., 0], velocities[..., 1]).max(axis=1), 0.9))
+    if speed > TOP_SPEED_MPS:
+        return f"a tenth of them drive faster than {speed:,.0f} m/s. {expected}: another unit, or more than 4 s?"
+    if not human or len(places) < LEAST_DRIVES:
+        return None
+    changed = velocities[:, second:] - velocities[:, :-second]
+    change = float(np.quantile(np.hypot(changed[..., 0], changed[..., 1]).max(axis=1), 0.9))
+    if change <= CHANGE_MPS:
+        return None
+    said = f"a tenth of them change their velocity by more than {change:.1f} m/s within a second, people by 2 m/s"
+    return f"{said}. {expected}: do they hold 8 s, or another unit?"
 
 
 @dataclass(frozen=True)
