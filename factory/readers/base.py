@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from factory.files import why_unread
+from factory.readers.signs import camera_sign, motion_sign, mount_sign
 from factory.wording import one_line, shown
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import CLIP_STEPS, AgentKind, AgentTracks, Camera, Clip
@@ -284,6 +285,8 @@ def _faults(clip: Clip) -> Iterator[Fault]:
         yield "split", f"{shown(clip.split)} is none of {', '.join(SPLITS)}"
     yield from _array("ego_states", clip.ego_states, (CLIP_STEPS, EGO_STATE_SIZE))
     yield from _array("world_from_ego", clip.world_from_ego, (CLIP_STEPS, 4, 4))
+    if sign := motion_sign(clip.ego_states):
+        yield "ego_states", sign
     yield from _agent_faults(clip)
     if fault := map_fault(clip.road_map):
         yield fault
@@ -381,11 +384,16 @@ def _sensor_faults(clip: Clip) -> Iterator[Fault]:
     names = [camera.name for camera in clip.cameras]
     if len(set(names)) != len(names):
         yield "cameras", "a name stands twice"
+    for camera in (*clip.cameras, *(clip.block.other_cameras if clip.block else ())):
+        if sign := camera_sign(camera):
+            yield f"cameras.{camera.name}", sign
     if uncalibrated := sorted({image.sensor for image in clip.images} - set(names)):
         yield "images", f"no calibration of camera {uncalibrated}"
     for kind in ("images", "sweeps"):
         for i, file in enumerate(getattr(clip, kind)):
             yield from _array(f"{kind}[{i}].world_from_ego", file.world_from_ego, (4, 4))
+            if file.ego_from_sensor is not None and (sign := mount_sign(file.ego_from_sensor)):
+                yield f"{kind}[{i}].ego_from_sensor", sign
 
 
 def _shape(field: str, array: Any, shape: tuple[int | None, ...]) -> Iterator[Fault]:

@@ -40,6 +40,7 @@ from scipy.spatial import cKDTree
 from factory.readers.apart import ProcessFunction
 from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, failures_as_bad_clip, split_of, validate_clip
 from factory.readers.settings import LogClips, WindowSettings, check_traversals
+from factory.readers.signs import map_sign, motion_sign
 from tasks.world.arrays import Array, Ints
 from tasks.world.clip import (
     CLIP_STEPS,
@@ -357,6 +358,8 @@ class LogReader(ABC, Generic[Log]):
         drive = self.drive(path)
         if isinstance(drive, str):
             return LogWindows(skipped=drive)
+        if sign := motion_sign(drive.ego_states):
+            raise BadClip(str(path), "ego", sign)
         driven = np.flatnonzero(np.isfinite(drive.ego_states).all(axis=1))
         driven = driven[driven >= drive.earliest]
         first, n_steps = (int(driven[0]), int(driven[-1] - driven[0]) + 1) if len(driven) else (0, 0)
@@ -486,7 +489,8 @@ def route_of_drive(road_map: RoadMap, poses: Array, file: str, field: str) -> Ro
     try:
         return route_of_log(road_map, poses[::ROUTE_SAMPLE_STEPS])
     except NoRoute as error:
-        raise BadClip(file, field, str(error)) from error
+        why = map_sign(poses, road_map)
+        raise BadClip(file, field, f"{error}: {why}" if why else str(error)) from error
 
 
 def files_within(files: Sequence[SensorFile], start: int, stop: int) -> tuple[SensorFile, ...]:

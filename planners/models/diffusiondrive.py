@@ -334,7 +334,10 @@ class DiffusionDrive(Planner):
 
     @classmethod
     def fixed_arrays(cls, settings: DiffusionDriveSettings, data: TrainingData) -> dict[str, FloatArray]:
-        """`anchors`. Raises ValueError for an unfit file, one of another meaning, or fewer distinct plans than anchors."""
+        """`anchors`.
+
+        Raises ValueError for an unfit file, numbers of another meaning, or fewer distinct plans than anchors.
+        """
         if settings.anchors is not None:
             anchors = checked_anchors(read_array(settings.anchors, "anchors"), settings.anchors)
             refuse_other_meaning(anchors, settings.anchors)

@@ -31,6 +31,7 @@ from factory.readers.logs import (
     route_of_drive,
 )
 from factory.readers.points import read_feather
+from factory.readers.signs import stamps_sign
 from tasks.world.arrays import Array, Bools, Indices, Ints
 from tasks.world.clip import MOVING_KINDS, STEP_S, AgentKind, AgentTracks, Camera, SensorFile
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, X, Y, wrap_angle
@@ -145,9 +146,11 @@ def numbers(path: Path, table: Mapping[str, NDArray[np.generic]], columns: tuple
 
 
 def stamps(path: Path, table: Mapping[str, NDArray[np.generic]]) -> Ints:
-    """The column timestamp_ns. Raises BadClip where it holds no integers."""
+    """The column timestamp_ns. Raises BadClip where it holds no integers, or another unit."""
     if table["timestamp_ns"].dtype.kind not in "iu":
         raise BadClip(str(path), "timestamp_ns", f"expected integers, found {table['timestamp_ns'].dtype}")
+    if sign := stamps_sign(table["timestamp_ns"].astype(np.int64), "ns"):
+        raise BadClip(str(path), "timestamp_ns", sign)
     return table["timestamp_ns"].astype(np.int64)
 
 
@@ -683,7 +686,10 @@ def _stamped(motion: LogMotion, sensor: str, folder: Path, suffix: str) -> list[
             raise BadClip(str(path), "name", f"expected <timestamp_ns>{suffix}")
         if before is not None and before.stem == path.stem:
             raise BadClip(str(path), "name", f"a second file of this instant, beside {before.name}: remove one")
-    times_s = seconds_since(motion.start_ns, np.array([int(path.stem) for path in files], dtype=np.int64))
+    stamps_ns = np.array([int(path.stem) for path in files], dtype=np.int64)
+    if sign := stamps_sign(stamps_ns, "ns"):
+        raise BadClip(str(folder), "names", sign)
+    times_s = seconds_since(motion.start_ns, stamps_ns)
     order = np.argsort(times_s, kind="stable")
     poses = world_from_ego_at(motion, times_s[order]) if files else ()
     return [SensorFile(sensor, str(files[i]), float(times_s[i]), pose) for i, pose in zip(order, poses)]

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from factory.readers.base import BadClip, bytes_of, id_text
 from factory.readers.pickles import Record, load_plain, load_records
+from factory.readers.signs import stamps_sign
 from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.clip import AgentKind
@@ -196,12 +197,14 @@ def parse_frames(value: Any, path: Path, whole: bool = True) -> LogFrames:
         frames.pop(i, None)
     if wrong and (whole or len(wrong) > MOST * len(value)):
         raise wrong[min(wrong)]
+    if sign := stamps_sign(np.array([frames[i].timestamp_us for i in sorted(frames)]), "us"):
+        raise BadClip(file, "frames.timestamp", sign)
     if len({frame.map_location for frame in frames.values()}) > 1:
         raise BadClip(file, "map_location", "changes within the log")
     known = np.array(sorted(frames))
     for i in sorted(wrong):
-        near = frames[int(known[np.argmin(np.abs(known - i))])]
-        stamp = near.timestamp_us + FRAME_US * (i - int(known[np.argmin(np.abs(known - i))]))
+        at = int(known[np.argmin(np.abs(known - i))])
+        near, stamp = frames[at], frames[at].timestamp_us + FRAME_US * (i - at)
         frames[i] = replace(near, token=f"unreadable-{i}", timestamp_us=stamp, cameras=(), lidar_path=None, boxes=None)
     return LogFrames(file, path.stem, tuple(frames[i] for i in range(len(value))))
 

@@ -39,6 +39,7 @@ from factory.datasets.py123d import Py123dClips
 from factory.datasets.py123d.arrow import (
     KINDS_OF_LABELS,
     SOURCES,
+    US_NS,
     ArrowFile,
     ConvertedSet,
     check_version,
@@ -59,6 +60,7 @@ from factory.readers.logs import (
     files_within,
     route_of_drive,
 )
+from factory.readers.signs import stamps_sign
 from factory.wording import shown
 from tasks.world.arrays import Array, Indices
 from tasks.world.clip import STEP_S, AgentKind, Camera, SensorFile
@@ -96,6 +98,8 @@ def read_motion(folder: Path) -> LogMotion:
     for file, stamps in ((ego, pose_stamps), (boxes, frame_stamps)):
         if len(stamps) == 0 or (np.diff(stamps) < 0).any():
             raise BadClip(str(file.path), "timestamp_us", "holds no rows, or time runs backwards")
+        if sign := stamps_sign(stamps // US_NS, "us"):
+            raise BadClip(str(file.path), "timestamp_us", sign)
     row, values = boxes.lists("bounding_box_se3")
     since_first, until_last = frame_stamps - pose_stamps[0], pose_stamps[-1] - frame_stamps
     posed = (since_first >= -MIN_POSE_SPACING_S * 1e9) & (until_last >= -SAME_FRAME_S * 1e9)

@@ -11,6 +11,7 @@ import numpy as np
 from factory.files import broken_link, is_named, why_unread
 from factory.readers.base import BadClip
 from factory.readers.pictures import frame_uri
+from factory.readers.signs import camera_sign, stamps_sign
 from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.clip import ROTATION_SLACK, STEP_S, Camera, Fisheye, SensorFile
@@ -122,7 +123,10 @@ def read_photographs(path: Path, root: Path, ego_states: Array) -> Photographs:
     only = next(iter(cameras)) if len(cameras) == 1 else None
     drive = _Drive(ego_states)
     images, seen = [], set[tuple[str, float]]()
-    for i, entry in enumerate(_entries(content, "frames", file)):
+    entries = _entries(content, "frames", file)
+    if sign := stamps_sign(np.array([_time(entry, file, f"frames[{i}]") for i, entry in enumerate(entries)]), "s"):
+        raise BadClip(file, "frames.t_s", sign)
+    for i, entry in enumerate(entries):
         field = f"frames[{i}]"
         name = entry.get("camera", only)
         if not isinstance(name, str) or name not in cameras:
@@ -207,9 +211,12 @@ def _camera(name: str, fields: Mapping[str, Any], file: str, under: str) -> Came
     if isinstance(readout_s, bool) or not isinstance(readout_s, int | float):
         raise BadClip(file, under + "readout_s", f"{shown(readout_s)}: expected seconds from the first row to the last")
     try:
-        return Camera(name, width, height, intrinsics, distortion, mount, fisheye, float(readout_s))
+        camera = Camera(name, width, height, intrinsics, distortion, mount, fisheye, float(readout_s))
     except ValueError as error:
         raise BadClip(file, under.rstrip(".") or "camera", str(error)) from error
+    if sign := camera_sign(camera):
+        raise BadClip(file, under.rstrip(".") or "camera", sign)
+    return camera
 
 
 def _time(entry: Mapping[str, Any], file: str, field: str) -> float:

@@ -52,6 +52,7 @@ from factory.readers.logs import (
     route_of_drive,
 )
 from factory.readers.pickles import load_plain
+from factory.readers.signs import stamps_sign
 from factory.wording import shown
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import CLIP_STEPS, STEP_S, AgentKind, AgentTracks
@@ -201,6 +202,8 @@ def frame_times(metadata: Mapping[str, Any], n_frames: int, file: str) -> Array:
     steps = np.diff(times)
     if not np.isfinite(times).all() or (steps <= 0.0).any():
         raise BadClip(file, "metadata.ts", "time is not finite and strictly increasing")
+    if sign := stamps_sign(times, "s"):
+        raise BadClip(file, "metadata.ts", sign)
     if n_frames < 2 or steps.max() > MAX_GAP_S:
         raise BadClip(file, "metadata.ts", f"frames further apart than {MAX_GAP_S} s cannot be resampled to 10 Hz")
     return times - times[0]

@@ -228,6 +228,7 @@ def calibrate(log: Path, **changed: float) -> None:
         {"sensor_name": ["front"], **{k: [v] for k, v in intrinsics.items()}},
     )
     mount = pose_columns(1, 0.0, np.array([1.0, 0.0, 1.4]))
+    mount |= {"qw": np.array([0.5]), "qx": np.array([-0.5]), "qy": np.array([0.5]), "qz": np.array([-0.5])}  # ahead
     mount |= {name: np.array([value]) for name, value in changed.items() if name in mount}
     write_table(log / "calibration" / "egovehicle_SE3_sensor.feather", {"sensor_name": ["front"], **mount})
 
@@ -238,7 +239,7 @@ def calibrate(log: Path, **changed: float) -> None:
         ({"width_px": 0}, r"intrinsics\.feather: calibration: camera front: size: 0x480"),
         ({"fx_px": -500.0}, "camera front: intrinsics: focal lengths must be positive"),
         ({"cx_px": float("nan")}, r"intrinsics\.feather: cx_px: holds NaN"),
-        ({"qw": 0.5}, r"SE3_sensor\.feather: qw qx qy qz: a quaternion is not of unit length"),
+        ({"qw": 0.9}, r"SE3_sensor\.feather: qw qx qy qz: a quaternion is not of unit length"),
     ],
 )
 def test_a_calibration_that_is_none_is_named(log: Path, changed: dict[str, float], said: str) -> None:

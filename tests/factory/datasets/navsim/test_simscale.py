@@ -20,6 +20,7 @@ from planners.data.batch import BevLayout
 from planners.data.bev import BevClass, bev_raster
 from tasks.world.frames import to_local, to_world
 from tasks.world.road_map import LightState
+from tasks.world.vocabulary import kinematic_trajectories
 from tests.factory.datasets.navsim import simscale_writer as simscale
 from tests.factory.datasets.navsim.geopackage_writer import CITIES, ORIGIN, stub_rows, write_geopackage
 
@@ -386,7 +387,7 @@ def test_rewards_become_labels_that_say_the_same(released: Path, tmp_path: Path)
     (tmp_path / "traj_pdm").mkdir()
     (tmp_path / "traj_pdm" / "sim").symlink_to(folder)
     (folder / "simcale_16384_pdm_v1.0-0.pkl").write_bytes(pickle.dumps({token: given}))
-    np.save(tmp_path / "vocabulary.npy", np.random.default_rng(1).random((k, 40, 3)).astype(np.float32))
+    np.save(tmp_path / "vocabulary.npy", kinematic_trajectories(k, 1).astype(np.float32))
     words = (f"rewards={tmp_path / 'traj_pdm'}", f"vocabulary={tmp_path / 'vocabulary.npy'}")
     assert imported(released, tmp_path / "out", *words) == COMPLETE
     rows = rows_of(tmp_path / "out")

@@ -34,7 +34,7 @@ def tables_of(*scenes: str) -> Tables:
     sensors = [("CAM_FRONT", "camera"), ("CAM_BACK", "camera"), ("LIDAR_TOP", "lidar"), ("RADAR_FRONT", "radar")]
     out: Tables = {name: [] for name in ("scene", "sample", "sensor", "calibrated_sensor", "sample_data", "ego_pose")}
     for channel, modality in sensors:
-        k = [[1266.4, 0.0, 816.3], [0.0, 1266.4, 491.5], [0.0, 0.0, 1.0]] if modality == "camera" else []
+        k = [[126.64, 0.0, 81.63], [0.0, 126.64, 49.15], [0.0, 0.0, 1.0]] if modality == "camera" else []
         turn = [0.7071067811865476, 0.0, 0.0, -0.7071067811865476] if channel == "LIDAR_TOP" else FRONT
         where = {"translation": [1.7, 0.0, 1.5], "rotation": turn, "camera_intrinsic": k}
         out["sensor"].append({"token": f"s-{channel}", "channel": channel, "modality": modality})
@@ -105,7 +105,7 @@ def test_a_clip_has_twelve_photos_a_second_each_where_it_was_taken_and_on_the_lo
         expected = np.interp(stamp, KEYFRAMES_US, 0.5 * np.arange(len(KEYFRAMES_US)), left=-0.035 / 0.8)
         assert clip.start_s + image.time_s == pytest.approx(expected, abs=1e-5)
     camera = clip.cameras[0]
-    assert (camera.name, camera.width, camera.intrinsics[1, 2]) == ("CAM_FRONT", 160, 491.5)
+    assert (camera.name, camera.width, camera.intrinsics[1, 2]) == ("CAM_FRONT", 160, 49.15)
     np.testing.assert_allclose(camera.ego_from_camera[:3, 2], [1.0, 0.0, 0.0], atol=1e-12)  # looks ahead
     np.testing.assert_allclose(camera.ego_from_camera[:3, 0], [0.0, -1.0, 0.0], atol=1e-12)  # its right is right
     data = load_sensors(block_of(clip), clip.cameras, 32, 18)
