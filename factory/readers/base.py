@@ -13,10 +13,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from factory.files import why_unread
-from factory.readers.signs import camera_sign, motion_sign, mount_sign
+from factory.readers.signs import camera_sign, map_sign, motion_sign, mount_sign, place_sign
 from factory.wording import one_line, shown
 from tasks.world.arrays import Array, Bytes
-from tasks.world.clip import CLIP_STEPS, AgentKind, AgentTracks, Camera, Clip
+from tasks.world.clip import CLIP_STEPS, STEP_S, AgentKind, AgentTracks, Camera, Clip
 from tasks.world.frames import EGO_STATE_SIZE, LARGEST
 from tasks.world.repair.records import Repair, first_repairs, repair_text
 from tasks.world.road_map import Lane, LightState, MapLayer, RoadMap, Route, TrafficLights
@@ -287,9 +287,13 @@ def _faults(clip: Clip) -> Iterator[Fault]:
     yield from _array("world_from_ego", clip.world_from_ego, (CLIP_STEPS, 4, 4))
     if sign := motion_sign(clip.ego_states):
         yield "ego_states", sign
+    if sign := place_sign(clip.world_from_ego, clip.ego_states):
+        yield "world_from_ego", sign
     yield from _agent_faults(clip)
     if fault := map_fault(clip.road_map):
         yield fault
+    if sign := map_sign(clip.ego_states, clip.road_map):
+        yield "road_map", sign
     yield from _route_faults(clip)
     yield from _polyline("centerline", clip.centerline)
     yield from _light_faults(clip)
@@ -392,6 +396,9 @@ def _sensor_faults(clip: Clip) -> Iterator[Fault]:
     for kind in ("images", "sweeps"):
         for i, file in enumerate(getattr(clip, kind)):
             yield from _array(f"{kind}[{i}].world_from_ego", file.world_from_ego, (4, 4))
+            step = min(max(round(file.time_s / STEP_S), 0), CLIP_STEPS - 1)
+            if sign := place_sign(file.world_from_ego[None], clip.ego_states[step, None]):
+                yield f"{kind}[{i}].world_from_ego", sign
             if file.ego_from_sensor is not None and (sign := mount_sign(file.ego_from_sensor)):
                 yield f"{kind}[{i}].ego_from_sensor", sign
 

@@ -1,7 +1,7 @@
 """What gives away that a log's calibration, poses or stamps mean something else: numbers that pass every other check.
 
 Each function says what it saw, with its number, and what helps; None: nothing gives it away. Numbers beside the limits
-are those of the 26 cameras and ten logs of Argoverse 2, nuPlan and nuScenes that were at hand.
+are those of 26 real cameras and ten real logs (Argoverse 2, nuPlan, nuScenes).
 """
 
 import numpy as np
@@ -81,9 +81,9 @@ def _intrinsics_sign(camera: Camera) -> str | None:
 
 # Poses
 
-FAR_M = 100.0  # of a whole drive from any lane
+FAR_M = 100.0  # of a whole drive from any lane, and of two poses at one instant
 MOVING_MPS, MOVING_STEPS = 1.0, 10
-OFF_MOTION_RAD = 0.5  # of headings, the median of the steps that move; 0.03
+OFF_MOTION_RAD = 0.35  # of headings, the median of the steps that move; 0.003 to 0.016
 REVERSING_MPS = 5.0  # faster, nobody drives backwards
 FASTEST_MPS = 80.0
 
@@ -102,10 +102,16 @@ def motion_sign(ego_states: Array) -> str | None:
     if off <= OFF_MOTION_RAD or (off >= np.pi - OFF_MOTION_RAD and speeds[moving].max() <= REVERSING_MPS):
         return None
     said = f"headings are {np.degrees(off):.0f} deg off the direction of motion (median of {moving.sum()} steps)"
-    return (
-        f"{said}: degrees, clockwise, or a quaternion in another order? Expected radians counter-clockwise from x, "
-        "x of the ego being forward"
-    )
+    expected = "expected radians from x, counter-clockwise, of the ego's axis that points forward"
+    return f"{said}: {expected}; are they degrees, clockwise, or of a quaternion in another order?"
+
+
+def place_sign(world_from_ego: Array, ego_states: Array) -> str | None:
+    """Of poses in space (S, 4, 4) that are elsewhere than the ego (S, >= 2) at the same instants."""
+    apart = float(np.hypot(*(world_from_ego[:, :2, 3] - ego_states[:, :2]).T).max())
+    if apart <= FAR_M:
+        return None
+    return f"up to {apart:,.0f} m from where ego_states have the ego: expected its poses in the same world frame"
 
 
 def map_sign(poses: Array, road_map: RoadMap) -> str | None:

@@ -49,10 +49,10 @@ FIRST_STEP = (0.5, 1.5)  # over the mean of the three after it; 1.0
 SIDEWAYS_RAD = 0.8  # from x to where motion begins; 0.0
 TURN_RAD = 0.2  # of the motion over a trajectory that tells how headings turn
 LEAST_TURNING = 3  # trajectories; else all that move are looked at
-OFF_MOTION_RAD = 0.15  # of headings, where trajectories turn; 0 to 0.05
-TOP_SPEED_MPS = 40.0  # of a tenth of them; 11 to 17
+OFF_MOTION_RAD = 0.1  # of headings, where trajectories turn; 0 to 0.05
+TOP_SPEED_MPS = 40.0  # of a tenth of them; 12 to 17
 VELOCITY_S = 0.5  # over which a velocity is taken
-CHANGE_MPS = 3.0  # of the velocity within a second, of a tenth of them; 1.6 to 2.0, and 5.9 where 40 rows hold 8 s
+CHANGE_MPS = 3.0  # of the velocity within a second, of a tenth of them; 1.7 to 2.0, and 5.9 where 40 rows of logs hold 8 s
 LEAST_DRIVES = 20  # whose tenth says anything of how people drive
 
 

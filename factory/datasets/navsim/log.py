@@ -192,13 +192,13 @@ def parse_frames(value: Any, path: Path, whole: bool = True) -> LogFrames:
             frames[i] = parse_frame(item, file, f"frames[{i}].", whole)
         except BadClip as error:
             wrong[i] = error
+    if sign := stamps_sign(np.array([frames[i].timestamp_us for i in sorted(frames)]), "us"):
+        raise BadClip(file, "frames.timestamp", sign)
     for i, problem in _out_of_place(frames, path):
         wrong[i] = problem
         frames.pop(i, None)
     if wrong and (whole or len(wrong) > MOST * len(value)):
         raise wrong[min(wrong)]
-    if sign := stamps_sign(np.array([frames[i].timestamp_us for i in sorted(frames)]), "us"):
-        raise BadClip(file, "frames.timestamp", sign)
     if len({frame.map_location for frame in frames.values()}) > 1:
         raise BadClip(file, "map_location", "changes within the log")
     known = np.array(sorted(frames))
