@@ -33,7 +33,7 @@ def camera_sign(camera: Camera) -> str | None:
         said = _place_sign(pose[:3, 3])
     else:
         return _intrinsics_sign(camera)
-    inverse = np.linalg.inv(pose)
+    inverse = np.asarray(np.linalg.inv(pose), np.float64)
     if _is_upright(inverse) and _is_on_vehicle(inverse[:3, 3]):
         said += ", its inverse would be right"
     return f"{said}: expected ego from camera, in metres, camera x right, y down, z forward"

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.world.arrays import Array, Indices
+from tasks.world.arrays import Array, FloatArray, Indices
 from tasks.world.clip import HORIZON_STEPS, STEP_S
 from tasks.world.frames import HEADING, to_local, wrap_angle
 
@@ -52,16 +52,19 @@ LEAST_TURNING = 3  # trajectories; else all that move are looked at
 OFF_MOTION_RAD = 0.1  # of headings, where trajectories turn; 0 to 0.05
 TOP_SPEED_MPS = 40.0  # of a tenth of them; 12 to 17
 VELOCITY_S = 0.5  # over which a velocity is taken
-CHANGE_MPS = 3.0  # of the velocity within a second, of a tenth of them; 1.7 to 2.0, and 5.9 where 40 rows of logs hold 8 s
+CHANGE_MPS = (
+    3.0  # of the velocity within a second, of a tenth of them; 1.7 to 2.0, and 5.9 where 40 rows of logs hold 8 s
+)
 LEAST_DRIVES = 20  # whose tenth says anything of how people drive
 
 
-def refuse_other_meaning(trajectories: Array, source: str, human: bool = True) -> None:
+def refuse_other_meaning(trajectories: FloatArray, source: str, human: bool = True) -> None:
     """Raises ValueError that names `source`, what gives away that its numbers mean something else, and what helps.
 
     trajectories: finite (K, N, 3) x [m], y [m], heading [rad] at 4 s / N .. 4 s, or (K, N, 2) without headings.
     human: they are driven as people drive, and are no states of anybody's choice.
     """
+    trajectories = np.asarray(trajectories, np.float64)
     step_s = HORIZON_STEPS * STEP_S / trajectories.shape[1]
     places = np.pad(trajectories[..., :2], ((0, 0), (1, 0), (0, 0)))  # from the start
     moved = np.diff(places, axis=1)

@@ -15,6 +15,9 @@ from pyarrow.feather import write_feather
 
 from factory.__main__ import main
 from factory.datasets.av2 import INTRINSICS, POSES
+from factory.setup.vocabulary import save_recovery_table
+from tasks.experts.recovery import RecoveryTable
+from tasks.world.vocabulary import kinematic_trajectories
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "numba", "scipy", "shapely", "pyarrow", "deltalake", "ray", "torch", "cv2")
@@ -130,6 +133,13 @@ WRONG = [
     run("vocabulary.file=nowhere.npy", says=["nowhere.npy", "No such file"]),
     run("vocabulary.file=broken.npy", says=["broken.npy: not readable as a numpy file: it holds no plain numbers"]),
     run("vocabulary.file=shape.npy", says=["shape.npy: trajectories have shape (3, 4), expected (K >= 1, 40, 3)"]),
+    run(
+        "vocabulary.file=degrees.npy", says=["degrees.npy: headings are ", "off the direction of motion", "in degrees"]
+    ),
+    run("vocabulary.file=now.npy", says=["now.npy: the first row lies 0.00 m from the start", "it is the row of now"]),
+    run(*STREET, "reward.label_vocabulary=swapped.npy", says=["swapped.npy: motion begins 90 deg off x", "swapped?"]),
+    run("expert.recovery.vocabularies=[swapped.npy]", says=["swapped.npy: motion begins 90 deg off x", "swapped?"]),
+    run("expert.recovery.table=degrees.npz", says=["degrees.npz: headings are ", "they are in degrees"]),
     run(*STREET, "render=map", "render.cameras=[nowhere]", says=["no camera nowhere; this rig has front_left, front"]),
     run("expert.recovery.table=nowhere.npz", says=["nowhere.npz: there is no such file"]),
     run(*STREET, "reward.label_vocabulary=shape.npy", says=["shape.npy: trajectories have shape (3, 4), expected (K"]),
@@ -158,6 +168,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "broken.npy").write_bytes(b"\x00broken")
     (tmp_path / "a_module.py").write_text("{}['x']")
     np.save(tmp_path / "shape.npy", np.zeros((3, 4)))
+    drives = kinematic_trajectories(60, 0)
+    np.save(tmp_path / "degrees.npy", drives * (1.0, 1.0, 180.0 / np.pi))
+    np.save(tmp_path / "now.npy", np.concatenate([np.zeros((60, 1, 3)), drives[:, :-1]], axis=1))
+    np.save(tmp_path / "swapped.npy", drives[..., [1, 0, 2]])
+    save_recovery_table(tmp_path / "degrees.npz", RecoveryTable(drives * (1.0, 1.0, 180.0 / np.pi)), {})
     (tmp_path / "a_scene.pkl").write_bytes(b"broken")  # that the rig's names are looked for before shows
     (tmp_path / "a_rig").mkdir()
     (tmp_path / "a_rig" / "cameras.json").write_text('{"cameras": {"CAM_FRONT": {}}}')

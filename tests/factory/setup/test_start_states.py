@@ -52,6 +52,7 @@ def test_starts_come_back_by_clip_in_the_order_of_the_file(tmp_path: Path) -> No
         ([("x", "fast")], "40 times x, y, heading"),
         ([("x", TRAJECTORIES[0] * np.nan)], "NaN or infinity"),
         ([(7, TRAJECTORIES[0])], "clip_id must be text"),
+        ([("x", TRAJECTORIES[k][:, [1, 0, 2]]) for k in range(9)], "motion begins 90 deg off x"),
         ([("no clip of this run", TRAJECTORIES[0])], "none of its 1 clips"),
     ],
 )

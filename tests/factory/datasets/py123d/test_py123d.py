@@ -285,7 +285,8 @@ def test_photos_lie_where_the_data_set_is(tmp_path: Path) -> None:
 
 def test_a_photo_s_own_pose_counts_and_a_fisheye_does_not(tmp_path: Path) -> None:
     folder = convert(write_log(tmp_path / "train" / "log-a"), tmp_path)
-    pose, lens = [7.0, 8.0, 9.0, 0.5, -0.5, 0.5, -0.5], [0.1, 0.0, 0.01, 0.02, 0.0]
+    x, y = road(np.array(SPEED * 0.5), np.array(0.0)) + 3.0  # of the log, whose own place there is 3 m off
+    pose, lens = [x, y, 9.0, 0.5, -0.5, 0.5, -0.5], [0.1, 0.0, 0.01, 0.02, 0.0]
     for number, (model, flat) in enumerate((("pinhole", False), ("pinhole", True), ("fisheye_mei", True))):
         told = {"camera_model": model, "is_undistorted": flat, "camera_name": str(number), "distortion": lens}
         write_camera(folder, number, [START_NS // 1000 + 500_000], [f"{number}.jpg"], pose, **told)
@@ -293,7 +294,7 @@ def test_a_photo_s_own_pose_counts_and_a_fisheye_does_not(tmp_path: Path) -> Non
     clip = reader.read(reader.index().refs[0])
     assert [camera.distortion.tolist() for camera in clip.cameras] == [[0.1, 0.0, 0.01, 0.02, 0.0], [0.0] * 5]
     assert len(clip.images) == 2
-    assert clip.images[0].world_from_ego[:3, 3] == pytest.approx([7.0 - 1.6, 8.0, 8.0])
+    assert clip.images[0].world_from_ego[:3, 3] == pytest.approx([x - 1.6, y, 8.0])
 
 
 def test_every_label_of_123d_has_a_kind() -> None:
