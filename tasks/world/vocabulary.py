@@ -64,9 +64,9 @@ def refuse_other_meaning(trajectories: FloatArray, source: str, human: bool = Tr
     trajectories: finite (K, N, 3) x [m], y [m], heading [rad] at 4 s / N .. 4 s, or (K, N, 2) without headings.
     human: they are driven as people drive, and are no states of anybody's choice.
     """
-    trajectories = np.asarray(trajectories, np.float64)
-    step_s = HORIZON_STEPS * STEP_S / trajectories.shape[1]
-    places = np.pad(trajectories[..., :2], ((0, 0), (1, 0), (0, 0)))  # from the start
+    values = np.asarray(trajectories, np.float64)
+    step_s = HORIZON_STEPS * STEP_S / values.shape[1]
+    places = np.pad(values[..., :2], ((0, 0), (1, 0), (0, 0)))  # from the start
     moved = np.diff(places, axis=1)
     moves = np.hypot(moved[..., 0], moved[..., 1]) > MOVING_MPS * step_s
     moves[:, 0] = False  # the step from the start may be the very fault
@@ -75,8 +75,8 @@ def refuse_other_meaning(trajectories: FloatArray, source: str, human: bool = Tr
         return
     places, moved, moves = places[drives], moved[drives], moves[drives]
     sign = _first_row_sign(places, moved, step_s) or _start_sign(moved, moves)
-    if not sign and trajectories.shape[2] == 3:
-        sign = _heading_sign(trajectories[drives, :, 2], moved[:, 1:], moves[:, 1:])
+    if not sign and values.shape[2] == 3:
+        sign = _heading_sign(values[drives, :, 2], moved[:, 1:], moves[:, 1:])
     if sign := sign or _speed_sign(places, step_s, human):
         raise ValueError(f"{source}: {sign}")
 
