@@ -55,6 +55,7 @@ from tasks.world.clip import (
     SensorFile,
 )
 from tasks.world.frames import VX, VY, X, Y
+from tasks.world.repair.articulated import articulated
 from tasks.world.repair.records import Repair, repairs_within
 from tasks.world.road_map import CenterlineFinder, NoRoute, RoadMap, Route, TrafficLights, route_of_log
 
@@ -384,6 +385,7 @@ class LogReader(ABC, Generic[Log]):
         if rest or start < 0 or stop > len(log.ego_states):
             raise BadClip(log.file, "start_ms", f"no window of {ref.window} starts at {ref.start_ms} ms")
         recorded = self.recorded(log, start, stop)
+        agents = only_present(log.agents.window(start, stop))
         ego_states = log.ego_states[start:stop].copy()  # the log stays with the reader, the clip is the caller's
         try:
             centerline = log.finder.centerline_from(ego_states[NOW, :3])
@@ -397,7 +399,7 @@ class LogReader(ABC, Generic[Log]):
             start_s=start * STEP_S,
             ego_states=ego_states,
             world_from_ego=recorded.world_from_ego,
-            agents=only_present(log.agents.window(start, stop)),
+            agents=agents,
             road_map=log.road_map,
             route=log.route,
             centerline=centerline,
@@ -408,7 +410,7 @@ class LogReader(ABC, Generic[Log]):
             block=None if recorded.block is None else self._with_others(ref, recorded.block),
             licence=log.licence,
             content_digest=self.digest_with_others(ref, log.content_digest),
-            repairs=repairs_within(log.repairs, (start - 0.5) * STEP_S, (stop - 0.5) * STEP_S),
+            repairs=repairs_within(log.repairs, (start - 0.5) * STEP_S, (stop - 0.5) * STEP_S) + articulated(agents),
         )
         return validate_clip(clip, log.file)
 

@@ -278,7 +278,7 @@ class Way(NamedTuple):
 
 
 @inner_kernel
-def _fade(travelled: float, length: float) -> tuple[float, float]:
+def fade(travelled: float, length: float) -> tuple[float, float]:
     """(value, slope) of a smooth step from 1 down to 0 over `length`."""
     u = travelled / length
     if u >= 1.0:
@@ -308,7 +308,7 @@ def pose_on_path(
     x, y, h = _point_on_path(paths, m, s)
     if travelled >= blend_length:
         return x, y, h
-    keep, slope = _fade(travelled, blend_length)
+    keep, slope = fade(travelled, blend_length)
     return x - math.sin(h) * offset * keep, y + math.cos(h) * offset * keep, h + turn * keep + math.atan(offset * slope)
 
 
@@ -395,7 +395,7 @@ def _range_in_strip(box: Box, x: float, y: float, heading: float, half_width: fl
 @inner_kernel
 def corridor_ahead(paths: Paths, way: Way, blend_length: float, lookahead: float) -> CorridorAhead:
     """Where the corridor ahead of a body is."""
-    keep, _ = _fade(way.travelled + way.front, blend_length)
+    keep, _ = fade(way.travelled + way.front, blend_length)
     offset, turn = abs(way.offset) * keep, abs(way.turn) * keep
     if keep > 0.0:
         turn += abs(way.offset) * STEEPEST_FADE / blend_length

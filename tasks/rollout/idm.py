@@ -103,7 +103,7 @@ def stop_line_gap(paths: Paths, m: int, step: int, nose: float, speed: float, de
 #
 # No tuple holds another one: taking a tuple out of a tuple counts a reference to each of its arrays.
 
-ABSENT, REPLAYED, DRIVEN, STANDING, EGO = 0, 1, 2, 3, 4  # what moves one at the moment
+ABSENT, REPLAYED, DRIVEN, STANDING, EGO, TOWED = 0, 1, 2, 3, 4, 5  # what moves one at the moment
 
 
 class Roles(NamedTuple):
@@ -117,6 +117,8 @@ class Roles(NamedTuple):
     standing: Bools  # (N,) parked
     moving_kind: Bools  # (N,) vehicle, pedestrian or bicycle: does not walk into a driven car
     enters_clear: Bools  # (N,) vehicles that may only enter with clearance to the ego
+    first_part: Ints  # (N,) of the vehicle it is a part of, which moves it; itself where nothing tows it
+    trails: Array  # (N, K, 2) where the way behind that led, newest first (tasks.rollout.towing); NaN where it ends
 
 
 class Yielding(NamedTuple):
@@ -134,6 +136,7 @@ class Yielding(NamedTuple):
     other_in: Array  # (Z,) the same along the other's path [m]; or the first step of its log in there
     other_out: Array  # (Z,) and the last
     gives_way: Bools  # (Z,) the other one goes first
+    trailing: Array  # (N,) what an agent tows reaches so far behind its own rear [m]; 0: it tows nothing
 
 
 class AgentStates(NamedTuple):
@@ -158,11 +161,11 @@ class RolloutRows(NamedTuple):
 class Motion(NamedTuple):
     """How each agent moves at every row, those due having switched to IDM."""
 
-    mode: Ints  # (T, N) ABSENT, REPLAYED, DRIVEN, STANDING
+    mode: Ints  # (T, N) ABSENT, REPLAYED, DRIVEN, STANDING, TOWED
     path: Ints  # (T, N) of one that is driven, -1: not driven
     clock: Ints  # (T, N) the step of its log a replayed one is at
-    s: Array  # (T, N) path length [m]
-    travelled: Array  # (T, N) since it is driven [m]
+    s: Array  # (T, N) path length [m]; of one that is towed behind the first part
+    travelled: Array  # (T, N) since it is driven or towed [m]
     speed: Array  # (T, N) along the path [m/s]
     offset: Array  # (T, N) to the left of the path, when it switched to IDM [m]
     turn: Array  # (T, N) against the path, when it switched to IDM [rad]
@@ -191,6 +194,12 @@ def empty_motion(n_rows: int, n: int) -> Motion:
         np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape),
         np.zeros(shape, np.bool_),
     )  # fmt: skip
+
+
+@inner_kernel
+def moves_off_log(mode: int) -> bool:
+    """Is one in that mode where the simulation has it?"""
+    return mode == DRIVEN or mode == TOWED
 
 
 # The traffic's rules for one agent: when it switches to IDM, how hard it drives, when it waits, when it enters.
@@ -273,7 +282,7 @@ def must_brake(roles: Roles, paths: Paths, driver: IdmDriver, rows: RolloutRows,
     for j in range(len(mode)):
         if (
             j == i
-            or mode[j] != DRIVEN
+            or not moves_off_log(mode[j])
             or not near_corridor(view, rows.boxes[t, j, 0], rows.boxes[t, j, 1], rows.radius[t, j])
         ):
             continue
@@ -298,10 +307,10 @@ def road_acceleration(paths: Paths, driver: IdmDriver, t: int, m: int, s: float,
 
 @inner_kernel
 def acceleration_for_others(
-    paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int, way: Way, speed: float,
+    roles: Roles, paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int, way: Way, speed: float,
     accel: float, yielding: Yielding | None,
 ) -> float:  # fmt: skip
-    """Acceleration [m/s2] of agent i, driven, for the others; `accel` without them.
+    """Acceleration [m/s2] of agent i, driven, for the others but what it tows; `accel` without them.
 
     One that keeps its intent slows down for a leader from what it could do at most, not from what it means to do.
     """
@@ -310,6 +319,7 @@ def acceleration_for_others(
         if (
             j == i
             or not rows.valid[t, j]
+            or (j < len(roles.first_part) and roles.first_part[j] == i)
             or not near_corridor(view, rows.boxes[t, j, 0], rows.boxes[t, j, 1], rows.radius[t, j])
         ):
             continue
@@ -332,7 +342,7 @@ def touches_driven(boxes: Array, k: int, i: int, rows: RolloutRows, t: int, mode
     box = box_of(boxes, k, i)
     radius = 0.5 * math.hypot(box[3], box[4])
     for j in range(len(mode)):
-        if j == i or mode[j] != DRIVEN:
+        if j == i or not moves_off_log(mode[j]):
             continue
         dx, dy, reach = rows.boxes[t, j, 0] - box[0], rows.boxes[t, j, 1] - box[1], radius + rows.radius[t, j]
         if dx * dx + dy * dy <= reach * reach and boxes_overlap(box, box_of(rows.boxes, t, j)):
@@ -347,13 +357,14 @@ def is_clear(
 ) -> bool:  # fmt: skip
     """May agent i appear as in step k of its log, as far as those already there in row t let it?
 
-    A vehicle needs the minimum gap at both ends; one that keeps its intent its headway too, and room to brake.
+    A vehicle needs the minimum gap at both ends; one that keeps its intent its headway too, and room to brake. Parts
+    of one vehicle need nothing between them.
     """
     if not roles.enters_clear[i]:
         return not (roles.moving_kind[i] and touches_driven(log.boxes, k, i, rows, t, mode))
     x, y, heading, length, width = box_of(log.boxes, k, i)
     for j in range(len(mode)):
-        if mode[j] == ABSENT:
+        if mode[j] == ABSENT or (j < len(roles.first_part) and roles.first_part[j] == roles.first_part[i]):
             continue
         margin = driver.min_gap_m
         if yielding is not None:

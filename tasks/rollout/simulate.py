@@ -8,6 +8,8 @@ The ego is tracked first, since it follows its plan whatever the traffic does; t
 * A vehicle that its whole log shows standing stays where it is; one that stands now does not start before its log
   does; one that its log stops at a junction stops there as long. The log is all we have of lights and signs that are
   not in the map.
+* The parts of an articulated vehicle (tasks/world/repair/articulated.py) drive as one: the first as any vehicle, the
+  others behind it along its way (tasks/rollout/towing.py). Where it replays its log they do so too.
 * A driven vehicle goes on when its log ends; a replayed one leaves with its log.
 * A vehicle first seen later enters at the first logged step where its box is free, with the minimum gap at both ends,
   and the ego's centre is ENTER_CLEARANCE_M away, and is driven from then on; else never. Parked cars, pedestrians and
@@ -18,8 +20,9 @@ The ego is tracked first, since it follows its plan whatever the traffic does; t
 * With `yields` a driver keeps the speeds and stops of its log instead of a target speed, and gives way to others, not
   to the ego, where ways cross or merge (tasks/rollout/yielding.py).
 
-That is `mode=idm`. In `navsim` the traffic is the public evaluation's, to the letter (tasks/rollout/navsim.py); in
-`custom` those whom IDM would drive are driven by a policy of a user's own (tasks/rollout/simulate.py).
+That is `mode=idm`. In `navsim` the traffic is the public evaluation's, to the letter (tasks/rollout/navsim.py), which
+knows no articulated vehicles: each part is an agent of its own there. In `custom` those whom IDM would drive are driven
+by a policy of a user's own (tasks/rollout/simulate.py).
 """
 
 import errno
@@ -52,6 +55,7 @@ from tasks.rollout.lane_following import (
 )
 from tasks.rollout.lqr import track
 from tasks.rollout.navsim import NavsimAgents, navsim_agents, roll_out_navsim
+from tasks.rollout.towing import trails_behind
 from tasks.rollout.traffic import apply_policy_answer, drive, initial_rows, who_is_asked
 from tasks.rollout.yielding import prepare_yielding
 from tasks.settings import MOST, TrafficSettings
@@ -59,6 +63,7 @@ from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import HORIZON_STEPS, MOVING_KINDS, PER_STEP, STEP_S, AgentKind, AgentTracks, Rollout, Scene
 from tasks.world.frames import EGO_STATE_SIZE, HEADING, LARGEST, PACIFICA, VX, VY, all_within
 from tasks.world.geometry import ego_boxes
+from tasks.world.repair.articulated import couplings, first_parts
 from tasks.world.road_map import RoadMap
 
 # Traffic that a policy of a user's own drives: what it is shown and answers, how it is named, how it is stepped.
@@ -163,6 +168,9 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     is_vehicle = np.array([kind == AgentKind.VEHICLE for kind in now.kinds], dtype=bool)
     moving_kind = np.array([kind in MOVING_KINDS for kind in now.kinds], dtype=bool)
     standing = is_vehicle & stands_always(log) & ~(moved & now.valid[start])
+    pairs = couplings(log)
+    first_part = first_parts(n, pairs)
+    is_first = first_part == np.arange(n)
     index = _indexed_lanes(scene.clip.road_map)
     ahead_m = _needed_path_length(scene, settings)
 
@@ -170,7 +178,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     clock = log_steps(scene)
     found: list[LanePath | None] = [None] * n
     logged_ways: list[LanePath | None] = [None] * n
-    for i in np.flatnonzero(is_vehicle & ~standing).tolist():
+    for i in np.flatnonzero(is_vehicle & ~standing & is_first).tolist():
         driven_before = bool(moved[i] and now.valid[start, i])
         if join[i] == NEVER and not driven_before:
             join[i] = first_later_step_on_lane(index, scene, i)
@@ -198,6 +206,8 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
         standing=standing,
         moving_kind=moving_kind,
         enters_clear=is_vehicle & ~standing,
+        first_part=first_part,
+        trails=trails_behind(scene, first_part, {towed: front for front, towed in pairs}),
     )
     yields = settings.yields and settings.mode == "idm"
     paths = stack_paths(

@@ -3,7 +3,7 @@
 All agents look at the same instant and then move together, so their order does not matter. A leader is any box, the
 ego included, that reaches into the corridor the driver's own body will sweep along its path. A vehicle that replays
 its log switches to IDM, along its logged way, as soon as a driven vehicle there asks for more than the comfortable
-deceleration; it stays there for the rest of the rollout.
+deceleration; it stays there for the rest of the rollout. What a driven vehicle tows follows it (towing.py).
 """
 
 import math
@@ -18,6 +18,7 @@ from tasks.rollout.idm import (
     EGO,
     REPLAYED,
     STANDING,
+    TOWED,
     AgentStates,
     IdmDriver,
     Motion,
@@ -38,6 +39,7 @@ from tasks.rollout.idm import (
     touches_driven,
     way_along,
 )
+from tasks.rollout.towing import hitch, towed_pose
 from tasks.rollout.yielding import body_turn_at, intended_acceleration, may_enter, yielding_acceleration
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.geometry import wrapped
@@ -58,6 +60,7 @@ def drive(
     for t in range(ego_boxes.shape[0] - 1):
         _switch_to_idm(roles, paths, driver, t, rows, mode, scratch, motion, yielding)
         _drive_on(start, roles, paths, driver, t, rows, mode, motion, yielding)
+        _tow(roles, driver, t, rows, mode, motion)
         _replay(log, roles, t, rows, mode, motion)
         _admit(start, log, roles, driver, t, rows, mode, scratch, motion, yielding)
     return rows, motion
@@ -114,6 +117,7 @@ def apply_policy_answer(
             rows.velocities[t + 1, i, 0], rows.velocities[t + 1, i, 1] = speed * math.cos(h), speed * math.sin(h)
             rows.center_z[t + 1, i] = motion.base_z[t, i] + paths.height[m, nearest_point_index(paths, s)]
             motion.was_driven[t + 1, i] = True
+    _tow(roles, driver, t, rows, mode, motion)
     _replay(log, roles, t, rows, mode, motion)
     _admit(start, log, roles, driver, t, rows, mode, np.empty(len(asked), np.int64), motion, None)
 
@@ -145,6 +149,7 @@ def _switch_to_idm(
 ) -> None:  # fmt: skip
     """Who is on its path and due switches to IDM, at its own pose and speed; so does who must brake on its log.
 
+    What it tows is moved by it from then on.
     Fills what moves each agent, and the ego, from row t on (N + 1,); row t + 1 of the motion is row t's. switch: (N,)
     scratch.
     """
@@ -167,6 +172,13 @@ def _switch_to_idm(
             motion.mode[t, i], motion.path[t, i], motion.travelled[t, i] = DRIVEN, m, 0.0
             motion.s[t, i], motion.offset[t, i], motion.turn[t, i], motion.speed[t, i] = s, offset, turn, speed
             motion.base_z[t, i] = rows.center_z[t, i] - paths.height[m, nearest_point_index(paths, s)]
+        first = roles.first_part[i]
+        if first != i and mode[i] == REPLAYED and rows.valid[t, i] and (mode[first] == DRIVEN or switch[first] >= 0):
+            mode[i] = TOWED
+            away, offset, turn = hitch(rows.boxes, rows.valid, first, t, roles.trails, i)
+            motion.mode[t, i], motion.s[t, i], motion.travelled[t, i] = TOWED, away, 0.0
+            motion.offset[t, i], motion.turn[t, i] = offset, turn
+            motion.base_z[t, i] = rows.center_z[t, i] - rows.center_z[t, first]
         motion.mode[t + 1, i], motion.path[t + 1, i] = motion.mode[t, i], motion.path[t, i]
         motion.clock[t + 1, i], motion.s[t + 1, i] = motion.clock[t, i], motion.s[t, i]
         motion.travelled[t + 1, i], motion.speed[t + 1, i] = motion.travelled[t, i], motion.speed[t, i]
@@ -194,7 +206,7 @@ def _drive_on(
             nose = s + 0.5 * rows.boxes[t, i, 3]
             accel = intended_acceleration(yielding, paths, driver, m, s, speed, start, t, nose)
         way = way_along(rows, t, i, m, s, travelled, motion.offset[t, i], motion.turn[t, i])
-        accel = acceleration_for_others(paths, driver, rows, t, i, way, speed, accel, yielding)
+        accel = acceleration_for_others(roles, paths, driver, rows, t, i, way, speed, accel, yielding)
         if yielding is not None:
             accel = yielding_acceleration(yielding, driver, start, t, i, m, s, speed, rows, mode, motion, accel)
         motion.was_driven[t + 1, i] = True
@@ -224,29 +236,65 @@ def _advance(
 
 
 @hidden_kernel
+def _tow(roles: Roles, driver: IdmDriver, t: int, rows: RolloutRows, mode: Ints, motion: Motion) -> None:
+    """Those towed come after what tows them, which is in row t + 1 already."""
+    for i in range(motion.mode.shape[1]):
+        if mode[i] != TOWED:
+            continue
+        first, since = roles.first_part[i], t
+        while since > 0 and motion.mode[since - 1, i] == TOWED:
+            since -= 1
+        _stay(rows, t, i)
+        step_m = math.hypot(
+            rows.boxes[t + 1, first, 0] - rows.boxes[t, first, 0], rows.boxes[t + 1, first, 1] - rows.boxes[t, first, 1]
+        )
+        motion.travelled[t + 1, i] += step_m
+        if step_m > 0.0:
+            x, y, h = towed_pose(
+                rows.boxes, rows.valid, first, t + 1, since, roles.trails, i,
+                motion.s[t, i], motion.offset[t, i], motion.turn[t, i], motion.travelled[t + 1, i],
+                driver.blend_length_m,
+            )  # fmt: skip
+            rows.boxes[t + 1, i, 0], rows.boxes[t + 1, i, 1], rows.boxes[t + 1, i, 2] = x, y, h
+        h, towing_h = rows.boxes[t + 1, i, 2], rows.boxes[t + 1, first, 2]
+        v = rows.velocities[t + 1, first, 0] * math.cos(towing_h) + rows.velocities[t + 1, first, 1] * math.sin(
+            towing_h
+        )
+        rows.velocities[t + 1, i, 0], rows.velocities[t + 1, i, 1] = v * math.cos(h), v * math.sin(h)
+        rows.center_z[t + 1, i] = rows.center_z[t + 1, first] + motion.base_z[t, i]
+        motion.was_driven[t + 1, i] = motion.was_driven[t + 1, first]
+
+
+@hidden_kernel
 def _replay(log: AgentStates, roles: Roles, t: int, rows: RolloutRows, mode: Ints, motion: Motion) -> None:
     """The parked stay, the replayed take the next step of their log.
 
     Who cannot brake along its log (who walks or cycles, or reverses) takes none to where a driven car is; one that
-    walks goes on once it is touched, a vehicle would drive through.
+    walks goes on once it is touched, a vehicle would drive through. What is towed waits as what tows it does.
     """
-    for i in range(motion.mode.shape[1]):
-        if mode[i] == STANDING:
-            _stay(rows, t, i)
-        if mode[i] != REPLAYED:
-            continue
-        k = min(motion.clock[t, i] + 1, log.valid.shape[0] - 1)
-        waits = False
-        if roles.moving_kind[i] and roles.logged_path[i] < 0 and rows.valid[t, i] and log.valid[k, i]:
-            waits = touches_driven(log.boxes, k, i, rows, t + 1, mode) and (
-                roles.enters_clear[i] or not touches_driven(rows.boxes, t, i, rows, t + 1, mode)
-            )
-        if waits:
-            _stay(rows, t, i)
-        else:
-            motion.clock[t + 1, i] = k
-            if log.valid[k, i]:
-                _place(rows, t + 1, log, k, i)
+    for towed in (False, True):  # what tows before what it tows
+        for i in range(motion.mode.shape[1]):
+            first = roles.first_part[i]
+            if (first != i) != towed:
+                continue
+            if mode[i] == STANDING:
+                _stay(rows, t, i)
+            if mode[i] != REPLAYED:
+                continue
+            k = min(motion.clock[t, i] + 1, log.valid.shape[0] - 1)
+            waits = False
+            if towed and mode[first] == REPLAYED and rows.valid[t, first]:
+                waits = rows.valid[t, i] and motion.clock[t + 1, first] == motion.clock[t, first]
+            elif roles.moving_kind[i] and roles.logged_path[i] < 0 and rows.valid[t, i] and log.valid[k, i]:
+                waits = touches_driven(log.boxes, k, i, rows, t + 1, mode) and (
+                    roles.enters_clear[i] or not touches_driven(rows.boxes, t, i, rows, t + 1, mode)
+                )
+            if waits:
+                _stay(rows, t, i)
+            else:
+                motion.clock[t + 1, i] = k
+                if log.valid[k, i]:
+                    _place(rows, t + 1, log, k, i)
 
 
 @hidden_kernel
@@ -254,7 +302,10 @@ def _admit(
     start: int, log: AgentStates, roles: Roles, driver: IdmDriver, t: int,
     rows: RolloutRows, mode: Ints, enters: Ints, motion: Motion, yielding: Yielding | None,
 ) -> None:  # fmt: skip
-    """Newcomers, judged against everyone who was already there. enters: (N,) scratch."""
+    """Newcomers, judged against everyone who was already there. enters: (N,) scratch.
+
+    The parts of one vehicle enter together, or by their log behind one that is not there yet, or is on its log.
+    """
     n = motion.mode.shape[1]
     k = min(start + t + 1, log.valid.shape[0] - 1)
     for i in range(n):
@@ -266,6 +317,17 @@ def _admit(
         )
         if yielding is not None and enters[i] and roles.path[i] >= 0:
             enters[i] = may_enter(yielding, driver, roles.path[i], k, t + 1, log, i, rows, mode, motion)
+    for i in range(n):
+        if roles.first_part[i] != i and mode[i] == ABSENT and not enters[i]:
+            enters[roles.first_part[i]] = False
+    for i in range(n):
+        first = roles.first_part[i]
+        if (
+            first != i
+            and not enters[first]
+            and (mode[first] == DRIVEN or (mode[first] == ABSENT and log.valid[k, first]))
+        ):
+            enters[i] = False
     for i in range(n):
         if enters[i]:
             motion.mode[t + 1, i], motion.clock[t + 1, i] = STANDING if roles.standing[i] else REPLAYED, k

@@ -474,7 +474,20 @@ def prepare_yielding(scene: Scene, roles: Roles, paths: Paths, log: AgentStates)
         zone_path=np.ascontiguousarray(who[:, 2]),
         **{name: np.ascontiguousarray(where[:, k]) for k, name in enumerate(_EDGES)},
         gives_way=_who_gives_way(paths, who, where, at, speed, begin, start),
+        trailing=_trailing(scene, roles),
     )
+
+
+def _trailing(scene: Scene, roles: Roles) -> Array:
+    """(N,) what each agent tows reaches so far behind its own rear [m]."""
+    now, out = scene.agents, np.zeros(len(roles.first_part))
+    for i in np.flatnonzero(roles.first_part != np.arange(len(out))).tolist():
+        first = roles.first_part[i]
+        shared = now.valid[:, i] & now.valid[:, first]
+        k = scene.step if shared[scene.step] else int(shared.argmax())
+        away = math.hypot(*(now.boxes[k, i, :2] - now.boxes[k, first, :2]))
+        out[first] = max(out[first], away + 0.5 * (now.boxes[k, i, 3] - now.boxes[k, first, 3]))
+    return out
 
 
 _EDGES = ("zone_in", "zone_out", "other_in", "other_out")
@@ -596,12 +609,15 @@ def yielding_acceleration(
             if mode[j] != DRIVEN or motion.path[t, j] != o:
                 continue
             other_s, other_speed, other_front = motion.s[t, j], motion.speed[t, j], 0.5 * rows.boxes[t, j, 3]
-            if other_s - other_front > yielding.other_out[z]:
+            if other_s - other_front - yielding.trailing[j] > yielding.other_out[z]:
                 continue
             other_ahead = yielding.other_in[z] - other_s - other_front
             if not (yielding.gives_way[z] or cannot_stop_before(other_speed, other_ahead, driver)):
                 continue
-            nose_s, rear_s = yielding.other_in[z] - other_front, yielding.other_out[z] + other_front
+            nose_s, rear_s = (
+                yielding.other_in[z] - other_front,
+                yielding.other_out[z] + other_front + yielding.trailing[j],
+            )
             comes = seconds_to(yielding, o, other_s, other_speed, start + t, nose_s, driver.accel_max)
             leaves = seconds_to(yielding, o, other_s, other_speed, start + t, rear_s, driver.accel_max)
         else:
@@ -611,7 +627,8 @@ def yielding_acceleration(
             leaves = (yielding.other_out[z] - motion.clock[t, j]) * STEP_S
             if leaves < 0.0:
                 continue
-        gone = seconds_to(yielding, m, s, speed, start + t, yielding.zone_out[z] + front, driver.accel_max)
+        rear = yielding.zone_out[z] + front + yielding.trailing[i]
+        gone = seconds_to(yielding, m, s, speed, start + t, rear, driver.accel_max)
         if comes == np.inf or comes > gone + GAP_S:
             continue
         there = seconds_to(yielding, m, s, speed, start + t, yielding.zone_in[z] - front, driver.accel_max)
@@ -641,7 +658,7 @@ def may_enter(
         if o < 0 or mode[j] != DRIVEN:
             continue
         other_front = 0.5 * rows.boxes[t, j, 3]
-        if motion.path[t, j] != o or motion.s[t, j] - other_front > yielding.other_out[z]:
+        if motion.path[t, j] != o or motion.s[t, j] - other_front - yielding.trailing[j] > yielding.other_out[z]:
             continue
         if cannot_stop_before(
             motion.speed[t, j], yielding.other_in[z] - motion.s[t, j] - other_front, driver

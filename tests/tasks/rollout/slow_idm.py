@@ -2,7 +2,8 @@
 
 Nobody is left out because it cannot matter: every box is asked for in every corridor, every edge of a path for the
 nearest one. All agents look at the same instant and then move together. How one driver answers one gap, and what a
-corridor finds of one box, is the product's, which test_idm.py holds against closed forms and shapely.
+corridor finds of one box, is the product's, which test_idm.py holds against closed forms and shapely; so is where a
+towed box is, which test_towing.py holds against a twin of its own.
 """
 
 import math
@@ -21,6 +22,7 @@ from tasks.rollout.idm import (
     REPLAYED,
     SMALLEST_GAP_M,
     STANDING,
+    TOWED,
     AgentStates,
     IdmDriver,
     Roles,
@@ -31,6 +33,7 @@ from tasks.rollout.idm import (
     needed_deceleration,
     stop_line_gap,
 )
+from tasks.rollout.towing import hitch, towed_pose
 from tests.tasks.rollout.slow_yielding import has_way, intended, turned_on, waits_before
 
 Array = NDArray[np.float64]
@@ -81,7 +84,7 @@ def _must_brake(
     if 0.5 * speed * speed <= driver.decel_max * SMALLEST_GAP_M:
         return False  # too slow to need it at any gap
     for j in range(mode.shape[0]):
-        if j == i or mode[j] != DRIVEN:
+        if j == i or (mode[j] != DRIVEN and mode[j] != TOWED):
             continue
         gap, h = _gap_to(paths, m, s, 0.0, left, turn, box, boxes[j], driver)
         if gap < np.inf:
@@ -93,8 +96,8 @@ def _must_brake(
 
 @kernel
 def _touches_driven(box: Array, row: Array, mode: NDArray[np.int64], but: int) -> bool:
-    for j in range(mode.shape[0]):  # noqa: SIM110 (compiled)
-        if j != but and mode[j] == DRIVEN and boxes_overlap(box, row[j]):
+    for j in range(mode.shape[0]):
+        if j != but and (mode[j] == DRIVEN or mode[j] == TOWED) and boxes_overlap(box, row[j]):
             return True
     return False
 
@@ -163,7 +166,8 @@ def drive(
     s, travelled, speed = np.zeros(n), np.zeros(n), np.zeros(n)
     offset, turn, base_z = np.zeros(n), np.zeros(n), np.zeros(n)
     was_driven = np.zeros(n, np.bool_)
-    fresh, takes = np.zeros(n, np.int64), np.full(n, -1)
+    fresh, takes, since = np.zeros(n, np.int64), np.full(n, -1), np.zeros(n, np.int64)
+    parts_last = np.argsort(roles.first_part != np.arange(n), kind="mergesort")
 
     for i in range(n):
         if now.valid[i]:
@@ -194,6 +198,13 @@ def drive(
                     turn[i] = (turn[i] - turned_on(yielding, m, s[i]) + math.pi) % (2.0 * math.pi) - math.pi
                 k = min(max(round(s[i] / PATH_SPACING_M), 0), paths.heading.shape[1] - 1)
                 base_z[i] = center_z[t, i] - paths.height[m, k]
+
+        for i in range(n):
+            lead = roles.first_part[i]
+            if lead != i and mode[i] == REPLAYED and mode[lead] == DRIVEN and valid[t, i]:
+                mode[i], since[i], travelled[i] = TOWED, t, 0.0
+                s[i], offset[i], turn[i] = hitch(boxes, valid, lead, t, roles.trails, i)
+                base_z[i] = center_z[t, i] - center_z[t, lead]
 
         # Everyone driven looks at row t and moves to row t + 1.
         s_now, speed_now = s.copy(), speed.copy()
@@ -226,7 +237,7 @@ def drive(
                 if line < np.inf:
                     accel = min(accel, following_acceleration(free, speed[i], line, 0.0, driver))
                 for j in range(n + 1):
-                    if j == i or (j < n and mode[j] == ABSENT) or (j < n and not valid[t, j]):
+                    if j == i or (j < n and (mode[j] == ABSENT or not valid[t, j] or roles.first_part[j] == i)):
                         continue
                     other = ego_boxes[t] if j == n else boxes[t, j]
                     gap, h = _gap_to(
@@ -244,6 +255,7 @@ def drive(
                             yielding, z, start + t, s[i], speed[i], 0.5 * length,
                             valid[t, j], path[j] if mode[j] == DRIVEN else -1, mode[j] == REPLAYED, clock[j],
                             s_now[j], speed_now[j], 0.5 * boxes[t, j, 3], driver.emergency_decel, driver.accel_max,
+                            yielding.trailing[i],
                         )  # fmt: skip
                         if gap < np.inf:
                             accel = min(accel, following_acceleration(driver.accel_max, speed[i], gap, 0.0, driver))
@@ -266,15 +278,40 @@ def drive(
             center_z[t + 1, i] = base_z[i] + paths.height[m, k]
             valid[t + 1, i] = True
 
+        for i in range(n):
+            if mode[i] != TOWED:
+                continue
+            lead = roles.first_part[i]
+            boxes[t + 1, i], valid[t + 1, i] = boxes[t, i], True
+            center_z[t + 1, i] = center_z[t + 1, lead] + base_z[i]
+            was_driven[i] = was_driven[lead]
+            moved = boxes[t + 1, lead] - boxes[t, lead]
+            if moved[0] != 0.0 or moved[1] != 0.0:
+                travelled[i] += math.hypot(moved[0], moved[1])
+                boxes[t + 1, i, 0], boxes[t + 1, i, 1], boxes[t + 1, i, 2] = towed_pose(
+                    boxes, valid, lead, t + 1, since[i], roles.trails, i, s[i], offset[i], turn[i], travelled[i],
+                    driver.blend_length_m,
+                )  # fmt: skip
+            h = boxes[t + 1, lead, 2]
+            v = velocities[t + 1, lead, 0] * math.cos(h) + velocities[t + 1, lead, 1] * math.sin(h)
+            velocities[t + 1, i, 0] = v * math.cos(boxes[t + 1, i, 2])
+            velocities[t + 1, i, 1] = v * math.sin(boxes[t + 1, i, 2])
+
         # The others: the parked stay, the replayed take the next step of their log; who cannot brake along it (who
         # walks or cycles, or reverses) not where a driven car is.
-        for i in range(n):
+        clock_before = clock.copy()
+        for i in parts_last:
             if mode[i] == STANDING:
                 boxes[t + 1, i], center_z[t + 1, i], valid[t + 1, i] = boxes[t, i], center_z[t, i], True
                 velocities[t + 1, i] = 0.0
             elif mode[i] == REPLAYED:
-                k = min(clock[i] + 1, n_log - 1)
-                if roles.moving_kind[i] and roles.logged_path[i] < 0 and valid[t, i] and log.valid[k, i]:
+                k, lead = min(clock[i] + 1, n_log - 1), roles.first_part[i]
+                if lead != i and mode[lead] == REPLAYED and valid[t, lead]:
+                    if clock[lead] == clock_before[lead] and valid[t, i]:
+                        boxes[t + 1, i], center_z[t + 1, i], valid[t + 1, i] = boxes[t, i], center_z[t, i], True
+                        velocities[t + 1, i] = 0.0
+                        continue
+                elif roles.moving_kind[i] and roles.logged_path[i] < 0 and valid[t, i] and log.valid[k, i]:
                     blocked = _touches_driven(log.boxes[k, i], boxes[t + 1], mode, i)
                     # One that walks goes on once it is touched; a vehicle would drive through.
                     if blocked and (roles.enters_clear[i] or not _touches_driven(boxes[t, i], boxes[t + 1], mode, i)):
@@ -295,10 +332,11 @@ def drive(
             box, ego = log.boxes[k, i], ego_boxes[t + 1]
             if roles.enters_clear[i]:
                 far = math.hypot(box[0] - ego[0], box[1] - ego[1]) >= ENTER_CLEARANCE_M
-                free = _is_free(box, boxes[t + 1], mode, ego, driver.min_gap_m)
+                others = np.where(roles.first_part == roles.first_part[i], ABSENT, mode)
+                free = _is_free(box, boxes[t + 1], others, ego, driver.min_gap_m)
                 if yielding is not None:
                     free = _has_room(
-                        box, log.velocities[k, i], boxes[t + 1], velocities[t + 1], mode, ego, ego_velocities[t + 1],
+                        box, log.velocities[k, i], boxes[t + 1], velocities[t + 1], others, ego, ego_velocities[t + 1],
                         driver,
                     )  # fmt: skip
                     v = math.hypot(log.velocities[k, i, 0], log.velocities[k, i, 1])
@@ -311,6 +349,15 @@ def drive(
             elif roles.moving_kind[i] and _touches_driven(box, boxes[t + 1], mode, i):
                 continue
             fresh[i] = STANDING if roles.standing[i] else REPLAYED
+        for i in range(n):
+            for j in range(n):  # the first part waits until all others that are not there can come with it
+                if j != i and roles.first_part[j] == i and mode[j] == ABSENT and fresh[j] == ABSENT:
+                    fresh[i] = ABSENT
+        for i in range(n):
+            lead = roles.first_part[i]
+            kept_out = mode[lead] == ABSENT and fresh[lead] == ABSENT and log.valid[k, lead]
+            if lead != i and (mode[lead] == DRIVEN or kept_out):
+                fresh[i] = ABSENT
         for i in range(n):
             if fresh[i] != ABSENT:
                 mode[i], clock[i] = fresh[i], k

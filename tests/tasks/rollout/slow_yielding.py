@@ -94,9 +94,13 @@ def cannot_stop(speed: float, ahead: float, emergency: float) -> bool:
 def waits_before(
     yielding: Yielding, z: int, step: int, s: float, speed: float, front: float,
     other_there: bool, other_drives_on: int, other_replays: bool, other_clock: int,
-    other_s: float, other_speed: float, other_front: float, emergency: float, accel_max: float,
+    other_s: float, other_speed: float, other_front: float, emergency: float, accel_max: float, trailing: float,
 ) -> float:  # fmt: skip
-    """Distance [m] of the nose to zone z if its owner waits before it, or inf. other_drives_on: a path, or -1."""
+    """Distance [m] of the nose to zone z if its owner waits before it, or inf. other_drives_on: a path, or -1.
+
+    trailing [m]: what the owner tows.
+    """
+    towed = yielding.trailing[yielding.zone_agent[z]]
     m = np.searchsorted(yielding.zone_start, z, side="right") - 1
     begin, end = yielding.zone_in[z], yielding.zone_out[z]
     ahead = begin - s - front
@@ -104,12 +108,12 @@ def waits_before(
         return np.inf
     o = yielding.zone_path[z]
     if o >= 0:
-        if other_drives_on != o or other_s - other_front > yielding.other_out[z]:
+        if other_drives_on != o or other_s - other_front - towed > yielding.other_out[z]:
             return np.inf
         other_ahead = yielding.other_in[z] - other_s - other_front
         if not yielding.gives_way[z] and not cannot_stop(other_speed, other_ahead, emergency):
             return np.inf
-        nose, rear = yielding.other_in[z] - other_front, yielding.other_out[z] + other_front
+        nose, rear = yielding.other_in[z] - other_front, yielding.other_out[z] + other_front + towed
         comes = seconds(yielding, o, other_s, other_speed, step, nose, accel_max)
         leaves = seconds(yielding, o, other_s, other_speed, step, rear, accel_max)
     else:
@@ -119,7 +123,7 @@ def waits_before(
         leaves = (yielding.other_out[z] - other_clock) * STEP_S
         if leaves < 0.0:
             return np.inf
-    gone = seconds(yielding, m, s, speed, step, end + front, accel_max)
+    gone = seconds(yielding, m, s, speed, step, end + front + trailing, accel_max)
     there = seconds(yielding, m, s, speed, step, begin - front, accel_max)
     meets = comes != np.inf and comes <= gone + 0.5 and there <= leaves + 0.5
     return ahead if meets else np.inf
@@ -143,7 +147,7 @@ def has_way(
         j, o = yielding.zone_agent[z], yielding.zone_path[z]
         if owner != m or o < 0 or mode[j] != DRIVEN or path[j] != o:
             continue
-        if s[j] - fronts[j] > yielding.other_out[z]:
+        if s[j] - fronts[j] - yielding.trailing[j] > yielding.other_out[z]:
             continue
         bound = cannot_stop(speed[j], yielding.other_in[z] - s[j] - fronts[j], emergency)
         if bound and cannot_stop(yielding.speed[m, k], yielding.zone_in[z] - yielding.at[m, k] - front, emergency):
