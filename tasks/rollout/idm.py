@@ -199,7 +199,7 @@ def empty_motion(n_rows: int, n: int) -> Motion:
 @inner_kernel
 def moves_off_log(mode: int) -> bool:
     """Is one in that mode where the simulation has it?"""
-    return mode == DRIVEN or mode == TOWED
+    return mode in (DRIVEN, TOWED)
 
 
 # The traffic's rules for one agent: when it switches to IDM, how hard it drives, when it waits, when it enters.

@@ -256,10 +256,8 @@ def _tow(roles: Roles, driver: IdmDriver, t: int, rows: RolloutRows, mode: Ints,
                 driver.blend_length_m,
             )  # fmt: skip
             rows.boxes[t + 1, i, 0], rows.boxes[t + 1, i, 1], rows.boxes[t + 1, i, 2] = x, y, h
-        h, towing_h = rows.boxes[t + 1, i, 2], rows.boxes[t + 1, first, 2]
-        v = rows.velocities[t + 1, first, 0] * math.cos(towing_h) + rows.velocities[t + 1, first, 1] * math.sin(
-            towing_h
-        )
+        h, ahead = rows.boxes[t + 1, i, 2], rows.boxes[t + 1, first, 2]
+        v = rows.velocities[t + 1, first, 0] * math.cos(ahead) + rows.velocities[t + 1, first, 1] * math.sin(ahead)
         rows.velocities[t + 1, i, 0], rows.velocities[t + 1, i, 1] = v * math.cos(h), v * math.sin(h)
         rows.center_z[t + 1, i] = rows.center_z[t + 1, first] + motion.base_z[t, i]
         motion.was_driven[t + 1, i] = motion.was_driven[t + 1, first]
@@ -322,11 +320,8 @@ def _admit(
             enters[roles.first_part[i]] = False
     for i in range(n):
         first = roles.first_part[i]
-        if (
-            first != i
-            and not enters[first]
-            and (mode[first] == DRIVEN or (mode[first] == ABSENT and log.valid[k, first]))
-        ):
+        kept_out = mode[first] == ABSENT and log.valid[k, first] and not enters[first]
+        if first != i and (mode[first] == DRIVEN or kept_out):
             enters[i] = False
     for i in range(n):
         if enters[i]:

@@ -614,10 +614,8 @@ def yielding_acceleration(
             other_ahead = yielding.other_in[z] - other_s - other_front
             if not (yielding.gives_way[z] or cannot_stop_before(other_speed, other_ahead, driver)):
                 continue
-            nose_s, rear_s = (
-                yielding.other_in[z] - other_front,
-                yielding.other_out[z] + other_front + yielding.trailing[j],
-            )
+            nose_s = yielding.other_in[z] - other_front
+            rear_s = yielding.other_out[z] + other_front + yielding.trailing[j]
             comes = seconds_to(yielding, o, other_s, other_speed, start + t, nose_s, driver.accel_max)
             leaves = seconds_to(yielding, o, other_s, other_speed, start + t, rear_s, driver.accel_max)
         else:

@@ -19,6 +19,7 @@ from tasks.world.repair.records import Repair
 TOUCHES_M, TOUCHES_S = 0.5, 0.1  # between two parts: a drawbar, and what no driver follows as near as
 TOUCHES_IN = 0.5  # of the frames
 APART_M = 4.0  # in any frame: then each goes its own way
+LOOK_STEPS = 8  # of every so many frames one tells which vehicles are worth a look at all of them
 SLACK = 1.5  # boxes are that much nearer to each other at a corner
 SHARED = 0.8  # of both lives
 DRIVES_MPS, DRIVES_STEPS = 2.0, 10  # as fast for as long: parked cars and those that wait are not coupled
@@ -68,10 +69,10 @@ def _always_near(agents: AgentTracks) -> list[tuple[int, int]]:
     seen_at = agents.boxes[agents.valid.argmax(axis=0), np.arange(n), :2]
     moved = np.where(agents.valid, _lengths(agents.boxes[..., :2] - seen_at), 0.0).max(axis=0, initial=0.0)
     moving = np.flatnonzero((moved >= MOVES_M) & [kind == AgentKind.VEHICLE for kind in agents.kinds])
-    boxes, valid = agents.boxes[:, moving], agents.valid[:, moving]
-    lives = valid.sum(axis=0)
-    shared = valid.T.astype(np.int64) @ valid
-    radius = np.where(valid, 0.5 * _lengths(boxes[..., 3:]), 0.0).max(axis=0, initial=0.0)
+    valid = agents.valid[:, moving].astype(np.float64)
+    shared, lives = valid.T @ valid, valid.sum(axis=0)
+    boxes, there = agents.boxes[::LOOK_STEPS, moving], agents.valid[::LOOK_STEPS, moving]
+    radius = np.where(there, 0.5 * _lengths(boxes[..., 3:]), 0.0).max(axis=0, initial=0.0)
     apart = _lengths(boxes[:, :, None, :2] - boxes[:, None, :, :2])
     far = (apart > radius[:, None] + radius + SLACK * APART_M).any(axis=0)  # false next to absent frames
     near = ~far & (shared >= DRIVES_STEPS) & (shared >= SHARED * np.maximum(lives[:, None], lives))
