@@ -68,7 +68,8 @@ def _always_near(agents: AgentTracks) -> list[tuple[int, int]]:
     n = len(agents)
     seen_at = agents.boxes[agents.valid.argmax(axis=0), np.arange(n), :2]
     moved = np.where(agents.valid, _lengths(agents.boxes[..., :2] - seen_at), 0.0).max(axis=0, initial=0.0)
-    moving = np.flatnonzero((moved >= MOVES_M) & [kind == AgentKind.VEHICLE for kind in agents.kinds])
+    is_vehicle = np.array([kind == AgentKind.VEHICLE for kind in agents.kinds], dtype=bool)
+    moving = np.flatnonzero(is_vehicle & (moved >= MOVES_M))
     valid = agents.valid[:, moving].astype(np.float64)
     shared, lives = valid.T @ valid, valid.sum(axis=0)
     boxes, there = agents.boxes[::LOOK_STEPS, moving], agents.valid[::LOOK_STEPS, moving]

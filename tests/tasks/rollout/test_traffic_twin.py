@@ -101,6 +101,30 @@ def test_so_it_does_under_other_settings(yields: bool, seed: int, blend_length_m
         assert_same(roll_out(traffic, egos[0]), slow_roll_out(traffic, egos[0]))
 
 
+def train(rng: np.random.Generator) -> list[worlds.Track]:
+    """A cab and its trailer on the lane of the random worlds, from some step on, and the last one's trailer at times."""
+    x, speed, first = rng.uniform(-60.0, 30.0), rng.uniform(2.0, 10.0), int(rng.choice([0, 0, NOW + 5, NOW + 20]))
+    return [
+        worlds.Track(x - 7.3 * k, rng.normal(0.0, 0.2), 0.0, speed, size=(8.0 - k, 2.5), first=first + (k % 2))
+        for k in range(rng.integers(2, 4))
+    ][:: rng.choice([-1, 1])]
+
+
+@BOTH
+@given(seed=seeds)
+@settings(max_examples=10)
+def test_a_train_in_a_crowd_equals_its_slow_twin(yields: bool, seed: int) -> None:
+    of, crowd = TrafficSettings(yields=yields), worlds.random_scene(seed)
+    scene = worlds.with_members(crowd, *train(np.random.default_rng(seed)))
+    egos = worlds.random_egos(scene, seed, 3)
+    first = prepare_traffic(scene, of)
+    assert first.roles is not None and (first.roles.first_part[-2:] != np.arange(len(scene.agents))[-2:]).any()
+    after = next_scene(scene, roll_out(first, egos[0]), scene.centerline)
+    for traffic in (first, prepare_traffic(after, of)):
+        for ego in egos:
+            assert_same(roll_out(traffic, ego), slow_roll_out(traffic, ego))
+
+
 def test_the_random_worlds_reach_every_rule() -> None:
     """Someone brakes on its log, someone waits, someone is kept out, and what the ego does changes what others do."""
     braked, waited, kept_out, answers = 0, 0, 0, 0

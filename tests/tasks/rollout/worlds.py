@@ -1,11 +1,11 @@
 """Small hand-made worlds: lanes, tracks and clips written as a few numbers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Clip, Scene, scene_of_clip
+from tasks.world.clip import CLIP_STEPS, NOW, PER_STEP, STEP_S, AgentKind, AgentTracks, Clip, Scene, scene_of_clip
 from tasks.world.frames import EGO_STATE_SIZE, HEADING, VX, X, Y
 from tasks.world.road_map import NO_LIGHTS, Lane, RoadMap, Route, TrafficLights
 
@@ -126,6 +126,15 @@ def clip(
 def scene(lanes: dict[str, Lane], *members: Track, **options: object) -> Scene:
     """The scene at NOW of a clip with these tracks."""
     return scene_of_clip(clip(lanes, tracks(*members), **options))  # type: ignore[arg-type]
+
+
+def with_members(of: Scene, *members: Track) -> Scene:
+    """The same scene with more agents behind those that it has."""
+    one, other = of.clip.agents, tracks(*members)
+    parts = (np.concatenate([getattr(one, name), getattr(other, name)], axis=1) for name in PER_STEP)
+    names = (*one.track_ids, *(f"more {name}" for name in other.track_ids))
+    agents = AgentTracks(names, (*one.kinds, *other.kinds), *parts, np.concatenate([one.heights, other.heights]))
+    return replace(of, clip=replace(of.clip, agents=agents), agents=agents)
 
 
 def straight_plan(of: Scene, speed: float | None = None) -> NDArray[np.float64]:
