@@ -38,8 +38,8 @@ PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred", "unlike_photos") 
 
 STAGES: tuple[Stage, ...] = (
     Stage("clip", 5, "clip", ("ego_standing", "broken_tracks", "route_ended", "no_earlier_frame")),
-    Stage("perturb", 2, "clip", ("no_gated_candidate", "no_good_candidate")),
-    Stage("rollout", 3, "attempt", ("route_ended",)),
+    Stage("perturb", 3, "clip", ("no_gated_candidate", "no_good_candidate")),
+    Stage("rollout", 4, "attempt", ("route_ended",)),
     Stage("expert", 1, "attempt", ("no_plan",)),
     Stage("reward", 1, "attempt", (*SUBSCORES, *END_FAULTS)),
     Stage("render", 12, "attempt", ("psnr", *PICTURE_FAULTS)),

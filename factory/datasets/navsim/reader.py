@@ -65,6 +65,7 @@ from tasks.caches import user_cache, with_checksum, without_checksum
 from tasks.kernels.compiled import write_whole
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import NOW, Block, Camera, Clip, SensorFile
+from tasks.world.repair.articulated import articulated
 from tasks.world.repair.records import later
 from tasks.world.repair.road import lights_on_map
 
@@ -538,6 +539,7 @@ class NavsimReader:
         states = ego_states(window)
         road = road_around(self.maps, frames[now], states[:, :2], states[NOW, :3], opened.log.file, now)
         lights, light_repairs = lights_on_map(traffic_lights(window), road.road_map.lanes, road.city_lanes)
+        agents = window_agents(window)
         images: tuple[SensorFile, ...] = ()
         sweeps: tuple[SensorFile, ...] = ()
         cameras: tuple[Camera, ...] = ()
@@ -558,7 +560,7 @@ class NavsimReader:
             start_s=ref.start_ms / 1000,
             ego_states=states,
             world_from_ego=world_from_ego(window),
-            agents=window_agents(window),
+            agents=agents,
             road_map=road.road_map,
             route=road.route,
             centerline=road.centerline,
@@ -574,6 +576,7 @@ class NavsimReader:
                 *road.repairs,
                 *light_repairs,
                 *(later(repair, ref.start_ms / 1000) for repair in repairs),
+                *articulated(agents),
             ),
         )
         return validate_clip(clip, opened.log.file)

@@ -34,7 +34,7 @@ GOLDEN: dict[str, Golden] = {
         },
     ),
     "perturb": Golden(
-        2,
+        3,
         {
             "indices": (260.846972, 26.2035031),
             "ends": (2.99269569, -0.856986137),
@@ -43,7 +43,7 @@ GOLDEN: dict[str, Golden] = {
         },
     ),
     "rollout": Golden(
-        3,
+        4,
         {
             "first idm ego": (31.1562574, 0.259936504),
             "first idm boxes": (179.467451, 1.28283393),

@@ -102,7 +102,7 @@ def test_so_it_does_under_other_settings(yields: bool, seed: int, blend_length_m
 
 
 def train(rng: np.random.Generator) -> list[worlds.Track]:
-    """A cab and its trailer on the lane of the random worlds, from some step on, and the last one's trailer at times."""
+    """A cab with one trailer or two on the lane of the random worlds, from some step on."""
     x, speed, first = rng.uniform(-60.0, 30.0), rng.uniform(2.0, 10.0), int(rng.choice([0, 0, NOW + 5, NOW + 20]))
     return [
         worlds.Track(x - 7.3 * k, rng.normal(0.0, 0.2), 0.0, speed, size=(8.0 - k, 2.5), first=first + (k % 2))
