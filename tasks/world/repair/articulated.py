@@ -4,7 +4,7 @@ Labels have a box and a track for each part. Nobody else drives so near: two veh
 they share, they touch in at least half, in all and in those in which they drive, and are never farther apart than
 labels wander. The numbers are chosen on real logs: the cab and trailer of AV2's 7fab2350 overlap or touch in 65 % of
 their frames, 53 % in the worst window, and are 3.2 m apart at most, since far boxes wander along the road; cars that
-drive in a queue touch in no frame (nuScenes, seven scenes: 0.55 m and more between them where they crawl).
+stay one behind the other in a queue touch in no frame (nuScenes, eight scenes: 0.55 m and more between them).
 """
 
 import math
@@ -22,8 +22,8 @@ APART_M = 4.0  # in any frame: then each goes its own way
 LOOK_STEPS = 8  # of every so many frames one tells which vehicles are worth a look at all of them
 SLACK = 1.5  # boxes are that much nearer to each other at a corner
 SHARED = 0.8  # of both lives
-DRIVES_MPS, DRIVES_STEPS = 2.0, 10  # as fast for as long: parked cars and those that wait are not coupled
-MOVES_M = 5.0  # from where it is first seen
+DRIVES_MPS, DRIVES_STEPS = 2.0, 5  # as fast for as long: parked cars and those that wait are not coupled
+MOVES_M = 2.0  # from where it is first seen
 
 
 def couplings(agents: AgentTracks) -> tuple[tuple[int, int], ...]:

@@ -99,6 +99,12 @@ def test_a_queue_that_crawls_is_no_train() -> None:
     assert pairs(along(crawls), along(crawls - 4.6 - 0.9)) == (), "0.9 m is nearer than any in the logs"
 
 
+def test_a_train_that_starts_late_in_the_window_is_found() -> None:
+    """At 1 m/s2 for the last 2.8 s."""
+    way = 0.5 * np.maximum(TIME - 5.2, 0.0) ** 2
+    assert pairs(along(way, size=CAB), along(way - BEHIND_M, size=TRAILER)) == ((0, 1),)
+
+
 def test_who_drives_side_by_side_is_no_train() -> None:
     assert pairs(along(DRIVES, size=CAB), along(DRIVES, 2.9, size=CAB)) == ()
     assert pairs(along(DRIVES, size=CAB), along(DRIVES - 4.0, 2.9, size=CAB)) == ()
@@ -144,13 +150,13 @@ def slow_couplings(agents: AgentTracks) -> set[tuple[int, int]]:
                 continue
             lives = [np.flatnonzero(agents.valid[:, k]) for k in (i, j)]
             shared = sorted(set(lives[0].tolist()) & set(lives[1].tolist()))
-            if len(shared) < 10 or len(shared) < 0.8 * max(map(len, lives)):
+            if len(shared) < 5 or len(shared) < 0.8 * max(map(len, lives)):
                 continue
             farthest = [
                 max(math.dist(agents.boxes[k, who, :2], agents.boxes[seen[0], who, :2]) for k in seen)
                 for who, seen in zip((i, j), lives)
             ]
-            if min(farthest) < 5.0:
+            if min(farthest) < 2.0:
                 continue
             touch, drive, apart, places = [], [], False, []
             leads = 0.0
@@ -167,7 +173,7 @@ def slow_couplings(agents: AgentTracks) -> set[tuple[int, int]]:
                 places.append((abs(turned.real) / (one[3] + other[3]), abs(turned.imag) / (one[4] + other[4])))
                 leads += float(between @ (agents.velocities[k, i] + agents.velocities[k, j]))
             driving = [t for t, d in zip(touch, drive) if d]
-            if apart or len(driving) < 10 or min(np.mean(touch), np.mean(driving)) < 0.5:
+            if apart or len(driving) < 5 or min(np.mean(touch), np.mean(driving)) < 0.5:
                 continue
             along_m, across_m = np.median(np.array(places), axis=0)
             if along_m >= 0.25 and across_m <= 0.25 and leads > 0.0:
