@@ -166,7 +166,7 @@ class Motion(NamedTuple):
     clock: Ints  # (T, N) the step of its log a replayed one is at
     s: Array  # (T, N) path length [m]; of one that is towed behind the first part
     travelled: Array  # (T, N) since it is driven or towed [m]
-    speed: Array  # (T, N) along the path [m/s]
+    speed: Array  # (T, N) along the path [m/s]; of one that is towed above the first part's
     offset: Array  # (T, N) to the left of the path, when it switched to IDM [m]
     turn: Array  # (T, N) against the path, when it switched to IDM [rad]
     base_z: Array  # (T, N) its centre's height above the path's [m]
@@ -221,9 +221,9 @@ def box_of(boxes: Array, t: int, i: int) -> Box:
 
 
 @inner_kernel
-def _forward_speed(rows: RolloutRows, t: int, i: int) -> float:
+def forward_speed(rows: RolloutRows, t: int, i: int) -> float:
     h = rows.boxes[t, i, 2]
-    return max(0.0, rows.velocities[t, i, 0] * math.cos(h) + rows.velocities[t, i, 1] * math.sin(h))
+    return rows.velocities[t, i, 0] * math.cos(h) + rows.velocities[t, i, 1] * math.sin(h)
 
 
 @inner_kernel
@@ -233,7 +233,7 @@ def project_onto_path(
     """(path length, offset to the left, turn, speed) of agent i if it starts to follow path m from row t."""
     s, left = project_on_path(paths, m, rows.boxes[t, i, 0], rows.boxes[t, i, 1])
     turn = wrapped(rows.boxes[t, i, 2] - pose_on_path(paths, m, s, 0.0, left, 0.0, driver.blend_length_m)[2])
-    return s, left, turn, _forward_speed(rows, t, i)
+    return s, left, turn, max(0.0, forward_speed(rows, t, i))
 
 
 @inner_kernel
@@ -273,7 +273,7 @@ def must_brake(roles: Roles, paths: Paths, driver: IdmDriver, rows: RolloutRows,
     m = roles.logged_path[i]
     if m < 0:
         return False
-    speed = _forward_speed(rows, t, i)
+    speed = max(0.0, forward_speed(rows, t, i))
     if 0.5 * speed * speed <= driver.decel_max * SMALLEST_GAP_M:
         return False  # too slow to need it at any gap
     s, left, turn, _ = project_onto_path(paths, m, rows, t, i, driver)

@@ -3,7 +3,8 @@
 Where the first part drives by IDM or a policy, the others have no drive of their own. A part's centre keeps its path
 length behind the first one's, along where that has been: in the rollout, and before in the log or an earlier rollout;
 farther back, where the parts in between and itself have been. It is headed as the chord of that way under its middle.
-How far beside that way it starts, and turned against it, fades as it goes. Compiled.
+How far beside that way it starts, and turned against it, fades as it goes; how much faster it is by its log, whose
+boxes wander along the road, is braked away as hard as tyres can. Compiled.
 """
 
 import math
@@ -14,7 +15,7 @@ from tasks.kernels.compiled import inner_kernel
 from tasks.rollout.corridor import fade
 from tasks.rollout.lane_following import LOGGED_PATH_SPACING_M
 from tasks.world.arrays import Array, Bools, Ints
-from tasks.world.clip import Scene
+from tasks.world.clip import STEP_S, Scene
 from tasks.world.geometry import wrapped
 
 CHORD = 0.25  # of a part's length, before and behind its middle: about where its wheels are
@@ -107,6 +108,12 @@ def hitch(boxes: Array, valid: Bools, first: int, t: int, trails: Array, i: int)
     x, y, h = _pose_behind(boxes, valid, first, t, t, trails, i, away)
     left = (boxes[t, i, 1] - y) * math.cos(h) - (boxes[t, i, 0] - x) * math.sin(h)
     return away, left, wrapped(boxes[t, i, 2] - h)
+
+
+@inner_kernel
+def faster_than_first(speed: float, hardest: float) -> float:
+    """[m/s] above the first part's, below 0: slower, a step later, at `hardest` [m/s2]."""
+    return math.copysign(max(abs(speed) - hardest * STEP_S, 0.0), speed)
 
 
 @inner_kernel

@@ -30,6 +30,7 @@ from tasks.rollout.idm import (
     empty_motion,
     empty_rows,
     far_from_ego,
+    forward_speed,
     is_clear,
     must_brake,
     nearest_point_index,
@@ -39,9 +40,10 @@ from tasks.rollout.idm import (
     touches_driven,
     way_along,
 )
-from tasks.rollout.towing import hitch, towed_pose
+from tasks.rollout.towing import faster_than_first, hitch, towed_pose
 from tasks.rollout.yielding import body_turn_at, intended_acceleration, may_enter, yielding_acceleration
 from tasks.world.arrays import Array, Bools, Ints
+from tasks.world.clip import STEP_S
 from tasks.world.geometry import wrapped
 
 
@@ -178,6 +180,7 @@ def _switch_to_idm(
             away, offset, turn = hitch(rows.boxes, rows.valid, first, t, roles.trails, i)
             motion.mode[t, i], motion.s[t, i], motion.travelled[t, i] = TOWED, away, 0.0
             motion.offset[t, i], motion.turn[t, i] = offset, turn
+            motion.speed[t, i] = forward_speed(rows, t, i) - forward_speed(rows, t, first)
             motion.base_z[t, i] = rows.center_z[t, i] - rows.center_z[t, first]
         motion.mode[t + 1, i], motion.path[t + 1, i] = motion.mode[t, i], motion.path[t, i]
         motion.clock[t + 1, i], motion.s[t + 1, i] = motion.clock[t, i], motion.s[t, i]
@@ -248,16 +251,17 @@ def _tow(roles: Roles, driver: IdmDriver, t: int, rows: RolloutRows, mode: Ints,
         step_m = math.hypot(
             rows.boxes[t + 1, first, 0] - rows.boxes[t, first, 0], rows.boxes[t + 1, first, 1] - rows.boxes[t, first, 1]
         )
+        faster = faster_than_first(motion.speed[t, i], driver.emergency_decel)
+        motion.speed[t + 1, i], motion.s[t + 1, i] = faster, motion.s[t, i] - faster * STEP_S
         motion.travelled[t + 1, i] += step_m
-        if step_m > 0.0:
+        if step_m > 0.0 or faster != 0.0:
             x, y, h = towed_pose(
                 rows.boxes, rows.valid, first, t + 1, since, roles.trails, i,
-                motion.s[t, i], motion.offset[t, i], motion.turn[t, i], motion.travelled[t + 1, i],
+                motion.s[t + 1, i], motion.offset[t, i], motion.turn[t, i], motion.travelled[t + 1, i],
                 driver.blend_length_m,
             )  # fmt: skip
             rows.boxes[t + 1, i, 0], rows.boxes[t + 1, i, 1], rows.boxes[t + 1, i, 2] = x, y, h
-        h, ahead = rows.boxes[t + 1, i, 2], rows.boxes[t + 1, first, 2]
-        v = rows.velocities[t + 1, first, 0] * math.cos(ahead) + rows.velocities[t + 1, first, 1] * math.sin(ahead)
+        h, v = rows.boxes[t + 1, i, 2], forward_speed(rows, t + 1, first) + faster
         rows.velocities[t + 1, i, 0], rows.velocities[t + 1, i, 1] = v * math.cos(h), v * math.sin(h)
         rows.center_z[t + 1, i] = rows.center_z[t + 1, first] + motion.base_z[t, i]
         motion.was_driven[t + 1, i] = motion.was_driven[t + 1, first]

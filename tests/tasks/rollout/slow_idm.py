@@ -34,6 +34,7 @@ from tasks.rollout.idm import (
     stop_line_gap,
 )
 from tasks.rollout.towing import hitch, towed_pose
+from tasks.world.clip import STEP_S
 from tests.tasks.rollout.slow_yielding import has_way, intended, turned_on, waits_before
 
 Array = NDArray[np.float64]
@@ -59,6 +60,12 @@ def _start_on(
     difference = box[2] - pose_on_path(paths, m, s, 0.0, left, 0.0, driver.blend_length_m)[2]
     turn = (difference + math.pi) % (2.0 * math.pi) - math.pi
     return s, left, turn, max(0.0, velocity[0] * math.cos(box[2]) + velocity[1] * math.sin(box[2]))
+
+
+@kernel
+def _along(box: Array, velocity: Array) -> float:
+    """[m/s] the way it is headed."""
+    return velocity[0] * math.cos(box[2]) + velocity[1] * math.sin(box[2])
 
 
 @kernel
@@ -204,6 +211,7 @@ def drive(
             if lead != i and mode[i] == REPLAYED and mode[lead] == DRIVEN and valid[t, i]:
                 mode[i], since[i], travelled[i] = TOWED, t, 0.0
                 s[i], offset[i], turn[i] = hitch(boxes, valid, lead, t, roles.trails, i)
+                speed[i] = _along(boxes[t, i], velocities[t, i]) - _along(boxes[t, lead], velocities[t, lead])
                 base_z[i] = center_z[t, i] - center_z[t, lead]
 
         # Everyone driven looks at row t and moves to row t + 1.
@@ -285,15 +293,16 @@ def drive(
             boxes[t + 1, i], valid[t + 1, i] = boxes[t, i], True
             center_z[t + 1, i] = center_z[t + 1, lead] + base_z[i]
             was_driven[i] = was_driven[lead]
-            moved = boxes[t + 1, lead] - boxes[t, lead]
-            if moved[0] != 0.0 or moved[1] != 0.0:
+            moved, most = boxes[t + 1, lead] - boxes[t, lead], driver.emergency_decel * STEP_S
+            speed[i] = 0.0 if abs(speed[i]) <= most else speed[i] - math.copysign(most, speed[i])
+            s[i] -= speed[i] * STEP_S
+            if moved[0] != 0.0 or moved[1] != 0.0 or speed[i] != 0.0:
                 travelled[i] += math.hypot(moved[0], moved[1])
                 boxes[t + 1, i, 0], boxes[t + 1, i, 1], boxes[t + 1, i, 2] = towed_pose(
                     boxes, valid, lead, t + 1, since[i], roles.trails, i, s[i], offset[i], turn[i], travelled[i],
                     driver.blend_length_m,
                 )  # fmt: skip
-            h = boxes[t + 1, lead, 2]
-            v = velocities[t + 1, lead, 0] * math.cos(h) + velocities[t + 1, lead, 1] * math.sin(h)
+            v = _along(boxes[t + 1, lead], velocities[t + 1, lead]) + speed[i]
             velocities[t + 1, i, 0] = v * math.cos(boxes[t + 1, i, 2])
             velocities[t + 1, i, 1] = v * math.sin(boxes[t + 1, i, 2])
 

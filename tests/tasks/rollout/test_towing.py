@@ -98,6 +98,17 @@ def test_one_that_starts_beside_the_way_and_turned_comes_onto_it_without_a_jump(
     assert (np.diff(boxes[:, 1]) <= 1e-12).all()
 
 
+def test_one_that_is_faster_by_its_log_brakes_no_harder_than_tyres_can() -> None:
+    """Labels of a far trailer wander along the road: now it is 1.7 m/s faster."""
+    cab = along(7.0 * TIME, size=CAB)
+    trailer = along(7.0 * TIME - 8.0 + 0.8 * np.sin(2.125 * TIME), size=TRAILER)
+    agents = run(worlds.scene(worlds.straight_road(), cab, trailer)).agents
+    assert -np.diff(agents.velocities[:, 1, 0]).min() <= 0.8 + 0.1
+    assert apart(agents)[0] == pytest.approx(8.0)
+    assert apart(agents)[3:] == pytest.approx(8.0 - 0.1 * (0.89 + 0.09), abs=0.01)
+    assert np.ptp(apart(agents)[3:]) < 1e-9
+
+
 def slow_place(scene: Scene, rollout: Rollout, t: int, away: float) -> shapely.Point:
     """Where the cab, agent 0, was `away` m before row t: on one line through its log, points 1 m apart, and rows."""
     past = scene.agents.boxes[: NOW + 1, 0, :2][scene.agents.valid[: NOW + 1, 0]]
@@ -215,13 +226,16 @@ def test_a_cab_does_not_come_before_its_trailer() -> None:
 
 
 def test_who_crosses_waits_for_the_whole_train() -> None:
-    """It would pass behind the cab, where the trailer is."""
+    """It passes behind the trailer as far as it would behind a car: 1.0 m if it looked at the cab alone."""
     roads = worlds.straight_road() | {"cross": lane("cross", [(30.0, -150.0), (30.0, 150.0)])}
-    north = np.column_stack([np.full(CLIP_STEPS, 30.0), 8.0 * TIME - 29.0, np.full(CLIP_STEPS, np.pi / 2)])
-    parts = train(8.0, start=6.0)
-    agents = run(worlds.scene(roads, *parts, Track(0.0, poses=north))).agents
-    cab, trailer, other = (shapely.polygons(box_corners(agents.boxes[:, k])) for k in range(3))
-    assert not (shapely.intersects(other, cab) | shapely.intersects(other, trailer)).any()
+    north = np.column_stack([np.full(CLIP_STEPS, 30.0), 5.0 * TIME - 17.0, np.full(CLIP_STEPS, np.pi / 2)])
+    scene = worlds.scene(roads, *train(8.0, start=12.0), Track(0.0, poses=north))
+    traffic = prepare_traffic(scene, TrafficSettings())
+    assert traffic.yielding is not None
+    assert traffic.yielding.trailing == pytest.approx([BEHIND_M + 0.5 * (TRAILER[0] - CAB[0]), 0.0, 0.0])
+    agents = roll_out(traffic, np.repeat(scene.ego_state[None], 41, axis=0)).agents
+    _, trailer, other = (shapely.polygons(box_corners(agents.boxes[:, k])) for k in range(3))
+    assert shapely.distance(other, trailer).min() > 1.2
     assert apart(agents) == pytest.approx(BEHIND_M, abs=1e-9)
 
 
