@@ -115,7 +115,7 @@ class LogMotion:
     rotations: Rotation  # P rotations, city from ego
     yaws: Array  # (P,) unwrapped [rad]
     tracks: tuple[BoxTrack, ...]  # ordered by track id
-    fill_s: float = FILLED_S  # two frames of a track at most this far apart hold the steps between them too
+    fill_s: float = FILLED_S  # two frames of the log at most this far apart hold the steps between them too
     repairs: tuple[Repair, ...] = ()
 
     @property
@@ -180,7 +180,7 @@ def read_motion(folder: Path) -> LogMotion:
     pose_times, pose_values, ego_repairs = whole_poses(
         pose_path, seconds_since(start_ns, pose_stamps), numbers(pose_path, poses, POSE_COLUMNS)
     )
-    if pose_times[0] > MIN_POSE_SPACING_S or pose_times[-1] < frame_times[-1] - SAME_FRAME_S:
+    if pose_times[0] > SAME_FRAME_S or pose_times[-1] < frame_times[-1] - SAME_FRAME_S:
         raise BadClip(str(pose_path), "timestamp_ns", "the poses do not span the annotated frames")
     city_from_ego = rotations(pose_path, pose_values)
     tracks, repairs = _tracks(
@@ -217,7 +217,7 @@ def whole_poses(path: Path, times_s: Array, poses: Array) -> tuple[Array, Array,
     boxes[:, :3], boxes[:, 3] = poses[:, 4:], headings_of(poses)
     left, repairs = whole_frames(times_s, boxes)
     if left.sum() <= MOST * len(left):
-        raise BadClip(str(path), " ".join(POSE_COLUMNS), f"{(~left).sum()} of {len(left)} poses cannot be")
+        raise BadClip(str(path), " ".join(POSE_COLUMNS), f"most of {len(left)} poses are NaN, infinite or no rotations")
     return times_s[left], poses[left], (*done, *repairs)
 
 
@@ -230,7 +230,7 @@ def ego_states_at(motion: LogMotion, times_s: Array) -> Array:
     """Ego states (S, 11) at times (S,): pose by linear interpolation, velocity and acceleration by a quadratic fit.
 
     The fit takes the poses within +-0.3 s; steering and rates are 0; slower than 0.1 m/s is standing. NaN where there
-    are fewer than four of them.
+    are fewer than four of them, and before the first pose.
     """
     states = np.zeros((len(times_s), EGO_STATE_SIZE))
     for column, known in ((X, motion.positions[:, 0]), (Y, motion.positions[:, 1]), (HEADING, motion.yaws)):
@@ -239,7 +239,7 @@ def ego_states_at(motion: LogMotion, times_s: Array) -> Array:
     for state, time in zip(states, times_s):
         offset = motion.pose_times_s - time
         near = np.abs(offset) <= EGO_FIT_HALF_WINDOW_S + ROUNDING_S
-        if near.sum() < 4:
+        if near.sum() < 4 or time < motion.pose_times_s[0] - MIN_POSE_SPACING_S:
             state[:] = np.nan
             continue
         basis = np.vander(offset[near], 3, increasing=True)
@@ -272,7 +272,7 @@ def agents_at(motion: LogMotion, times_s: Array) -> AgentTracks:
     valid = np.zeros((len(times_s), len(motion.tracks)), dtype=bool)
     boxes, velocities, center_z = (np.full((*valid.shape, *columns), np.nan) for columns in ((5,), (2,), ()))
     for i, track in enumerate(motion.tracks):
-        here = valid[:, i] = seen_at(track.times_s, times_s, motion.fill_s)
+        here = valid[:, i] = seen_at(track.times_s, times_s, motion.fill_s, motion.frame_times_s)
         known = np.column_stack([track.centers[:, :2], track.headings, track.sizes[:, :2]])
         for column in range(5):
             boxes[here, i, column] = np.interp(times_s[here], track.times_s, known[:, column])
@@ -314,10 +314,16 @@ def _nearest(sorted_times: Array, times_s: Array) -> Indices:
     return np.where(np.abs(times_s - sorted_times[left]) <= np.abs(sorted_times[right] - times_s), left, right)
 
 
-def seen_at(sorted_times: Array, times_s: Array, fill_s: float) -> Bools:
-    """(S,) whether one of the sorted times is less than 50 ms away, or two enclose it that are at most fill_s apart."""
+def seen_at(sorted_times: Array, times_s: Array, fill_s: float, frame_times_s: Array | None = None) -> Bools:
+    """(S,) whether one of the sorted times is less than 50 ms away, or two enclose it that are at most fill_s apart.
+
+    frame_times_s: of the log, where the sorted times are those of one thing; frames that do not show it are its gap.
+    """
+    between = np.diff(sorted_times)
+    if frame_times_s is not None:
+        between[np.diff(np.searchsorted(frame_times_s, sorted_times)) > 1] = np.inf
     near = np.abs(sorted_times[_nearest(sorted_times, times_s)] - times_s) < SAME_FRAME_S
-    gaps = np.concatenate([[np.inf], np.diff(sorted_times), [np.inf]])  # before each of them, and after the last
+    gaps = np.concatenate([[np.inf], between, [np.inf]])  # before each of them, and after the last
     return np.asarray(near | (gaps[np.searchsorted(sorted_times, times_s)] <= fill_s + ROUNDING_S))
 
 
@@ -336,15 +342,28 @@ def _tracks(
     if kinds.count(None) > MOST * len(kinds):
         raise BadClip(str(path), "category", f"unknown class {sorted(unknown)}")
     poses = numbers(path, table, POSE_COLUMNS)
-    ego = _nearest(pose_times_s, times_s)
+    turned, moved = poses_at(pose_times_s, city_from_ego, positions, times_s)
     boxes = np.zeros((len(times_s), 9))
-    boxes[:, :3] = city_from_ego[ego].apply(poses[:, 4:]) + positions[ego]
-    boxes[:, 3] = headings_of(poses, city_from_ego[ego])
+    boxes[:, :3] = turned.apply(poses[:, 4:]) + moved
+    boxes[:, 3] = headings_of(poses, turned)
     boxes[:, 4:7] = numbers(path, table, SIZE_COLUMNS)
     ids = [id_text(name) for name in table["track_uuid"].tolist()]
-    at = _nearest(pose_times_s, frame_times_s)
-    ego_poses = np.column_stack([positions[at, :2], yaw_of(city_from_ego[at])])
+    turned, moved = poses_at(pose_times_s, city_from_ego, positions, frame_times_s)
+    ego_poses = np.column_stack([moved[:, :2], yaw_of(turned)])
     return repaired_tracks(frame_times_s, times_s, ids, kinds, boxes, ego_poses)
+
+
+def poses_at(pose_times_s: Array, rotations_: Rotation, positions: Array, times_s: Array) -> tuple[Rotation, Array]:
+    """The poses of times (S,): that of the same instant, and one in between where that was left out."""
+    at = _nearest(pose_times_s, times_s)
+    far = np.abs(pose_times_s[at] - times_s) > MIN_POSE_SPACING_S
+    if not far.any():
+        return rotations_[at], positions[at]
+    turned, moved = rotations_[at].as_quat(), positions[at]
+    within = np.clip(times_s[far], pose_times_s[0], pose_times_s[-1])
+    turned[far] = Slerp(pose_times_s, rotations_)(within).as_quat()
+    moved[far] = np.stack([np.interp(within, pose_times_s, axis) for axis in positions.T], axis=1)
+    return Rotation.from_quat(turned), moved
 
 
 def repaired_tracks(

@@ -212,11 +212,12 @@ def parse_frames(value: Any, path: Path, whole: bool = True) -> LogFrames:
 def _out_of_place(frames: Mapping[int, Frame], path: Path) -> Iterator[tuple[int, BadClip]]:
     """The frames that do not belong where they stand, and why."""
     file = str(path)
-    last: Frame | None = None
+    order = sorted(frames)
+    late = {order[k] for k in _out_of_time([frames[i].timestamp_us for i in order])}
     seen: set[str] = set()
-    for i in sorted(frames):
+    for i in order:
         frame = frames[i]
-        if last is not None and frame.timestamp_us <= last.timestamp_us:
+        if i in late:
             yield i, BadClip(file, f"frames[{i}].timestamp", "time does not go on")
         elif frame.log_name != path.stem:  # NAVSIM finds logs by the one and scenes by the other
             problem = f"is {shown(frame.log_name)}, but the file is named {path.stem!r}: rename the file"
@@ -224,8 +225,19 @@ def _out_of_place(frames: Mapping[int, Frame], path: Path) -> Iterator[tuple[int
         elif frame.token in seen:
             yield i, BadClip(file, "token", f"{frame.token} stands twice")
         else:
-            last = frame
             seen.add(frame.token)
+
+
+def _out_of_time(stamps: Sequence[int]) -> list[int]:
+    """Which stamps to leave out so that the others increase: first those that most of the others speak against."""
+    clash = np.triu(np.less_equal.outer(np.array(stamps), np.array(stamps)).T, 1)
+    clash |= clash.T
+    out = []
+    while clash.any():
+        worst = len(clash) - 1 - int(np.argmax(clash.sum(axis=0)[::-1]))
+        clash[worst] = clash[:, worst] = False
+        out.append(worst)
+    return out
 
 
 def parse_frame(item: Any, file: str, place: str, whole: bool = True) -> Frame:

@@ -26,6 +26,7 @@ from factory.datasets.av2.reader import (
     ego_states_at,
     headings_of,
     observed_at,
+    poses_at,
     repaired_tracks,
     rotations,
     seconds_since,
@@ -110,8 +111,8 @@ def read_motion(folder: Path) -> LogMotion:
     times_s = seconds_since(start_ns, frame_stamps)
     frames = np.unique(times_s[row[boxed[0]] : row[boxed[-1]] + 1])
     pose_times, world_from_rear, positions, ego_repairs = _rear_axle(ego, seconds_since(start_ns, pose_stamps))
-    at = np.clip(np.searchsorted(pose_times, frames), 0, len(pose_times) - 1)
-    ego_poses = np.column_stack([positions[at, :2], yaw_of(world_from_rear[at])])
+    turned, moved = poses_at(pose_times, world_from_rear, positions, frames)
+    ego_poses = np.column_stack([moved[:, :2], yaw_of(turned)])
     tracks, repairs = _tracks(boxes, row, values, boxed, times_s, frames, ego_poses)
     return LogMotion(
         folder=folder,
@@ -231,9 +232,9 @@ def _kinds(boxes: ArrowFile, labels: pa.Array) -> list[AgentKind | None]:
         known = ", ".join(KINDS_OF_LABELS)
         raise BadClip(str(boxes.path), "metadata.box_detection_label_class", f"unknown labels {name}; known: {known}")
     kinds = KINDS_OF_LABELS[name]
-    found = [kinds[label] if label is not None and label < len(kinds) else None for label in labels.to_pylist()]
+    found = [kinds[label] if label is not None and 0 <= label < len(kinds) else None for label in labels.to_pylist()]
     if found.count(None) > MOST * len(found):
-        raise BadClip(str(boxes.path), "label", f"most are above {len(kinds) - 1}, the last one of {name}")
+        raise BadClip(str(boxes.path), "label", f"most are none of {name}, which ends at {len(kinds) - 1}")
     return found
 
 

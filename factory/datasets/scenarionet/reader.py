@@ -257,6 +257,7 @@ def observed_agents(
     Raises BadClip where that is most of them.
     """
     found: list[tuple[str, AgentKind, LoggedTrack]] = []
+    names = set[str]()
     done: list[Repair] = []
     wrong: list[BadClip] = []
     for track_id in tracks:
@@ -267,14 +268,18 @@ def observed_agents(
         try:
             if name is None:
                 raise BadClip(file, f"tracks[{shown(track_id)}]", "is no id of a track, expected text or a number")
+            if name in names:
+                raise BadClip(file, f"tracks[{name}]", "stands twice, as a text and as a number")
             if not isinstance(kind, str) or kind not in KINDS:
                 raise BadClip(file, f"tracks[{name}].type", f"unknown class {shown(kind)}")
             track = read_track(tracks, track_id, len(times_s), file)
         except BadClip as error:
-            what = "token" if name is None else "class" if error.field.endswith(".type") else "impossible"
+            what = "class" if error.field.endswith(".type") else "impossible"
+            what = "token" if name is None else "twice" if name in names else what
             done.append(Repair(what, name or shown(track_id), np.nan, error.problem, LEFT_OUT))
             wrong.append(error)
             continue
+        names.add(name)
         if track.valid.any():
             found.append((name, KINDS[kind], track))
     if len(wrong) > MOST * max(len(tracks) - 1, 1):
@@ -666,7 +671,7 @@ def whole_ego(ego: LoggedTrack, times_s: Array, file: str) -> tuple[LoggedTrack,
     boxes[:, :3], boxes[:, 3] = ego.position[frames], ego.heading[frames]
     left, repairs = whole_frames(times_s[frames], boxes)
     if left.sum() <= MOST * len(left):
-        raise BadClip(file, "tracks[sdc].state", f"{(~left).sum()} of {len(left)} poses of the ego cannot be")
+        raise BadClip(file, "tracks[sdc].state", f"most of {len(left)} poses of the ego are NaN or infinite")
     known = frames[left]
     valid = np.isin(np.arange(len(times_s)), known)
     for before, after in pairwise(known.tolist()):

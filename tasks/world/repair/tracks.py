@@ -6,7 +6,7 @@ is left out, named anew, turned round or put between its neighbours.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, wraps
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -30,6 +30,7 @@ MOST = 0.5  # of a thing's frames: more than these say what it is
 KNOWN_AFTER_S = 0.6  # a thing unseen for longer may have turned round
 TURNED_RAD = 2.6  # from one frame to the next no car turns so far: it is pi, off by what it really turned
 MOVING_MPS = 2.0  # faster, motion tells which way a thing looks
+REVERSED_MPS, REVERSED_S = 5.0, 1.0  # nobody drives backwards so fast for so long
 SPIKE_FRAMES = 2  # as many that lie elsewhere are a fault of theirs, more of them are another thing
 USUAL_S = 1.1  # around a step, over which a thing's usual speed is taken
 TOP_SPEED_MPS = {  # nobody in traffic is faster; 10 m/s is a sprinter
@@ -81,31 +82,58 @@ Repairs = tuple[Repair, ...]
 def observed(
     frame_times_s: Array, times_s: Array, ids: Sequence[str | None], kinds: Sequence[AgentKind | None], boxes: Array
 ) -> tuple[ObservedTracks, Repairs]:
-    """n boxes in any order as tracks ordered by id, each of the kind of its first box.
+    """n boxes in any order as tracks ordered by id, each of the first kind that its boxes name.
 
-    times_s: (n,) of the frames frame_times_s (F,); boxes: (n, 9). What no id names or is of no known kind (None) is
-    left out, and what has the id of another box of its frame.
+    times_s: (n,) of the frames frame_times_s (F,); boxes: (n, 9). What no id names is left out, things of no known kind
+    (None) and what has the id of another box of its frame.
     """
     done: list[Repair] = []
-    whole = np.array([i is not None and k is not None for i, k in zip(ids, kinds)], bool)
-    for row in np.flatnonzero(~whole).tolist():
-        what, was = ("token", "no id") if ids[row] is None else ("class", "of no known class")
-        done.append(Repair(what, ids[row] or f"box {row}", float(times_s[row]), was, LEFT_OUT))
-    order = np.flatnonzero(whole)[np.argsort(times_s[whole], kind="stable")]
-    names, first, column = np.unique([str(ids[row]) for row in order], return_index=True, return_inverse=True)
-    frame_of = np.searchsorted(frame_times_s, times_s[order])
-    placed, at = np.unique(frame_of * len(names) + column, return_index=True)
-    for k in np.setdiff1d(np.arange(len(order)), at).tolist():
-        name, time_s = str(names[column[k]]), float(times_s[order[k]])
-        done.append(Repair("twice", name, time_s, "two boxes of one frame", "the first of them"))
+    in_time = np.argsort(times_s, kind="stable").tolist()
+    frame_of = np.searchsorted(frame_times_s, times_s)
+    kind_of: dict[str | None, AgentKind] = {}
+    unnamed = set[int]()
+    for row in in_time:
+        if ids[row] is None:
+            done.append(Repair("token", f"box {row}", float(times_s[row]), "no id", LEFT_OUT))
+            unnamed.add(int(frame_of[row]))
+        elif (kind := kinds[row]) is not None:
+            kind_of.setdefault(ids[row], kind)
+    for row in in_time:
+        if kinds[row] is None and (name := ids[row]) is not None:
+            now = kind_of[name].lower() if name in kind_of else LEFT_OUT
+            done.append(Repair("class", name, float(times_s[row]), "of no known class", now))
+    known = np.array([row for row in in_time if ids[row] in kind_of], int)
+    names, column = np.unique([str(ids[row]) for row in known], return_inverse=True)
+    placed, at = np.unique(frame_of[known] * len(names) + column, return_index=True)
+    for k in np.setdiff1d(np.arange(len(known)), at).tolist():
+        time_s = float(times_s[known[k]])
+        done.append(Repair("twice", str(names[column[k]]), time_s, "two boxes of one frame", "the first of them"))
+        unnamed.add(int(frame_of[known[k]]))
     rows = np.full((len(frame_times_s), len(names)), UNSEEN)
     of_things = np.zeros((*rows.shape, 9))
-    rows.ravel()[placed], of_things.reshape(-1, 9)[placed] = order[at], boxes[order[at]]
-    of_kinds = tuple(kind for k in order[first] if (kind := kinds[k]) is not None)
+    rows.ravel()[placed], of_things.reshape(-1, 9)[placed] = known[at], boxes[known[at]]
+    for frame in unnamed:  # what is missing there may be what lost its name, and is put between its neighbours
+        rows[frame, rows[frame] == UNSEEN] = TAKEN_OUT
+    of_kinds = tuple(kind_of[name] for name in names.tolist())
     return ObservedTracks(frame_times_s, tuple(names.tolist()), of_kinds, of_things, rows), tuple(done)
 
 
 Pass = Callable[[ObservedTracks, Array], tuple[ObservedTracks, Repairs]]
+
+
+def settled(one: Pass) -> Pass:
+    """The pass, again and again until it finds nothing more: what is taken out changes what is left."""
+
+    @wraps(one)
+    def all_of_it(tracks: ObservedTracks, ego_poses: Array) -> tuple[ObservedTracks, Repairs]:
+        done: Repairs = ()
+        while True:
+            tracks, found = one(tracks, ego_poses)
+            if not found:
+                return tracks, done
+            done += found
+
+    return all_of_it
 
 
 def repaired(tracks: ObservedTracks, ego_poses: Array) -> tuple[ObservedTracks, Repairs]:
@@ -132,7 +160,7 @@ def _of_things(tracks: ObservedTracks, things: Ints) -> ObservedTracks:
 
 
 def without_impossible_values(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, Repairs]:
-    """Boxes that cannot be are left out; where most of a thing's are, the thing."""
+    """Boxes that cannot be are left out; where most of a thing's are, the thing. What is unseen is 0."""
     sizes, seen = tracks.boxes[..., LENGTH : HEIGHT + 1], tracks.seen
     possible = np.asarray((np.abs(tracks.boxes) <= LARGEST).all(axis=-1))
     possible &= ((sizes >= LEAST_SIZE_M) & (sizes <= LARGEST_SIZE_M)).all(axis=-1)
@@ -142,9 +170,10 @@ def without_impossible_values(tracks: ObservedTracks, _: Array) -> tuple[Observe
         was = [_impossible(box) for box in tracks.boxes[bad, n]]
         tracks, found = _left_out(tracks, int(n), bad, "impossible", was)
         done += found
-    return tracks, tuple(done)
+    return replace(tracks, boxes=np.where(tracks.seen[..., None], tracks.boxes, 0.0)), tuple(done)
 
 
+@settled
 def with_jumps_apart(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, Repairs]:
     """An identity that jumps is two things; a frame or two that lie elsewhere, and speeds that nothing has, go."""
     done: list[Repair] = []
@@ -178,6 +207,7 @@ def without_the_ego(tracks: ObservedTracks, ego_poses: Array) -> tuple[ObservedT
     return tracks, tuple(done)
 
 
+@settled
 def without_doubles(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, Repairs]:
     """Two things of one kind that are in one place for most of the shorter one's life are the longer one.
 
@@ -204,7 +234,7 @@ def without_doubles(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, R
 
 
 def with_headings_turned(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, Repairs]:
-    """Headings of vehicles and bicycles that are off by pi in some frames, as motion or else most frames say it."""
+    """Headings of vehicles and bicycles that are off by pi, as motion or else most frames say it."""
     boxes, done = tracks.boxes, list[Repair]()
     for n, kind in enumerate(tracks.kinds):
         if kind not in (AgentKind.VEHICLE, AgentKind.BICYCLE):
@@ -313,10 +343,14 @@ def _jumps(tracks: ObservedTracks, n: int, frames: Ints) -> Bools:
     if float(np.hypot(*np.ptp(moved / dt[:, None], axis=0)) * dt.max()) <= NOISE_M:
         return jumps  # nothing is farther from the usual than the fastest from the slowest
     steps = max(3, 2 * round(USUAL_S / float(np.median(dt)) / 2.0) + 1)
-    if len(dt) >= steps:
-        usual = np.stack([median_filter(v, steps, mode="nearest") for v in (moved / dt[:, None]).T], axis=1)
-        off = np.hypot(*(moved - usual * dt[:, None]).T)
-        jumps |= (off > NOISE_M + LARGEST_ACCEL_MPS2 * dt**2) & (dt <= KNOWN_AFTER_S)
+    unknown = dt > KNOWN_AFTER_S  # what comes before them says nothing of the speed behind them
+    for run in np.split(np.arange(len(dt)), np.flatnonzero(np.diff(np.cumsum(unknown))) + 1):
+        run = run[~unknown[run]]
+        if len(run) >= steps:
+            took = dt[run, None]
+            usual = np.stack([median_filter(v, steps, mode="mirror") for v in (moved[run] / took).T], axis=1)
+            off = np.hypot(*(moved[run] - usual * took).T)
+            jumps[run] |= off > NOISE_M + LARGEST_ACCEL_MPS2 * dt[run] ** 2
     return jumps
 
 
@@ -325,14 +359,17 @@ def _in_pieces(tracks: ObservedTracks, n: int, pieces: Sequence[Ints]) -> tuple[
     name, done = tracks.track_ids[n], list[Repair]()
     things: list[Ints] = []
     for i, piece in enumerate(pieces):
-        last = i + 1 == len(pieces)
-        spike = len(piece) <= SPIKE_FRAMES and (last or not things or _goes_on(tracks, n, things[-1], pieces[i + 1]))
-        if spike:
+        before, after = things[-1] if things else None, pieces[i + 1 : i + 3]
+        if before is None:
+            spike = len(after) < 2 or not _goes_on(tracks, n, piece, after[1])
+        else:
+            spike = _goes_on(tracks, n, before, after[0]) if after else not _goes_on(tracks, n, before, piece)
+        if spike and len(piece) <= SPIKE_FRAMES:
             for f in piece:
                 done.append(Repair("jump", name, float(tracks.times_s[f]), "away from its other frames", LEFT_OUT))
             tracks = tracks.without(piece, n)
-        elif things and _goes_on(tracks, n, things[-1], piece):
-            things[-1] = np.concatenate([things[-1], piece])
+        elif before is not None and _goes_on(tracks, n, before, piece):
+            things[-1] = np.concatenate([before, piece])
         else:
             things.append(piece)
     for later in things[1:]:
@@ -394,8 +431,8 @@ def _pairs_inside(tracks: ObservedTracks) -> Iterable[tuple[int, int, int]]:
     import shapely  # here alone: workers that drive do not need it
 
     counts: dict[tuple[int, int], int] = {}
-    corners = np.nan_to_num(box_corners(tracks.boxes[..., [X, Y, HEADING, LENGTH, WIDTH]]))
-    reach = float(np.nanmax(np.where(tracks.seen, tracks.boxes[..., LENGTH], np.nan), initial=0.0)) / 2.0
+    corners = box_corners(tracks.boxes[..., [X, Y, HEADING, LENGTH, WIDTH]])
+    reach = float(tracks.boxes[tracks.seen][:, [LENGTH, WIDTH]].max(initial=0.0)) / 2.0
     kinds = np.array([list(AgentKind).index(kind) for kind in tracks.kinds], int)
     for frame, seen in enumerate(tracks.seen):
         here = np.flatnonzero(seen)
@@ -426,15 +463,16 @@ def _center_inside(boxes: Array, pairs: Ints) -> Bools:
 
 def _turned_round(tracks: ObservedTracks, n: int, run: Ints) -> Bools:
     """(K,) of K frames of thing n in a row: which look the other way."""
-    heading = tracks.boxes[run, n, HEADING]
+    heading, times_s = tracks.boxes[run, n, HEADING], tracks.times_s[run]
     turned = np.cumsum(np.abs(wrap_angle(np.diff(heading, prepend=heading[0]))) > TURNED_RAD) % 2 == 1
-    if not turned.any():
-        return turned
-    moved = np.gradient(tracks.boxes[run, n, :2], tracks.times_s[run], axis=0)
+    moved = np.gradient(tracks.boxes[run, n, :2], times_s, axis=0)
     forward = np.cos(heading) * moved[:, 0] + np.sin(heading) * moved[:, 1]
     forward[np.hypot(*moved.T) < MOVING_MPS] = 0.0
     forward[turned] *= -1.0
-    first_is_right = forward.sum() > 0.0 if forward.any() else turned.mean() <= MOST
+    if turned.any():
+        first_is_right = forward.sum() > 0.0 if forward.any() else turned.mean() <= MOST
+    else:
+        first_is_right = times_s[-1] - times_s[0] < REVERSED_S or forward.mean() > -REVERSED_MPS
     return turned if first_is_right else ~turned
 
 

@@ -184,22 +184,72 @@ def test_map_route_and_marks_come_from_the_vector_map(log: Path) -> None:
     assert clip.ego_states[NOW, X] == pytest.approx(road(np.array(SPEED * 1.5), np.array(0.0))[0])
 
 
-def test_missing_frames_and_jumping_tracks_are_dropped_and_counted(log: Path) -> None:
-    def without_the_last_frames(columns: dict[str, list]) -> None:
-        gone = {START_NS + k * 100_000_000 for k in (100, 101)}
+def without_frames(*numbers: int) -> Callable[[dict[str, list]], None]:
+    def change(columns: dict[str, list]) -> None:
+        gone = {START_NS + k * 100_000_000 for k in numbers}
         keep = [i for i, stamp in enumerate(columns["timestamp_ns"]) if stamp not in gone]
         for name in columns:
             columns[name] = [columns[name][i] for i in keep]
 
-    edit(log / "annotations.feather", without_the_last_frames)
+    return change
+
+
+@pytest.mark.parametrize("missing", [(100,), (100, 101, 102, 103)])
+def test_frames_that_are_missing_for_half_a_second_are_filled_in(log: Path, tmp_path: Path, missing: tuple) -> None:
+    """Everything goes straight here: on the line between its neighbours it is where it was."""
+    whole = AV2Reader(write_log(tmp_path / "whole" / "log-a"))
+    edit(log / "annotations.feather", without_frames(*missing))
+    reader = AV2Reader(log)
+    index = reader.index()
+    assert [ref.start_ms for ref in index.refs] == [0, 1000, 2000] and not index.dropped
+    for ref in index.refs:
+        found, expected = reader.read(ref), whole.read(ref)
+        assert found.agents.valid.all()
+        np.testing.assert_allclose(found.agents.boxes, expected.agents.boxes, atol=1e-9)
+        np.testing.assert_allclose(found.agents.velocities, expected.agents.velocities, atol=1e-9)
+        shown = ref.start_ms > 0  # the first window ends before
+        assert [(r.what, r.time_s, r.now) for r in found.repairs] == [("gap", 9.9, "filled in")] * shown
+
+
+def test_longer_gaps_of_frames_are_dropped_and_counted(log: Path) -> None:
+    edit(log / "annotations.feather", without_frames(100, 101, 102, 103, 104))
     index = AV2Reader(log).index()
     assert [ref.start_ms for ref in index.refs] == [0] and index.dropped == {"broken_tracks": 2}
 
+
+def test_a_car_that_its_frames_do_not_show_is_absent_there(log: Path) -> None:
+    def without_the_car(columns: dict[str, list]) -> None:
+        for values in columns.values():
+            del values[50:53]
+
+    edit(log / "annotations.feather", without_the_car)
+    reader = AV2Reader(log)
+    clip = reader.read(reader.index().refs[0])
+    car = clip.agents.track_ids.index("car")
+    assert np.flatnonzero(~clip.agents.valid[:, car]).tolist() == [50, 51, 52]
+    assert not clip.repairs
+
+
+def test_a_car_that_lies_elsewhere_in_one_frame_is_where_its_others_say(log: Path, tmp_path: Path) -> None:
     def jump(columns: dict[str, list]) -> None:
         columns["tx_m"][50] += 30.0
 
     edit(log / "annotations.feather", jump)
-    assert AV2Reader(log).index().dropped == {"broken_tracks": 3}
+    reader, whole = AV2Reader(log), AV2Reader(write_log(tmp_path / "whole" / "log-a"))
+    index = reader.index()
+    assert len(index.refs) == 3 and not index.dropped
+    found, expected = reader.read(index.refs[0]), whole.read(index.refs[0])
+    np.testing.assert_allclose(found.agents.boxes, expected.agents.boxes, atol=1e-9)
+    assert [(r.what, r.thing, r.time_s) for r in found.repairs] == [("jump", "car", 5.0), ("gap", "car", 5.0)]
+
+
+def test_a_log_whose_ego_jumps_and_goes_on_there_has_no_window_across_the_jump(log: Path) -> None:
+    def jump(columns: dict[str, list]) -> None:
+        columns["tx_m"][1050:] = [x + 30.0 for x in columns["tx_m"][1050:]]
+
+    edit(log / "city_SE3_egovehicle.feather", jump)
+    index = AV2Reader(log).index()
+    assert [ref.start_ms for ref in index.refs] == [0] and index.dropped == {"broken_tracks": 2}
 
 
 def test_a_log_without_annotations_is_skipped_with_its_reason(log: Path) -> None:

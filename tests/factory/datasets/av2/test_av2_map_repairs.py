@@ -10,7 +10,7 @@ import shapely
 from factory.datasets.av2.reader import AV2Reader
 from factory.readers.base import BadClip
 from tasks.world.clip import Clip
-from tasks.world.repair.records import LEFT_OUT, repair_counts
+from tasks.world.repair.records import LEFT_OUT, RepairCount, repair_counts
 from tests.factory.datasets.av2.test_av2 import START_NS, boundary, edit_map, write_log, write_table
 
 NAN = float("nan")
@@ -120,7 +120,7 @@ def test_lights_of_no_lane_and_of_a_lane_left_out_are_left_out_and_counted(tmp_p
     write_table(log / "traffic_lights.feather", lights)
     clip = read(log)
     assert clip.lights.lane_ids == ("2",)
-    assert repair_counts(clip.repairs) == {"lane": (0, 1), "light": (0, 2)}
+    assert repair_counts(clip.repairs) == (RepairCount("lane", 0, 1), RepairCount("light", 0, 2))
 
 
 def test_where_no_lane_for_cars_is_left_the_log_is_refused_with_the_reason(tmp_path: Path) -> None:

@@ -91,21 +91,21 @@ WHEN_LISTED = {  # what the choice of windows meets
         f"{EGO}: ego_state_se3.imu_se3: column is missing",
     ),
     "a pose is null": (column(f"{EGO}:imu_se3", set_first(None)), "imu_se3: holds nulls"),
-    "a pose is NaN": (column(f"{EGO}:imu_se3", set_first([float("nan")] * 7)), "imu_se3: holds NaN"),
-    "no rotation": (column(f"{EGO}:imu_se3", set_first([0.0] * 7)), f"{EGO}: qw qx qy qz"),
     "no mount": (told(EGO, rear_axle_to_imu_se3=None), f"{EGO}: metadata.rear_axle_to_imu_se3"),
     "poses of six numbers": (
         lambda log: rewrite(log / EGO, {"ego_state_se3.imu_se3": fixed(np.zeros((len(stamps(log)), 6)))}),
         "expected lists of 7 numbers",
     ),
     "unknown labels": (told(BOXES, box_detection_label_class="mine.Label"), "unknown labels Label; known: AV2Sensor"),
-    "label beyond": (column(f"{BOXES}:label", set_first([99, 99])), "label: 99: AV2SensorBoxDetectionLabel has 30"),
-    "labels of no box": (column(f"{BOXES}:label", set_first([18])), "track_token label: not one of each"),
-    "a track without a token": (
-        column(f"{BOXES}:track_token", set_first(["", "car"])),
-        f"{BOXES}: track_token: frame 0 has a box that no token names",
+    "most poses NaN": (
+        column(f"{EGO}:imu_se3", lambda values: values.__setitem__(slice(0, 700), [[float("nan")] * 7] * 700)),
+        f"{EGO}: qw qx qy qz tx_m ty_m tz_m: most of ",
     ),
-    "twice in a frame": (column(f"{BOXES}:track_token", set_first(["car", "car"])), "track car stands twice"),
+    "most labels beyond": (
+        column(f"{BOXES}:label", lambda values: values.__setitem__(slice(0, 70), [[99, 99]] * 70)),
+        "label: most are none of AV2SensorBoxDetectionLabel, which ends at 29",
+    ),
+    "labels of no box": (column(f"{BOXES}:label", set_first([18])), "track_token label: not one of each"),
     "no boxes": (
         lambda log: [
             column(f"{BOXES}:{name}", lambda values: values.__setitem__(slice(None), [[] for _ in values]))(log)
@@ -118,6 +118,88 @@ WHEN_LISTED = {  # what the choice of windows meets
         f"{BOXES}: metadata: missing from the schema",
     ),
 }
+
+
+def set_one(number: int, change: Callable[[Any], Any]) -> Callable[[list[Any]], object]:
+    return lambda values: values.__setitem__(number, change(values[number]))
+
+
+def first_box(*changed: tuple[int, float]) -> Callable[[list[Any]], list[Any]]:
+    """Values of a frame's first box, the car's, by their place."""
+
+    def change(boxes: list[Any]) -> list[Any]:
+        values = list(boxes[0])
+        for i, value in changed:
+            values[i] = value
+        return [values, *boxes[1:]]
+
+    return change
+
+
+# what is wrong -> what is changed, and (pass, thing, time) of what is told; pose 300 and frame 30 are at 3.0 s
+REPAIRED = {
+    "a pose is NaN": (
+        column(f"{EGO}:imu_se3", set_one(300, lambda _: [float("nan")] * 7)),
+        [("impossible", "ego", 3.0)],
+    ),
+    "no rotation": (column(f"{EGO}:imu_se3", set_one(300, lambda _: [0.0] * 7)), [("impossible", "ego", 3.0)]),
+    "a pose elsewhere": (
+        column(f"{EGO}:imu_se3", set_one(300, lambda pose: [pose[0] + 50.0, *pose[1:]])),
+        [("jump", "ego", 3.0)],
+    ),
+    "label beyond": (
+        column(f"{BOXES}:label", set_one(30, lambda _: [99, 99])),
+        [("class", "car", 3.0), ("class", "cone", 3.0)],
+    ),
+    "a label is null": (column(f"{BOXES}:label", set_one(30, lambda v: [None, v[1]])), [("class", "car", 3.0)]),
+    "a track without a token": (
+        column(f"{BOXES}:track_token", set_one(30, lambda _: ["", "cone"])),
+        [("token", "box 60", 3.0), ("gap", "car", 3.0)],
+    ),
+    "twice in a frame": (
+        column(f"{BOXES}:track_token", set_one(30, lambda _: ["car", "car"])),
+        [("twice", "car", 3.0), ("gap", "cone", 3.0)],
+    ),
+    "a box is NaN": (
+        column(f"{BOXES}:bounding_box_se3", set_one(30, first_box((0, float("nan"))))),
+        [("impossible", "car", 3.0), ("gap", "car", 3.0)],
+    ),
+    "a box without height": (
+        column(f"{BOXES}:bounding_box_se3", set_one(30, first_box((9, -1.0)))),
+        [("impossible", "car", 3.0), ("gap", "car", 3.0)],
+    ),
+    "a box elsewhere": (
+        column(f"{BOXES}:bounding_box_se3", set_one(30, first_box((1, 0.0)))),
+        [("jump", "car", 3.0), ("gap", "car", 3.0)],
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", REPAIRED)
+def test_a_fault_of_one_thing_is_put_right_or_left_out_and_told_and_nothing_else_changes(
+    source: Path, tmp_path: Path, fault: str
+) -> None:
+    """Everything drives straight here: between two frames it is where it was."""
+    spoil, told = REPAIRED[fault]
+    spoil(convert(source, tmp_path / "spoiled"))
+    convert(source, tmp_path / "sound")
+    reader, whole = (Py123dReader(tmp_path / name) for name in ("spoiled", "sound"))
+    index = reader.index()
+    assert index.refs == whole.index().refs and not index.dropped and not index.broken
+    found, sound = reader.read(index.refs[1]), whole.read(index.refs[1])
+    assert [(r.what, r.thing, round(r.time_s, 9)) for r in found.repairs] == told
+    assert found.agents.track_ids == sound.agents.track_ids and found.agents.kinds == sound.agents.kinds
+    assert np.array_equal(found.agents.valid, sound.agents.valid)
+    np.testing.assert_allclose(found.agents.boxes, sound.agents.boxes, atol=1e-9)
+    np.testing.assert_allclose(found.agents.velocities, sound.agents.velocities, atol=1e-9)
+    np.testing.assert_allclose(found.ego_states, sound.ego_states, atol=1e-8)
+
+
+def test_a_log_whose_first_pose_cannot_be_begins_a_step_later(source: Path, tmp_path: Path) -> None:
+    column(f"{EGO}:imu_se3", set_first([float("nan")] * 7))(convert(source, tmp_path))
+    index = Py123dReader(tmp_path).index()
+    assert [ref.start_ms for ref in index.refs] == [100, 1100, 2100] and not index.dropped
+
 
 WHEN_READ = {  # what only a clip's own log meets
     "truncated map": (lambda log: cut_short(log / MAP), f"{MAP}: file: cannot be read"),

@@ -226,12 +226,24 @@ def test_a_jump_of_the_ego_breaks_every_window_across_it(tmp_path):
     assert np.abs(reader.read(index.refs[0]).ego_states[:, AX]).max() < 0.1
 
 
-def test_frames_where_the_ego_is_invalid_break_their_windows(tmp_path):
+@pytest.mark.parametrize(("invalid", "windows"), [(3, 6), (4, 6), (5, 1)])
+def test_frames_where_the_ego_is_invalid_are_filled_up_to_half_a_second_and_else_break_their_windows(
+    tmp_path, invalid, windows
+):
     scenario = town.waymo(150)
-    scenario["tracks"]["17"]["state"]["valid"][100:103] = False
-    town.save(scenario, tmp_path)
-    index = ScenarioNetReader(tmp_path).index()
-    assert len(index.refs) == 1 and index.dropped == {"broken_tracks": 5}
+    for name, values in scenario["tracks"]["17"]["state"].items():
+        values[100 : 100 + invalid] = False if name == "valid" else 0.0  # as the converters do
+    path = town.save(scenario, tmp_path)
+    reader = ScenarioNetReader(path)
+    index = reader.index()
+    assert len(index.refs) == windows and index.dropped == ({"broken_tracks": 6 - windows} if windows < 6 else {})
+    repairs = reader.read(index.refs[-1]).repairs
+    assert [(r.what, r.thing, r.time_s) for r in repairs] == [("gap", "ego", pytest.approx(9.9))] * (windows == 6)
+    whole = read_log(town.save(town.waymo(150), tmp_path / "whole")).ego_states
+    told = read_log(path).ego_states
+    here = np.isfinite(told).all(axis=1)
+    assert here.all() == (windows == 6)
+    np.testing.assert_allclose(told[here], whole[here], atol=1e-3)
 
 
 def test_an_ego_that_stands_and_a_log_too_short_are_counted(tmp_path):

@@ -1,5 +1,6 @@
-"""What a ScenarioNet reader refuses, and how it says so; which files it finds, and what it keeps."""
+"""What a ScenarioNet reader repairs and refuses, and how it says so; which files it finds, and what it keeps."""
 
+import copy
 import os
 import pickle
 
@@ -8,6 +9,7 @@ import pytest
 
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import BadClip, ClipRef
+from tasks.world.repair.records import LEFT_OUT
 from tests.factory.datasets.scenarionet import scenarionet_scenarios as town
 
 
@@ -31,8 +33,13 @@ def with_value(value, *path):
     return change
 
 
-def nan_pose(scenario):
-    scenario["tracks"]["ego"]["state"]["position"][40, 0] = np.nan
+def at(track_id, name, frames, value):
+    """Values of one track's state, changed at some frames."""
+
+    def change(scenario):
+        scenario["tracks"][track_id]["state"][name][frames] = value
+
+    return change
 
 
 def backwards(scenario):
@@ -50,10 +57,14 @@ BREAKS = {
     "metadata.ts: time is not finite and strictly increasing": backwards,
     "metadata.ts: frames further apart": with_value(np.arange(121.0), "metadata", "ts"),
     r"tracks\[ego\].state.position: missing": without("tracks", "ego", "state", "position"),
-    r"tracks\[ego\].state.position: NaN pose": nan_pose,
-    r"tracks\[lead\].state.heading: shape": with_value(np.zeros(7), "tracks", "lead", "state", "heading"),
-    r"tracks\[lead\].type: unknown class 'TRAM'": with_value("TRAM", "tracks", "lead", "type"),
-    r"tracks\[lead\].state: length, width, height": without("tracks", "lead", "state", "length"),
+}
+BREAKS |= {
+    r"tracks\[sdc\].state: most of 121 poses of the ego are NaN": lambda s: at("ego", "position", slice(0, 70), np.nan)(
+        s
+    ),
+    r"tracks\[lead\].type: unknown class 'TRAM'": lambda s: [
+        track.update(type="TRAM") for name, track in s["tracks"].items() if name != "ego"
+    ],
 }
 MAP_BREAKS = {
     "map_features: the map is empty": with_value({}, "map_features"),
@@ -90,6 +101,66 @@ def test_a_broken_file_is_named_with_its_field_and_hurts_no_other(tmp_path, mess
     with pytest.raises(BadClip, match=message) as error:
         reader.read(next(iter(index.broken)))
     assert error.value.file == str(path)
+
+
+def again(name, of, forward_m=0.0):
+    def change(scenario):
+        scenario["tracks"][name] = copy.deepcopy(scenario["tracks"][of])
+        scenario["tracks"][name]["state"]["position"][:, 0] += forward_m
+
+    return change
+
+
+# what is wrong -> the things that it costs, and (pass, thing, whether it is left out) of what is told
+REPAIRS = {
+    "NaN pose": (at("ego", "position", 40, np.nan), (), [("gap", "ego", False), ("impossible", "ego", True)]),
+    "ego elsewhere": (at("ego", "position", 40, 9000.0), (), [("gap", "ego", False), ("jump", "ego", True)]),
+    "NaN heading of a box": (
+        at("lead", "heading", 40, np.nan),
+        (),
+        [("gap", "lead", False), ("impossible", "lead", True)],
+    ),
+    "a box of no length": (at("lead", "length", 40, 0.0), (), [("gap", "lead", False), ("impossible", "lead", True)]),
+    "a length below zero": (at("lead", "length", slice(None), -1.2959), ("lead",), [("impossible", "lead", True)]),
+    "misshapen": (
+        with_value(np.zeros(7), "tracks", "lead", "state", "heading"),
+        ("lead",),
+        [("impossible", "lead", True)],
+    ),
+    "unknown class": (with_value("TRAM", "tracks", "lead", "type"), ("lead",), [("class", "lead", True)]),
+    "no lengths": (without("tracks", "lead", "state", "length"), ("lead",), [("impossible", "lead", True)]),
+    "no states": (without("tracks", "lead", "state"), ("lead",), [("impossible", "lead", True)]),
+    "no dict": (with_value(None, "tracks", "lead"), ("lead",), [("class", "lead", True)]),
+    "a track without an id": (again(None, "lead"), (), [("token", "None", True)]),
+    "ego listed as agent": (again("me", "ego"), (), [("ego", "me", True)]),
+    "car listed twice": (again("zwei", "lead", 0.2), (), [("twice", "zwei", True)]),
+    "one id as text and number": (lambda s: [again("5", "rider")(s), again(5, "lead")(s)], (), None),
+    "heading turned round": (at("lead", "heading", 40, np.pi), (), [("heading", "lead", False)]),
+}
+
+
+@pytest.mark.parametrize("fault", REPAIRS)
+def test_a_fault_of_one_thing_is_put_right_or_left_out_and_told_and_nothing_else_changes(tmp_path, fault):
+    """All drive straight at one speed here: between two frames they are where they were."""
+    spoil, costs, told = REPAIRS[fault]
+    scenario = town.nuscenes()
+    spoil(scenario)
+    found, sound = (
+        ScenarioNetReader(town.save(s, tmp_path / name))
+        for s, name in ((scenario, "spoiled"), (town.nuscenes(), "sound"))
+    )
+    index = found.index()
+    assert index.refs == sound.index().refs and not index.dropped and not index.broken
+    clip, whole = found.read(index.refs[0]), sound.read(index.refs[0])
+    if told is not None:
+        assert sorted({(r.what, r.thing, r.now == LEFT_OUT) for r in clip.repairs}) == told
+    kept = [name for name in sorted(whole.agents.track_ids) if name not in costs]
+    assert [name for name in clip.agents.track_ids if name != "5"] == kept
+    of = [[agents.track_ids.index(name) for name in kept] for agents in (clip.agents, whole.agents)]
+    for name in ("boxes", "velocities", "valid", "center_z"):
+        here, there = (getattr(c.agents, name)[:, columns] for c, columns in zip((clip, whole), of))
+        np.testing.assert_allclose(here, there, atol=1e-9)
+    np.testing.assert_allclose(clip.ego_states, whole.ego_states, atol=1e-6)
 
 
 @pytest.mark.parametrize("message", list(MAP_BREAKS))

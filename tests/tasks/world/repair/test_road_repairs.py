@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tasks.world.arrays import Array
-from tasks.world.repair.records import LEFT_OUT, repair_counts
+from tasks.world.repair.records import LEFT_OUT, RepairCount, repair_counts
 from tasks.world.repair.road import (
     LaneSides,
     crossing_between,
@@ -261,7 +261,7 @@ def test_lanes_that_are_none_are_left_out_and_their_links_hurt_nobody() -> None:
     ):
         found, repairs = sound_lanes(lanes | {"1": broken})
         assert list(found) == ["0", "2"] and all(same_lines(found[k], lanes[k]) for k in found)
-        assert repair_counts(repairs) == {"lane": (0, 1)}
+        assert repair_counts(repairs) == (RepairCount("lane", 0, 1),)
         assert [(repair.thing, repair.now) for repair in repairs] == [("1", LEFT_OUT)]
 
 
