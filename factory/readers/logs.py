@@ -204,6 +204,7 @@ def _length(places: Array) -> float:
 STEP_MS = round(STEP_S * 1000)
 ROUTE_SAMPLE_STEPS = 2  # the route looks at the ego every 0.2 s
 CACHED_LOGS = 2
+FITTED_S = 0.65  # around a window: what velocities at its ends are fitted to, and half a step
 EGO_STANDING, BROKEN_TRACKS = "ego_standing", "broken_tracks"  # reasons of the stage "clip"
 
 
@@ -410,7 +411,8 @@ class LogReader(ABC, Generic[Log]):
             block=None if recorded.block is None else self._with_others(ref, recorded.block),
             licence=log.licence,
             content_digest=self.digest_with_others(ref, log.content_digest),
-            repairs=repairs_within(log.repairs, (start - 0.5) * STEP_S, (stop - 0.5) * STEP_S) + articulated(agents),
+            repairs=repairs_within(log.repairs, start * STEP_S - FITTED_S, (stop - 1) * STEP_S + FITTED_S)
+            + articulated(agents),
         )
         return validate_clip(clip, log.file)
 
