@@ -396,12 +396,21 @@ def _track_velocities(track: BoxTrack, half_window_s: float) -> Array:
     offset = track.times_s[None, :] - track.times_s[:, None]  # (n, n)
     near = np.abs(offset) <= half_window_s + ROUNDING_S
     count = near.sum(axis=1)
-    centered = np.where(near, offset - (np.where(near, offset, 0.0).sum(axis=1) / count)[:, None], 0.0)
-    moved = track.centers[None, :, :2] - track.centers[:, None, :2]  # (n, n, 2)
-    spread = (centered**2).sum(axis=1)
-    slope = (centered[..., None] * moved).sum(axis=1) / np.where(spread > 0.0, spread, 1.0)[:, None]
+    # Those near stand side by side, K at most. They are summed in order, so that no frame beyond them changes a digit.
+    k = np.arange(count.max())
+    here, at = k < count[:, None], np.minimum(np.argmax(near, axis=1)[:, None] + k, n - 1)  # (n, K)
+    offset = np.where(here, np.take_along_axis(offset, at, axis=1), 0.0)
+    centered = np.where(here, offset - (_sum_in_order(offset) / count)[:, None], 0.0)
+    moved = track.centers[at, :2] - track.centers[:, None, :2]  # (n, K, 2)
+    spread = _sum_in_order(centered**2)
+    slope = _sum_in_order(centered[..., None] * moved) / np.where(spread > 0.0, spread, 1.0)[:, None]
     standing = np.hypot(*slope.T) < STANDING_SPEED_MPS
     return np.where(standing[:, None], 0.0, slope)
+
+
+def _sum_in_order(values: Array) -> Array:
+    """Over axis 1, one after the other; numpy's own sum goes by blocks whose bounds depend on the length."""
+    return np.asarray(np.cumsum(values, axis=1)[:, -1])
 
 
 # An Argoverse 2 vector map (log_map_archive_*.json) as a RoadMap. Format: Wilson et al. 2021, argoverse/av2-api.
