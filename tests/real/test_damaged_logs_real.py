@@ -1,0 +1,20 @@
+"""A few of the damaged logs of tests.chaos.damaged_logs."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.chaos.damaged_logs import INJECTIONS, damaged, data_sets
+
+SEEDS = {"av2": (3, 8), "nuscenes": (2, 5), "navsim": (0, 1)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SEEDS)
+def test_damage_stays_where_it_is_and_is_told(name: str, shared_root: Path, tmp_path: Path) -> None:
+    ((_, data),) = data_sets(shared_root, tmp_path, [name])
+    said = list[str]()
+    table = damaged(data, SEEDS[name], said.append)
+    assert not said, "\n".join(said)
+    assert table.keys() <= INJECTIONS.keys() and sum(told.injected for told in table.values()) >= 2 * len(SEEDS[name])
+    assert all(told.is_fine for told in table.values()) and sum(told.repaired for told in table.values())
