@@ -9,6 +9,7 @@ import importlib
 import io
 import json
 import os
+import re
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -23,7 +24,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pyarrow import fs
 
-from factory.files import DamagedFile, atomic_file, in_submitted_job, is_companion
+from factory.files import DamagedFile, atomic_file, in_submitted_job, is_data
 from factory.store.schema import TableSpec
 from factory.wording import one_line
 from tasks.caches import Damaged, with_checksum, without_checksum
@@ -137,13 +138,16 @@ class Location:
         return _remote(os.getpid(), self.uri, tuple(sorted(self.options.items())))
 
 
+OWN_DRAFT = re.compile(r"\..*\.tmp|\.trial-[0-9a-f]+")  # hidden files that runs leave; others are somebody else's
+
+
 def _local_files(folder: Path) -> Iterator[Path]:
     """What is in a folder and is none. No link to a folder is followed, as what is listed may be removed.
 
     Other processes make and remove folders there: one that is gone before it is opened has no files.
     """
     try:
-        entries = [entry for entry in os.scandir(folder) if not is_companion(entry.name)]
+        entries = [entry for entry in os.scandir(folder) if is_data(entry.name) or OWN_DRAFT.fullmatch(entry.name)]
     except FileNotFoundError:
         return
     for entry in entries:

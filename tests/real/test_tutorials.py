@@ -1,6 +1,7 @@
 """The tutorials' commands, run from the pages' own text on the real logs, print what the pages show.
 
-Those of docs/tutorials/first_planner.md and cluster.md: tests/test_first_planner.py, tests/factory/test_job_submit.py.
+Those of docs/tutorials/first_planner.md: tests/test_first_planner.py, of docs/tutorials/cluster.md:
+tests/factory/test_job_submit.py.
 """
 
 import re

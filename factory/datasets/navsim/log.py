@@ -311,7 +311,7 @@ def parse_command(values: CheckedValues) -> str:
     DriveEngine/process_data/helpers/driving_command.py:57, 91-97). Raises BadClip.
 
     Of three places it lacks the last: unknown is a route that cannot be followed (ibid., 66-69), which NAVSIM's own
-    page does not know ("left, straight or right", autonomousvision/navsim @ 51cecd5, v0.1, docs/agents.md:13).
+    page on agents does not know ("left, straight or right", autonomousvision/navsim @ 51cecd5, v0.1, line 13).
     """
     one_hot = values.numbers("driving_command", (None,)).tolist()
     if len(one_hot) not in (3, 4) or sorted(one_hot) != [*[0.0] * (len(one_hot) - 1), 1.0]:

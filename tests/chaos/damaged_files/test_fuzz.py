@@ -33,19 +33,24 @@ def test_a_mutant_is_accepted_or_refused_and_does_nothing_else(folder: Path, kin
 
 
 FOUND = [
-    ("json, a map", 284),  # an int beyond a float
     ("pickle, OpenScene", 453),  # the same
     ("pickle, OpenScene", 3297),  # a camera whose path is an array
     ("yaml, a scene filter", 10),  # no text
     ("feather, intrinsics", 1645),  # a column whose name is no text
     ("mcap", 1909),  # an opcode that no checksum covers
+]
+
+
+REPAIRED = [
+    ("json, a map", 284),  # an int beyond a float
     ("arrow, 123D's map", 55),  # a lane of 10^100 km
 ]
 
 
-@pytest.mark.parametrize(("kind", "number"), FOUND)
+@pytest.mark.parametrize(("kind", "number"), [*FOUND, *REPAIRED])
 def test_what_was_found_stays_found(folder: Path, kind: str, number: int) -> None:
-    assert ProcessFunction(answer)(Question(str(folder), kind, number), kind) == "refused"
+    left_out = "accepted" if (kind, number) in REPAIRED else "refused"
+    assert ProcessFunction(answer)(Question(str(folder), kind, number), kind) == left_out
 
 
 def test_a_mutant_is_the_same_again_and_no_copy(folder: Path) -> None:

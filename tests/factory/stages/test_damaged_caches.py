@@ -130,7 +130,7 @@ def test_a_recovery_table_is_made_again_in_the_cache(
     save_vocabulary(tmp_path / "v.npy", Vocabulary(kinematic_trajectories(20, 0)), {})
     run = SimpleNamespace(
         clips=lambda: (reader, reader.index()),
-        config=SimpleNamespace(vocabulary=SimpleNamespace(file=None), clips={"root": "town"}),
+        config=SimpleNamespace(vocabulary=SimpleNamespace(file=None), clips={"root": "town"}, repairs="make"),
     )
     golden = _recovery_table(run, [str(tmp_path / "v.npy")]).digest  # type: ignore[arg-type]
     (path,) = (tmp_path / "cache").rglob("recovery-*.npz")

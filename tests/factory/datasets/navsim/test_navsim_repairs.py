@@ -101,7 +101,6 @@ def test_a_fault_of_one_box_is_put_right_or_left_out_and_told_and_nothing_else_c
         lambda frame: frame.update(timestamp=0),
         lambda frame: frame.update(timestamp=2 * frame["timestamp"]),
         lambda frame: frame.pop("anns") and frame["cams"].clear(),
-        lambda frame: frame.pop("driving_command"),
     ],
 )
 def test_a_frame_that_cannot_be_read_costs_the_windows_it_is_in(
