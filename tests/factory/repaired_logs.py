@@ -8,7 +8,7 @@ from examples.csv_logs import CsvReader
 from factory.readers.logs import WholeLog
 from tasks.world.repair.records import LEFT_OUT, Repair
 
-GAP = Repair("gap", "car", 2.3, "no box", "a box between those of 2.2 s and 2.4 s")
+GAP = Repair("gap", "car", 1.3, "no box", "a box between those of 1.2 s and 1.4 s")
 SECOND_GAP = replace(GAP, time_s=3.1)
 IMPOSSIBLE = Repair("impossible", "van", 4.0, "length -1.30 m", LEFT_OUT)
 CROSSING = Repair("crossing", "pc_1", math.nan, "a bow tie of 62 m2", "a ring of 429 m2")

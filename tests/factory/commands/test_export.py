@@ -162,7 +162,7 @@ def test_a_human_sample_has_no_perturbation() -> None:
 
 def test_the_command_writes_one_file_or_every_nth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    write_table(out, [sample(i, "recovery", stage_versions="{}") for i in range(4)])
+    write_table(out, [sample(i, "recovery", stage_versions="{}", world_from_ego=None) for i in range(4)])
     ids = sorted(Store(out).samples)
     assert main(["mcap", f"out={out}", "every=2", f"to={tmp_path / 'looks'}"]) == 0
     written = [Path(line) for line in capsys.readouterr().out.split()]
