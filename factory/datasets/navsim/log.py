@@ -152,6 +152,7 @@ class Frame:
     lidar_path: str | None  # of the merged sweep below the folder of sensor blobs
     boxes: FrameBoxes | None  # None: nobody annotated the frame
     repairs: tuple[Repair, ...] = ()  # of its boxes, at time 0
+    unreadable: bool = False  # stands where one cannot be read: its neighbour without boxes and blobs
 
     @property
     def command(self) -> str:
@@ -163,7 +164,7 @@ class Frame:
 class LogFrames:
     """The frames of one log in time order, timestamps strictly increasing.
 
-    One that cannot be read stands as a frame that nobody annotated, which no clip holds.
+    One that cannot be read stands as `unreadable`, which no clip holds.
     """
 
     file: str
@@ -205,7 +206,8 @@ def parse_frames(value: Any, path: Path, whole: bool = True) -> LogFrames:
     for i in sorted(wrong):
         at = int(known[np.argmin(np.abs(known - i))])
         near, stamp = frames[at], frames[at].timestamp_us + FRAME_US * (i - at)
-        frames[i] = replace(near, token=f"unreadable-{i}", timestamp_us=stamp, cameras=(), lidar_path=None, boxes=None)
+        named = replace(near, token=f"unreadable-{i}", timestamp_us=stamp, unreadable=True)
+        frames[i] = replace(named, cameras=(), lidar_path=None, boxes=None)
     return LogFrames(file, path.stem, tuple(frames[i] for i in range(len(value))))
 
 

@@ -243,10 +243,11 @@ def _texts(value: object, where: str) -> tuple[str, ...]:
 # A log of OpenScene takes a second to open, and navtrain names 1,192 of them. So what the choice needs is kept, a
 # small table a log, in the user's cache; it is made again where the log's size or time of change is another.
 
-TABLE_VERSION = 5  # of the tables kept
+TABLE_VERSION = 6  # of the tables kept
 FRAME_S, SLACK_S = 0.5, 0.05  # between two frames; more or less is a gap
 GAP, SHORT_HISTORY, SHORT_FUTURE = "gap_in_frames", "short_history", "short_future"
 NO_ROUTE, NO_BOXES, STANDING, ABSENT = "no_route", "not_annotated", "ego_standing", "absent_token"
+UNREADABLE = "unreadable_frame"
 log = logging.getLogger(__name__)
 
 
@@ -258,6 +259,7 @@ class FrameTable:
     timestamps_us: Ints  # (F,)
     has_route: Bools  # (F,)
     annotated: Bools  # (F,)
+    unreadable: Bools  # (F,)
     speeds: NDArray[np.float32]  # (F,) of the ego [m/s]
     locations: NDArray[np.str_]  # (F,) the city, the same in all frames
     x_m: Array  # (F,) of the rear axle on the city's map
@@ -307,6 +309,7 @@ def frame_table(log: LogFrames) -> FrameTable:
         timestamps_us=np.array([frame.timestamp_us for frame in frames], np.int64),
         has_route=np.array([bool(frame.roadblock_ids) for frame in frames]),
         annotated=np.array([frame.boxes is not None for frame in frames]),
+        unreadable=np.array([frame.unreadable for frame in frames]),
         speeds=np.array([np.hypot(*frame.dynamic_state[:2]) for frame in frames], np.float32),
         locations=np.array([frame.map_location for frame in frames]),
         x_m=np.array([frame.pose[0] for frame in frames], np.float64),
@@ -407,6 +410,8 @@ def usable_windows(table: FrameTable, windows: list[int], choice: WindowChoice) 
             dropped[SHORT_FUTURE] += 1
         elif stretch[first] != stretch[stop - 1]:
             dropped[GAP] += 1
+        elif table.unreadable[first:stop].any():
+            dropped[UNREADABLE] += 1
         elif not table.has_route[now]:
             dropped[NO_ROUTE] += 1
         elif not table.annotated[first:stop].all():
