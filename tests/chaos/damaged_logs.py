@@ -33,7 +33,6 @@ from factory.datasets.navsim.log import KIND_OF_NAME
 from factory.datasets.navsim.reader import NavsimReader
 from factory.datasets.scenarionet.reader import KINDS, ScenarioNetReader
 from factory.readers.base import BadClip, ClipReader
-from factory.readers.pickles import load_plain
 from factory.run import main as run
 from factory.store.samples import Store
 from tasks.world.clip import CLIP_STEPS, STEP_S, AgentKind, AgentTracks, Clip
@@ -448,7 +447,7 @@ class NuscenesLog(DamagedLog):
         """Raises OSError."""
         super().__init__()
         self.path = path
-        self.scenario: dict[str, Any] = load_plain(path.read_bytes(), str(path))
+        self.scenario: dict[str, Any] = pickle.loads(path.read_bytes())
         self.sdc = self.scenario["metadata"]["sdc_id"]
         self.times_s = np.asarray(self.scenario["metadata"]["ts"])[: self.scenario["length"]]
         self.times_s = self.times_s - self.times_s[0]
@@ -533,7 +532,7 @@ class NavsimLog(DamagedLog):
         """Raises OSError."""
         super().__init__()
         self.path = path
-        self.frames: list[Any] = load_plain(path.read_bytes(), str(path))
+        self.frames: list[Any] = pickle.loads(path.read_bytes())
         self.times_s = np.array([(f["timestamp"] - self.frames[0]["timestamp"]) / 1e6 for f in self.frames])
 
     def frames_left(self) -> np.ndarray:
@@ -885,7 +884,7 @@ def exported_logs(av2: Path, folder: Path) -> Iterator[Path]:
     city = "us-ma-boston"
     if code := factory(["export", "navsim", f"out={out}", f"to={to}", f"map_location={city}", "missing=none"]):
         raise RuntimeError(f"the export ended with {code}")
-    samples = [load_plain(path.read_bytes(), str(path)) for path in sorted(to.glob("navsim_logs/*/*.pkl"))]
+    samples = [pickle.loads(path.read_bytes()) for path in sorted(to.glob("navsim_logs/*/*.pkl"))]
     for log_folder in sorted(av2.iterdir()):
         name = log_folder.name.replace("-", "_")
         own = sorted((s for s in samples if s[0]["log_name"].startswith(name)), key=lambda s: s[0]["timestamp"])
