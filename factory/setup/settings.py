@@ -298,10 +298,10 @@ def recovery_expert(run: RunContext, **settings: Any) -> RecoveryExpert:
 
 def _recovery_table(run: RunContext, vocabularies: Sequence[str]) -> RecoveryTable:
     """Of all TRAIN windows and the vocabulary files, kept in the user's cache."""
-    reader, index = run.clips()
     named = run.config.vocabulary.file
     files = [*vocabularies, *([named] if named else [])]
-    loaded = [load_vocabulary(file) for file in dict.fromkeys(files)]
+    loaded = [load_vocabulary(file) for file in dict.fromkeys(files)]  # before clips, which may be hours of listing
+    reader, index = run.clips()
     digests = _log_digests(reader, index)
     if digests is None:
         return build_recovery_table([train_windows(reader)], loaded)
