@@ -7,6 +7,7 @@ to the database).
 """
 
 import hashlib
+from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -59,7 +60,15 @@ from tasks.world.clip import CLIP_STEPS, STEP_S, AgentKind, AgentTracks
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY, X, Y, planar_matrices, wrap_angle
 from tasks.world.repair.records import LEFT_OUT, Repair
 from tasks.world.repair.road import lights_on_map
-from tasks.world.repair.tracks import EGO, MOST, UNSEEN, ObservedTracks, clock_repairs, repaired, whole_frames
+from tasks.world.repair.tracks import (
+    EGO,
+    MOST,
+    UNSEEN,
+    ObservedTracks,
+    clock_repairs,
+    repaired,
+    whole_frames,
+)
 from tasks.world.road_map import TrafficLights
 
 # ScenarioNet's tracks as 10 Hz arrays: a smooth ego at its rear axle, agents with velocities derived again.
@@ -149,7 +158,8 @@ KINDS = {
     **dict.fromkeys(("TRAFFIC_OBJECT", "OTHER", "UNSET"), AgentKind.GENERIC_OBJECT),
 }
 KEYFRAME_STEPS = 5
-MAX_GAP_S = 0.55  # between two frames; longer ones cannot be filled in
+MAX_GAP_S = 0.55  # between two frames; longer ones cannot be filled in, no clip reaches across them
+LONGEST_GAP_S = 600.0  # of one drive
 SLOPE_STEPS = 5  # +-0.55 s holds five steps to each side
 STANDING_MPS = 0.1
 FIT_STEPS = 7  # +-0.3 s
@@ -190,31 +200,67 @@ class LoggedTrack:
         """(3,) median over the valid frames; NaN where none is stored."""
         return np.median(self.sizes[self.valid], axis=0) if self.valid.any() else np.full(3, np.nan)
 
+    def at_frames(self, rows: Ints) -> "LoggedTrack":
+        """The same at some of its frames."""
+        return LoggedTrack(self.position[rows], self.heading[rows], self.valid[rows], self.sizes[rows])
 
-def frame_times(metadata: Mapping[str, Any], n_frames: int, file: str) -> Array:
-    """(T,) seconds since the first frame. Raises BadClip for missing, non-monotonic or too sparse times."""
+
+@dataclass(frozen=True)
+class Frames:
+    """The T frames of a log whose stamps are in order, and the S steps of 0.1 s among them."""
+
+    rows: Ints  # (T,) their numbers in the file
+    times_s: Array  # (T,) increasing since the first
+    at: Array  # (S,) fractional index of the frame at each step; whole where the log runs at 10 Hz within 1 ms
+    known: Bools  # (S,) whether the frames around a step are near enough to each other to tell what is in between
+    repairs: tuple[Repair, ...]
+
+
+def frames_of(metadata: Mapping[str, Any], n_frames: int, file: str) -> Frames:
+    """The clock of a log. Raises BadClip for missing, too sparse and mostly unordered stamps."""
     if "ts" not in metadata:
         raise BadClip(file, "metadata.ts", "missing")
-    stored = np.asarray(metadata["ts"]).reshape(-1)
+    stored = as_floats(metadata["ts"], file, "metadata.ts").reshape(-1)
     if len(stored) == n_frames + 1:  # nuScenes' converter counts with arange(0, end, 0.1): rounding may add one
         stored = stored[:-1]
-    times = _numbers(stored, (n_frames,), file, "metadata.ts")
-    steps = np.diff(times)
-    if not np.isfinite(times).all() or (steps <= 0.0).any():
-        raise BadClip(file, "metadata.ts", "time is not finite and strictly increasing")
-    if sign := stamps_sign(times, "s"):
+    stamps = _numbers(stored, (n_frames,), file, "metadata.ts").copy()
+    twice = np.flatnonzero(np.diff(stamps) == 0.0)
+    stamps[[*twice, *(twice + 1)]] = np.nan  # nothing tells which of the two it is of
+    rows = _longest_increasing(stamps)
+    if len(rows) <= MOST * n_frames:
+        raise BadClip(file, "metadata.ts", "time is not finite and increasing in most of the frames")
+    if sign := stamps_sign(stamps[rows], "s"):
         raise BadClip(file, "metadata.ts", sign)
-    if n_frames < 2 or steps.max() > MAX_GAP_S:
+    times_s = stamps[rows] - stamps[rows[0]]
+    apart = np.diff(times_s)
+    if not len(apart) or np.median(apart) > MAX_GAP_S:
         raise BadClip(file, "metadata.ts", f"frames further apart than {MAX_GAP_S} s cannot be resampled to 10 Hz")
-    return times - times[0]
+    if apart.max() > LONGEST_GAP_S:
+        raise BadClip(file, "metadata.ts", f"no frame for {apart.max():,.0f} s: one log is one drive, split it there")
+    unordered = (
+        Repair("clock", f"frame {k}", float(np.interp(k, rows, times_s)), f"stamped {stored[k]:g} s", LEFT_OUT)
+        for k in np.setdiff1d(np.arange(n_frames), rows).tolist()
+    )
+    at = np.arange(len(rows), dtype=np.float64)
+    if np.abs(times_s - STEP_S * at).max() >= 1e-3:
+        at = np.interp(STEP_S * np.arange(int(np.floor(times_s[-1] / STEP_S + 1e-6)) + 1), times_s, at)
+    before = np.minimum(at.astype(int), len(apart) - 1)
+    known = (at == np.floor(at)) | (apart[before] <= MAX_GAP_S)
+    return Frames(rows, times_s, at, known, (*clock_repairs(times_s), *unordered))
 
 
-def fractional_frame_indices(times: Array) -> Array:
-    """(S,) fractional frame index of every 0.1 s step; whole numbers where the log runs at 10 Hz within 1 ms."""
-    if np.abs(times - STEP_S * np.arange(len(times))).max() < 1e-3:
-        return np.arange(len(times), dtype=np.float64)
-    steps = STEP_S * np.arange(int(np.floor(times[-1] / STEP_S + 1e-6)) + 1)
-    return np.interp(steps, times, np.arange(len(times)))
+def _longest_increasing(stamps: Array) -> Ints:
+    """Indices of the most stamps that increase strictly, of finite ones."""
+    ends, last, before = list[float](), list[int](), dict[int, int]()  # smallest end of a run of each length
+    for k in np.flatnonzero(np.isfinite(stamps)).tolist():
+        length = bisect_left(ends, stamps[k])
+        before[k] = last[length - 1] if length else -1
+        ends[length : length + 1], last[length : length + 1] = [float(stamps[k])], [k]
+    chosen, k = list[int](), last[-1] if last else -1
+    while k >= 0:
+        chosen.append(k)
+        k = before[k]
+    return np.array(chosen[::-1], int)
 
 
 def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, file: str) -> LoggedTrack:
@@ -240,19 +286,19 @@ def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, fi
     return LoggedTrack(position, heading, valid, sizes)
 
 
-def ground_height(ego: LoggedTrack, at: Array, file: str) -> Array:
+def ground_height(ego: LoggedTrack, frames: Frames, file: str) -> Array:
     """(S,) height of the road under the ego: below Waymo's box centre; 0 where the file keeps the ego at z = 0."""
     if not ego.position[ego.valid, 2].any():
-        return np.zeros(len(at))
+        return np.zeros(len(frames.at))
     if not np.isfinite(ego.size[2]):
         raise BadClip(file, "tracks[sdc].state.height", "missing, and the ego is not at z = 0")
-    return resampled(ego, at)[0][:, 2] - ego.size[2] / 2.0
+    return resampled(ego, frames)[0][:, 2] - ego.size[2] / 2.0
 
 
 def observed_agents(
-    tracks: Mapping[Any, Any], sdc_id: str, times_s: Array, file: str
+    tracks: Mapping[Any, Any], sdc_id: str, n_frames: int, frames: Frames, file: str
 ) -> tuple[ObservedTracks, tuple[Repair, ...]]:
-    """All tracks but the ego at the log's frames (T,); those that name no id, no class or no states are left out.
+    """All tracks but the ego at the log's T frames; those that name no id, no class or no states are left out.
 
     Raises BadClip where that is most of them.
     """
@@ -272,7 +318,7 @@ def observed_agents(
                 raise BadClip(file, f"tracks[{name}]", "stands twice, as a text and as a number")
             if not isinstance(kind, str) or kind not in KINDS:
                 raise BadClip(file, f"tracks[{name}].type", f"unknown class {shown(kind)}")
-            track = read_track(tracks, track_id, len(times_s), file)
+            track = read_track(tracks, track_id, n_frames, file).at_frames(frames.rows)
         except BadClip as error:
             what = "class" if error.field.endswith(".type") else "impossible"
             what = "token" if name is None else "twice" if name in names else what
@@ -284,24 +330,24 @@ def observed_agents(
             found.append((name, KINDS[kind], track))
     if len(wrong) > MOST * max(len(tracks) - 1, 1):
         raise wrong[0]
-    boxes = np.zeros((len(times_s), len(found), 9))
+    boxes = np.zeros((len(frames.rows), len(found), 9))
     rows = np.full(boxes.shape[:2], UNSEEN)
     for n, (_, _, track) in enumerate(found):
         boxes[:, n, :3], boxes[:, n, 3], boxes[:, n, 4:7] = track.position, track.heading, track.sizes
         rows[track.valid, n] = n
     ids, kinds = tuple(name for name, _, _ in found), tuple(kind for _, kind, _ in found)
-    return ObservedTracks(times_s, ids, kinds, boxes, rows), tuple(done)
+    return ObservedTracks(frames.times_s, ids, kinds, boxes, rows), tuple(done)
 
 
-def agent_tracks(seen: ObservedTracks, at: Array, ground: Array) -> AgentTracks:
-    """Tracks at the fractional frames `at` (S,), heights above `ground` (S,)."""
-    valid = np.zeros((len(at), len(seen)), bool)
+def agent_tracks(seen: ObservedTracks, frames: Frames, ground: Array) -> AgentTracks:
+    """Tracks at the steps (S,), heights above `ground` (S,)."""
+    valid = np.zeros((len(frames.at), len(seen)), bool)
     boxes, z = np.full((*valid.shape, 5), np.nan), np.full(valid.shape, np.nan)
     heights = np.zeros(len(seen))
     for n in range(len(seen)):
         box = seen.boxes[:, n]
         track = LoggedTrack(box[:, :3], box[:, 3], seen.seen[:, n], box[:, 4:7])
-        position, heading, here = resampled(track, at)
+        position, heading, here = resampled(track, frames)
         flat = not track.position[track.valid, 2].any()  # nuPlan stores no height: the box stands on the ground
         valid[:, n] = here
         boxes[here, n, :2], boxes[here, n, 2] = position[here, :2], heading[here]
@@ -319,15 +365,15 @@ def agent_tracks(seen: ObservedTracks, at: Array, ground: Array) -> AgentTracks:
     )
 
 
-def resampled(track: LoggedTrack, at: Array) -> tuple[Array, Array, Bools]:
-    """(S, 3) position, (S,) heading in [-pi, pi), (S,) valid: both frames around the fractional one must be."""
-    before = np.floor(at).astype(int)
+def resampled(track: LoggedTrack, frames: Frames) -> tuple[Array, Array, Bools]:
+    """(S, 3) position, (S,) heading in [-pi, pi), (S,) valid: both frames around a step must be, and near it."""
+    before = np.floor(frames.at).astype(int)
     after = np.minimum(before + 1, len(track.valid) - 1)
-    share = at - before
+    share = frames.at - before
     after = np.where(share > 0.0, after, before)
     position = track.position[before] + share[:, None] * (track.position[after] - track.position[before])
     heading = track.heading[before] + share * wrap_angle(track.heading[after] - track.heading[before])
-    return position, wrap_angle(heading), track.valid[before] & track.valid[after]
+    return position, wrap_angle(heading), track.valid[before] & track.valid[after] & frames.known
 
 
 def fitted_velocities(xy: Array, valid: Bools) -> Array:
@@ -357,16 +403,16 @@ def fitted_velocities(xy: Array, valid: Bools) -> Array:
     return slope
 
 
-def ego_segments(track: LoggedTrack, source: Source, at: Array) -> tuple[Array, Ints]:
+def ego_segments(track: LoggedTrack, source: Source, frames: Frames) -> tuple[Array, Ints]:
     """Ego states (S, 11), and (S,) the number of the continuous drive that a step belongs to; NaN and -1: none.
 
     Columns 7..10 (steering and rates) are 0, as NAVSIM initialises an ego.
     """
-    position, heading, valid = resampled(track, at)
+    position, heading, valid = resampled(track, frames)
     xy = position[:, :2]
     if source.can_bus and len(xy) > 1 and _keyframe_weights(xy).all():
         xy, heading, valid = on_log_clock(xy, heading, valid)
-    states, segment = np.full((len(at), EGO_STATE_SIZE), np.nan), np.full(len(at), -1, np.int64)
+    states, segment = np.full((len(xy), EGO_STATE_SIZE), np.nan), np.full(len(xy), -1, np.int64)
     broken = jumps(xy) | ~valid[1:] | ~valid[:-1]
     runs = pairwise([0, *(np.flatnonzero(broken) + 1).tolist(), len(xy)])
     long_enough = [(a, b) for a, b in runs if b - a >= FIT_STEPS and valid[a:b].all()]
@@ -647,18 +693,17 @@ def read_motion(scenario: Mapping[str, Any], file: str) -> LoggedDrive:
     named = id_text(sdc_id)
     if named is None or sdc_id not in tracks:
         raise BadClip(file, "metadata.sdc_id", f"missing, or names no track: {shown(sdc_id)}")
-    times_s = frame_times(scenario["metadata"], n_frames, file)
-    at = fractional_frame_indices(times_s)
-    ego, of_ego = whole_ego(read_track(tracks, sdc_id, n_frames, file), times_s, file)
-    states, segment = ego_segments(ego, source, at)
-    ground = ground_height(ego, at, file)
-    seen, left_out = observed_agents(tracks, named, times_s, file)
+    frames = frames_of(scenario["metadata"], n_frames, file)
+    ego, of_ego = whole_ego(read_track(tracks, sdc_id, n_frames, file).at_frames(frames.rows), frames.times_s, file)
+    states, segment = ego_segments(ego, source, frames)
+    ground = ground_height(ego, frames, file)
+    seen, left_out = observed_agents(tracks, named, n_frames, frames, file)
     poses = np.column_stack([ego.position[:, :2], ego.heading])
     poses[:, :2] -= source.origin_to_rear_axle_m * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
     poses[~ego.valid] = np.nan
     seen, repairs = repaired(seen, poses)
-    repairs = (*clock_repairs(times_s), *of_ego, *left_out, *repairs)
-    return LoggedDrive(states, agent_tracks(seen, at, ground), segment, repairs=repairs)
+    repairs = (*frames.repairs, *of_ego, *left_out, *repairs)
+    return LoggedDrive(states, agent_tracks(seen, frames, ground), segment, repairs=repairs)
 
 
 def whole_ego(ego: LoggedTrack, times_s: Array, file: str) -> tuple[LoggedTrack, tuple[Repair, ...]]:
@@ -698,7 +743,7 @@ def read_log(path: Path) -> ScenarioLog:
     lanes, map_repairs = road_map(scenario["map_features"], every_light.lane_ids, name, location, file)
     lights, light_repairs = lights_on_map(every_light, lanes.lanes)
     route = route_of_drive(lanes, motion.ego_states[motion.segment >= 0, :3], file, "map_features")
-    frames = np.floor(fractional_frame_indices(frame_times(metadata, n_frames, file)) + 1e-9).astype(int)
+    frames = frames_of(metadata, n_frames, file)
     return ScenarioLog(
         file=file,
         motion=motion,
@@ -706,7 +751,7 @@ def read_log(path: Path) -> ScenarioLog:
         agents=motion.agents,
         road_map=lanes,
         route=route,
-        lights=TrafficLights(lights.lane_ids, lights.states[frames]),
+        lights=TrafficLights(lights.lane_ids, lights.states[frames.rows[(frames.at + 1e-9).astype(int)]]),
         licence=source.licence,
         content_digest=digest,
         split=folder_split(path) or nuscenes_split(path.stem) or waymo_split(metadata.get("source_file")),

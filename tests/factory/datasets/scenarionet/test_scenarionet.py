@@ -8,6 +8,7 @@ from shapely.geometry import Point, Polygon
 from factory.datasets.scenarionet.map import pieces
 from factory.datasets.scenarionet.reader import (
     SLOPE_STEPS,
+    Frames,
     LoggedTrack,
     ScenarioNetReader,
     fitted_velocities,
@@ -246,6 +247,29 @@ def test_frames_where_the_ego_is_invalid_are_filled_up_to_half_a_second_and_else
     np.testing.assert_allclose(told[here], whole[here], atol=1e-3)
 
 
+def test_a_gap_in_a_log_costs_the_windows_across_it_and_no_others(tmp_path):
+    """Frames 120 to 139 of 300 are gone: 2.1 s without any, with 12 s before and 16 s behind them."""
+    left = np.setdiff1d(np.arange(300), np.arange(120, 140))
+    scenario = town.waymo(300)
+    scenario["length"], scenario["metadata"]["ts"] = len(left), scenario["metadata"]["ts"][left]
+    for track in scenario["tracks"].values():
+        track["state"] = {name: values[left] for name, values in track["state"].items()}
+    for light in scenario["dynamic_map_states"].values():
+        light["state"]["object_state"] = [light["state"]["object_state"][k] for k in left]
+    broken, whole = (
+        ScenarioNetReader(town.save(s, tmp_path / name))
+        for s, name in ((scenario, "broken"), (town.waymo(300), "whole"))
+    )
+    index = broken.index()
+    apart = [ref for ref in whole.index().refs if ref.start_ms + 9500 < 12000 or ref.start_ms >= 14000]
+    assert index.refs == tuple(apart) and len(apart) == 10 and index.dropped == {"broken_tracks": 11}
+    for ref in apart:
+        clip, same = broken.read(ref), whole.read(ref)
+        np.testing.assert_allclose(clip.ego_states, same.ego_states, atol=1e-3)
+        np.testing.assert_allclose(clip.agents.boxes, same.agents.boxes, atol=1e-9)
+        assert (clip.lights.states == same.lights.states).all()
+
+
 def test_an_ego_that_stands_and_a_log_too_short_are_counted(tmp_path):
     ego = np.tile([30.0, town.EGO_Y], (town.N_FRAMES, 1))
     town.save(town.nuscenes(ego=ego), tmp_path, "sd_a.pkl")
@@ -272,7 +296,8 @@ def test_between_two_frames_a_track_turns_the_short_way_round() -> None:
     positions = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     headings = np.array([np.pi - 0.1, -np.pi + 0.1])
     track = LoggedTrack(positions, headings, np.ones(2, bool), np.ones(3))
-    position, heading, valid = resampled(track, np.array([0.0, 0.25, 0.5]))
+    frames = Frames(np.arange(2), np.array([0.0, 0.4]), np.array([0.0, 0.25, 0.5]), np.ones(3, bool), ())
+    position, heading, valid = resampled(track, frames)
     np.testing.assert_allclose(position[:, 0], [0.0, 0.5, 1.0])
     np.testing.assert_allclose(heading, [np.pi - 0.1, np.pi - 0.05, -np.pi], atol=1e-12)
     assert valid.all()

@@ -43,7 +43,14 @@ def at(track_id, name, frames, value):
 
 
 def backwards(scenario):
-    scenario["metadata"]["ts"][50] = 0.0
+    scenario["metadata"]["ts"] = scenario["metadata"]["ts"][::-1]
+
+
+def stamped(value, frame=50):
+    def change(scenario):
+        scenario["metadata"]["ts"][frame] = value
+
+    return change
 
 
 BREAKS = {
@@ -54,7 +61,8 @@ BREAKS = {
     "metadata.ts: missing": without("metadata", "ts"),
     "metadata.sdc_id: missing": without("metadata", "sdc_id"),
     "metadata.dataset: 'pg' is not supported": with_value("pg", "metadata", "dataset"),
-    "metadata.ts: time is not finite and strictly increasing": backwards,
+    "metadata.ts: time is not finite and increasing in most of the frames": backwards,
+    "metadata.ts: no frame for 9,988 s": stamped(1e4, 120),
     "metadata.ts: frames further apart": with_value(np.arange(121.0), "metadata", "ts"),
     r"tracks\[ego\].state.position: missing": without("tracks", "ego", "state", "position"),
 }
@@ -111,6 +119,7 @@ def again(name, of, forward_m=0.0):
     return change
 
 
+WITHOUT_FRAME_50 = [("clock", "frame 50", True), ("gap", "", False)]
 # what is wrong -> the things that it costs, and (pass, thing, whether it is left out) of what is told
 REPAIRS = {
     "NaN pose": (at("ego", "position", 40, np.nan), (), [("gap", "ego", False), ("impossible", "ego", True)]),
@@ -136,6 +145,14 @@ REPAIRS = {
     "car listed twice": (again("zwei", "lead", 0.2), (), [("twice", "zwei", True)]),
     "one id as text and number": (lambda s: [again("5", "rider")(s), again(5, "lead")(s)], (), None),
     "heading turned round": (at("lead", "heading", 40, np.pi), (), [("heading", "lead", False)]),
+    "a stamp of long ago": (stamped(0.0), (), WITHOUT_FRAME_50),
+    "a stamp of later": (stamped(1e6), (), WITHOUT_FRAME_50),
+    "no stamp": (stamped(np.nan), (), WITHOUT_FRAME_50),
+    "a stamp twice": (
+        lambda s: stamped(s["metadata"]["ts"][49])(s),
+        (),
+        [("clock", "frame 49", True), *WITHOUT_FRAME_50],
+    ),
 }
 
 
