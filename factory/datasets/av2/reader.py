@@ -35,7 +35,7 @@ from factory.readers.signs import stamps_sign
 from tasks.world.arrays import Array, Bools, Indices, Ints
 from tasks.world.clip import MOVING_KINDS, STEP_S, AgentKind, AgentTracks, Camera, SensorFile
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, X, Y, wrap_angle
-from tasks.world.repair.records import Repair
+from tasks.world.repair.records import LEFT_OUT, Repair
 from tasks.world.repair.road import (
     LaneSides,
     crossing_between,
@@ -172,16 +172,17 @@ def read_motion(folder: Path) -> LogMotion:
     """Poses and annotations of the log in `folder`. Raises BadClip."""
     path, pose_path = folder / ANNOTATIONS, folder / POSES
     boxes = read_feather(path, ("timestamp_ns", "track_uuid", "category", *SIZE_COLUMNS, *POSE_COLUMNS), whole=False)
-    box_stamps = stamps(path, boxes)
-    start_ns = int(box_stamps.min())
     poses = read_feather(pose_path, ("timestamp_ns", *POSE_COLUMNS), whole=False)
-    pose_stamps = stamps(pose_path, poses)
+    pose_stamps, box_stamps = stamps(pose_path, poses), stamps(path, boxes)
+    posed, stray_repairs = posed_frames(box_stamps, pose_stamps, SAME_FRAME_S)
+    if posed.sum() <= MOST * len(posed):
+        raise BadClip(str(pose_path), "timestamp_ns", "the poses do not span the annotated frames")
+    boxes, box_stamps = {name: column[posed] for name, column in boxes.items()}, box_stamps[posed]
+    start_ns = int(box_stamps.min())
     frame_times = seconds_since(start_ns, np.unique(box_stamps))
     pose_times, pose_values, ego_repairs = whole_poses(
         pose_path, seconds_since(start_ns, pose_stamps), numbers(pose_path, poses, POSE_COLUMNS)
     )
-    if pose_times[0] > SAME_FRAME_S or pose_times[-1] < frame_times[-1] - SAME_FRAME_S:
-        raise BadClip(str(pose_path), "timestamp_ns", "the poses do not span the annotated frames")
     city_from_ego = rotations(pose_path, pose_values)
     tracks, repairs = _tracks(
         path, boxes, seconds_since(start_ns, box_stamps), frame_times, pose_times, pose_values[:, 4:], city_from_ego
@@ -195,8 +196,22 @@ def read_motion(folder: Path) -> LogMotion:
         rotations=city_from_ego,
         yaws=np.unwrap(yaw_of(city_from_ego)),
         tracks=tracks,
-        repairs=(*clock_repairs(frame_times), *ego_repairs, *repairs),
+        repairs=(*clock_repairs(frame_times), *stray_repairs, *ego_repairs, *repairs),
     )
+
+
+def posed_frames(frame_stamps: Ints, pose_stamps: Ints, before_s: float) -> tuple[Bools, tuple[Repair, ...]]:
+    """(F,) which frames [ns] are at most before_s before the first of the ego's poses, or a frame behind the last.
+
+    What is stamped farther than MAX_LOG_S from most poses is of no drive.
+    """
+    near = np.abs(pose_stamps - np.median(pose_stamps)) <= MAX_LOG_S * 1e9
+    first, last = pose_stamps[near].min(), pose_stamps[near].max()
+    posed = (frame_stamps >= first - before_s * 1e9) & (frame_stamps <= last + SAME_FRAME_S * 1e9)
+    if posed.all():
+        return posed, ()
+    was = f"{len(np.unique(frame_stamps[~posed]))} frames at which the ego has no pose"
+    return posed, (Repair("clock", "", np.nan, was, LEFT_OUT),)
 
 
 def whole_poses(path: Path, times_s: Array, poses: Array) -> tuple[Array, Array, tuple[Repair, ...]]:
@@ -205,10 +220,16 @@ def whole_poses(path: Path, times_s: Array, poses: Array) -> tuple[Array, Array,
     Raises BadClip where most of them cannot be.
     """
     done: list[Repair] = []
+    near = np.abs(times_s - np.median(times_s)) <= MAX_LOG_S
+    if not near.all():
+        was = f"{(~near).sum()} poses stamped over a day from the others"
+        done.append(Repair("clock", EGO, np.nan, was, LEFT_OUT))
+        times_s, poses = times_s[near], poses[near]
     if (np.diff(times_s) < 0.0).any():
         late = times_s < np.maximum.accumulate(times_s)
         was = f"{late.sum()} poses out of order"
-        done.append(Repair("clock", EGO, float(times_s[late][0]), was, "by their stamps"))
+        first, last = float(times_s[late].min()), float(times_s[late].max())
+        done.append(Repair("clock", EGO, first, was, "by their stamps", last))
         order = np.argsort(times_s, kind="stable")
         times_s, poses = times_s[order], poses[order]
     keep = distinct_time_indices(times_s)

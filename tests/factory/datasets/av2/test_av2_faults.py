@@ -39,22 +39,24 @@ def stretch(lanes: Iterable[dict], to: float = 4e7) -> None:
         lane["left_lane_boundary"][-1]["x"] = to
 
 
-def years_later(columns: dict[str, list]) -> None:
-    last = max(columns["timestamp_ns"])
-    columns["timestamp_ns"] = [stamp + 10**17 * (stamp == last) for stamp in columns["timestamp_ns"]]
+def last_later(by_s: int) -> Callable[[dict[str, list]], None]:
+    def change(columns: dict[str, list]) -> None:
+        last = max(columns["timestamp_ns"])
+        columns["timestamp_ns"] = [stamp + by_s * 10**9 * (stamp == last) for stamp in columns["timestamp_ns"]]
+
+    return change
+
+
+def two_days(columns: dict[str, list]) -> None:
+    first = min(columns["timestamp_ns"])
+    last_later(80_000)(columns)
+    columns["timestamp_ns"] = [stamp - 80_000 * 10**9 * (stamp == first) for stamp in columns["timestamp_ns"]]
 
 
 POSES, BOXES = "city_SE3_egovehicle.feather", "annotations.feather"
 BROKEN = {
     "missing poses": (lambda log: (log / "city_SE3_egovehicle.feather").unlink(), "city_SE3_egovehicle.feather: file"),
     "truncated feather": (lambda log: cut_short(log / "annotations.feather"), "annotations.feather: file"),
-    "poses end early": (
-        lambda log: edit(
-            log / "city_SE3_egovehicle.feather",
-            lambda table: [column.__delitem__(slice(900, None)) for column in table.values()],
-        ),
-        "city_SE3_egovehicle.feather: timestamp_ns",
-    ),
     "most poses NaN": (
         lambda log: edit(
             log / "city_SE3_egovehicle.feather",
@@ -84,10 +86,7 @@ BROKEN = {
         lambda log: edit_map(log, lambda content: stretch(content["lane_segments"].values(), 10**400)),
         "left_lane_boundary: not a list of x, y, z points",
     ),
-    "stamps of years": (
-        lambda log: [edit(log / name, years_later) for name in ("annotations.feather", "city_SE3_egovehicle.feather")],
-        "timestamps: a log of",
-    ),
+    "stamps of two days": (lambda log: [edit(log / name, two_days) for name in (BOXES, POSES)], "timestamps: a log of"),
     "empty map": (lambda log: edit_map(log, lambda content: content["lane_segments"].clear()), "lane_segments"),
     "bicycle lanes only": (
         lambda log: edit_map(
@@ -165,7 +164,7 @@ def the_ego(columns: dict[str, list]) -> None:
         values += ["me"] * 117 if name == "track_uuid" else [1.4] * 117 if name == "tx_m" else again
 
 
-# what is wrong -> its file, what is changed there, and (pass, thing, time) of what is told
+# what is wrong -> its file, what is changed there, and (pass, thing, time, None: of the whole log) of what is told
 REPAIRED = {
     "NaN pose": (POSES, set_value("tx_m", 7, float("nan")), [("impossible", "ego", 0.07)]),
     "NaN pose at a frame": (POSES, set_value("tx_m", 300, float("nan")), [("impossible", "ego", 3.0)]),
@@ -173,6 +172,7 @@ REPAIRED = {
     "pose that is null": (POSES, set_value("tz_m", 300, None), [("impossible", "ego", 3.0)]),
     "time runs backwards": (POSES, set_value("timestamp_ns", 9, START_NS), [("clock", "ego", 0.0)]),
     "poses in another order": (POSES, swap, [("clock", "ego", 3.0)]),
+    "a pose of long ago": (POSES, set_value("timestamp_ns", 300, 0), [("clock", "ego", None)]),
     "no rotation": (POSES, set_value("qw", 3, 0.0), [("impossible", "ego", 0.03)]),
     "no rotation at a frame": (POSES, set_value("qw", 500, 0.0), [("impossible", "ego", 5.0)]),
     "unknown class": (BOXES, set_value("category", 5, "DRAGON"), [("class", "car", 0.5)]),
@@ -193,6 +193,40 @@ REPAIRED = {
 }
 
 
+# what is wrong -> its file, what is changed there, windows that are left of three, what is told
+OUTSIDE = {
+    "poses end early": (
+        POSES,
+        lambda columns: [column.__delitem__(slice(1100, None)) for column in columns.values()],
+        2,
+        "6 frames at which the ego has no pose",
+    ),
+    "a box of long ago": (BOXES, set_value("timestamp_ns", 5, 0), 3, "1 frames at which the ego has no pose"),
+    "a frame of years later": (BOXES, last_later(10**8), 3, "1 frames at which the ego has no pose"),
+    "a pose of years later": (POSES, last_later(10**8), 3, "1 poses stamped over a day from the others"),
+}
+
+
+@pytest.mark.parametrize("fault", OUTSIDE)
+def test_what_is_stamped_outside_the_drive_is_left_out_and_told_and_costs_no_other_window(
+    tmp_path: Path, fault: str
+) -> None:
+    file, change, left, told = OUTSIDE[fault]
+    edit(write_log(tmp_path / "spoiled" / "log") / file, change)
+    write_log(tmp_path / "sound" / "log")
+    reader, whole = (AV2Reader(tmp_path / name) for name in ("spoiled", "sound"))
+    index = reader.index()
+    assert index.refs == whole.index().refs[:left] and not index.broken and not index.dropped
+    for ref in index.refs:
+        found, sound = reader.read(ref), whole.read(ref)
+        assert told in {repair.was for repair in found.repairs}
+        assert found.agents.track_ids == sound.agents.track_ids
+        np.testing.assert_array_equal(found.ego_states, sound.ego_states)
+        here = found.agents.valid
+        assert (~here).sum() == (fault == "a box of long ago" and ref.start_ms == 0)
+        np.testing.assert_array_equal(found.agents.boxes[here], sound.agents.boxes[here])
+
+
 @pytest.mark.parametrize("fault", REPAIRED)
 def test_a_fault_of_one_thing_is_put_right_or_left_out_and_told_and_nothing_else_changes(
     tmp_path: Path, fault: str
@@ -202,7 +236,8 @@ def test_a_fault_of_one_thing_is_put_right_or_left_out_and_told_and_nothing_else
     spoiled = write_log(tmp_path / "spoiled" / "log")
     edit(spoiled / file, change)
     found, sound = read_log(spoiled), read_log(write_log(tmp_path / "sound" / "log"))
-    assert [(r.what, r.thing, round(r.time_s, 9)) for r in found.repairs] == told
+    at = (None if np.isnan(r.time_s) else round(r.time_s, 9) for r in found.repairs)
+    assert [(r.what, r.thing, t) for r, t in zip(found.repairs, at)] == told
     assert found.agents.track_ids == sound.agents.track_ids
     assert found.agents.kinds == sound.agents.kinds
     assert found.agents.valid.all()
