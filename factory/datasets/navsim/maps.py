@@ -169,6 +169,11 @@ def _table(path: Path, layer: str, target: str) -> LayerTable:
             columns[name] = numbers.astype(np.int64)
         else:
             columns[name] = numbers
+    if layer == "crosswalks" and wkb is not None:  # which no other layer names and no metric looks at
+        whole = shapely.area(shapely.make_valid(shapely.from_wkb(wkb))) > 0.0  # the area of no shape is NaN
+        for fid in fids[~whole]:
+            log.warning("%s: layer %s, fid %d: encloses no area, left out", path, layer, fid)
+        fids, wkb, columns = fids[whole], wkb[whole], {name: column[whole] for name, column in columns.items()}
     shapes = _projected(path, layer, meta["crs"], target, fids, wkb)
     if "was_m2" in MADE.get(layer, ()):
         shapes, columns["was_m2"] = _ordered(shapes)

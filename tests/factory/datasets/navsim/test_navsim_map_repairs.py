@@ -45,6 +45,19 @@ def test_a_crossing_in_another_order_is_the_square_and_told_from_the_kept_tables
         assert "12.0 m2" in repair.was and "24.0 m2" in repair.now
 
 
+def test_crossings_that_enclose_nothing_are_left_out_and_the_city_is_read(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    shapes = [shapely.Polygon(SQUARE[[0, 1, 0]]), shapely.Polygon(SQUARE), shapely.Polygon()]
+    version, zone = CITIES[CITY]
+    crossings = [{"fid": 7 + k, "shape": shape, "is_marked": 1} for k, shape in enumerate(shapes)]
+    rows = stub_rows() | {"crosswalks": crossings}
+    write_geopackage(tmp_path / "maps" / CITY / version / "map.gpkg", rows, zone)
+    (ring,) = read(tmp_path, []).road_map.crossings
+    assert shapely.Polygon(ring).area == pytest.approx(24.0, abs=1e-3)
+    assert [fid for fid in (7, 8, 9) if f"layer crosswalks, fid {fid}: encloses no area" in caplog.text] == [7, 9]
+
+
 def test_a_light_of_no_lane_of_the_city_is_left_out_and_told(tmp_path: Path) -> None:
     write_city(tmp_path)
     assert read(tmp_path, [(3, True)]).repairs == ()
