@@ -10,7 +10,6 @@ from functools import cached_property, wraps
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.spatial import cKDTree
 
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import STEP_S, AgentKind
@@ -44,6 +43,7 @@ TOP_SPEED_MPS = {  # nobody in traffic is faster; 10 m/s is a sprinter
 }
 LARGEST_ACCEL_MPS2 = 10.0
 NOISE_M = 2.5  # from one frame to the next: boxes are corrected as more of a thing comes into view
+AT_ONCE = 1 << 18  # pairs of boxes that are looked at in one go
 ONE_PLACE = 0.5  # of what two boxes cover together both cover: two things cannot, but one listed twice
 
 
@@ -88,34 +88,35 @@ def observed(
     (None) and what has the id of another box of its frame.
     """
     done: list[Repair] = []
-    in_time = np.argsort(times_s, kind="stable").tolist()
+    in_time = np.argsort(times_s, kind="stable")
+    rows_ids_kinds = [(row, ids[row], kinds[row]) for row in in_time.tolist()]
+    kind_of = {name: kind for _, name, kind in reversed(rows_ids_kinds) if name is not None and kind is not None}
     frame_of = np.searchsorted(frame_times_s, times_s)
-    kind_of: dict[str | None, AgentKind] = {}
     unnamed = set[int]()
-    for row in in_time:
-        if ids[row] is None:
+    for row, name, _ in rows_ids_kinds:
+        if name is None:
             done.append(Repair("token", f"box {row}", float(times_s[row]), "no id", LEFT_OUT))
             unnamed.add(int(frame_of[row]))
-        elif (kind := kinds[row]) is not None:
-            kind_of.setdefault(ids[row], kind)
-    for row in in_time:
-        if kinds[row] is None and (name := ids[row]) is not None:
+    for row, name, kind in rows_ids_kinds:
+        if kind is None and name is not None:
             now = kind_of[name].lower() if name in kind_of else LEFT_OUT
             done.append(Repair("class", name, float(times_s[row]), "of no known class", now))
-    known = np.array([row for row in in_time if ids[row] in kind_of], int)
-    names, column = np.unique([str(ids[row]) for row in known], return_inverse=True)
+    names = sorted(kind_of)
+    column_of = {name: column for column, name in enumerate(names)}
+    column = np.array([-1 if name is None else column_of.get(name, -1) for _, name, _ in rows_ids_kinds], int)
+    known, column = in_time[column >= 0], column[column >= 0]
     placed, at = np.unique(frame_of[known] * len(names) + column, return_index=True)
     for k in np.setdiff1d(np.arange(len(known)), at).tolist():
         time_s = float(times_s[known[k]])
-        done.append(Repair("twice", str(names[column[k]]), time_s, "two boxes of one frame", "the first of them"))
+        done.append(Repair("twice", names[column[k]], time_s, "two boxes of one frame", "the first of them"))
         unnamed.add(int(frame_of[known[k]]))
     rows = np.full((len(frame_times_s), len(names)), UNSEEN)
     of_things = np.zeros((*rows.shape, 9))
     rows.ravel()[placed], of_things.reshape(-1, 9)[placed] = known[at], boxes[known[at]]
     for frame in unnamed:  # what is missing there may be what lost its name, and is put between its neighbours
         rows[frame, rows[frame] == UNSEEN] = TAKEN_OUT
-    of_kinds = tuple(kind_of[name] for name in names.tolist())
-    return ObservedTracks(frame_times_s, tuple(names.tolist()), of_kinds, of_things, rows), tuple(done)
+    of_kinds = tuple(kind_of[name] for name in names)
+    return ObservedTracks(frame_times_s, tuple(names), of_kinds, of_things, rows), tuple(done)
 
 
 Pass = Callable[[ObservedTracks, Array], tuple[ObservedTracks, Repairs]]
@@ -177,13 +178,16 @@ def without_impossible_values(tracks: ObservedTracks, _: Array) -> tuple[Observe
 def with_jumps_apart(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, Repairs]:
     """An identity that jumps is two things; a frame or two that lie elsewhere, and speeds that nothing has, go."""
     done: list[Repair] = []
-    for n in range(len(tracks)):
+    steps = _steps(tracks)
+    for n in np.flatnonzero(~_even(tracks, steps)).tolist():
         frames = tracks.frames(n)
         apart = np.flatnonzero(_jumps(tracks, n, frames)) + 1
         if len(apart):
             tracks, found = _in_pieces(tracks, n, np.split(frames, apart))
             done += found
-    for n in range(len(tracks)):
+    steps = _steps(tracks) if done else steps
+    limits = np.array([TOP_SPEED_MPS[kind] for kind in tracks.kinds])
+    for n in np.flatnonzero((steps.speeds > limits).any(axis=0)).tolist():
         fast = _too_fast(tracks, n)
         if len(fast):
             limit = TOP_SPEED_MPS[tracks.kinds[n]]
@@ -236,9 +240,8 @@ def without_doubles(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, R
 def with_headings_turned(tracks: ObservedTracks, _: Array) -> tuple[ObservedTracks, Repairs]:
     """Headings of vehicles and bicycles that are off by pi, as motion or else most frames say it."""
     boxes, done = tracks.boxes, list[Repair]()
-    for n, kind in enumerate(tracks.kinds):
-        if kind not in (AgentKind.VEHICLE, AgentKind.BICYCLE):
-            continue
+    drives = np.array([kind in (AgentKind.VEHICLE, AgentKind.BICYCLE) for kind in tracks.kinds], bool)
+    for n in np.flatnonzero(drives & ~_looks_ahead(tracks, _steps(tracks))).tolist():
         frames = tracks.frames(n)
         for run in np.split(frames, np.flatnonzero(np.diff(tracks.times_s[frames]) > KNOWN_AFTER_S) + 1):
             wrong = run[_turned_round(tracks, n, run)] if len(run) > 1 else run[:0]
@@ -331,6 +334,53 @@ def _impossible(box: Array) -> str:
     sizes = box[LENGTH : HEIGHT + 1]
     wrong[LENGTH : HEIGHT + 1] |= ~((sizes >= LEAST_SIZE_M) & (sizes <= LARGEST_SIZE_M))
     return ", ".join(f"{name} {value:g}" for name, value, bad in zip(names, box, wrong) if bad)
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """From frame to frame of each thing, at the second of the two; NaN where there is none."""
+
+    before: Ints  # (F, N) the first of the two
+    took_s: Array  # (F, N)
+    velocities: Array  # (F, N, 2)
+
+    @cached_property
+    def speeds(self) -> Array:
+        """(F, N)"""
+        return np.hypot(self.velocities[..., 0], self.velocities[..., 1])
+
+
+def _steps(tracks: ObservedTracks) -> _Steps:
+    seen = tracks.seen
+    last = np.maximum.accumulate(np.where(seen, np.arange(len(seen))[:, None], -1), axis=0)
+    before = np.concatenate([np.full((1, len(tracks)), -1), last[:-1]])
+    took_s = np.where(seen & (before >= 0), tracks.times_s[:, None] - tracks.times_s[before], np.nan)
+    xy = tracks.boxes[..., :2]
+    return _Steps(before, took_s, (xy - np.take_along_axis(xy, before[..., None], axis=0)) / took_s[..., None])
+
+
+def _even(tracks: ObservedTracks, steps: _Steps) -> Bools:
+    """(N,) whose steps are so alike that none is a jump: no step is farther from the usual than two are apart."""
+    limits = np.array([TOP_SPEED_MPS[kind] for kind in tracks.kinds])
+    known = ~np.isnan(steps.took_s)
+    fast = (known & (steps.speeds * steps.took_s > limits * steps.took_s + NOISE_M)).any(axis=0)
+    here = known[..., None]
+    widest = np.where(here, steps.velocities, -np.inf).max(axis=0) - np.where(here, steps.velocities, np.inf).min(
+        axis=0
+    )
+    apart_m = np.hypot(*widest.T) * np.where(known, steps.took_s, -np.inf).max(axis=0)
+    return ~fast & ((apart_m <= NOISE_M) | ~known.any(axis=0))
+
+
+def _looks_ahead(tracks: ObservedTracks, steps: _Steps) -> Bools:
+    """(N,) which never turn by more than TURNED_RAD between two frames, nor ever go backwards at REVERSED_MPS."""
+    heading = tracks.boxes[..., HEADING]
+    ahead = np.full(len(tracks), True)
+    for looks in (heading, before := np.take_along_axis(heading, steps.before, axis=0)):
+        forward = np.cos(looks) * steps.velocities[..., 0] + np.sin(looks) * steps.velocities[..., 1]
+        ahead &= ~(forward <= -REVERSED_MPS).any(axis=0)
+    turned = np.abs(wrap_angle(heading - before)) > TURNED_RAD
+    return np.asarray(ahead & ~(turned & ~np.isnan(steps.took_s)).any(axis=0))
 
 
 def _jumps(tracks: ObservedTracks, n: int, frames: Ints) -> Bools:
@@ -430,35 +480,43 @@ def _pairs_inside(tracks: ObservedTracks) -> Iterable[tuple[int, int, int]]:
     """(n, m, frames) of all things n < m of one kind that are in one place in some frames."""
     import shapely  # here alone: workers that drive do not need it
 
-    counts: dict[tuple[int, int], int] = {}
-    corners = box_corners(tracks.boxes[..., [X, Y, HEADING, LENGTH, WIDTH]])
-    reach = float(tracks.boxes[tracks.seen][:, [LENGTH, WIDTH]].max(initial=0.0)) / 2.0
-    kinds = np.array([list(AgentKind).index(kind) for kind in tracks.kinds], int)
-    for frame, seen in enumerate(tracks.seen):
-        here = np.flatnonzero(seen)
-        if len(here) < 2:
-            continue
-        pairs = here[cKDTree(tracks.boxes[frame, here, :2]).query_pairs(reach, output_type="ndarray")]
-        pairs = pairs[kinds[pairs[:, 0]] == kinds[pairs[:, 1]]]
-        pairs = pairs[_center_inside(tracks.boxes[frame], pairs)]
-        if len(pairs):
-            one, other = (shapely.polygons(corners[frame, pairs[:, i]]) for i in (0, 1))
-            shared = shapely.area(shapely.intersection(one, other))
-            both = shapely.area(one) + shapely.area(other) - shared
-            for n, m in pairs[shared >= ONE_PLACE * both].tolist():
-                counts[min(n, m), max(n, m)] = counts.get((min(n, m), max(n, m)), 0) + 1
-    return [(n, m, together) for (n, m), together in counts.items()]
+    half = np.where(tracks.seen, np.hypot(tracks.boxes[..., LENGTH], tracks.boxes[..., WIDTH]) / 2.0, 0.0).max(axis=0)
+    pairs = _pairs_near(tracks, half)
+    reach = half[pairs].max(axis=1)  # of the centre of the smaller, which is in the larger
+    counts = np.zeros(len(pairs), int)
+    for start in range(0, len(tracks.times_s), block := max(1, AT_ONCE // max(len(pairs), 1))):
+        seen, boxes = tracks.seen[start : start + block], tracks.boxes[start : start + block]
+        (dx, dy), (first, second) = (boxes[:, pairs[:, 0], k] - boxes[:, pairs[:, 1], k] for k in (X, Y)), pairs.T
+        frame, pair = np.nonzero(seen[:, first] & seen[:, second] & (dx**2 + dy**2 <= reach**2))
+        one, other = boxes[frame, first[pair]], boxes[frame, second[pair]]
+        inside = _center_inside(one, other)
+        one, other, pair = one[inside], other[inside], pair[inside]
+        if len(pair):
+            shapes = [shapely.polygons(box_corners(b[:, [X, Y, HEADING, LENGTH, WIDTH]])) for b in (one, other)]
+            shared = shapely.area(shapely.intersection(*shapes))
+            together = shared >= ONE_PLACE * (shapely.area(shapes[0]) + shapely.area(shapes[1]) - shared)
+            counts += np.bincount(pair[together], minlength=len(pairs))
+    return [(n, m, together) for (n, m), together in zip(pairs.tolist(), counts.tolist()) if together]
 
 
-def _center_inside(boxes: Array, pairs: Ints) -> Bools:
-    """(P,) whether the centre of the smaller box is in the larger, as in one place it has to be."""
-    area = boxes[:, LENGTH] * boxes[:, WIDTH]
-    large, small = pairs.T
-    large, small = np.where(area[large] >= area[small], (large, small), (small, large))
-    dx, dy = boxes[small, X] - boxes[large, X], boxes[small, Y] - boxes[large, Y]
-    c, s = np.cos(boxes[large, HEADING]), np.sin(boxes[large, HEADING])
+def _pairs_near(tracks: ObservedTracks, half: Array) -> Ints:
+    """(P, 2) things n < m of one kind whose extents over all time overlap; half: (N,) diagonals of their boxes."""
+    here, xy = tracks.seen[..., None], tracks.boxes[..., :2]
+    least = np.where(here, xy, np.inf).min(axis=0) - half[:, None]
+    most = np.where(here, xy, -np.inf).max(axis=0) + half[:, None]
+    kinds = np.array([kind.value for kind in tracks.kinds])
+    near = ((least[:, None] <= most) & (least <= most[:, None])).all(axis=-1) & (kinds[:, None] == kinds)
+    return np.argwhere(np.triu(near, 1))
+
+
+def _center_inside(one: Array, other: Array) -> Bools:
+    """(K,) of K pairs of boxes whether the centre of the smaller is in the larger, as in one place it has to be."""
+    swap = (one[:, LENGTH] * one[:, WIDTH] < other[:, LENGTH] * other[:, WIDTH])[:, None]
+    large, small = np.where(swap, other, one), np.where(swap, one, other)
+    dx, dy = (small[:, axis] - large[:, axis] for axis in (X, Y))
+    c, s = np.cos(large[:, HEADING]), np.sin(large[:, HEADING])
     along, across = np.abs(c * dx + s * dy), np.abs(c * dy - s * dx)
-    return np.asarray((along <= boxes[large, LENGTH] / 2.0) & (across <= boxes[large, WIDTH] / 2.0))
+    return np.asarray((along <= large[:, LENGTH] / 2.0) & (across <= large[:, WIDTH] / 2.0))
 
 
 def _turned_round(tracks: ObservedTracks, n: int, run: Ints) -> Bools:
