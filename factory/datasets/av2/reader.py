@@ -173,7 +173,7 @@ def read_motion(folder: Path) -> LogMotion:
     path, pose_path = folder / ANNOTATIONS, folder / POSES
     boxes = read_feather(path, ("timestamp_ns", "track_uuid", "category", *SIZE_COLUMNS, *POSE_COLUMNS), whole=False)
     poses = read_feather(pose_path, ("timestamp_ns", *POSE_COLUMNS), whole=False)
-    pose_stamps, box_stamps = stamps(pose_path, poses), stamps(path, boxes)
+    box_stamps, pose_stamps = stamps(path, boxes), stamps(pose_path, poses)
     posed, stray_repairs = posed_frames(box_stamps, pose_stamps, SAME_FRAME_S)
     if posed.sum() <= MOST * len(posed):
         raise BadClip(str(pose_path), "timestamp_ns", "the poses do not span the annotated frames")
