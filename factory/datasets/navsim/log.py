@@ -152,7 +152,7 @@ class Frame:
     lidar_path: str | None  # of the merged sweep below the folder of sensor blobs
     boxes: FrameBoxes | None  # None: nobody annotated the frame
     repairs: tuple[Repair, ...] = ()  # of its boxes, at time 0
-    unreadable: bool = False  # stands where one cannot be read: its neighbour without boxes and blobs
+    unreadable: str = ""  # why the one that stands here cannot be read: this is its neighbour, without boxes and blobs
 
     @property
     def command(self) -> str:
@@ -206,7 +206,7 @@ def parse_frames(value: Any, path: Path, whole: bool = True) -> LogFrames:
     for i in sorted(wrong):
         at = int(known[np.argmin(np.abs(known - i))])
         near, stamp = frames[at], frames[at].timestamp_us + FRAME_US * (i - at)
-        named = replace(near, token=f"unreadable-{i}", timestamp_us=stamp, unreadable=True)
+        named = replace(near, token=f"unreadable-{i}", timestamp_us=stamp, unreadable=str(wrong[i]))
         frames[i] = replace(named, cameras=(), lidar_path=None, boxes=None)
     return LogFrames(file, path.stem, tuple(frames[i] for i in range(len(value))))
 

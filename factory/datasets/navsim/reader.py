@@ -243,7 +243,7 @@ def _texts(value: object, where: str) -> tuple[str, ...]:
 # A log of OpenScene takes a second to open, and navtrain names 1,192 of them. So what the choice needs is kept, a
 # small table a log, in the user's cache; it is made again where the log's size or time of change is another.
 
-TABLE_VERSION = 6  # of the tables kept
+TABLE_VERSION = 7  # of the tables kept
 FRAME_S, SLACK_S = 0.5, 0.05  # between two frames; more or less is a gap
 GAP, SHORT_HISTORY, SHORT_FUTURE = "gap_in_frames", "short_history", "short_future"
 NO_ROUTE, NO_BOXES, STANDING, ABSENT = "no_route", "not_annotated", "ego_standing", "absent_token"
@@ -259,7 +259,7 @@ class FrameTable:
     timestamps_us: Ints  # (F,)
     has_route: Bools  # (F,)
     annotated: Bools  # (F,)
-    unreadable: Bools  # (F,)
+    unreadable: NDArray[np.str_]  # (F,) why a frame cannot be read; empty: it can
     speeds: NDArray[np.float32]  # (F,) of the ego [m/s]
     locations: NDArray[np.str_]  # (F,) the city, the same in all frames
     x_m: Array  # (F,) of the rear axle on the city's map
@@ -309,7 +309,7 @@ def frame_table(log: LogFrames) -> FrameTable:
         timestamps_us=np.array([frame.timestamp_us for frame in frames], np.int64),
         has_route=np.array([bool(frame.roadblock_ids) for frame in frames]),
         annotated=np.array([frame.boxes is not None for frame in frames]),
-        unreadable=np.array([frame.unreadable for frame in frames]),
+        unreadable=np.array([frame.unreadable for frame in frames], np.str_),
         speeds=np.array([np.hypot(*frame.dynamic_state[:2]) for frame in frames], np.float32),
         locations=np.array([frame.map_location for frame in frames]),
         x_m=np.array([frame.pose[0] for frame in frames], np.float64),
@@ -410,7 +410,7 @@ def usable_windows(table: FrameTable, windows: list[int], choice: WindowChoice) 
             dropped[SHORT_FUTURE] += 1
         elif stretch[first] != stretch[stop - 1]:
             dropped[GAP] += 1
-        elif table.unreadable[first:stop].any():
+        elif (table.unreadable[first:stop] != "").any():
             dropped[UNREADABLE] += 1
         elif not table.has_route[now]:
             dropped[NO_ROUTE] += 1
@@ -518,6 +518,9 @@ class NavsimReader:
                 continue
             kept, reasons = usable_windows(table, wanted, self.choice)
             dropped += reasons
+            if reasons[UNREADABLE]:
+                why = table.unreadable[table.unreadable != ""]
+                log.warning("%s (%d such frames, which cost %d windows)", why[0], len(why), reasons[UNREADABLE])
             start_ms = table.start_ms
             refs += [ClipRef(self.name, log_id, int(start_ms[now - FRAMES_BEFORE])) for now in kept]
         if cities and None not in cities.values():

@@ -105,7 +105,7 @@ def test_a_fault_of_one_box_is_put_right_or_left_out_and_told_and_nothing_else_c
     ],
 )
 def test_a_frame_that_cannot_be_read_costs_the_windows_it_is_in(
-    tmp_path: Path, spoil: Callable[[dict[str, Any]], object]
+    tmp_path: Path, spoil: Callable[[dict[str, Any]], object], caplog: pytest.LogCaptureFixture
 ) -> None:
     frames = road_frames(n=60)
     write_city(tmp_path)
@@ -118,6 +118,7 @@ def test_a_frame_that_cannot_be_read_costs_the_windows_it_is_in(
     assert not index.broken
     lost = [ref for ref in sound.refs if ref not in index.refs]
     assert set(index.refs) < set(sound.refs) and index.dropped == {"unreadable_frame": len(lost)} and lost
+    assert f"(1 such frames, which cost {len(lost)} windows)" in caplog.text and f"{log}: " in caplog.text
     reader.read(index.refs[0])
     assert [ref for ref in sound.refs if not ref.start_ms <= 12_500 <= ref.start_ms + 9_500] == list(index.refs)
 

@@ -39,7 +39,7 @@ def table(n: int, **other: np.ndarray) -> FrameTable:
             timestamps_us=1_600_000_000_000_000 + 500_000 * np.arange(n),
             has_route=np.ones(n, bool),
             annotated=np.ones(n, bool),
-            unreadable=np.zeros(n, bool),
+            unreadable=np.full(n, ""),
             speeds=np.full(n, 8.0, np.float32),
             locations=np.full(n, "us-ma-boston"),
             x_m=4.0 * np.arange(n),
