@@ -181,10 +181,8 @@ class GtrsDense(Planner):
         Raises ValueError where a file is missing or the samples are labelled with another vocabulary, or none.
         """
         labelled = data.label_vocabulary
-        if labelled is None:
-            raise ValueError("gtrs_dense learns from labels of a vocabulary and these samples carry none")
-        if settings.vocabulary is None:
-            raise ValueError(f"vocabulary: give the .npy file of trajectories with digest {labelled}, the labels' own")
+        settings.check_labels(labelled)
+        assert settings.vocabulary is not None
         vocabulary = _read_vocabulary(settings.vocabulary, "vocabulary")
         if vocabulary.digest != labelled:
             raise ValueError(

@@ -225,6 +225,13 @@ class GtrsDenseSettings(NetworkSettings):
         if not 0.0 < self.kept <= 1.0:
             raise ValueError(f"kept={self.kept}: a share of the vocabulary above 0, at most 1")
 
+    def check_labels(self, labelled: str | None) -> None:
+        """labelled: digest of the samples' vocabulary. Raises ValueError where there is none, or no file of it."""
+        if labelled is None:
+            raise ValueError("gtrs_dense learns from labels of a vocabulary and these samples carry none")
+        if self.vocabulary is None:
+            raise ValueError(f"vocabulary: give the .npy file of trajectories with digest {labelled}, the labels' own")
+
     @property
     def backbone(self) -> BackboneSettings:
         """Of an encoder of the picture alone."""

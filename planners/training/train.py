@@ -28,7 +28,7 @@ from factory.config.shapes import GIVE, deep_merge, to_plain
 from planners.data.index import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings, fitting_batch
-from planners.models.settings import PlannerChoice, settings_class, settings_of
+from planners.models.settings import GtrsDenseSettings, PlannerChoice, settings_class, settings_of
 from planners.training.checkpoint import (
     Keep,
     best_checkpoint,
@@ -153,7 +153,12 @@ def main(argv: Sequence[str]) -> None:
         train_on_ray(partial(train, config), config.out, **dataclasses.asdict(config.ray))
     else:
         config.training  # noqa: B018 - raises ConfigError for a planner that does not learn
-        dataset = open_data(config.data, mix=config.mix)
+        dataset, settings = open_data(config.data, mix=config.mix), settings_of(config.planner)
+        if isinstance(settings, GtrsDenseSettings) and config.init_from is None:  # before PyTorch takes its seconds
+            try:
+                settings.check_labels(dataset.label_vocabulary)
+            except ValueError as error:
+                raise ConfigError(f"planner {config.planner.name}: {error}") from error
         from planners.training.processes import join_process_group
 
         with join_process_group(config.device) as process:
