@@ -14,8 +14,9 @@ import json
 import logging
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,7 @@ def private_folder(name: str) -> Path:
 SEAL = b"\nsha256\n"
 SEAL_BYTES = len(SEAL) + 32
 MEMBER = "sha256"  # of JSON
+MOST_DIFFERENT = 8  # bytes in which a damaged file and its damaged copy differ: 256 ways to choose
 
 
 class Damaged(ValueError):
@@ -73,6 +75,20 @@ def without_checksum(data: bytes, key: str = "") -> bytes:
     content = data[:-SEAL_BYTES]
     _compare(hashlib.sha256(content), data[-SEAL_BYTES:], key)
     return content
+
+
+def whole_of_two(one: bytes, other: bytes, is_whole: Callable[[bytes], bool]) -> bytes | None:
+    """What both were, where some bytes of one and others of the other are damaged; None where no choice is whole."""
+    differ = [k for k, (a, b) in enumerate(zip(one, other)) if a != b]
+    if len(one) != len(other) or len(differ) > MOST_DIFFERENT:
+        return None
+    for chosen in product((one, other), repeat=len(differ)):
+        tried = bytearray(one)
+        for k, source in zip(differ, chosen):
+            tried[k] = source[k]
+        if is_whole(bytes(tried)):
+            return bytes(tried)
+    return None
 
 
 def append_checksum(path: Path, key: str = "") -> None:

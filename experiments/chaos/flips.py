@@ -72,7 +72,7 @@ def kinds(out: Path) -> dict[str, tuple[Path, int, Callable[[], Outcome]]]:
     def log(path: Path) -> Outcome:
         (found,) = damaged_logs(store.location)
         restore_logs(store.location)
-        return "found" if found[1].name.endswith(path.name) and path.read_bytes() == originals[path] else "other"
+        return "found" if found.name.endswith(path.name) and path.read_bytes() == originals[path] else "other"
 
     def of_shard() -> Outcome:
         return "found" if shard.name in verify(Store(out)).damage[0] else "other"

@@ -6,7 +6,7 @@ import shlex
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -94,15 +94,23 @@ def verify(request: VerifyRequest) -> int:
 
     Damage is a file that is missing or is not what was written, of a table, its log, the episodes, the benchmark's
     scenes or the cache; a key twice, a round out of order. Orphans are harmless: files that no commit names, left
-    behind by a run that died; readers ignore them and `python -m factory clean` removes them. repair=true puts a
-    damaged log back from the copies beside it and takes damaged files out of the tables, a transaction each;
-    nothing else is touched. It waits for no run: while one writes here it is refused. Exit code 1: damaged, after a
-    repair what it could not put right.
+    behind by a run that died; readers ignore them and `python -m factory clean` removes them. repair=true puts
+    damaged logs and run.json back from the copies beside them and takes damaged files out of the tables, a transaction
+    each; nothing else is touched, and rounds whose earlier ones went are told as missing. It waits for no run: while
+    one writes here it is refused. Exit code 1: damaged, after a repair what it could not put right.
     """
+    from factory.stages.assets import damaged_blocks
     from factory.store.location import BadLocation
     from factory.store.samples import OtherSchema, refuse_other_schema
     from factory.store.table import AnotherWriter, DamagedLog
-    from factory.store.verify import RunInProgress, claim_for_upkeep, damaged_logs, drop_damaged, restore_logs
+    from factory.store.verify import (
+        RunInProgress,
+        claim_for_upkeep,
+        damaged_beside_logs,
+        damaged_logs,
+        drop_damaged,
+        restore_logs,
+    )
 
     out = location_of_out(request.out)
     try:
@@ -111,9 +119,16 @@ def verify(request: VerifyRequest) -> int:
             for name in restore_logs(out):
                 print(f"put back {name}")
         if found := damaged_logs(out):
-            for name, damage in found:
-                print(f"DAMAGED {name}/{damage.name}: {damage.problem}")
-            print(f"{len(found)} damages of the tables' logs; the tables were not read. repair=true puts them back")
+            told = [str(part) for part in (*found, *damaged_beside_logs(out))]
+            told += [f"{name}: {problem}" for name, problem in damaged_blocks(out).items()]
+            for line in told:
+                print(f"DAMAGED {line}")
+            how = "repair=true puts the tables' logs back first"
+            if request.repair:
+                how = (
+                    "neither what is in the logs nor its copy tells what was written; put them back from a copy of out"
+                )
+            print(f"{len(told)} damages; rows were not read: {how}")
             return DAMAGED
         store = open_store(request.out)
         verdict = _verify_again(request.out)
@@ -132,6 +147,8 @@ def verify(request: VerifyRequest) -> int:
         print(f"DAMAGED {line}")
     for line in verdict.orphans:
         print(f"orphan  {line}")
+    for line in verdict.missing:
+        print(f"missing {line}: the run's command makes the others again")
     print(f"{verdict.n_samples} samples, {len(verdict.damage)} damages, {len(verdict.orphans)} orphans")
     if verdict.files:
         print(
@@ -144,12 +161,12 @@ def verify(request: VerifyRequest) -> int:
 def _verify_again(out: str) -> "Verdict":
     """Of the tables and of the blocks in the cache, opened anew."""
     from factory.stages.assets import damaged_blocks
-    from factory.store.verify import Verdict, verify
+    from factory.store.verify import verify
 
     store = open_store(out)
     found, blocks = verify(store), damaged_blocks(store.location)
     damage = (*found.damage, *(f"{name}: {problem}" for name, problem in blocks.items()))
-    return Verdict(found.n_samples, damage, found.orphans, (*found.files, *blocks))
+    return replace(found, damage=damage, files=(*found.files, *blocks))
 
 
 UNITS_S = {"d": 86_400.0, "h": 3600.0, "min": 60.0}

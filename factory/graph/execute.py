@@ -4,7 +4,6 @@ The driver can die at any moment: what is committed is done, the rest is tried a
 same result.
 """
 
-import json
 import os
 import threading
 import time
@@ -45,9 +44,10 @@ from factory.graph.steps import NotReady, Work
 from factory.readers.base import ClipRef
 from factory.store.funnel import Funnel, funnel_of
 from factory.store.location import BadLocation
-from factory.store.samples import CURRENT_RUN, ChangedRun, History, Kind, OnChange, Store
+from factory.store.samples import CURRENT_RUN, LAST_RUN, ChangedRun, History, Kind, OnChange, Store
 from factory.store.table import AnotherWriter
 from factory.wording import one_line
+from tasks.caches import json_with_checksum
 
 Executor = Literal["local", "ray"]
 
@@ -241,7 +241,7 @@ class _Run:
 
         def note(outlook: Outlook) -> None:
             with suppress(OSError):  # for people, and again in some seconds; a commit to the same place says it
-                store.location.write(CURRENT_RUN, (json.dumps(document | asdict(outlook), indent=1) + "\n").encode())
+                store.location.write(CURRENT_RUN, json_with_checksum(document | asdict(outlook)).encode())
 
         note(Outlook(began_ms))
         metrics = RunMetrics(graph.record_metric, store.location)
@@ -338,4 +338,4 @@ def write_last_run(store: Store, summary: RunSummary) -> None:
         "seconds": {stage: {"tasks": n, "seconds": total} for stage, (n, total) in summary.seconds.items()},
         "notes": summary.notes,
     }
-    store.location.write("last_run.json", (json.dumps(document, indent=1) + "\n").encode())
+    store.location.write(LAST_RUN, json_with_checksum(document).encode())

@@ -32,7 +32,7 @@ from factory.store.schema import (
     why_other_schema,
 )
 from factory.store.table import Bytes, Codes, Ints, KeyedTable, distinct_rows, fixed_bytes, text_codes
-from tasks.caches import MEMBER, json_with_checksum, parse_json_with_checksum
+from tasks.caches import MEMBER, Damaged, json_with_checksum, parse_json_with_checksum
 from tasks.world.repair.records import Repair, RepairCount
 
 # What became of attempts: the tables `outcomes`, `candidates` and `plans`, and the history that a run goes on from.
@@ -368,8 +368,10 @@ def _outcome_codes(
 OnChange = Literal["stop", "keep", "redo"]
 QUIET_S = 900.0  # a run that said it began and was not heard of for so long is taken for gone
 RUN_FILE = "run.json"
+RUN_COPY = "samples/_commits/run.json"  # the same once more: nothing else of a run tells what is in it
 CURRENT_RUN = "current_run.json"  # what the newest run set out to do; over once last_run.json has its began_ms
 LAST_RUN = "last_run.json"
+FACTS = "report.json"  # what only the newest run knows: its facts, and what its reader left out
 IMPORTED = "import.source"  # a setting that tables of others' rows have, and no run
 WAYS_OUT = "Go on with on_change=keep, replace with on_change=redo, or choose another out"
 SHOWN = 3  # changed settings that a message names
@@ -413,8 +415,8 @@ class NewestRun:
 
     def _fields_of(self, name: str, data: bytes | None) -> dict[str, Any]:
         try:
-            return dict(json.loads(data or b"{}"))
-        except (ValueError, TypeError):
+            return {} if data is None else parse_json_with_checksum(data)
+        except Damaged:
             self.damaged.append(name)
             return {}
 
@@ -486,7 +488,8 @@ class Store:
         record = json.loads(canonical_json(record))
         if not records and (len(self.samples) or len(self.outcomes)):
             raise ChangedRun(
-                f"{self.location.uri}: {RUN_FILE} is missing beside tables with rows; restore it or take another out"
+                f"{self.location.uri}: {RUN_FILE} is missing beside tables with rows; python -m factory verify "
+                f"out={self.location.uri} repair=true puts it back"
             )
         if records:
             changes = record_differences(records[-1], record)
@@ -534,9 +537,10 @@ class Store:
         if starts_over:
             for table in (self.plans, self.candidates, self.outcomes):
                 table.commit([], drop=list(table))
-        if list(records) != self.runs():
+        if list(records) != self.runs() or not self.location.has(RUN_COPY):
             document = json.loads(canonical_json({"schema_version": SCHEMA_VERSION, "runs": list(records)}))
-            self.location.write(RUN_FILE, json_with_checksum(document).encode())
+            for name in (RUN_COPY, RUN_FILE):
+                self.location.write(name, json_with_checksum(document).encode())
         twice = {key.decode() for key in np.intersect1d(self.outcomes.keys(), self.samples.keys(), True).tolist()}
         if twice:
             age = run_number_lookup(records)
@@ -575,9 +579,10 @@ class Store:
 
     def document(self, name: str) -> dict[str, Any]:
         """A JSON file that runs leave beside the tables, empty where there is none. Raises DamagedFile."""
+        data = self.location.read(name)
         try:
-            return dict(json.loads(self.location.read(name) or b"{}"))
-        except (ValueError, TypeError) as error:
+            return {} if data is None else parse_json_with_checksum(data)
+        except Damaged as error:
             raise DamagedFile(f"{self.location.uri}/{name}: not readable: {error}") from error
 
     def last_commit_ms(self) -> int:

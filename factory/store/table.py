@@ -22,6 +22,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
+from operator import ne
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -44,7 +45,7 @@ from factory.store.location import (
 )
 from factory.store.schema import TableSpec
 from factory.wording import one_line
-from tasks.caches import Damaged, with_checksum, without_checksum
+from tasks.caches import MOST_DIFFERENT, SEAL_BYTES, Damaged, whole_of_two, with_checksum, without_checksum
 
 # Texts of millions of rows as integers: a number for each different text.
 
@@ -207,6 +208,7 @@ def retry_broken_listing(ask: Callable[[], T]) -> T:
 
 LOG, COPIES = "_delta_log", "_commits"
 LAST = "_last_checkpoint"  # where the newest checkpoint is; written over by each
+MOST_UNSEALED = 2  # bytes of a seal that may be damaged themselves; of what it does not fit nearly all 32 differ
 NUMBERED = re.compile(r"(\d{20})\.(json|checkpoint\.parquet)")
 
 
@@ -253,7 +255,7 @@ class CommitCopies:
 
     def damage(self) -> list[DamagedPart]:
         """What is not as it was. Of a table without copies nothing can be said."""
-        copies, problems = self._unsealed()
+        copies, problems = self._sealed()
         there = set(self._log.names())
         newest = max((name for name in there & copies.keys() if name.endswith(".parquet")), default="")
         for name in sorted(copies):
@@ -271,35 +273,57 @@ class CommitCopies:
         absent = (name for name in there if NUMBERED.fullmatch(name) and name < last and name not in known)
         return problems + [DamagedPart(f"{COPIES}/{name}", "is missing") for name in sorted(absent)]
 
-    def restore(self, found: DamagedPart) -> None:
-        """Put a file of the log back from its copy, or a copy from its file."""
+    def restore(self, found: DamagedPart) -> bool:
+        """Put a file of the log back from its copy, or a copy from its file; whether either tells what was written."""
         folder, _, name = found.name.partition("/")
-        if folder == COPIES:
-            if not self._copy(name):
-                self._copies.remove(name)
-            return
-        self._log.write(name, self._copy_of(name))
+        whole = self._committed(name)
+        if whole is None and (folder == LOG or self._log.has(name)):
+            return False
+        if whole is None:
+            self._copies.remove(name)
+        elif folder == LOG:
+            self._log.write(name, whole)
+        else:
+            self._copies.write(name, with_checksum(whole, name))
+        return True
 
-    def _copy(self, name: str) -> bool:
+    def _copy(self, name: str) -> None:
         data = self._log.read(name)
         if data is not None:
             self._copies.write(name, with_checksum(data, name))
-        return data is not None
 
-    def _copy_of(self, name: str) -> bytes:
-        """Raises Damaged."""
-        return without_checksum(self._copies.read(name) or b"", name)
-
-    def _unsealed(self) -> tuple[Mapping[str, bytes], list[DamagedPart]]:
-        whole, problems = {}, []
+    def _sealed(self) -> tuple[Mapping[str, bytes], list[DamagedPart]]:
+        """What was committed, by name; and which copies are damaged."""
+        found, problems = {}, []
         for name in self._copies.names():
             if name != LAST and not NUMBERED.fullmatch(name):  # a draft that a killed writer left
                 continue
             try:
-                whole[name] = self._copy_of(name)
+                without_checksum(self._copies.read(name) or b"", name)
             except Damaged as error:
                 problems.append(DamagedPart(f"{COPIES}/{name}", str(error)))
-        return whole, problems
+            if (whole := self._committed(name)) is not None:
+                found[name] = whole
+        return found, problems
+
+    def _committed(self, name: str) -> bytes | None:
+        """What was written under this name, by the log's file, its sealed copy and their bytes where both are damaged.
+
+        None where no choice between bytes that differ fits the seal. A copy that was cut, or is another file, says
+        nothing: then the log is believed, as where there is no copy.
+        """
+        sealed, data = self._copies.read(name) or b"", self._log.read(name)
+        try:
+            return without_checksum(sealed, name)
+        except Damaged:
+            content, seal = sealed[:-SEAL_BYTES], sealed[-SEAL_BYTES:]
+        if data is None or len(content) != len(data) or sum(map(ne, content, data)) > MOST_DIFFERENT:
+            return data
+
+        def fits(tried: bytes) -> bool:
+            return sum(map(ne, with_checksum(tried, name)[-SEAL_BYTES:], seal)) <= MOST_UNSEALED
+
+        return whole_of_two(content, data, fits)
 
     def _last_problem(self, data: bytes | None, copy: bytes, there: set[str]) -> str:
         if data in (None, copy):  # without it the log is read from its list of files

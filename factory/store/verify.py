@@ -8,12 +8,12 @@ readers ignore them.
 """
 
 import hashlib
-import json
 import re
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pyarrow as pa
@@ -32,7 +32,7 @@ from factory.store.location import (
     raising_damaged_file,
     write_shard,
 )
-from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, QUIET_S, Store
+from factory.store.samples import CURRENT_RUN, FACTS, IMPORTED, LAST_RUN, QUIET_S, RUN_COPY, RUN_FILE, Store
 from factory.store.table import (
     COPIES,
     LOG,
@@ -44,11 +44,13 @@ from factory.store.table import (
     packed_tables,
     text_codes,
 )
+from tasks.caches import Damaged, parse_json_with_checksum, whole_of_two
 
 TABLES = ("plans", "candidates", "samples", "outcomes")
 OF_WALKS = ["clip_id", "expert", "candidate_index", "round", "settings_hash"]
 PREPARED, SCENES = "cache/prepared", "scenes"
 DRAFT = re.compile(r"\..*\.tmp")  # that a killed run left
+OTHER_CONTENT = "its content is not what its name says"
 NAMED = re.compile(r"(.*/)?part-([0-9a-f]{32})\.parquet")
 
 
@@ -60,35 +62,71 @@ class Verdict:
     damage: tuple[str, ...]
     orphans: tuple[str, ...]  # relative to `out`
     files: tuple[str, ...] = ()  # relative to `out`: damaged ones that a repair takes out, to be made again
+    missing: tuple[str, ...] = ()  # rounds that a repair took out, until the run's command makes them again
 
 
-def damaged_logs(out: Location) -> list[tuple[str, DamagedPart]]:
-    """Table, and what of its log is not what was committed; asked before the tables are opened."""
-    return [(name, damage) for name in TABLES for damage in CommitCopies(out.child(name)).damage()]
+def damaged_logs(out: Location) -> list[DamagedPart]:
+    """What of the tables' logs and of run.json is not what was written, relative to `out`; asked before tables open."""
+    found = [(name, damage) for name in TABLES for damage in CommitCopies(out.child(name)).damage()]
+    return [*(DamagedPart(f"{name}/{damage.name}", damage.problem) for name, damage in found), *_damaged_records(out)]
+
+
+def _damaged_records(out: Location) -> list[DamagedPart]:
+    texts = {name: out.read(name) for name in (RUN_FILE, RUN_COPY)}
+    found = [DamagedPart(name, _json_problem(data)) for name, data in texts.items() if data is not None]
+    if texts[RUN_FILE] is None and texts[RUN_COPY] is not None:
+        found.append(DamagedPart(RUN_FILE, "is missing"))
+    return [part for part in found if part.problem]
+
+
+def _json_problem(data: bytes) -> str:
+    try:
+        parse_json_with_checksum(data)
+    except Damaged as error:
+        return f"not readable: {error}"
+    return ""
+
+
+def damaged_beside_logs(out: Location) -> list[DamagedPart]:
+    """What can be said without the tables, where their logs are damaged: of shards, which name their content, and of
+    what is kept beside them."""
+    found = []
+    for table in TABLES:
+        folder = out.child(table)
+        for path in folder.names():
+            named = NAMED.fullmatch(path)
+            if named and hashlib.sha256(folder.read(path) or b"").hexdigest()[:32] != named[2]:
+                found.append(DamagedPart(f"{table}/{path}", OTHER_CONTENT))
+    return found + _damaged_kept(out) + _damaged_episodes(out, out.child(EPISODES_FOLDER).names())
 
 
 def verify(store: Store) -> Verdict:
     """Read every live file, episode and kept file, and hold the tables against each other."""
-    damage = [f"{name}/{found}" for name, found in damaged_logs(store.location)]
+    damage = [str(found) for found in damaged_logs(store.location)]
     broken: list[DamagedPart] = []
     for table in store.tables:
         broken += _damaged_files(table)
     orphans = orphaned_files(store)
     kept = _damaged_kept(store.location)
     if damage or broken:
+        kept += _damaged_episodes(store.location, store.location.child(EPISODES_FOLDER).names())
         damage += [*map(str, (*broken, *kept)), "keys and rounds were not checked: fix the files first"]
         return Verdict(0, tuple(damage), tuple(orphans), tuple(found.name for found in (*broken, *kept)))
     rows: list[pa.Table] = []
     for table in store.tables:
         damage += _duplicate_keys(table, rows if table is store.samples else None)
+    missing: list[str] = []
     try:
-        damage += _broken_rows(rows, store)
+        unordered, missing = _broken_rows(rows, store)
+        damage += unordered
     except DamagedFile as error:
         damage.append(str(error))
-    kept += _damaged_episodes(store)
+    kept += _damaged_episodes(store.location, _live_episodes(store))
     damage += map(str, kept)
     orphans += outdated_episodes(store)
-    return Verdict(len(store.samples), tuple(damage), tuple(orphans), tuple(found.name for found in kept))
+    return Verdict(
+        len(store.samples), tuple(damage), tuple(orphans), tuple(found.name for found in kept), tuple(missing)
+    )
 
 
 def orphaned_files(store: Store) -> list[str]:
@@ -136,7 +174,7 @@ def _problem_of(table: KeyedTable, path: str, file: LiveFile) -> str:
         return f"has {len(data):,} bytes, the log says {file.n_bytes:,}"
     named = NAMED.fullmatch(path)
     if named and hashlib.sha256(data).hexdigest()[:32] != named[2]:
-        return "its content is not what its name says"
+        return OTHER_CONTENT
     with raising_damaged_file(f"{table.location.uri}/{path}"):
         parquet = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
         if file.n_rows and parquet.metadata.num_rows != file.n_rows:
@@ -176,11 +214,9 @@ def _damaged_kept(out: Location) -> list[DamagedPart]:
             except (BadCacheFile, FileNotFoundError) as error:  # the latter: a file of another kind of name
                 problem = str(error).removeprefix(f"{out.child(folder).uri}/{name}").removeprefix(": ").strip()
                 found.append(DamagedPart(f"{folder}/{name}", problem))
-    for name in (CURRENT_RUN, LAST_RUN):
-        try:
-            dict(json.loads(out.read(name) or b"{}"))
-        except (ValueError, TypeError) as error:
-            found.append(DamagedPart(name, f"not readable: {error}; the next run writes it anew"))
+    for name in (CURRENT_RUN, LAST_RUN, FACTS):
+        if (data := out.read(name)) is not None and (problem := _json_problem(data)):
+            found.append(DamagedPart(name, f"{problem}; the next run writes it anew"))
     return found
 
 
@@ -199,16 +235,20 @@ def _duplicate_keys(table: KeyedTable, kept: list[pa.Table] | None) -> list[str]
     return [f"{table.spec.name}: {keys[at].decode()} stands twice, again in {paths[file[at]]}" for at in again]
 
 
-def _broken_rows(parts: Sequence[pa.Table], store: Store) -> list[str]:
-    """Of samples, with the columns OF_WALKS: rounds out of order, and settings that nothing is known of."""
+def _broken_rows(parts: Sequence[pa.Table], store: Store) -> tuple[list[str], list[str]]:
+    """Of samples, with the columns OF_WALKS: rounds out of order and unknown settings; rounds that are missing."""
     rows = pa.concat_tables([store.samples.schema_of(OF_WALKS, encoded=True).empty_table(), *packed_tables(parts, "")])
     unknown = set(text_codes(rows["settings_hash"])[1]) - {run["settings_hash"] for run in store.runs()}
     named = [f"samples: settings_hash {name} is not in run.json" for name in sorted(unknown)]
-    return [*_broken_rounds(rows, store), *named]
+    unordered, missing = _broken_rounds(rows, store)
+    return [*unordered, *named], missing
 
 
-def _broken_rounds(rows: pa.Table, store: Store) -> list[str]:
-    """Rounds of a walk count 0, 1, 2 ... in the order of its candidates. Of imported rows they are their source's."""
+def _broken_rounds(rows: pa.Table, store: Store) -> tuple[list[str], list[str]]:
+    """Rounds of a walk count 0, 1, 2 ... in the order of its candidates; those of another order, those with some gone.
+
+    Of imported rows they are their source's.
+    """
     imported = {run["settings_hash"] for run in store.runs() if IMPORTED in run["settings"]}
     rows = rows.filter(pc.invert(pc.is_in(rows["settings_hash"], value_set=pa.array(sorted(imported), pa.string()))))
     (clip, clip_ids), (expert, experts) = text_codes(rows["clip_id"]), text_codes(rows["expert"])
@@ -219,16 +259,17 @@ def _broken_rounds(rows: pa.Table, store: Store) -> list[str]:
     first = np.diff(walk, prepend=-1) != 0
     starts = np.flatnonzero(first)
     ordinal = np.arange(len(walk)) - np.repeat(starts, np.diff(starts, append=len(walk)))
-    found = []
+    unordered, missing = list[str](), list[str]()
     for broken in np.unique(walk[number != ordinal]).tolist():
         pairs = [(int(c), int(r)) for c, r in zip(candidate[walk == broken], number[walk == broken])]
         of = f"clip {clip_ids[broken // len(experts)]}, expert {experts[broken % len(experts)]}"
-        found.append(f"samples: {of}: candidates and rounds {pairs}")
-    return found
+        goes_on = all(one[1] < other[1] for one, other in pairwise(pairs))
+        (missing if goes_on else unordered).append(f"samples: {of}: candidates and rounds {pairs}")
+    return unordered, missing
 
 
-def _damaged_episodes(store: Store) -> list[DamagedPart]:
-    folder, live, found = store.location.child(EPISODES_FOLDER), _live_episodes(store), []
+def _damaged_episodes(out: Location, live: Collection[str]) -> list[DamagedPart]:
+    folder, found = out.child(EPISODES_FOLDER), []
     for name in folder.names():
         try:
             if name in live:
@@ -282,11 +323,21 @@ def refuse_while_running(store: Store) -> None:
 
 
 def restore_logs(out: Location) -> list[str]:
-    """Put damaged files of the tables' logs back as they were committed; their names."""
-    found = damaged_logs(out)
-    for name, damage in found:
-        CommitCopies(out.child(name)).restore(damage)
-    return [f"{name}/{damage.name}" for name, damage in found]
+    """Put damaged files of the tables' logs and run.json back as they were, where anything tells it; their names."""
+    return [damage.name for damage in damaged_logs(out) if _restored(out, damage)]
+
+
+def _restored(out: Location, damage: DamagedPart) -> bool:
+    if damage.name not in (RUN_FILE, RUN_COPY):
+        table, _, name = damage.name.partition("/")
+        return CommitCopies(out.child(table)).restore(DamagedPart(name, damage.problem))
+    first, second = (out.read(name) or b"" for name in (RUN_FILE, RUN_COPY))
+    whole = next((text for text in (first, second) if not _json_problem(text)), None)
+    whole = whole or whole_of_two(first, second, lambda tried: not _json_problem(tried))
+    if whole is None:
+        return False
+    out.write(damage.name, whole)
+    return True
 
 
 def drop_damaged(store: Store, verdict: Verdict) -> None:

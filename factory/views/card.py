@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from factory import __version__
 from factory.store.funnel import Funnel, funnel_of_tables, funnel_tables
-from factory.store.samples import Kind, Store
+from factory.store.samples import FACTS, Kind, Store
 from factory.store.schema import SCHEMA_VERSION
 from factory.store.table import text_codes
 from factory.views.status import STATUS, value_counts
@@ -106,7 +106,7 @@ def _sources_section(samples: pa.Table) -> Iterator[str]:
 
 def _settings_section(store: Store) -> Iterator[str]:
     record = _newest_run_record(store)
-    told = store.document("report.json").get("facts", {})
+    told = store.document(FACTS).get("facts", {})
     command = store.newest_run().current.get("command")
     yield "\n## How it was made\n"
     yield f"driving-data-factory {__version__}, settings `{record['settings_hash']}`."

@@ -8,7 +8,6 @@ Every step is a process of its own; seconds are of its CPU, over what its import
 is asked for by name alone, for it changes the table: one more round for two minutes, on a Ray of two workers.
 """
 
-import json
 import math
 import resource
 import subprocess
@@ -33,6 +32,7 @@ from factory.readers.base import ClipRef
 from factory.store.location import Shard, write_shard
 from factory.store.samples import CANDIDATES, OUTCOMES, Store
 from factory.store.schema import SAMPLES, RunIdentity, TableSpec, attempt_id, sample_rows_to_table
+from tasks.caches import json_with_checksum
 from tests.factory.toy import ToyWork, row_of, stream
 
 EXPERTS = ("pdm_closed", "recovery")
@@ -104,7 +104,7 @@ def write(out: Path, attempts: int, commits: int) -> None:
     told = {"began_ms": 1, "command": None, "folder": "/"}
     last = {"began_ms": 1, "exit_code": 0, "message": "", "executed": {}, "seconds": {}, "notes": []}
     for name, document in (("current_run.json", told), ("last_run.json", last)):
-        (out / name).write_text(json.dumps(document))
+        (out / name).write_text(json_with_checksum(document))
 
 
 def _row() -> dict[str, Any]:

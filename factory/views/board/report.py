@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 
 from factory.config.arguments import Refused
 from factory.store.reader import decode_stored_image
-from factory.store.samples import Store
+from factory.store.samples import FACTS, Store
 from factory.store.schema import NOW_INDEX
 from factory.store.table import text_equals
 from factory.views.board.gallery import Pictures, failures, gallery, gallery_card, newest_first_place, sample_page
@@ -27,6 +27,7 @@ from factory.views.board.server import STATIC
 from factory.views.board.watch import Snapshot, Watch
 from factory.views.pictures import front_camera, images_at_now, small_jpeg
 from factory.views.status import value_counts
+from tasks.caches import json_with_checksum
 
 if TYPE_CHECKING:
     from factory.setup.settings import Run
@@ -38,7 +39,6 @@ N_VARIED = 24
 PER_EXPERT = 200  # samples that `spread` looks at
 CAMERA_PX = 320  # width of a camera frame on the page
 FILE = "report.html"
-FACTS = "report.json"  # what only the newest run knows: its facts, and what its reader left out
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' data:; style-src 'unsafe-inline'; img-src data:; "
     "base-uri 'none'; form-action 'none'"
@@ -80,7 +80,7 @@ def write_facts(store: Store, assembled: "Run") -> None:
             "Broken logs": {f"{ref.log_id} at {ref.start_ms} ms": why for ref, why in index.broken.items()},
         },
     }
-    store.location.write(FACTS, json.dumps(facts).encode())
+    store.location.write(FACTS, json_with_checksum(facts).encode())
 
 
 def report_page(store: Store, shot: Snapshot, pictures: Pictures, extra: Mapping[str, Any]) -> bytes:

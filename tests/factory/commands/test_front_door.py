@@ -24,6 +24,7 @@ from factory.store.table import COPIES
 from factory.views.sample_text import prepared_episode
 from factory.views.status import failure_summary
 from planners.__main__ import main as planners_main
+from tasks.caches import json_with_checksum
 from tests.factory.filmed import FilmedWork
 from tests.factory.toy import ToyWork, executed, refs
 
@@ -287,7 +288,7 @@ def test_retry_calls_no_code_that_a_table_alone_names(
     location, named = Store(out).location, "+expert.mine._target_=my_package.MyExpert"
     kept = location.read(CURRENT_RUN)
     document = {"folder": str(out), "command": ["rounds=2", named]}
-    location.write(CURRENT_RUN, json.dumps(document).encode())
+    location.write(CURRENT_RUN, json_with_checksum(document).encode())
     try:
         code, _, error = ask(capsys, "retry", f"out={out}")
         assert code == 2 and named in error and not asked

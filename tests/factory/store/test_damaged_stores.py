@@ -1,6 +1,6 @@
 """verify survives every damage and names the file; a repair takes out what was damaged, and the run makes it again."""
 
-import json
+import random
 import shutil
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from factory.store.samples import Store
 from factory.store.schema import SAMPLES
 from factory.store.table import AnotherWriter, CommitCopies
 from factory.store.verify import damaged_logs, restore_logs, verify
+from tasks.caches import json_with_checksum
 from tests.factory.damage import damaged
 from tests.factory.data_folders import add_companions
 from tests.factory.tables import assert_same_tables
@@ -72,8 +73,29 @@ def test_every_damage_of_a_log_is_named_and_put_back(out: Path, folder: str) -> 
             if content is None and folder == "_commits" and not path.name.startswith("0" * 20):
                 path.write_bytes(whole)  # the newest copy is gone: its writer was killed before it wrote it
                 continue
-            assert [f"{table}/{found.name}" for table, found in damaged_logs(location)] == [name]
+            assert [found.name for found in damaged_logs(location)] == [name]
             assert restore_logs(location) == [name] and path.read_bytes() == whole and not damaged_logs(location)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_pass_names_every_flipped_bit_and_one_repair_heals_them_all(
+    out: Path, golden: Path, seed: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of nearly all files, logs and their copies at once among them; pages for people are made anew in any case."""
+    rng = random.Random(seed)
+    kept = [path for path in files(out, "**/*") if path.suffix != ".html" and path.name != "README.md"]
+    hit = rng.sample(kept, len(kept) * 2 // 3)
+    for path in hit:
+        content = bytearray(path.read_bytes())
+        content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+        path.write_bytes(content)
+    code, said = told(capsys, str(out))
+    assert code == DAMAGED and [path for path in hit if str(path.relative_to(out)) not in said] == []
+    code, said = told(capsys, str(out), "repair=true")
+    assert (code, "DAMAGED" in said) == (COMPLETE, False), said
+    assert told(capsys, str(out))[0] == COMPLETE
+    assert run(out) == COMPLETE
+    assert_same_tables(out, golden)
 
 
 def test_the_command_says_so_and_repairs_a_log(out: Path, golden: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -126,7 +148,7 @@ def test_checkpoints_are_held_too(out: Path) -> None:
         whole = path.read_bytes()
         for content in damaged(whole, every=max(1, len(whole) // 15)):
             path.write_bytes(content)
-            assert [found.name for _, found in damaged_logs(location)] == [f"_delta_log/{path.name}"]
+            assert [found.name for found in damaged_logs(location)] == [f"samples/_delta_log/{path.name}"]
             restore_logs(location)
             assert path.read_bytes() == whole
     for path in files(out, "samples/_delta_log/*.json")[:50]:
@@ -168,13 +190,13 @@ def test_damage_beside_the_tables_is_named_and_taken_out(
         path.write_bytes(content)
         code, said = told(capsys, str(out))
         assert code == DAMAGED and str(name) in said, content
-    if part == "run.json":  # what the rows were made with nobody can make again
-        return
     code, said = told(capsys, str(out), "repair=true")
-    assert code == COMPLETE and f"taken out {name}" in said
+    assert code == COMPLETE and f"{'put back' if part == 'run.json' else 'taken out'} {name}" in said
+    if part == "run.json":
+        assert path.read_bytes() == whole
     assert run(out) == COMPLETE
     assert_same_tables(out, golden)
-    if not part.startswith("current"):
+    if "run" not in part:
         assert path.is_file() is part.startswith("episodes")  # a clip whose attempts are done is not prepared again
 
 
@@ -193,7 +215,7 @@ def test_a_command_that_meets_damage_says_which_file_why_and_what_names_and_mend
     out: Path, part: str, commands: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     sample = SampleTable(out)[0]["attempt_id"]
-    (out / "report.json").write_text("{}")
+    (out / "report.json").write_text(json_with_checksum({}))
     path = files(out, part)[-1]
     for content in (path.read_bytes()[:-9], None):
         path.unlink() if content is None else path.write_bytes(content)
@@ -222,7 +244,7 @@ def test_the_reader_refuses_with_the_file_s_name(out: Path) -> None:
 def test_nothing_is_repaired_while_a_run_writes(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = files(out, "samples/*/*/*.parquet")[0]
     path.write_bytes(b"")
-    (out / "last_run.json").write_text(json.dumps({"began_ms": 1}))
+    (out / "last_run.json").write_text(json_with_checksum({"began_ms": 1}))
     for name, more in (("verify", ["repair=true"]), ("clean", []), ("compact", [])):
         assert COMMANDS[name].load()([f"out={out}", *more]) == BAD_CONFIG
         assert "a run is writing here; wait until it has ended" in capsys.readouterr().err
@@ -325,9 +347,7 @@ def test_a_commit_s_copy_under_another_s_name_is_no_copy_of_it(out: Path) -> Non
     log, (first, second, *_) = files(out, "samples/_delta_log/*.json"), files(out, "samples/_commits/*.json")
     whole, logged = second.read_bytes(), [path.read_bytes() for path in log]
     second.write_bytes(first.read_bytes())
-    assert [f"{name}/{damage.name}" for name, damage in damaged_logs(Location(str(out)))] == [
-        f"samples/_commits/{second.name}"
-    ]
+    assert [damage.name for damage in damaged_logs(Location(str(out)))] == [f"samples/_commits/{second.name}"]
     check([f"out={out}", "repair=true"])
     assert second.read_bytes() == whole and [path.read_bytes() for path in log] == logged
 

@@ -1,6 +1,5 @@
 """The card of a run's data set: valid front matter, the tables' own numbers, and true when a run did not finish."""
 
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from factory.views.board.overview import overview
 from factory.views.board.watch import Watch
 from factory.views.card import FILE, card, write_card
 from factory.views.status import open_store, status_lines
+from tasks.caches import json_with_checksum
 from tests.factory.toy import ToyWork, executed, refs
 
 report_main = COMMANDS["report"].load()
@@ -136,7 +136,7 @@ def test_no_markup_comes_out_of_data(out: Path) -> None:
     evil = "<script>alert(1)</script> | x\n---\nlicense: mit"
     store = Store(out)
     told = {"facts": {evil: evil}}
-    store.location.write("report.json", json.dumps(told).encode())
+    store.location.write("report.json", json_with_checksum(told).encode())
     text = card(store)
     assert "<script" not in text and front_matter(text)["license"] == "other"
     assert [len(row) for row in table_rows(text, "How it was made")] == [2], "a bar in a cell is escaped"

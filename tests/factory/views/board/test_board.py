@@ -26,6 +26,7 @@ from factory.views.board.server import SERVED, STATIC, Board, Server
 from factory.views.board.watch import Watch
 from factory.views.pictures import crop_to_60_m, encode_image, sample_bev
 from factory.views.sample_text import logged_drive
+from tasks.caches import json_with_checksum, parse_json_with_checksum
 from tests.factory.toy import executed
 from tests.factory.views.board.runs import EVIL, REFS, VIEW, counted, run, told
 
@@ -118,8 +119,11 @@ def test_a_run_over_a_stopped_one_is_running_and_its_time_left_is_that_of_its_te
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run(tmp_path, 1, n=2)
-    old = json.loads((tmp_path / "last_run.json").read_text()) | {"exit_code": 4, "message": "interrupted; run again"}
-    (tmp_path / "last_run.json").write_text(json.dumps(old))
+    old = parse_json_with_checksum((tmp_path / "last_run.json").read_bytes()) | {
+        "exit_code": 4,
+        "message": "interrupted; run again",
+    }
+    (tmp_path / "last_run.json").write_text(json_with_checksum(old))
 
     def words() -> str:
         status_main([f"out={tmp_path}"])
@@ -131,11 +135,11 @@ def test_a_run_over_a_stopped_one_is_running_and_its_time_left_is_that_of_its_te
     line = ProgressLine(10, lambda elapsed_s: 3077.0, stream := io.StringIO(), note=told.append)
     line.show(RunCounts(2), last=True)
     begun = {"began_ms": old["began_ms"] + 1, "command": None} | asdict(told[0])
-    (tmp_path / "current_run.json").write_text(json.dumps(begun))
+    (tmp_path / "current_run.json").write_text(json_with_checksum(begun))
     assert "interrupted" not in (going := words()) and "running" in going
     assert "'left': '51 min'" in going and "ETA 51 min" in going and "ETA 51 min" in stream.getvalue()
     never_began = old | {"began_ms": 0, "ended_ms": begun["began_ms"] + 1}
-    (tmp_path / "last_run.json").write_text(json.dumps(never_began))
+    (tmp_path / "last_run.json").write_text(json_with_checksum(never_began))
     assert "interrupted" in (ended := words()) and "running" not in ended
 
 

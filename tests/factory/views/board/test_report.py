@@ -10,8 +10,9 @@ import pyarrow as pa
 import pytest
 
 from factory.commands.table import COMMANDS
-from factory.store.samples import Store
-from factory.views.board.report import FACTS, FILE, N_LOOKS, N_SAMPLES, PER_EXPERT, varied_sample_ids
+from factory.store.samples import FACTS, Store
+from factory.views.board.report import FILE, N_LOOKS, N_SAMPLES, PER_EXPERT, varied_sample_ids
+from tasks.caches import json_with_checksum
 from tests.factory.views.board.runs import EVIL, counted, run, told
 
 main = COMMANDS["report"].load()
@@ -23,7 +24,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     run(folder, 2)
     remembered = {"facts": {EVIL: EVIL}, "left_out": {"Skipped logs": {EVIL: EVIL}}}
-    (folder / FACTS).write_text(json.dumps(remembered))
+    (folder / FACTS).write_text(json_with_checksum(remembered))
     assert main([f"out={folder}"]) == 0
     return folder
 
