@@ -32,11 +32,6 @@ LEFT_BY_DISKS = ("@eadir", "#recycle", "#snapshot", "@recycle", "@recently-snaps
 LEFT_BESIDE = frozenset((*LEFT_BY_MACOS, *LEFT_BY_WINDOWS, *LEFT_BY_DISKS))
 
 
-def is_companion(name: str) -> bool:
-    """Whether a system or a file server leaves files or folders of this name beside others'."""
-    return name.startswith("._") or name.lower() in LEFT_BESIDE
-
-
 def is_data(name: str) -> bool:
     """Whether a file or folder of this name in somebody's data is data.
 
@@ -44,7 +39,7 @@ def is_data(name: str) -> bool:
     and an editor's copies, which would be read as the same logs again. Unfinished downloads and backups (.part,
     .crdownload, ~) have other suffixes than what is looked for.
     """
-    return not (name.startswith((".", "~$")) or is_companion(name))
+    return not (name.startswith((".", "~$")) or name.lower() in LEFT_BESIDE)
 
 
 def matching(folder: Path, pattern: str) -> list[Path]:
@@ -176,12 +171,9 @@ def locked(file: IO[Any]) -> Iterator[None]:
         except OSError as error:
             if error.errno not in NO_LOCKS:
                 raise
-            fcntl.flock(held.enter_context(_stand_in(file.name).open("ab")), fcntl.LOCK_EX)
+            stand_in = f"{hashlib.sha256(os.path.realpath(file.name).encode()).hexdigest()[:32]}.lock"
+            fcntl.flock(held.enter_context((private_folder("locks") / stand_in).open("ab")), fcntl.LOCK_EX)
         yield
-
-
-def _stand_in(name: str) -> Path:
-    return private_folder("locks") / f"{hashlib.sha256(os.path.realpath(name).encode()).hexdigest()[:32]}.lock"
 
 
 # What differs inside a submitted Ray job: the working directory is a copy that Ray throws away.

@@ -126,7 +126,11 @@ def draw_and_describe_sample(store: "Store", table: "SampleTable", which: str, r
 
     attempt_id = find_sample_id(table, store, which)
     row = table[attempt_id]
-    path = _picture_path(attempt_id, request.to)
+    target = Path(request.to or ".")
+    is_png = target.suffix.lower() == ".png"
+    if target.suffix and not is_png and not target.is_dir():
+        raise Refused(f"to={request.to}: the picture is a PNG; name a file ending in .png, or a folder")
+    path = target if is_png else target / f"sample_{attempt_id}.png"
     drawn = labelled_trajectories(row, request.vocabulary)
     yield from sample_fact_lines(row)
     yield from label_lines(row, drawn is not None)
@@ -149,15 +153,6 @@ def draw_and_describe_sample(store: "Store", table: "SampleTable", which: str, r
             yield f"film          {path.with_suffix('.mp4').resolve()}"
     except OSError as error:
         raise Refused(f"to={request.to or '.'}: the picture cannot be written: {error}") from error
-
-
-def _picture_path(attempt_id: str, to: str | None) -> Path:
-    target = Path(to or ".")
-    if target.suffix.lower() == ".png":
-        return target
-    if target.suffix and not target.is_dir():
-        raise Refused(f"to={to}: the picture is a PNG; name a file ending in .png, or a folder")
-    return target / f"sample_{attempt_id}.png"
 
 
 @dataclass(frozen=True)

@@ -53,16 +53,12 @@ class Plugin:
 def plugins_by_name(kind: str) -> dict[str, list[Plugin]]:
     """Name -> what installed packages offer under it; kind: a key of GROUPS."""
     found: dict[str, list[Plugin]] = {}
-    for entry in _entry_points(_package_folder_times()).select(group=GROUPS[kind]):
+    searched = [Path(folder) for folder in sys.path if Path(folder).is_dir()]
+    written = tuple((str(folder), folder.stat().st_mtime_ns) for folder in searched)
+    for entry in _entry_points(written).select(group=GROUPS[kind]):
         package = "an unnamed package" if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"
         found.setdefault(entry.name, []).append(Plugin(entry.name, entry.module, entry.attr, package))
     return {name: sorted(found[name], key=lambda plugin: plugin.package) for name in sorted(found)}
-
-
-def _package_folder_times() -> tuple[tuple[str, int], ...]:
-    """The folders that are searched for packages, and when each was last written."""
-    folders = [Path(folder) for folder in sys.path]
-    return tuple((str(folder), folder.stat().st_mtime_ns) for folder in folders if folder.is_dir())
 
 
 @lru_cache(maxsize=1)

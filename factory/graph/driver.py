@@ -396,7 +396,9 @@ class RunDriver:
         self._uncached = ""  # why the first could not be kept
         self._tally = RunCounts()
         self._wanted = {
-            (clip.ref.clip_id, walk.expert): _samples_left(walk, rounds) for clip in plan.todo for walk in clip.walks
+            (clip.ref.clip_id, walk.expert): max(0, (1 if walk.once else rounds) - walk.n_found)
+            for clip in plan.todo
+            for walk in clip.walks
         }
         self._forecast = RunForecast(Workload(), Workload(left=sum(self._wanted.values())))
 
@@ -708,8 +710,3 @@ class RunDriver:
         for stage, spent in seconds.items():
             self._seconds[stage][0] += 1
             self._seconds[stage][1] += spent
-
-
-def _samples_left(walk: WalkState, rounds: int) -> int:
-    """Samples that the walk is still to make, as far as its list lasts."""
-    return max(0, (1 if walk.once else rounds) - walk.n_found)

@@ -26,7 +26,7 @@ from factory.graph.driver import (
     RunDriver,
     WriteFailed,
 )
-from factory.graph.guard import CRASHED
+from factory.graph.guard import CRASHED, read_note
 from factory.graph.local import (
     Claims,
     ClusterDied,
@@ -38,7 +38,7 @@ from factory.graph.local import (
     notes_folder,
 )
 from factory.graph.own_process import AGAIN, NEW_CLUSTERS, new_cluster_text
-from factory.graph.plan import RunPlan, RunRecords, make_plan, plan_after_crash, read_crash, retry_policy
+from factory.graph.plan import RunPlan, RunRecords, make_plan, plan_after_crash, retry_policy
 from factory.graph.progress import Outlook, RunMetrics, RunTotals
 from factory.graph.steps import NotReady, Work
 from factory.readers.base import ClipRef
@@ -147,7 +147,8 @@ class _Run:
             return RunSummary(BAD_CONFIG, f"{error}; {damaged}")
         self._notes = notes_folder(self._store.location)
         records = RunRecords(self._identity, self._digests)
-        plan, self._died = plan_after_crash(read_crash(self._notes), plan, records, self._policy)
+        crash = read_note(self._notes / CRASHED) or {}  # what was in hand when the last run died, by its guard
+        plan, self._died = plan_after_crash(crash, plan, records, self._policy)
         self._use_plan(plan)
         if plan.frozen:
             kept_clips = f"{len(plan.frozen)} clips kept as they are"

@@ -24,7 +24,7 @@ from factory.exits import ignore_terminal_signals, terminal_signals_blocked
 from factory.files import DiskFull
 from factory.graph import steps
 from factory.graph.guard import OVER, WORK, WatchedProcess, read_note
-from factory.graph.progress import Record, record_nothing
+from factory.graph.progress import Record
 from factory.graph.steps import Failure, NotReady, StopCheck, Work, warm
 from factory.readers.base import ClipRef
 from factory.store.location import Location
@@ -219,11 +219,6 @@ def task_name(step: str, args: tuple[Any, ...]) -> str:
     return "+".join(args[0]) if step in ("attempt", "attempts") else step
 
 
-def task_cores(step: str, args: tuple[Any, ...]) -> int:
-    """That a task uses: a reconstruction is told how many threads it has."""
-    return int(args[1]) if step == "reconstruct" else 1
-
-
 @dataclass
 class _Result:
     value: Any = None
@@ -244,7 +239,7 @@ class Graph(ABC):
     parallelism = 1  # tasks at once
     cores = os.cpu_count() or 1  # that one task can have
     attempt_tasks: Sequence[Sequence[str]] = (ATTEMPT,)  # the stages of an attempt, by task
-    record_metric: Record = staticmethod(record_nothing)
+    record_metric: Record = staticmethod(lambda metric, value, labels: None)  # nobody watches a run in one process
 
     @abstractmethod
     def submit(self, step: str, *args: Any) -> Ticket:

@@ -3,10 +3,8 @@
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any
 
-from factory.graph.guard import CRASHED, read_note
 from factory.graph.steps import HUMAN_CANDIDATE, Failure, PreparedClip
 from factory.readers.base import ClipRef
 from factory.store.samples import (
@@ -391,11 +389,6 @@ def past_from_outcome(outcome: Outcome) -> PastAttempt:
 
 
 # A run that died at a task: the next one counts it against that clip or attempt, and comes to it last.
-
-
-def read_crash(folder: Path) -> Mapping[str, Any]:
-    """What was in hand when the last run died, as its guard wrote it; empty where none did."""
-    return read_note(folder / CRASHED) or {}
 
 
 def plan_after_crash(

@@ -291,10 +291,6 @@ METRICS = tuple(metric for metric in list(globals().values()) if isinstance(metr
 Record = Callable[[Metric, float, Mapping[str, str]], None]
 
 
-def record_nothing(metric: Metric, value: float, labels: Mapping[str, str]) -> None:
-    """Of runs in one process: nobody watches."""
-
-
 class RunMetrics:
     """Turns what the driver learns into metrics."""
 

@@ -100,7 +100,9 @@ def find_or_make_benchmark(
         selection = read_selection(str(listed))
     except ValueError as error:
         raise ConfigError(f"benchmark={name}: {error}") from error
-    places = _places(name, root, _maps(name, maps, root), selection, pictures)
+    there = maps is None and MAPS not in os.environ and (root / "maps").is_dir()
+    found = root / "maps" if there else _there(name, "maps", maps, MAPS, "nuPlan's maps, with one folder a city")
+    places = _places(name, root, found, selection, pictures)
     out = f"{made.rstrip('/')}/{name}"
     store = Location.parse(out)
     source = {"benchmark": name, "pictures": pictures, "files": _digest(places, listed)}
@@ -150,12 +152,6 @@ def _places(name: str, data: Path, maps: Path, selection: Selection, pictures: b
         if not folder.is_dir():
             raise ConfigError(f"benchmark={name}: {folder} is missing: {what}")
     return NavsimFolders(logs, sensors if pictures else None, scenes if name == "navhard" else None, maps)
-
-
-def _maps(name: str, given: str | None, data: Path) -> Path:
-    if given is None and MAPS not in os.environ and (data / "maps").is_dir():
-        return data / "maps"
-    return _there(name, "maps", given, MAPS, "nuPlan's maps, with one folder a city")
 
 
 def _split(name: str, given: str | None) -> Path:

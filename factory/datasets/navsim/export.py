@@ -186,16 +186,6 @@ def scene_filter_yaml(logs: Sequence[WrittenLog]) -> str:
     )
 
 
-def split_yaml(names: SplitNames) -> str:
-    """What run_dataset_caching takes as train_test_split; data_split is the folder that the logs really lie in."""
-    return f"data_split: {names.folder}\ndefaults:\n- scene_filter: {names.yaml}\n"
-
-
-def log_split_yaml(logs: Sequence[WrittenLog]) -> str:
-    """Which logs a training takes, and which it validates on (SS training/dataset.py:129-146)."""
-    return "".join(_list(key, (log.log for log in logs if log.data_split == name)) for name, key in LISTS.items())
-
-
 def _list(key: str, values: Iterable[str]) -> str:
     """In double quotes: a token of digits alone, or one with an e among them, would be read as a number."""
     listed = list(values)
@@ -263,17 +253,12 @@ class ExportSummary:
     notes: tuple[str, ...]  # what its user should know
 
 
-def in_this_process(write: WriteGroup, groups: Iterable[RowGroup]) -> Generator[list[WrittenLog], None, None]:
-    """In this process."""
-    yield from map(write, groups)
-
-
 def export(
     table: KeyedTable,
     to: Path,
     settings: ExportSettings,
     trajectories: Array | None = None,
-    each: Each = in_this_process,
+    each: Each = map,
     say: Say = print,
 ) -> ExportSummary:
     """Write all samples that `settings` choose below `to`; what a call before has written stays.
@@ -456,8 +441,12 @@ def _write_split_files(
         of_split = [log for log in logs if log.folder == split.folder]
         taken = [log for log in of_split if log.has_route]
         yield write_file(root, f"{folder}/scene_filter/{split.yaml}.yaml", scene_filter_yaml(taken).encode())
-        yield write_file(root, f"{folder}/{split.yaml}.yaml", split_yaml(split).encode())
-        yield write_file(root, split.log_split, log_split_yaml(taken).encode())
+        # What run_dataset_caching takes as train_test_split; data_split is the folder that the logs really lie in.
+        content = f"data_split: {split.folder}\ndefaults:\n- scene_filter: {split.yaml}\n"
+        yield write_file(root, f"{folder}/{split.yaml}.yaml", content.encode())
+        # Which logs a training takes, and which it validates on (SS training/dataset.py:129-146).
+        lists = (_list(key, (log.log for log in taken if log.data_split == name)) for name, key in LISTS.items())
+        yield write_file(root, split.log_split, "".join(lists).encode())
         if settings.missing == "black" and any(log.absent_pictures for log in of_split):
             yield write_file(root, split.picture(BLACK), black_picture())
 

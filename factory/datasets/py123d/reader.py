@@ -265,11 +265,6 @@ def read_rig(folder: Path) -> dict[Path, Camera]:
     return {path: _camera(file, rear_from_imu) for path, file in pinholes.items()}
 
 
-def has_photo_files(folder: Path) -> bool:
-    """Whether the log's photos are files."""
-    return any(pa.types.is_string(_data_type(open_file(path, rows=False))) for path in matching(folder, CAMERAS))
-
-
 def recorded_photos(motion: LogMotion, rig: dict[Path, Camera], sensor_root: Path) -> tuple[SensorFile, ...]:
     """The log's photos, seconds since its first annotated frame, posed as their tables say.
 
@@ -434,7 +429,8 @@ class Py123dReader(LogReader[Py123dLog]):
 
     def block(self, ref: ClipRef) -> str | None:
         """Log and second at which the block begins that the clip is rendered from; None where there are no photos."""
-        if self.sensor_root is None or not has_photo_files(self.path_of(ref)):
+        tables = [] if self.sensor_root is None else matching(self.path_of(ref), CAMERAS)
+        if not any(pa.types.is_string(_data_type(open_file(path, rows=False))) for path in tables):  # of files' names
             return None
         first, _ = self.block_steps(ref.start_ms // STEP_MS)
         return f"{ref.log_id}@{first * STEP_S:g}s"

@@ -410,7 +410,11 @@ def _drivable_areas(
         if str(key).startswith("boundary_") and isinstance(feature, dict) and "polyline" in feature
     ]
     outline, repairs = _outlines(named, "polyline", "area", file)
-    if outline and all(len(line) > 3 and _ends_meet(line) for line in outline.values()):
+    closed = (  # as far as the points at the lines' ends are finite
+        len(line) > 3 and (not np.isfinite(line[[0, -1]]).all() or np.allclose(line[0], line[-1]))
+        for line in outline.values()
+    )
+    if outline and all(closed):
         found = [simple_area(line, key) for key, line in outline.items()]
         rings = [ring for ring, _ in found if ring is not None]
         repairs = (*repairs, *chain(*(of_ring for _, of_ring in found)))
@@ -418,11 +422,6 @@ def _drivable_areas(
         near = shapely.convex_hull(shapely.MultiPolygon(shapes)).buffer(SURFACE_MARGIN_M)
         shapes.append(shapely.intersection(surface, near))
     return paved_areas(shapes), repairs
-
-
-def _ends_meet(line: Array) -> bool:
-    """Whether a line is closed, as far as the points at its ends are finite."""
-    return not np.isfinite(line[[0, -1]]).all() or np.allclose(line[0], line[-1])
 
 
 def _outlines(

@@ -107,11 +107,7 @@ def paint(scene: LitScene, camera: Camera, world_from_ego: Array) -> Bytes:
     view, rays = camera_view(scale @ camera.intrinsics, world_from_camera)
     height, width = CELLS * camera.height + 2, CELLS * camera.width + 2
     ids, planes = rasterise_view(scene, view, SAMPLES * width, SAMPLES * height)
-    return _through_optics(shade(scene, ids, planes, np.ascontiguousarray(world_from_camera[:3, 3]), rays))
-
-
-def _through_optics(cells: F32) -> Bytes:
-    """(H, W, 3) of cells (2 H + 2, 2 W + 2, 3) in [0, 255]."""
+    cells = shade(scene, ids, planes, np.ascontiguousarray(world_from_camera[:3, 3]), rays)  # (2 H + 2, 2 W + 2, 3)
     n_rows, n_columns = len(cells) - 3, cells.shape[1] - 3
     rows = np.sum([weight * cells[k : n_rows + k : CELLS] for k, weight in enumerate(OPTICS)], axis=0)
     both = np.sum([weight * rows[:, k : n_columns + k : CELLS] for k, weight in enumerate(OPTICS)], axis=0)
@@ -197,7 +193,10 @@ def scan_lidar(scene: LitScene, world_from_ego: Array, beams: int, azimuths: int
         distance[mine[met]] = 1.0 / (inverse_depth[met] * local[met, 2])
         normals = scene.mesh.normals[hit[met]] @ world_from_ego[:3, :3]
         facing = np.abs(np.einsum("ij,ij->i", normals, direction[mine[met]]))
-        intensity[mine[met]] = _reflectance(scene, hit[met]) * (0.35 + 0.65 * facing)
+        reflected = np.clip(scene.mesh.colour[hit[met]].mean(axis=1), 0.05, 0.6)
+        for material, value in _REFLECTANCE.items():
+            reflected[scene.mesh.material[hit[met]] == material] = value
+        intensity[mine[met]] = reflected * (0.35 + 0.65 * facing)
     keep = np.flatnonzero((distance > RANGE_M[0]) & (distance < RANGE_M[1]))  # false for NaN
     return LidarReturns(
         (MOUNT_M + direction[keep] * distance[keep, None]).astype(np.float32),
@@ -205,10 +204,3 @@ def scan_lidar(scene: LitScene, world_from_ego: Array, beams: int, azimuths: int
         laser[keep].astype(np.uint8),
         (shot[keep] * (100_000_000 // azimuths)).astype(np.int32),
     )
-
-
-def _reflectance(scene: LitScene, triangle: ShortInts) -> Array:
-    out = np.clip(scene.mesh.colour[triangle].mean(axis=1), 0.05, 0.6)
-    for material, value in _REFLECTANCE.items():
-        out[scene.mesh.material[triangle] == material] = value
-    return out

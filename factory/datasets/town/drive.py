@@ -435,7 +435,9 @@ def _attempt(
             planned.add(replace(car, poses=np.repeat(car.poses, len(times), axis=0)), 0.0)
     ego_v = float(np.interp(start, path.s, path.limit)) * rng.uniform(0.8, 0.95)
     if rng.random() < 0.7:
-        _lead(planned, path, start + 4.6 + ego_v * rng.uniform(1.9, 3.2), ego_v)
+        begins = start + 4.6 + ego_v * rng.uniform(1.9, 3.2)
+        own = path_of_lanes(streets, list(path.lane_ids), DrivingStyle(float(rng.uniform(0.88, 1.02))))
+        _vehicle(planned, "lead", own, begins, ego_v, int(rng.choice(3, p=[0.7, 0.2, 0.1])))
     s, v = planned.driven(path, start, ego_v, style)
     if v.min() < SLOWEST_MPS or v[WARM_STEPS:].mean() < 4.5 or s[-1] > path.s[-1] - 40.0:
         return None
@@ -473,12 +475,6 @@ def _vehicle(planned: _PlannedTraffic, name: str, path: TownPath, start: float, 
     poses = curves.poses_at(path.poses, s)
     poses[s > path.s[-1] - 1.0] = np.nan
     planned.add(TownTrack(name, category, (length, width, height), poses, planned.look_seed()), 0.35)
-
-
-def _lead(planned: _PlannedTraffic, path: TownPath, start: float, speed: float) -> None:
-    """A vehicle in front of the ego, on the ego's own way."""
-    own = path_of_lanes(planned.streets, list(path.lane_ids), DrivingStyle(float(planned.rng.uniform(0.88, 1.02))))
-    _vehicle(planned, "lead", own, start, speed, int(planned.rng.choice(3, p=[0.7, 0.2, 0.1])))
 
 
 def _cars(planned: _PlannedTraffic, centre: Array) -> None:

@@ -177,7 +177,10 @@ def build_scenery(streets: Streets, rng: np.random.Generator) -> Scenery:
     everything = np.vstack([road.line[:, :2] for road in streets.roads])
     middle, reach = (everything.min(0) + everything.max(0)) / 2, np.ptp(everything, axis=0).max() / 2 + 260.0
     _plain(b, middle, reach)
-    taken = build_houses(b, streets, _reserved(streets), rng)
+    beside = PAVEMENT_M + 0.05  # no house stands on a street or its pavements
+    shapes = [shapely.LineString(r.line[:, :2]).buffer(r.half_width + beside, cap_style="flat") for r in streets.roads]
+    shapes += [shapely.Polygon(j.ring).buffer(PAVEMENT_M + 0.6) for j in streets.junctions]
+    taken = build_houses(b, streets, shapes, rng)
     plant_trees(b, streets, taken, rng)
     _furniture(b, streets, rng)
     lamps = tuple(_signal(b, post.pose, post.width) for post in streets.posts)
@@ -288,15 +291,6 @@ def _plain(b: MeshBuilder, middle: Array, reach: float) -> None:
     for factor, height, tone in ((1.0, 16.0, (0.20, 0.27, 0.17)), (0.93, 12.0, (0.25, 0.32, 0.18))):
         line = middle + (ring - middle) * factor
         b.strip(lifted(line, PLAIN_Z), lifted(line, height), angle * reach, 0.0, height, tx.TREELINE, tone, 5)
-
-
-def _reserved(streets: Streets) -> list[shapely.Geometry]:
-    """Streets with their pavements: no house stands there."""
-    roads = [
-        shapely.LineString(road.line[:, :2]).buffer(road.half_width + PAVEMENT_M + 0.05, cap_style="flat")
-        for road in streets.roads
-    ]
-    return roads + [shapely.Polygon(j.ring).buffer(PAVEMENT_M + 0.6) for j in streets.junctions]
 
 
 def _furniture(b: MeshBuilder, streets: Streets, rng: np.random.Generator) -> None:

@@ -411,7 +411,8 @@ def _vector_map(streets: Streets, drive: TownDrive) -> dict[str, dict[str, Any]]
         for lane in _near_lanes(streets, drive)
     }
     areas = {
-        str(1 + k): {"area_boundary": _points(_simplified(ring)), "id": 1 + k} for k, ring in enumerate(streets.areas)
+        str(1 + k): {"area_boundary": _points(np.asarray(ring.simplify(0.01).exterior.coords)[:-1]), "id": 1 + k}
+        for k, ring in enumerate(map(shapely.Polygon, streets.areas))
     }
     crossings = {
         str(501 + k): {"edge1": _points(crossing.edge1), "edge2": _points(crossing.edge2), "id": 501 + k}
@@ -422,11 +423,6 @@ def _vector_map(streets: Streets, drive: TownDrive) -> dict[str, dict[str, Any]]
 
 def _points(line: Array) -> list[dict[str, float]]:
     return [{"x": round(float(x), 4), "y": round(float(y), 4), "z": 0.0} for x, y in line[:, :2]]
-
-
-def _simplified(ring: Array) -> Array:
-    """The ring without the points that lie within 1 cm of its other edges."""
-    return np.asarray(shapely.Polygon(ring).simplify(0.01).exterior.coords)[:-1]
 
 
 def _thinned(line: Array) -> Array:
@@ -508,8 +504,8 @@ def write_towns(towns: Sequence[TownFolder], settings: TownSettings) -> None:
                     painting[_start_painter(town, begun[-1], settings, lifeline)] = town
             for child in [child for child in painting if child.poll() is not None]:
                 town = painting.pop(child)
-                if refused := _refusal_of(child):
-                    raise refused
+                if refused := child.communicate()[0]:
+                    raise OSError(*json.loads(refused))
                 if child.returncode != 0:
                     ended = f"its process ended with exit {child.returncode} and said above why"
                     raise RuntimeError(
@@ -534,12 +530,6 @@ def _start_painter(
     told = {"seed": town.seed, "indices": town.indices, "root": str(town.root), "settings": asdict(settings)}
     command = [sys.executable, "-m", __name__, json.dumps(told | {"unfinished": str(unfinished)})]
     return subprocess.Popen(command, stdin=lifeline, stdout=subprocess.PIPE)  # noqa: S603 - a list, no shell
-
-
-def _refusal_of(ended: "subprocess.Popen[bytes]") -> OSError | None:
-    """What a painter that ended was refused, as it told."""
-    told, _ = ended.communicate()
-    return OSError(*json.loads(told)) if told else None
 
 
 def main(told: str) -> None:

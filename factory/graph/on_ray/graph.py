@@ -45,13 +45,12 @@ from factory.graph.local import (
     notes_folder,
     remove_if_empty,
     start_run_notes,
-    task_cores,
     task_name,
     task_note,
 )
 from factory.graph.own_process import check_address_answers, no_cluster_text
 from factory.graph.plan import AttemptBatch
-from factory.graph.progress import METRICS, Metric, Record, Type
+from factory.graph.progress import METRICS, Metric, Type
 from factory.graph.steps import BatchReport, Failure, NotReady, PreparedClip, Work, attempt, never_stop
 from factory.store.location import BadLocation, Location
 from factory.store.samples import ErrorKind
@@ -193,15 +192,6 @@ WARMING = {"key": "warm", "what": "compiling kernels", "run": "", "limited": Fal
 _HELD: dict[str, Any] = {}  # per worker process: the run's Work, fetched once
 
 
-def ray_metric_recorder() -> Record:
-    """By way of `ray.util.metrics`: each node's agent serves Prometheus.
-
-    Measured: 4 us a value, about 50 us an attempt of 100 ms or more.
-    """
-    recording = {metric.name: _recording(metric) for metric in METRICS}
-    return lambda metric, value, labels: recording[metric.name](value, dict(labels))
-
-
 def _recording(metric: Metric) -> Callable[[float, dict[str, str]], None]:
     labels = ("run", *metric.labels)
     match metric.type:
@@ -238,7 +228,8 @@ class RayGraph(Graph):
         self._is_ours = self._connected and join_or_start_cluster(workers)
         self.parallelism = tasks_at_once(workers, self._is_ours)
         self.cores = min(self.parallelism, *(per_node("CPU") or [1]))  # none yet where a cluster grows from nothing
-        self.record_metric = ray_metric_recorder()
+        recording = {metric.name: _recording(metric) for metric in METRICS}  # each node's agent serves Prometheus
+        self.record_metric = lambda metric, value, labels: recording[metric.name](value, dict(labels))
         self._supplied: dict[str, Any] = {
             "work": [ray.put(work)],
             "out": out,
@@ -287,9 +278,9 @@ class RayGraph(Graph):
             except RayError as error:
                 if node not in nodes_of_cluster():
                     continue  # it has left the cluster: no task goes there
-                raise _not_ready_error(
-                    error, f"node {node} could not get its kernels ready: {one_line(error)}"
-                ) from error
+                said = f"node {node} could not get its kernels ready: {one_line(error)}"
+                is_of_code = isinstance(error, RayTaskError) and _error_kind(error) is not ErrorKind.MACHINE
+                raise (NotReady if is_of_code else MachineFailure)(said) from error
             if isinstance(answer, Failure):
                 raise not_ready_error(answer)
 
@@ -327,7 +318,7 @@ class RayGraph(Graph):
                 gpu = self._gpu_share if draws else None
                 memory = self._claims.memory_bytes(ticket.step)
                 memory = memory if self._most_memory is None else min(memory, self._most_memory)
-                cores = task_cores(step, args)
+                cores = int(args[1]) if step == "reconstruct" else 1  # it is told how many threads it has
                 n_rows = args[-1].samples if step == "attempts" else 1
                 task = _remote_task(ticket.step, cores, gpu, memory or None, 1 + n_rows)
                 told = task_note(step, ticket.step, args) | self._costs.limits_for(ticket.step) | {"run": self._run}
@@ -383,12 +374,6 @@ def _error_kind(error: RayError) -> ErrorKind:
     """A worker that died may have died of its clip; a node, its memory or its object store are the machine's."""
     ill = isinstance(error, ILL) or machine_fault_of(error.cause if isinstance(error, RayTaskError) else error)
     return ErrorKind.MACHINE if ill else ErrorKind.SYSTEM
-
-
-def _not_ready_error(error: RayError, said: str) -> Exception:
-    """Where a task that gets kernels ready did not end: its code is to blame, else Ray or the machine."""
-    is_of_code = isinstance(error, RayTaskError) and _error_kind(error) is not ErrorKind.MACHINE
-    return NotReady(said) if is_of_code else MachineFailure(said)
 
 
 @dataclass(frozen=True)
