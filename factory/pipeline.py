@@ -482,9 +482,13 @@ class BenchmarkWork(FactoryWork):
             assert prepared.scenes is not None, "prepared by a run without frames"
             rng = random_stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
             judged = drive_under_log_replay(scene_of_clip(prepared.scenes.before), Human(), self.pdm, rng, timed)
-            return Drive(
-                _earlier_ref(payload.ref), None, judged, None, row_overrides=_lineage_of_earlier_row(payload.clip)
-            )
+            overrides = {  # what its row says about the clip, instead of the earlier window that it was read from
+                "clip_id": payload.clip.clip_id,
+                "clip_start_s": payload.clip.start_s,
+                "now_s": (NOW - BEFORE_STEPS) * STEP_S,
+                "parent_states": payload.clip.ego_states[[NOW, NOW + HORIZON_STEPS]],
+            }
+            return Drive(_earlier_ref(payload.ref), None, judged, None, row_overrides=overrides)
         chosen = payload.candidates[candidate]
         led_to = drive_follow_up(payload.clip, chosen.rollout, self.traffic, self.pdm, timed)
         if isinstance(led_to, Rejected):
@@ -492,16 +496,6 @@ class BenchmarkWork(FactoryWork):
         shown = seen_half_a_second_earlier(led_to, chosen.rollout, self.pdm) if expert == FOLLOW_UP_BEFORE else None
         now = led_to.scene.step
         return Drive(payload.ref, chosen, led_to, None, shared=(now - BEFORE_STEPS, now), sampled_instead=shown)
-
-
-def _lineage_of_earlier_row(clip: Clip) -> dict[str, object]:
-    """What the row of the log 0.5 s before T says about its clip, instead of the earlier window it was read from."""
-    return {
-        "clip_id": clip.clip_id,
-        "clip_start_s": clip.start_s,
-        "now_s": (NOW - BEFORE_STEPS) * STEP_S,
-        "parent_states": clip.ego_states[[NOW, NOW + HORIZON_STEPS]],
-    }
 
 
 def _earlier_ref(ref: ClipRef) -> ClipRef:

@@ -12,7 +12,7 @@ complete, 2 bad settings or no clip (nothing is written), 3 complete with failed
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -51,12 +51,6 @@ def interleave_by_log(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
     queues = list(logs.values())
     groups = [queues[i : i + hands] for i in range(0, len(queues), hands)]
     return [ref for group in groups for turn in zip_longest(*group) for ref in turn if ref is not None]
-
-
-def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:
-    """Stage -> (tasks, seconds) of this run as a small table; seconds add up over the workers."""
-    lines = [f"{stage:<12}{n:>8}{total:>10.1f}{total / n:>10.2f}" for stage, (n, total) in seconds.items() if n]
-    return "\n".join([f"{'stage':<12}{'tasks':>8}{'seconds':>10}{'each':>10}", *lines])
 
 
 def needed_kernel_parts(config: RunConfig) -> list[str]:
@@ -105,7 +99,9 @@ def _checked(asked: CommandLine) -> RunConfig:
     config = load_config(asked.words)
     if unusable := why_unusable(config.out):
         raise ConfigError(unusable)
-    refuse_what_is_not_there(config)
+    refuse_missing_root(config.clips)
+    refuse_missing_classes(config)
+    refuse_cameras_of_no_rig(config)
     return config
 
 
@@ -198,7 +194,10 @@ def _run(
         return summary.exit_code
     print(image_sources_text(store, [ref.clip_id for ref in refs]))
     if summary.seconds:
-        print(seconds_text(summary.seconds))
+        print(f"{'stage':<12}{'tasks':>8}{'seconds':>10}{'each':>10}")
+        for stage, (n, total) in summary.seconds.items():
+            if n:
+                print(f"{stage:<12}{n:>8}{total:>10.1f}{total / n:>10.2f}")
     if set(config.experts) >= NEEDED and summary.exit_code == COMPLETE:
         print(write_benchmark(store, refs, assembled.work.identity, config.rounds, config.benchmark))
     write_facts(store, assembled)
@@ -214,13 +213,6 @@ def _run(
 # What a run names outside its settings, looked up before anything heavy is imported and any clip is read.
 #
 # Classes of plug-ins, folders of logs, the cameras of their rigs. What only reading a clip can tell comes later.
-
-
-def refuse_what_is_not_there(config: RunConfig) -> None:
-    """Raises ConfigError for the first name that stands for nothing, with the nearest that does."""
-    refuse_missing_root(config.clips)
-    refuse_missing_classes(config)
-    refuse_cameras_of_no_rig(config)
 
 
 def refuse_missing_classes(config: RunConfig) -> None:

@@ -53,7 +53,10 @@ def read_header(data: bytes | Bytes) -> tuple[str, Size]:
             next((_size(view[at:end]) for marker, at, end in _segments(view) if marker in SIZED), (0, 0)),
         )
     else:
-        raise BadPicture(_other(bytes(view[:8])))
+        head = bytes(view[:8])
+        names = [name for begin, name in OTHERS.items() if head.startswith(begin)]
+        other = f"a {names[0]} file: convert it to" if names else "not"
+        raise BadPicture(f"{other} a JPEG or PNG picture" if head else "the file is empty")
     if not (size[0] and size[1]):
         raise BadPicture(f"a {name} that is cut off")
     return name, size
@@ -149,13 +152,6 @@ def _size(segment: memoryview) -> Size:
 
 def _number(value: memoryview) -> int:
     return int.from_bytes(value, "big")
-
-
-def _other(head: bytes) -> str:
-    if not head:
-        return "the file is empty"
-    other = next((f"a {name} file: convert it to" for begin, name in OTHERS.items() if head.startswith(begin)), "not")
-    return f"{other} a JPEG or PNG picture"
 
 
 def _said(size: Size) -> str:

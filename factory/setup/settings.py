@@ -124,8 +124,9 @@ def assemble(config: RunConfig) -> Run:
             name: build_expert(RunContext(config, name, opened)) for name in config.experts if name not in FRAMES
         }
         reader, index = opened()
-        if starts is not None:
-            starts.refuse_other_clips(ref.clip_id for ref in (*index.refs, *index.broken))
+        clip_ids = {ref.clip_id for ref in (*index.refs, *index.broken)}
+        if starts is not None and starts.of_clip.keys().isdisjoint(clip_ids):
+            raise ValueError(f"perturb.starts: none of its {len(starts.of_clip)} clips is among those of clips=")
     except ValueError as error:
         raise error if isinstance(error, ConfigError) else ConfigError(str(error)) from error
     frames = tuple(name for name in config.experts if name in FRAMES)

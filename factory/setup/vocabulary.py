@@ -7,7 +7,7 @@ them a run later reads, so that a run's `limit` never changes what the experts k
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -126,11 +126,6 @@ class StartTrajectories:
 
     of_clip: Mapping[str, Array]  # clip_id -> (S, 40, 3) ego frame at T, 0.1 .. 4.0 s, in the order of the file
     digest: str  # 16 hex digits of all of it, whatever the order of the clips
-
-    def refuse_other_clips(self, clip_ids: Iterable[str]) -> None:
-        """Raises ValueError where none of these clips has a start."""
-        if self.of_clip.keys().isdisjoint(clip_ids):
-            raise ValueError(f"perturb.starts: none of its {len(self.of_clip)} clips is among those of clips=")
 
 
 def load_start_trajectories(path: str) -> StartTrajectories:

@@ -470,17 +470,13 @@ def damaged_blocks(out: Location) -> dict[str, str]:
     found = {}
     for path in sorted(folder.glob("block-*")) if out.is_local else ():
         try:
-            _check_file(path)
+            if path.name.endswith(SUFFIX):
+                read_scene(path, path.stem)
+            elif path.name.endswith(FIT_SUFFIX):
+                verify_checksum(path, path.name)
+            elif path.name.endswith(RIG_SUFFIX):
+                read_rig_file(path)
         except (Damaged, BadScene) as error:
             problem = str(error).removeprefix(f"{path}: ")
             found[f"cache/{path.name}"] = f"{problem}; the next run makes it again"
     return found
-
-
-def _check_file(path: Path) -> None:
-    if path.name.endswith(SUFFIX):
-        read_scene(path, path.stem)
-    elif path.name.endswith(FIT_SUFFIX):
-        verify_checksum(path, path.name)
-    elif path.name.endswith(RIG_SUFFIX):
-        read_rig_file(path)

@@ -135,7 +135,11 @@ def scene_tensors(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) ->
     for name, part in parts.items():
         out |= {f"{name}.{field.name}": getattr(part, field.name) for field in fields(Gaussians)}
     if dtype is SceneDtype.FLOAT16:
-        out = {name: _in_half(name, array) if _may_be_half(name) else array for name, array in out.items()}
+        out |= {
+            name: _in_half(name, array)
+            for name, array in out.items()
+            if name == "sky" or name.rpartition(".")[2] in IN_HALF
+        }
     if asset.exposures:
         out["exposures"] = np.stack([exposure.affine for exposure in asset.exposures])
     if asset.taken:
@@ -198,10 +202,6 @@ def scene_from_parts(tensors: Tensors, described: Mapping[str, Any], digest: str
         shifts=BoxShifts(tuple(described["shifts"]), tensors["shifts"]) if "shifts" in described else NO_SHIFTS,
         bodies=tuple(OwnBody(camera, tensors[f"bodies.{i}"]) for i, camera in enumerate(described.get("bodies", ()))),
     )
-
-
-def _may_be_half(name: str) -> bool:
-    return name == "sky" or name.rpartition(".")[2] in IN_HALF
 
 
 def _in_half(name: str, array: NDArray[Any]) -> NDArray[np.float16]:

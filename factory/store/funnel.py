@@ -120,13 +120,10 @@ def _reasons(outcomes: pa.Table) -> tuple[Codes, tuple[str, ...], Codes]:
     found, at = distinct_texts(outcomes, ("kind", "stage", "reason", "error_kind"))
     words = [_reason(*row) for row in found]
     known = list(dict.fromkeys([ACCEPTED, EXHAUSTED, *words]))
-    tasks = np.array([_task_index(stage) for _, stage, _, _ in found], np.int32)
+    # The place in ATTEMPT of the task of a stage or name; of one that was not told the first.
+    places = {name: i for i, task in reversed(list(enumerate(ATTEMPT))) for name in (task, *STAGES_OF[task])}
+    tasks = np.array([places.get(stage, 0) for _, stage, _, _ in found], np.int32)
     return np.array([known.index(word) for word in words], np.int32)[at], tuple(known), tasks[at]
-
-
-def _task_index(stage: str) -> int:
-    """Place in ATTEMPT of the task of that stage or name; of one that was not told the first."""
-    return next((i for i, name in enumerate(ATTEMPT) if stage == name or stage in STAGES_OF[name]), 0)
 
 
 def _reason(kind: str, stage: str, reason: str, error_kind: str) -> str:

@@ -242,11 +242,6 @@ def with_partition_columns(stored: pa.Table, schema: pa.Schema, partition: Mappi
     return pa.table(same, schema=schema)
 
 
-def dictionary_encoded(field: pa.Field) -> pa.Field:
-    """The column with its texts as numbers into a dictionary."""
-    return field.with_type(pa.dictionary(pa.int32(), pa.string())) if field.type == pa.string() else field
-
-
 def open_parquet(location: Location, path: str) -> pq.ParquetFile:
     """One file. Only where reading costs round trips are a read's columns fetched together, before they are decoded."""
     filesystem, base = location.filesystem()

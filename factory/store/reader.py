@@ -103,18 +103,14 @@ class SampleTable:
 
     def sample(self, which: int | str, columns: Sequence[str] | None = None) -> Sample:
         """One sample, or some of its columns; reads the row group it stands in."""
-        at = self._row_number(which) if isinstance(which, str) else which
+        at = which if isinstance(which, int) else int(np.searchsorted(self._keys, which.encode()))
+        if isinstance(which, str) and (at == len(self._keys) or self._keys[at].decode() != which):
+            raise KeyError(which)
         path = self._paths[self._files[at]]
         with raising_damaged_file(f"{self._table.location.uri}/{path}"):
             group, row = find_row_group(self._file(path), int(self._rows[at]))
         (sample,) = self.rows(path, group, columns, slice(row, row + 1))
         return sample
-
-    def _row_number(self, attempt_id: str) -> int:
-        at = int(np.searchsorted(self._keys, attempt_id.encode()))
-        if at == len(self._keys) or self._keys[at].decode() != attempt_id:
-            raise KeyError(attempt_id)
-        return at
 
     def __iter__(self) -> Iterator[Sample]:
         return self.iterate()

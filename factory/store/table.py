@@ -38,7 +38,6 @@ from factory.files import DamagedFile, naming_disk_errors
 from factory.store.location import (
     Location,
     Shard,
-    dictionary_encoded,
     read_parquet,
     with_partition_columns,
     write_shard,
@@ -591,7 +590,9 @@ class KeyedTable:
         """Of some columns, None: all; encoded: as of `read`."""
         names = self.spec.schema.names if columns is None else columns
         fields = [self.spec.schema.field(name) for name in names]
-        return pa.schema([dictionary_encoded(f) if encoded and f.name != self.spec.key else f for f in fields])
+        numbers = pa.dictionary(pa.int32(), pa.string())  # texts as numbers into a dictionary
+        encodes = [encoded and f.name != self.spec.key and f.type == pa.string() for f in fields]
+        return pa.schema([f.with_type(numbers) if to_number else f for f, to_number in zip(fields, encodes)])
 
     def lost_commit(self) -> int | None:
         """The number of a commit that was made and that the log does not have any more; None where it has all."""

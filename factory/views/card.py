@@ -44,7 +44,8 @@ def write_card(store: Store) -> str:
 def card(store: Store) -> str:
     """The text: YAML front matter, then Markdown."""
     samples, outcomes, lists = funnel_tables(store, COLUMNS)
-    orphans = _orphans(store)
+    live = set(store.samples.live_files())
+    orphans = sum(name.endswith(".parquet") and name not in live for name in store.samples.location.names())
     parts = (
         _front_matter(samples, orphans),
         _overview_section(store, samples),
@@ -201,11 +202,6 @@ def _state(store: Store) -> str:
     if run.goes_on:
         return "not finished: the same command goes on"
     return STATUS.get(run.last.get("exit_code", -1), ("not finished", ""))[0]
-
-
-def _orphans(store: Store) -> int:
-    live = set(store.samples.live_files())
-    return sum(name.endswith(".parquet") and name not in live for name in store.samples.location.names())
 
 
 def _counts(samples: pa.Table, by: Sequence[str], distinct: Sequence[str] = ()) -> list[tuple[object, ...]]:

@@ -76,6 +76,7 @@ def episode_messages(row: Row, logged: Array | None = None) -> list[Message]:
 
     row: every column of a sample; logged: (M, >=3) the log's drive from T on, world frame, where it is known.
     """
+    facts = {column.name: row[column.name] for column in FACTS}  # lineage, licence, scores and tags
     found = [
         *_transforms(row),
         *_cameras(row),
@@ -83,7 +84,7 @@ def episode_messages(row: Row, logged: Array | None = None) -> list[Message]:
         *_agents(row),
         *_map(row),
         *_trajectories(row, logged),
-        Message("/sample", _time_ns(row, -NOW_INDEX * STEP_S), sample_message(row)),
+        Message("/sample", _time_ns(row, -NOW_INDEX * STEP_S), SampleMessage(**facts)),
     ]
     return sorted(found, key=lambda message: message.time_ns)
 
@@ -91,11 +92,6 @@ def episode_messages(row: Row, logged: Array | None = None) -> list[Message]:
 def episode_of(row: Row, logged: Array | None = None) -> bytes:
     """The sample as one MCAP file."""
     return episode_bytes(episode_messages(row, logged), metadata_of(row))
-
-
-def sample_message(row: Row) -> Any:
-    """Lineage, licence, scores and tags of a row."""
-    return SampleMessage(**{column.name: row[column.name] for column in FACTS})
 
 
 def metadata_of(row: Row) -> dict[str, str]:

@@ -119,7 +119,11 @@ def draw_bev(
             nose = np.stack([(corners[0] + corners[3]) / 2.0, box[:2]])
             cv2.polylines(image, [pixels(nose)], False, BACKGROUND, 1, cv2.LINE_AA, _SHIFT)
     cv2.fillPoly(image, [pixels(box_corners(ego_boxes(ego, PACIFICA)))], EGO, cv2.LINE_AA, _SHIFT)
-    _captions(image, title, paths)
+    write_text(image, title, (8, 18), 0.42)
+    for row, path in enumerate(path for path in paths if path.label):
+        y = height - 10 - 16 * row
+        cv2.line(image, (8, y - 4), (26, y - 4), path.colour, 3, cv2.LINE_AA)
+        write_text(image, path.label, (32, y))
     return image
 
 
@@ -128,15 +132,6 @@ def _polyline(image: Bytes, points: ShortInts, path: DrawnPath) -> None:
     for start in range(0, len(points) - 1, every):
         piece = points[start : start + length]
         cv2.polylines(image, [piece], False, path.colour, path.width_px, cv2.LINE_AA, _SHIFT)
-
-
-def _captions(image: Bytes, title: str, paths: Sequence[DrawnPath]) -> None:
-    height = image.shape[0]
-    write_text(image, title, (8, 18), 0.42)
-    for row, path in enumerate(path for path in paths if path.label):
-        y = height - 10 - 16 * row
-        cv2.line(image, (8, y - 4), (26, y - 4), path.colour, 3, cv2.LINE_AA)
-        write_text(image, path.label, (32, y))
 
 
 def write_text(image: Bytes, text: str, at: tuple[int, int], size: float = 0.4, colour: Colour = (20, 20, 20)) -> None:
@@ -366,12 +361,6 @@ def images_at_now(row: Row) -> list[dict[str, Any]]:
         if known is None or abs(image["time_s"]) < abs(known["time_s"]):
             nearest[image["camera"]] = image
     return list(nearest.values())
-
-
-def images_up_to_now(row: Row, camera: str) -> list[dict[str, Any]]:
-    """What one camera saw up to now, in order of time."""
-    taken = [image for image in row["images"] or () if image["camera"] == camera and image["time_s"] < 0.1]
-    return sorted(taken, key=lambda image: float(image["time_s"]))
 
 
 def front_camera(row: Row) -> str | None:

@@ -157,11 +157,18 @@ def lineage(store: "Store", which: str) -> list[Part]:
 
     attempt_id = _find_attempt_id(store, which)
     is_sample = attempt_id in store.samples
-    path, row = _light_row(store.samples if is_sample else store.outcomes, attempt_id)
+    table = store.samples if is_sample else store.outcomes
+    large = {"images", "cameras", "label_subscores", "label_progress"}
+    small = [f.name for f in table.spec.schema if f.name not in large and not f.name.startswith(("agent_", "lane_"))]
+    path, row = _file_and_row(table, attempt_id, small)
     records = store.runs()
     number = run_number_lookup(records)(row)
     record = records[number] if number >= 0 else {}
-    clip = _candidates_row(store, row)
+    clip: Row = {}  # of the table of candidates, with its file
+    if row["clip_id"] in store.candidates:
+        names = store.candidates.spec.schema.names
+        file, clip = _file_and_row(store.candidates, row["clip_id"], names)
+        clip = {**clip, "file": file}
     parts = [("run", _run_facts(store, record, number, row)), ("clip", _clip_facts(store, row, clip))]
     if row["candidate_index"] >= 0:
         parts.append(("candidate", _candidate_facts(row, clip, record)))
@@ -185,13 +192,6 @@ def _find_attempt_id(store: "Store", which: str) -> str:
     return found[0]
 
 
-def _light_row(table: "KeyedTable", attempt_id: str) -> tuple[str, Row]:
-    """The file it stands in, and the row without what is large."""
-    large = {"images", "cameras", "label_subscores", "label_progress"}
-    small = [f.name for f in table.spec.schema if f.name not in large and not f.name.startswith(("agent_", "lane_"))]
-    return _file_and_row(table, attempt_id, small)
-
-
 def _file_and_row(table: "KeyedTable", key: str, columns: Sequence[str]) -> tuple[str, Row]:
     """A key's file, and these columns of its row."""
     import pyarrow.compute as pc
@@ -199,14 +199,6 @@ def _file_and_row(table: "KeyedTable", key: str, columns: Sequence[str]) -> tupl
     path = table.path_of(key)
     rows = table.read_file(path, table.live_files()[path], columns)
     return path, rows.filter(pc.equal(rows[table.spec.key], key)).to_pylist()[0]
-
-
-def _candidates_row(store: "Store", row: Row) -> Row:
-    """The clip's row of candidates with its file, empty where it has none."""
-    if row["clip_id"] not in store.candidates:
-        return {}
-    path, found = _file_and_row(store.candidates, row["clip_id"], store.candidates.spec.schema.names)
-    return {**found, "file": path}
 
 
 def _run_facts(store: "Store", record: Row, number: int, row: Row) -> list[tuple[str, object]]:

@@ -67,7 +67,9 @@ def logged_vehicles(store: "Store", asset: RenderAsset) -> tuple[list[LoggedVehi
         raise BadScene(f"{store.location.uri}: no prepared clip of log {stretch} in its cache")
     times_ms = sorted({time_ms for boxes in seen.values() for time_ms in boxes})
     known = [name for name, boxes in seen.items() if boxes]
-    tokens = _worldengine_tokens(known)
+    tokens = [re.sub(r"[^A-Za-z0-9-]", "-", name) for name in known]  # it cuts at underscores, and a point would nest
+    if len(set(tokens)) < len(tokens):
+        raise BadScene(f"track ids {', '.join(known)}: two of them make the same token")
     times_s = block.start_s + 1e-3 * np.array(times_ms)
     vehicles = [
         LoggedVehicle(token, asset.nodes[name], times_s, _poses_of_boxes(seen[name], times_ms))
@@ -112,14 +114,6 @@ def _poses_of_boxes(boxes: dict[int, Array], times_ms: Sequence[int]) -> Array:
     rows = [i for i, time_ms in enumerate(times_ms) if time_ms in boxes]
     poses[rows] = world_from_boxes(np.stack([boxes[times_ms[i]] for i in rows]))
     return poses
-
-
-def _worldengine_tokens(names: Sequence[str]) -> list[str]:
-    """Names as WorldEngine takes them: it cuts at underscores, and a point would nest."""
-    tokens = [re.sub(r"[^A-Za-z0-9-]", "-", name) for name in names]
-    if len(set(tokens)) < len(tokens):
-        raise BadScene(f"track ids {', '.join(names)}: two of them make the same token")
-    return tokens
 
 
 # How well scenes show photos they were not made of, camera by camera: for `factory scene` and the report.

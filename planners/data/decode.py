@@ -163,10 +163,8 @@ def _jpegs_at_now(images: pa.ListArray, cameras: Sequence[tuple[str, ...]]) -> l
     ends = np.frombuffer(jpeg.buffers()[1], np.int32)[jpeg.offset : jpeg.offset + len(jpeg) + 1]
     flat = np.frombuffer(data, np.uint8)
 
-    def jpeg_of(entry: int) -> Bytes:
-        return flat[ends[entry] : ends[entry + 1]].copy()
-
-    return [tuple(jpeg_of(found[row, name]) for name in chosen) for row, chosen in enumerate(cameras)]
+    entries = [[found[row, name] for name in chosen] for row, chosen in enumerate(cameras)]
+    return [tuple(flat[ends[entry] : ends[entry + 1]].copy() for entry in mine) for mine in entries]
 
 
 def _row_getter(column: Column, stored: pa.Array) -> Callable[[int], Any]:

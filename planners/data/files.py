@@ -118,11 +118,6 @@ def leaf_paths(file: pq.ParquetFile, columns: Sequence[str]) -> list[str]:
     return [path for path, plain in paths if any(_under(plain, c) for c in columns)]
 
 
-def read_group(file: pq.ParquetFile, group: int, paths: Sequence[str]) -> pa.Table:
-    """Leaves of one row group, in this thread."""
-    return file.read_row_group(group, columns=paths, use_threads=False)
-
-
 def read_all(file: pq.ParquetFile, paths: Sequence[str]) -> pa.Table:
     """Leaves of all row groups, in this thread."""
     return file.read(columns=paths, use_threads=False)

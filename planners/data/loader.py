@@ -28,7 +28,7 @@ import pyarrow as pa
 from factory.store.location import raising_damaged_file
 from planners.data.batch import Batch, Needs
 from planners.data.decode import BatchBuffer, StoredRows, count_labels
-from planners.data.files import leaf_paths, read_group
+from planners.data.files import leaf_paths
 from planners.data.images import GB, PictureCache, stitch
 from planners.data.index import Dataset, Feed, make_feed, order_inputs
 from planners.data.mix import EpochOrder, MixSettings, Side, WindowKey, make_order
@@ -57,10 +57,6 @@ class _PendingRows:
     @property
     def is_done(self) -> bool:
         return all(future.done() for future in self.futures)
-
-    @property
-    def is_cancelled(self) -> bool:
-        return any(future.cancelled() for future in self.futures)
 
     @cached_property
     def rows(self) -> dict[int, Place]:
@@ -98,7 +94,7 @@ class WindowMemory:
         self._to_come = [window for window in windows if window.key[0] not in self._staying]
         self._read: dict[WindowKey, _PendingRows] = {}
         for side in sorted({window.key[0] for window in windows} & set(self._staying)):
-            if side not in self._stay or self._stay[side].is_cancelled:
+            if side not in self._stay or any(future.cancelled() for future in self._stay[side].futures):
                 self._stay[side] = self._submit(self._staying[side], 0)
         self._advance()
 
@@ -150,7 +146,8 @@ class WindowMemory:
             stored = file.open(check_pages=not checked)
             paths = leaf_paths(stored, self._feed.columns)
             for group in np.unique(groups).tolist():
-                found |= self._rows(read_group(stored, group, paths), samples[groups == group])
+                leaves = stored.read_row_group(group, columns=paths, use_threads=False)
+                found |= self._rows(leaves, samples[groups == group])
                 self._checked.add((number, group))
         return found
 

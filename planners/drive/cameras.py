@@ -108,12 +108,6 @@ def ego_state_at(scene: Scene, offset: int) -> Array:
     return scene.ego_history[HISTORY_STEPS + offset][None]
 
 
-def ground_poses(clip: Clip) -> Array:
-    """(L, 4, 4) poses that tell how the road lies, of the clip's ego and of its block's sensors."""
-    files = () if clip.block is None else (*clip.block.images, *clip.block.sweeps)
-    return np.concatenate([clip.world_from_ego, *(file.world_from_ego[None] for file in files)])
-
-
 # A drive's cameras as the painter of its reader shows them: pictures without a reconstruction.
 
 
@@ -175,7 +169,9 @@ class RenderedCameras:
     def images(self, scene: Scene, offset: int) -> Images:
         """As a sample's pictures are drawn (factory.stages.imaging)."""
         s, step = self.settings, scene.step + offset
-        poses = pose_on_ground(self.asset.on_road(ground_poses(self.clip)), ego_state_at(scene, offset))
+        files = () if self.clip.block is None else (*self.clip.block.images, *self.clip.block.sweeps)
+        known = np.concatenate([self.clip.world_from_ego, *(file.world_from_ego[None] for file in files)])
+        poses = pose_on_ground(self.asset.on_road(known), ego_state_at(scene, offset))
         agents = self.asset.lifted(scene.agents, clip_offset_s(self.clip))
         seen = render_views(self.asset, self.cameras, poses, agents, [step], s.width, s.height, s.backend)[0]
         imaging = Imaging(s, "")

@@ -70,11 +70,6 @@ class RequestedDrives:
         rows = [row | {"planner": label} for label, row in asked if row is not None]
         return sorted(rows, key=lambda row: self.planners.index(row["planner"]))
 
-    def is_made(self, table: KeyedTable) -> bool:
-        """Whether nothing is left: of an item's drives, which are committed together, some are there."""
-        done = set(table)
-        return not self.broken and all(any(key.drive_id in done for _, key in item.keys) for item in self.items)
-
 
 def drive_all(settings: DriveSettings) -> tuple[list[Row], list[FailedDrive]]:
     """Drive what is not driven yet: the rows of all that were asked for, by planner and clip, and what could not be.
@@ -103,13 +98,18 @@ def read_drives(settings: DriveSettings) -> tuple[list[Row], bool]:
     """
     asked = _requested_drives(settings)
     table = open_drives(asked.work.out)
-    return asked.rows(table), asked.is_made(table)
+    done = set(table)  # of an item's drives, which are committed together, some are there or none
+    whole = all(any(key.drive_id in done for _, key in item.keys) for item in asked.items)
+    return asked.rows(table), whole and not asked.broken
 
 
 def _requested_drives(settings: DriveSettings) -> RequestedDrives:
     from factory.setup.settings import choose_vocabulary, open_reader  # half a second that no refusal waits for
 
-    planners = _planners(settings)
+    planners: list[tuple[DrivingPlanner, tuple[Pictures, ...]]] = []  # and which pictures each is shown
+    for one in find_planners(settings.planner, settings.planners, settings.bounds, settings.settings):
+        looks = make_driver(one, settings.pdm).needs_pictures
+        planners.append((DrivingPlanner(one.label, one.spec, one.digest), settings.pictures if looks else ("none",)))
     reader, index = open_reader(settings.clips)
     if any("truth" in kinds for _, kinds in planners) and painter_of(reader) is None:
         raise ConfigError("pictures=truth is the painter's of the synthetic town: give pictures=engine for these clips")
@@ -122,15 +122,6 @@ def _requested_drives(settings: DriveSettings) -> RequestedDrives:
     work = DriveWork(reader, choose_vocabulary(settings.vocabulary), settings, out)
     items = list(_items(work, index.refs[: settings.limit], planners))
     return RequestedDrives(work, items, index.broken, [who.label for who, _ in planners])
-
-
-def _planners(settings: DriveSettings) -> list[tuple[DrivingPlanner, tuple[Pictures, ...]]]:
-    """Who drives, and which pictures each is shown. Raises ConfigError for nobody."""
-    found: list[tuple[DrivingPlanner, tuple[Pictures, ...]]] = []
-    for one in find_planners(settings.planner, settings.planners, settings.bounds, settings.settings):
-        looks = make_driver(one, settings.pdm).needs_pictures
-        found.append((DrivingPlanner(one.label, one.spec, one.digest), settings.pictures if looks else ("none",)))
-    return found
 
 
 def _items(
@@ -181,15 +172,9 @@ def main(argv: Sequence[str]) -> None:
     if rows:
         lines, apart = summarise_drives(rows, settings.confidence), picture_source_effects(rows, settings.confidence)
         print(summary_text(lines, apart, settings.confidence))
-        if work_folder := local_folder(settings.out):
-            write_summary(work_folder, lines, apart)
-            print(f"look at {work_folder}")
+        if (place := Location.parse(settings.out)).is_local:  # on an object store the table of drives says all
+            write_summary(Path(place.uri), lines, apart)
+            print(f"look at {place.uri}")
     if failed:
         shown = "; ".join(f"clip {one.clip_id}: {one.why}" for one in failed[:SHOWN_FAILURES])
         raise Failed(f"{len(failed)} drives or clips could not be driven: {shown}")
-
-
-def local_folder(out: str) -> Path | None:
-    """Where tables of numbers go; None on an object store, whose table of drives says all."""
-    place = Location.parse(out)
-    return Path(place.uri) if place.is_local else None

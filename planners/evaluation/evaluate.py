@@ -204,7 +204,10 @@ def _score_clips(
     spent = 0.0
     with RateBar("clips scored", len(clips)) as progress:
         for done, clip_id in enumerate(clips, start=1):
-            prepared = _prepared(benchmark, clip_id, rules)
+            if benchmark.one_stage:
+                prepared: ClipFrames | LoneFrame = prepare_lone(clip_id, benchmark.scene(clip_id), rules)
+            else:
+                prepared = prepare_clip(benchmark.scenes(clip_id), rules)
             began = time.perf_counter()
             last, driven, log_id = driven, {}, benchmark.log_of(clip_id)
             for one in who:
@@ -220,12 +223,6 @@ def _score_clips(
             n_rows = sum(map(len, rows.values()))
             progress.show(done, f"{1000.0 * spent / n_rows:.1f} ms a frame and planner")
     return rows
-
-
-def _prepared(benchmark: Benchmark, clip_id: str, rules: Rules) -> ClipFrames | LoneFrame:
-    if benchmark.one_stage:
-        return prepare_lone(clip_id, benchmark.scene(clip_id), rules)
-    return prepare_clip(benchmark.scenes(clip_id), rules)
 
 
 def what_decides(results: Mapping[str, Sequence[ClipResult]]) -> list[str]:

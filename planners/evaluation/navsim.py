@@ -175,7 +175,13 @@ def read_table(path: Path) -> PublicTable:
     summary = {"one_stage": _columns(found[AVERAGE][0], found[AVERAGE][2])} if not two_stage else _stages_of(found)
     failed = tuple(token for token in rows if token not in logged and token not in follow_ups)
     table = PublicTable(str(path), logged, follow_ups, summary, failed)
-    _check_summary(table)
+    said, again = summary[table.stage], means_over(np.stack(list(logged.values())))
+    for name, written, mean in zip(COLUMNS, said, again):
+        if not np.isclose(written, mean, rtol=0.0, atol=SAME, equal_nan=True):
+            raise ValueError(
+                f"{path}: the summary of {table.stage} says {written} for {LONG.get(name, name)}, its {len(logged)} "
+                f"rows make {mean}: rows are missing or were changed"
+            )
     return table
 
 
@@ -200,27 +206,12 @@ def _columns(sub_scores: Array, score: float) -> Array:
     return row
 
 
-def _check_summary(table: PublicTable) -> None:
-    said, again = table.summary[table.stage], means_over(np.stack(list(table.logged.values())))
-    for name, written, mean in zip(COLUMNS, said, again):
-        if not np.isclose(written, mean, rtol=0.0, atol=SAME, equal_nan=True):
-            raise ValueError(
-                f"{table.file}: the summary of {table.stage} says {written} for {LONG.get(name, name)}, its "
-                f"{len(table.logged)} rows make {mean}: rows are missing or were changed"
-            )
-
-
 Measure = tuple[str, str]  # stage, human filter
 SUFFIXES = (".csv", ".csv.gz")
 NOTE = (
     "tables of NAVSIM's: stage_two and final are the files' own summaries and have no interval, since no file says "
     "where a plan ended"
 )
-
-
-def is_table(path: str) -> bool:
-    """Whether a run of `compare` is a file of NAVSIM's."""
-    return path.endswith(SUFFIXES)
 
 
 def read_tables(paths: Sequence[str]) -> list[list[PublicTable]]:

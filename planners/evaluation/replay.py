@@ -23,7 +23,6 @@ from factory.views.pictures import (
     DrawnPath,
     draw_bev,
     front_camera,
-    images_up_to_now,
     letterboxed,
     map_shapes,
     write_mp4,
@@ -76,7 +75,8 @@ def film_frames(shown: ReplayStage, logged: Array | None) -> Iterator[Image]:
     frame = shown.pair.now
     scene, drive = frame.scene, shown.rollout
     camera = front_camera(shown.sample)
-    pictures = images_up_to_now(shown.sample, camera) if camera else []
+    mine = [image for image in shown.sample["images"] or () if image["camera"] == camera and image["time_s"] < 0.1]
+    pictures = sorted(mine, key=lambda image: float(image["time_s"]))  # of one camera up to now
     ways = [DrawnPath(drive.ego_states, PERTURBED, "drive"), DrawnPath(shown.plan, EXPERT, "plan", dashed=True)]
     ways += [] if logged is None else [DrawnPath(logged, LOGGED, "logged", dashed=True)]
     for row in range(-HISTORY_STEPS, HORIZON_STEPS + 1):

@@ -77,11 +77,6 @@ def prepare_frame(scene: Scene, traffic: TrafficSettings, pdm: PdmSettings, logg
     return _with_human(frame)
 
 
-def with_traffic(frame: PreparedFrame, traffic: TrafficSettings) -> PreparedFrame:
-    """The same frame with traffic that moves otherwise."""
-    return _with_human(replace(frame, traffic=prepare_traffic(frame.scene, traffic), human=None))
-
-
 def logged_poses(scene: Scene) -> Array:
     """(40, 3) the logged drive of the next 4 s in the ego frame, known every 0.5 s and linear between."""
     first = scene.step + COARSE_STEP
@@ -169,7 +164,8 @@ def prepare_clip(scenes: ClipScenes, rules: Rules) -> ClipFrames:
     logged = pair(scenes.logged, True, "the logged frames")
     alone = logged
     if rules.one_stage != rules.two_stage:
-        alone = PreparedPair(*(with_traffic(frame, rules.one_stage) for frame in logged))
+        changed = (replace(f, traffic=prepare_traffic(f.scene, rules.one_stage), human=None) for f in logged)
+        alone = PreparedPair(*map(_with_human, changed))
     follow_ups = {i: pair(frames, False, f"follow-up {i}") for i, frames in scenes.follow_ups.items()}
     return ClipFrames(scenes.clip_id, alone, logged, follow_ups)
 

@@ -294,7 +294,9 @@ def initialise_as_public(model: nn.Module) -> None:
     """
     for module in model.modules():
         if isinstance(module, TokenExchange):
-            _as_gpt(module)
+            for linear in (part for part in module.modules() if isinstance(part, nn.Linear)):
+                nn.init.normal_(linear.weight, std=GPT_DEVIATION)
+                nn.init.zeros_(linear.bias)
         elif isinstance(module, BasicBlock):
             nn.init.zeros_(module.bn2.weight)
         elif isinstance(module, Attention):
@@ -308,13 +310,6 @@ def copy_first_layer(layers: nn.ModuleList) -> None:
     """Give all layers the weights of the first."""
     for layer in layers[1:]:
         layer.load_state_dict(layers[0].state_dict())
-
-
-def _as_gpt(exchange: TokenExchange) -> None:
-    for module in exchange.modules():
-        if isinstance(module, nn.Linear):
-            nn.init.normal_(module.weight, std=GPT_DEVIATION)
-            nn.init.zeros_(module.bias)
 
 
 def _init_as_torch_attention(attention: Attention) -> None:

@@ -4,6 +4,7 @@ Chitta et al. 2022 in the public form for NAVSIM without lidar; the defaults are
 picture of 2048 x 512: 56 M parameters (SimScale, supplement, table 4).
 """
 
+import math
 from collections.abc import Mapping
 from typing import ClassVar
 
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 
 from planners.data.batch import Batch, Needs
 from planners.models.layers import AgentHead, BevHead, LatentFusion, auxiliary_losses, initialise_as_public
-from planners.models.planner import Planner, add_base_plan, bound_heading, evaluating, imitation_l1, visible_status
+from planners.models.planner import Planner, add_base_plan, evaluating, imitation_l1, visible_status
 from planners.models.settings import LtfSettings
 from tasks.world.arrays import FloatArray
 
@@ -58,7 +59,8 @@ class Ltf(Planner):
             torch.cat([cells, self.status(visible_status(self.settings.status, batch))[:, None]], 1) + self.key_position
         )
         queries = self.decoder(self.queries.expand(len(batch), -1, -1), keys)
-        plan = bound_heading(self.plan_head(queries[:, 0]).float().view(-1, 8, 3))
+        raw = self.plan_head(queries[:, 0]).float().view(-1, 8, 3)
+        plan = torch.cat([raw[..., :2], raw[..., 2:].tanh() * math.pi], -1)  # the heading as the public code bounds it
         return add_base_plan(self.settings.plan_from, plan, batch), queries[:, 1:], fused.bev
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:

@@ -11,7 +11,6 @@ A planner's file has a frozen dataclass of settings and a `Planner` made from it
 a training begins, and checkpoints carry them.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -114,11 +113,6 @@ def visible_status(which: Status, batch: Batch) -> Tensor:
         return batch.status
     known = len(COMMANDS) + 2
     return torch.cat([batch.status[:, :known], torch.zeros_like(batch.status[:, known:])], -1)
-
-
-def bound_heading(poses: Tensor) -> Tensor:
-    """(..., 3) with the heading within -pi .. pi, as the public TransFuser does: tanh(h) pi."""
-    return torch.cat([poses[..., :2], poses[..., 2:].tanh() * math.pi], -1)
 
 
 def imitation_l1(plan: Tensor, batch: Batch) -> Tensor:

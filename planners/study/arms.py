@@ -81,11 +81,6 @@ class ArmDrives:
         return paired_interval(a, b, weights=(weight_a, weight_b), clusters=self.clusters)
 
 
-def arm_name(label: str) -> str:
-    """Of a training's label."""
-    return label.rpartition("-")[0]
-
-
 def drive_settings(arms: Sequence[Training], out: str, drives: str) -> DriveSettings:
     """Of these trainings and the bounds. Raises ConfigError."""
     named = ",".join(f"{one.label}: '{one.spec(Path(out))}'" for one in arms)
@@ -125,7 +120,7 @@ def read_arm_drives(arms: Sequence[Training], out: str, drives: str) -> list[Arm
 
 
 def _paired(kind: str, by_label: Mapping[str, Mapping[Start, Row]], labels: Sequence[str]) -> ArmDrives | None:
-    names = list(dict.fromkeys(map(arm_name, labels)))
+    names = list(dict.fromkeys(label.rpartition("-")[0] for label in labels))
     seeds = sorted({label.rpartition("-")[2] for label in labels}, key=int)
     whole = [seed for seed in seeds if all(f"{name}-{seed}" in by_label for name in names)]
     sides = {name: [by_label[f"{name}-{seed}"] for seed in whole] for name in names}

@@ -81,7 +81,7 @@ def main(argv: Sequence[str]) -> None:
     if settings.column not in COLUMNS:
         raise ConfigError(f"compare.column={settings.column}: one of {', '.join(COLUMNS)}")
     a, b = ([side] if isinstance(side, str) else side for side in (settings.a, settings.b))
-    if of_tables := any(map(navsim.is_table, [*a, *b])):
+    if of_tables := any(run.endswith(navsim.SUFFIXES) for run in (*a, *b)):
         if settings.drives is not None:
             raise ConfigError("drives= goes with folders of `python -m planners evaluate`, not with tables of NAVSIM's")
         found = compare_tables(a, b, settings)

@@ -117,12 +117,9 @@ def read_study(path: Path) -> StudyFrames:
         for label, rows in groupby(zip(*columns), key=itemgetter(0))
     }
     meta = json.loads(kept)
-    return StudyFrames(tuple(meta["trainings"]), tuple(map(_comparison, meta["comparisons"])), clips)
-
-
-def _comparison(told: Mapping[str, Any]) -> Comparison:
-    setups = {side: told[side] and Setup(**told[side]) for side in ("setup", "reference")}
-    return Comparison(**{**told, **setups})
+    for one in meta["comparisons"]:
+        one |= {side: one[side] and Setup(**one[side]) for side in ("setup", "reference")}
+    return StudyFrames(tuple(meta["trainings"]), tuple(Comparison(**one) for one in meta["comparisons"]), clips)
 
 
 def _table(label: str, rows: Sequence[FrameRow]) -> pa.Table:

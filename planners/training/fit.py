@@ -206,7 +206,8 @@ def fit(
     asked = Event()
     with calling_on_stop_signal(asked.set), RateBar("steps", loop.steps, first, quiet=not process.writes) as counter:
         step, shown = first, "-"  # until the losses are looked at
-        for batch in _next_batches(batches, loop.steps - first):
+        epochs = (batches.epoch(epoch) for epoch in count(int(batches.state()["epoch"])))  # from its position on
+        for batch in islice(chain.from_iterable(epochs), loop.steps - first):
             torch.manual_seed(step_seed(loop.seed, step, process.rank))
             rate = learning_rate(training, step, loop.steps, epoch_steps)
             terms, scaling = _step(model, optimiser, scaler, batch, rate, training.gradient_clip, loop, process)
@@ -281,12 +282,6 @@ def _is_best(out: Path, measure: str, measured: Mapping[str, float]) -> bool:
         return False
     before = best_checkpoint(out, measure)
     return before is None or measured[measure] < read_record(before)["validation"][measure]
-
-
-def _next_batches(batches: Batches, n: int) -> Iterator[Batch]:
-    """The next n batches, epoch after epoch, from the loader's position on."""
-    epochs = (batches.epoch(epoch) for epoch in count(int(batches.state()["epoch"])))
-    return islice(chain.from_iterable(epochs), n)
 
 
 def _resume(

@@ -44,7 +44,6 @@ from planners.training.optim import TrainingSettings
 
 if TYPE_CHECKING:  # PyTorch is imported once the settings and the samples are found to fit
     from planners.models.planner import Planner
-    from planners.training.fit import Precision
     from planners.training.processes import TrainingProcess
 
 LARGEST_BATCH = 32
@@ -234,11 +233,14 @@ def train(config: TrainConfig, process: TrainingProcess, dataset: Dataset | None
             why = f"a batch of {asked} takes more samples than there are"
             print(f"note: planner.training.batch_size={asked} -> {training.batch_size}: {why}")
         print(_plan_text(config, record, loader, resume_from), flush=True)
+    precision = config.precision
+    if precision == "auto":
+        precision = "bf16" if process.device.type == "cuda" else "fp32"
     loop = StepSettings(
         seed=config.seed,
         steps=steps,
         accumulate=config.accumulate,
-        precision=_precision(config, process),
+        precision=precision,
         log_every=config.log_every,
         checkpoint_every=config.checkpoint_every,
         validate_every=config.validate_every,
@@ -301,12 +303,6 @@ def _load_first_weights(planner: Planner, config: TrainConfig) -> dict[str, str]
     load_weights(planner, folder)
     backbones: dict[str, str] = read_record(folder)["backbones"]
     return backbones
-
-
-def _precision(config: TrainConfig, process: TrainingProcess) -> Precision:
-    if config.precision == "auto":
-        return "bf16" if process.device.type == "cuda" else "fp32"
-    return config.precision
 
 
 def _identity(config: TrainConfig, dataset: Dataset, steps: int, process: TrainingProcess) -> dict[str, Any]:

@@ -258,7 +258,7 @@ def export(
     to: Path,
     settings: ExportSettings,
     trajectories: Array | None = None,
-    each: Each = map,
+    each: Each = lambda write, groups: (write(group) for group in groups),
     say: Say = print,
 ) -> ExportSummary:
     """Write all samples that `settings` choose below `to`; what a call before has written stays.

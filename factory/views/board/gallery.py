@@ -15,7 +15,7 @@ from factory.store.reader import decode_stored_image, find_row_group
 from factory.store.samples import Kind, Store
 from factory.store.schema import AGENT_STEPS, SAMPLES, SCHEMA, table_to_rows
 from factory.store.table import KeyedTable, text_equals
-from factory.views.board.watch import Snapshot, decode_dictionaries
+from factory.views.board.watch import Snapshot
 from factory.views.episode_messages import episode_of
 from factory.views.pictures import (
     BEV_COLUMNS,
@@ -92,7 +92,8 @@ def failures(shot: Snapshot, page: int = 1, size: int = 50) -> Json:
     """A page of failed attempts with their errors, by log; of a failed clip `expert` is empty. Raises BadRequest."""
     rows = shot.outcomes.filter(pa.array(text_equals(shot.outcomes["kind"], Kind.FAILED.value)))
     by = [("log_id", "ascending"), ("clip_id", "ascending"), ("attempt_id", "ascending")]
-    order = np.asarray(pc.sort_indices(decode_dictionaries(rows.select([name for name, _ in by])), sort_keys=by))
+    texts = pa.table({name: rows[name].cast(pa.string()) for name, _ in by})  # which can be sorted
+    order = np.asarray(pc.sort_indices(texts, sort_keys=by))
 
     def failure(row: Row) -> Json:
         kind = row["error_kind"]

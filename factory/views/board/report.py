@@ -161,10 +161,10 @@ def _text(data: bytes) -> str:
 
 def _document(kept: Mapping[str, Any]) -> bytes:
     """index.html with everything that it names inside; data is JSON in which no tag can begin."""
-    scripts = {
-        path.stem: "data:text/javascript;base64," + _text(_with_bare_imports(path.read_text(encoding="utf-8")).encode())
-        for path in STATIC.glob("*.js")
-    }
+    scripts = {}
+    for path in STATIC.glob("*.js"):  # imports by bare names, which the import map knows: a data: URL has no neighbours
+        script = re.sub(r'from "\./(\w+)\.js"', r'from "\1"', path.read_text(encoding="utf-8"))
+        scripts[path.stem] = f"data:text/javascript;base64,{_text(script.encode())}"
     data = json.dumps(kept, allow_nan=False).replace("<", "\\u003c")
     page = (STATIC / "index.html").read_text(encoding="utf-8")
     page, links = re.subn(r"<link [^>]*>\n|<script [^>]*></script>\n", "", page)
@@ -177,8 +177,3 @@ def _document(kept: Mapping[str, Any]) -> bytes:
         '<script type="module">import "app";</script>\n</head>'
     )
     return page.replace("</head>", inside).encode()
-
-
-def _with_bare_imports(script: str) -> str:
-    """Its imports by bare names, which the import map knows: a data: URL has no neighbours."""
-    return re.sub(r'from "\./(\w+)\.js"', r'from "\1"', script)

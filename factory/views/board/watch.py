@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from factory.store import funnel
 from factory.store.samples import CURRENT_RUN, LAST_RUN, PLANS, RUN_FILE, NewestRun, Store
 from factory.store.table import KeyedTable, LiveFile, pack_small, packed_tables
-from tasks.world.arrays import F32, Ints
+from tasks.world.arrays import Ints
 
 SAMPLE_COLUMNS = (
     "attempt_id",
@@ -73,7 +73,10 @@ class WatchedTable:
         self.files, self._seen = self.table.file_facts(), self.table.version
         self.parts = {paths: part for paths, part in self.parts.items() if self.files.keys() >= set(paths)}
         if len(self.parts) > MOST_PARTS:  # of a run that is watched, a few files each
-            self.parts = {sum(self.parts, ()): _merge_files(list(self.parts.values()))}
+            parts = list(self.parts.values())
+            rows = pa.concat_tables(part.rows for part in parts).unify_dictionaries().combine_chunks()
+            whole = WatchedFiles(rows, _summed([part.seconds for part in parts]), _joined(parts))
+            self.parts = {sum(self.parts, ()): whole}
         known = {path for paths in self.parts for path in paths}
         for pack in pack_small(sorted(self.files.keys() - known), lambda path: self.files[path].n_rows):
             self.parts[tuple(pack)] = self._read(pack)
@@ -102,7 +105,9 @@ class WatchedTable:
         if "seconds" in self._columns:
             return WatchedFiles(kept, seconds=seconds_of(rows["seconds"]))
         if "candidates" in self._columns:
-            return WatchedFiles(kept, end_points=end_points_of(rows["candidates"]))
+            flat = pc.list_flatten(rows["candidates"])
+            x, y = (pc.struct_field(flat, name).to_numpy().astype(np.float32) for name in ("end_x", "end_y"))
+            return WatchedFiles(kept, end_points=np.stack([x, y], axis=1))
         if "candidate_end" in self._columns:
             return WatchedFiles(
                 kept, end_points=pc.list_flatten(rows["candidate_end"]).to_numpy().reshape(-1, 4)[:, :2]
@@ -110,19 +115,8 @@ class WatchedTable:
         return WatchedFiles(kept)
 
 
-def _merge_files(parts: Sequence[WatchedFiles]) -> WatchedFiles:
-    rows = pa.concat_tables(part.rows for part in parts).unify_dictionaries().combine_chunks()
-    return WatchedFiles(rows, _summed([part.seconds for part in parts]), _joined(parts))
-
-
 def _joined(parts: Iterable[WatchedFiles]) -> Points:
     return np.concatenate([np.zeros((0, 2), np.float32), *(part.end_points for part in parts)])
-
-
-def decode_dictionaries(rows: pa.Table) -> pa.Table:
-    """Some rows with their texts as texts, which can be sorted and listed."""
-    kinds = [f.with_type(f.type.value_type) if pa.types.is_dictionary(f.type) else f for f in rows.schema]
-    return rows.cast(pa.schema(kinds))
 
 
 def _with_file_and_row(rows: pa.Table, number: int, file: LiveFile) -> pa.Table:
@@ -140,13 +134,6 @@ def seconds_of(column: pa.ChunkedArray) -> dict[str, tuple[int, float]]:
     sums = pa.concat_tables(flat).group_by("stage").aggregate([("s", "count"), ("s", "sum")])
     rows = zip(*(sums[name].to_pylist() for name in ("stage", "s_count", "s_sum")))
     return {stage: (n, seconds) for stage, n, seconds in rows}
-
-
-def end_points_of(column: pa.ChunkedArray) -> F32:
-    """(N, 2) where the candidates of all rows end."""
-    flat = pc.list_flatten(column)
-    x, y = (pc.struct_field(flat, name).to_numpy().astype(np.float32) for name in ("end_x", "end_y"))
-    return np.stack([x, y], axis=1)
 
 
 @dataclass(frozen=True)
