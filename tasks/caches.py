@@ -114,7 +114,8 @@ def verify_checksum(path: Path, key: str = "") -> None:
 
 def json_with_checksum(members: Mapping[str, Any]) -> str:
     """As text for people too, the checksum last."""
-    return json.dumps({**members, MEMBER: _json_digest(members)}, indent=1)
+    digest = hashlib.sha256(json.dumps(members).encode()).hexdigest()
+    return json.dumps({**members, MEMBER: digest}, indent=1)
 
 
 def parse_json_with_checksum(text: bytes) -> dict[str, Any]:
@@ -127,10 +128,6 @@ def parse_json_with_checksum(text: bytes) -> dict[str, Any]:
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise error if isinstance(error, Damaged) else Damaged("no JSON with a checksum") from error
     return members
-
-
-def _json_digest(members: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(members).encode()).hexdigest()
 
 
 def _keyed(sha: "hashlib._Hash", key: str) -> bytes:

@@ -8,7 +8,7 @@ the proposal fail traffic light compliance, as in nuPlan's PDM.
 
 import hashlib
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -661,7 +661,10 @@ def plan_pdm_closed(
     now, of which the on-route ones matter; speed_limit_mps: of the lane the centerline starts on, None where unknown.
     Raises ValueError where the centerline has no length or the speed limit is not positive.
     """
-    red, lights = red_connectors(polygons, red_lane_ids & route_lane_ids)
+    lit = red_lane_ids & route_lane_ids
+    connectors = [one for one in polygons if one.layer is MapLayer.LANE_CONNECTOR and one.token in lit]
+    red = tuple(one.token for one in connectors)
+    lights = tuple(shapely.Polygon(one.ring[:, :2]) for one in connectors)
     seen = forecast(ego_state, agents, lights)
     candidates = proposals(ego_state, centerline, seen, speed_limit_mps, settings)
     driven = candidates.poses[:, : SCORED_STEPS + 1]
@@ -683,6 +686,9 @@ def plan_for(scene: Scene, settings: PdmSettings = PDM_DEFAULTS) -> PdmPlan:
     """PDM-Closed from a scene, seeing its agents and lights at the scene's step only."""
     clip = scene.clip
     center = ego_boxes(scene.ego_state, PACIFICA)[:2]
+    on_route = (clip.road_map.lanes.get(lane_id) for lane_id in sorted(clip.route.lane_ids))
+    start = scene.centerline[:2]
+    first = next((lane for lane in on_route if lane is not None and np.array_equal(lane.centerline[:2], start)), None)
     return plan_pdm_closed(
         ego_state=scene.ego_state,
         centerline=scene.centerline,
@@ -690,19 +696,9 @@ def plan_for(scene: Scene, settings: PdmSettings = PDM_DEFAULTS) -> PdmPlan:
         polygons=polygons_near(clip.road_map, center, RADIUS_M),
         route_lane_ids=clip.route.lane_ids,
         red_lane_ids=red_lane_ids(scene),
-        speed_limit_mps=speed_limit_of(scene),
+        speed_limit_mps=None if first is None else first.speed_limit_mps,
         settings=settings,
     )
-
-
-def red_connectors(
-    polygons: Sequence[MapPolygon], red_on_route: Collection[str]
-) -> tuple[tuple[str, ...], tuple[shapely.Polygon, ...]]:
-    """The connectors among `polygons` that are red on the route: their ids, and their areas."""
-    red = [
-        polygon for polygon in polygons if polygon.layer is MapLayer.LANE_CONNECTOR and polygon.token in red_on_route
-    ]
-    return tuple(polygon.token for polygon in red), tuple(shapely.Polygon(polygon.ring[:, :2]) for polygon in red)
 
 
 def red_lane_ids(scene: Scene) -> frozenset[str]:
@@ -710,17 +706,6 @@ def red_lane_ids(scene: Scene) -> frozenset[str]:
     lights = scene.clip.lights
     states = lights.states[scene.step] if lights.lane_ids else ()
     return frozenset(lane_id for lane_id, state in zip(lights.lane_ids, states) if state == LightState.RED)
-
-
-def speed_limit_of(scene: Scene) -> float | None:
-    """Of the lane [m/s] that the scene's centre line starts on; None where unknown."""
-    clip = scene.clip
-    on_route = (clip.road_map.lanes.get(lane_id) for lane_id in sorted(clip.route.lane_ids))
-    starts = (
-        lane for lane in on_route if lane is not None and np.array_equal(lane.centerline[:2], scene.centerline[:2])
-    )
-    first = next(starts, None)
-    return None if first is None else first.speed_limit_mps
 
 
 @dataclass(frozen=True)

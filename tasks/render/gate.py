@@ -384,7 +384,10 @@ def check_drive_pictures(
         own = [asset.own_body(camera.name) for camera in cameras]
         looked_at = measure_rendered_views(scene, eyes, views, pose, backend, own)
         for camera, eye, view, found in zip(rig, eyes, views, looked_at, strict=True):
-            inside = _tracks_containing(eye.world_from_camera[:3, 3], there)
+            away = eye.world_from_camera[:3, 3] - there.boxes[:, :3]
+            local = np.einsum("nij,ni->nj", world_from_boxes(there.boxes)[:, :3, :3], away)
+            within = (np.abs(local) < there.boxes[:, 4:7] / 2.0).all(axis=1)
+            inside = [there.track_ids[j] for j in np.flatnonzero(within)]
             fault = ("lens_covered", f"inside track {inside[0]}") if inside else picture_fault(found, settings)
             if fault is None and album is not None and step in stored:
                 fault = vehicle_fault(album, there, eye, view, settings)
@@ -520,13 +523,6 @@ def _on_the_lens(scene: Gaussians, eye: Array) -> Gaussians:
     close = near.take((distance[chosen] < LENS_M) | ((along * along).sum(axis=1) < INSIDE_SIGMAS**2))
     means = (eye + MAGNIFIED * (close.means - eye)).astype(np.float32)
     return replace(close, means=means, log_scales=close.log_scales + np.float32(math.log(MAGNIFIED)))
-
-
-def _tracks_containing(eye: Array, there: PlacedAgents) -> list[str]:
-    """Tracks whose box has the eye (3,) inside."""
-    local = np.einsum("nij,ni->nj", world_from_boxes(there.boxes)[:, :3, :3], eye - there.boxes[:, :3])
-    inside = (np.abs(local) < there.boxes[:, 4:7] / 2.0).all(axis=1)
-    return [there.track_ids[j] for j in np.flatnonzero(inside)]
 
 
 # The gate for blocks: what a block's held-out photos must come out with, at the size that pictures are stored in.

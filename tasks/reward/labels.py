@@ -23,7 +23,7 @@ from tasks.rollout.simulate import TrafficScene, roll_out_longer
 from tasks.settings import ExpertGate
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bools
-from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentTracks, Scene
+from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene
 from tasks.world.frames import (
     AX,
     HALF_LENGTH,
@@ -104,7 +104,8 @@ def hit_after_s(traffic: TrafficScene, prepared: PreparedScene, states: Array, b
     left = tracks.valid.any(axis=0) & ~touching(ego_boxes(after[0], PACIFICA), tracks.boxes[0])
     boxes = np.where(tracks.valid[:, left, None], tracks.boxes[:, left], np.nan)
     score = collision_scores(tracks.kinds)[left]
-    is_stopped = (score > 0.0) | _stands_when_first_seen(tracks)[left]
+    velocity = tracks.velocities[tracks.valid.argmax(axis=0), np.arange(len(tracks))]  # where it is first seen
+    is_stopped = (score > 0.0) | (np.hypot(*velocity.T) <= STOPPED_SPEED_MPS)[left]
     return STEP_S * float(_first_hit(rule_context(prepared, with_history=False), boxes, is_stopped, score, after))
 
 
@@ -130,14 +131,6 @@ def extrapolate(states: Array, braking_mps2: float = 0.0) -> Array:
     after[:, AX] = -slowing
     after[:, STEERING], after[:, YAW_RATE] = end[STEERING], curvature * after[:, VX]
     return np.concatenate([states, after])
-
-
-def _stands_when_first_seen(tracks: AgentTracks) -> Bools:
-    """(N,) at most STOPPED_SPEED_MPS at the first step at which it is there."""
-    first = tracks.valid.argmax(axis=0)
-    velocity = tracks.velocities[first, np.arange(len(tracks))]
-    stands: Bools = np.hypot(velocity[:, 0], velocity[:, 1]) <= STOPPED_SPEED_MPS
-    return stands
 
 
 @kernel

@@ -68,7 +68,10 @@ class LaneIndex:
     def successors(self, lane: int) -> list[int]:
         """Following lanes, straightest first."""
         if lane not in self.known_successors:
-            self.known_successors[lane] = _straightest_first(self, lane)
+            after = [self.number[name] for name in self.lanes[lane].successors if name in self.number]
+            ends = self.lanes[lane].centerline[-1, 2] if len(after) > 1 else 0.0
+            turns = {k: abs(float(wrap_angle(self.lanes[k].centerline[-1, 2] - ends))) for k in after}
+            self.known_successors[lane] = sorted(after, key=lambda k: (round(turns[k], 6), k))
         return self.known_successors[lane]
 
 
@@ -170,15 +173,6 @@ def on_a_lane(distance: Array, difference: Array) -> Bools:
     return (distance <= SNAP_M) & (difference <= SNAP_HEADING_RAD)
 
 
-def _straightest_first(index: LaneIndex, lane: int) -> list[int]:
-    following = [index.number[name] for name in index.lanes[lane].successors if name in index.number]
-    if len(following) < 2:
-        return following
-    heading = index.lanes[lane].centerline[-1, 2]
-    turns = {k: round(abs(float(wrap_angle(index.lanes[k].centerline[-1, 2] - heading))), 6) for k in following}
-    return sorted(following, key=lambda k: (turns[k], k))
-
-
 HEADING_COST_M = 2.0  # metres of distance one radian is worth, as in the route matching (docs/reward.md 0)
 START_COST_WEIGHT = 0.3  # of the distance at the start, against the mean distance of the log
 MAX_WAYS = 48  # ways compared at most, straightest first
@@ -212,7 +206,9 @@ def find_path(index: LaneIndex, pose: Array, log_poses: Array, ahead_m: float) -
     if not starts:
         return None
     starts = _with_neighbors(index, starts, distance[0], difference[0])
-    ahead = {k: _lane_length_ahead(index, k, pose) for k in starts}
+    lines = {k: index.points[index.first[k] : index.first[k + 1], :2] for k in starts}
+    nearest = {k: int(((line - pose[:2]) ** 2).sum(axis=1).argmin()) for k, line in lines.items()}
+    ahead = {k: index.length_from(k, point) for k, point in nearest.items()}
     # To be told apart ways must go as far as the log gets from here.
     reach = float(np.hypot(*(log_poses[:, :2] - pose[:2]).T).max(initial=0.0)) * 1.2 + 10.0
     ways = _ways(index, ahead, reach)
@@ -293,12 +289,6 @@ def _with_neighbors(index: LaneIndex, starts: list[int], distance: Array, differ
             if other is not None and other not in starts and difference[other] <= SNAP_HEADING_RAD:
                 beside.append(other)
     return list(dict.fromkeys(starts + beside))
-
-
-def _lane_length_ahead(index: LaneIndex, lane: int, pose: Array) -> float:
-    """Length of the lane still ahead of a pose."""
-    xy = index.points[index.first[lane] : index.first[lane + 1], :2]
-    return index.length_from(lane, int(((xy - pose[:2]) ** 2).sum(axis=1).argmin()))
 
 
 def _ways(index: LaneIndex, starts: Mapping[int, float], reach: float) -> list[list[int]]:
@@ -476,16 +466,6 @@ def stands_always(log: AgentTracks) -> Bools:
     return stands & (seen >= 2)
 
 
-def join_steps(index: LaneIndex, scene: Scene) -> Ints:
-    """(N,) the scene's step for agents that are on a lane now, NEVER for all others."""
-    start = scene.step
-    out = np.full(len(scene.agents), NEVER)
-    here = np.flatnonzero(scene.agents.valid[start])
-    on = on_a_lane(*lane_distances_and_turns(index, scene.agents.boxes[start, here, :3])).any(axis=1)
-    out[here[on]] = start
-    return out
-
-
 def first_later_step_on_lane(index: LaneIndex, scene: Scene, i: int) -> int:
     """First later step at which agent i is on a lane; NEVER if it never is."""
     log, start = scene.clip.agents, scene.step
@@ -533,12 +513,6 @@ StopLine = tuple[float, Bytes]  # path length [m], states (41,) at every step of
 LATERAL_ACCEL_MAX = 3.0  # m/s2, slows down in curves
 STOP_STEPS = 5  # a logged stop lasts at least this long
 STOP_BEFORE_ENTRY_M, STOP_BEHIND_ENTRY_M = 12.0, 2.0  # where, around a junction's entry, a stop belongs to it
-
-
-def path_numbers(found: list[LanePath | None]) -> Ints:
-    """Index of each path among those there are, -1 where there is none."""
-    has = np.array([path is not None for path in found], dtype=bool)
-    return np.where(has, np.cumsum(has) - 1, -1)
 
 
 def stack_paths(
@@ -612,7 +586,8 @@ def _light_lines(scene: Scene, path: LanePath) -> list[StopLine]:
 
 def _logged_stops(scene: Scene, path: LanePath, i: int, stopped: Bools) -> list[StopLine]:
     """Stop lines agent i's own log, `stopped` (S,), implies: at a junction's entry, where it stops, until it leaves."""
-    entries = _junction_entries(scene, path)
+    inside = [scene.clip.road_map.lanes[lane_id].is_intersection for lane_id, _ in path.lane_entries]
+    entries = [at for (_, at), here, before in zip(path.lane_entries, inside, [False, *inside]) if here and not before]
     if not entries or np.count_nonzero(stopped) < STOP_STEPS:
         return []
     log = scene.clip.agents
@@ -632,13 +607,3 @@ def _logged_stops(scene: Scene, path: LanePath, i: int, stopped: Bools) -> list[
             steps = np.arange(scene.step, scene.step + HORIZON_STEPS + 1)
             lines.append((max(near[0], nose), np.where(steps < until, CLOSED, OPEN).astype(np.uint8)))
     return lines
-
-
-def _junction_entries(scene: Scene, path: LanePath) -> list[float]:
-    lanes = scene.clip.road_map.lanes
-    inside, entries = False, []
-    for lane_id, at in path.lane_entries:
-        if lanes[lane_id].is_intersection and not inside:
-            entries.append(at)
-        inside = lanes[lane_id].is_intersection
-    return entries

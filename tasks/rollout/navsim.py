@@ -297,19 +297,15 @@ class _Footprint:
 
     def __init__(self, body: shapely.Polygon | None, looks: int) -> None:
         """body: None for an agent's footprint, which is made when it is first asked for; looks: that were before it."""
-        self.is_body, self._looks, self._is_simple = body is not None, looks, False
+        self.is_body, self.looks, self._is_simple = body is not None, looks, False
         self._stages: list[shapely.Geometry] = [] if body is None else [body]
-
-    def seen_again(self, looks: int) -> None:
-        """The same shape stands there anew."""
-        self._looks = looks
 
     def at(self, looks: int, agent: _Agent | None, headway_s: float) -> shapely.Geometry:
         """The shape in the look of this number."""
         if not self._stages:
             assert agent is not None
             self._stages.append(agent.footprint(headway_s))
-        times = looks - self._looks
+        times = looks - self.looks
         while len(self._stages) <= times and not self._is_simple:
             simpler = shapely.simplify(self._stages[-1], SIMPLE_M, preserve_topology=True)
             fewer = shapely.get_num_coordinates(simpler) < shapely.get_num_coordinates(self._stages[-1])
@@ -397,7 +393,7 @@ class _Traffic:
         agent.progress += STEP_S * agent.speed
         agent.speed = max(agent.speed + STEP_S * acceleration, 0.0)
         if before == (agent.progress, agent.speed) and not self.footprints[k].is_body:
-            self.footprints[k].seen_again(self.looks)
+            self.footprints[k].looks = self.looks  # the same shape stands there anew
         else:
             agent.pose = path.pose(agent.progress)
             self.footprints[k] = _Footprint(None, self.looks)

@@ -43,11 +43,11 @@ from tasks.rollout.lane_following import (
     find_path,
     first_later_step_on_lane,
     index_lanes,
-    join_steps,
+    lane_distances_and_turns,
     log_steps,
     logged_path,
     logged_track,
-    path_numbers,
+    on_a_lane,
     stack_paths,
     stands_always,
     start_step,
@@ -174,7 +174,9 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     index = _indexed_lanes(scene.clip.road_map)
     ahead_m = _needed_path_length(scene, settings)
 
-    join, hold = join_steps(index, scene), np.zeros(n, dtype=np.int64)
+    join, hold = np.full(n, NEVER), np.zeros(n, dtype=np.int64)
+    here = np.flatnonzero(now.valid[start])
+    join[here[on_a_lane(*lane_distances_and_turns(index, now.boxes[start, here, :3])).any(axis=1)]] = start
     clock = log_steps(scene)
     found: list[LanePath | None] = [None] * n
     logged_ways: list[LanePath | None] = [None] * n
@@ -196,7 +198,8 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
             join[i] = 0  # wherever its log is by now
         else:
             hold[i] = start_step(log, i, step)
-    numbers = path_numbers(found + logged_ways)
+    has = np.array([path is not None for path in found + logged_ways], dtype=bool)
+    numbers = np.where(has, np.cumsum(has) - 1, -1)  # of each path among those there are
     roles = Roles(
         path=numbers[:n],
         logged_path=numbers[n:],

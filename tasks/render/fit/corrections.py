@@ -76,7 +76,10 @@ def align_cameras(of: OverlapColourMoments) -> F32:
             matrices[c], offsets[c] = _transport(*shown, *_moments(*now), PULL / of.count[c].sum())
     _, group = connected_components(of.count > 0, directed=False)
     for number in np.unique(group[tied]):
-        _centre_on_photos(matrices, offsets, tied[group[tied] == number])
+        rows = tied[group[tied] == number]  # whose exposures' inverses are the identity on average
+        back = np.linalg.inv(matrices[rows])
+        turn, shift = back.mean(axis=0), -np.einsum("cij,cj->ci", back, offsets[rows]).mean(axis=0)
+        matrices[rows], offsets[rows] = turn @ matrices[rows], offsets[rows] @ turn.T + shift
     return np.column_stack([(matrices - np.eye(3)).reshape(n, 9), offsets]).astype(np.float32)
 
 
@@ -94,7 +97,9 @@ def relative_brightness(grey: F32, seen: Bools) -> Array:
         if turn == 0:
             weight = shares
         else:
-            weight = shares / (1.0 + ((logs - out[:, None] - _point_means(logs, out, weight)) / DISAGREES) ** 2)
+            off = logs - out[:, None]
+            means = (weight * off).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
+            weight = shares / (1.0 + ((off - means) / DISAGREES) ** 2)
         of = np.maximum(weight.sum(axis=0), 1e-12)
         system = np.diag(weight.sum(axis=1) + 1.0) - (weight / of) @ weight.T  # a point's own colour is eliminated
         right = (weight * logs).sum(axis=1) - weight @ ((weight * logs).sum(axis=0) / of)
@@ -102,10 +107,6 @@ def relative_brightness(grey: F32, seen: Bools) -> Array:
         out[~tied] = 0.0
         out[tied] -= out[tied].mean()
     return out
-
-
-def _point_means(logs: Array, photos: Array, weight: Array) -> Array:
-    return np.asarray((weight * (logs - photos[:, None])).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12))
 
 
 def _moments(count: Array, first: Array, second: Array) -> tuple[Array, Array]:
@@ -138,14 +139,6 @@ def _matrix_root(matrix: Array) -> Array:
     """The symmetric root of a positive matrix (3, 3)."""
     values, vectors = np.linalg.eigh(matrix)
     return cast(Array, (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
-
-
-def _centre_on_photos(matrices: Array, offsets: Array, rows: Array) -> None:
-    """Moves the common colours of cameras `rows`, in place: the exposures' inverses are the identity on average."""
-    back = np.linalg.inv(matrices[rows])
-    turn, shift = back.mean(axis=0), -np.einsum("cij,cj->ci", back, offsets[rows]).mean(axis=0)
-    matrices[rows] = turn @ matrices[rows]
-    offsets[rows] = offsets[rows] @ turn.T + shift
 
 
 EXPOSURE_SIZE = 12  # a photo's row: 3 x 3 matrix minus identity, then 3 offsets

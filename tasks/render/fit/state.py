@@ -394,18 +394,13 @@ def _copy_gaussians(state: FitState, targets: Ints, sources: Ints, rng: np.rando
     rows[targets] = sources
     state.keep_rows(rows)
     means = state.learned["means"].values
-    means[targets] += JITTER * _random_offsets(state, targets, rng)
+    quats = state.learned["quats"].values[targets]
+    turns = rotations_of(quats / np.linalg.norm(quats, axis=1, keepdims=True))
+    local = rng.standard_normal((len(targets), 3)) * np.exp(state.learned["log_scales"].values[targets])
+    means[targets] += JITTER * np.einsum("nij,nj->ni", turns, local).astype(np.float32)
     for name in SHAPES:
         state.learned[name].forget(np.concatenate([named, targets]))
     state.keep_rows(np.argsort(state.owner, kind="stable"))
-
-
-def _random_offsets(state: FitState, rows: Ints, rng: np.random.Generator) -> F32:
-    """Random offsets (M, 3) as far as the Gaussians at `rows` reach."""
-    quats = state.learned["quats"].values[rows]
-    turns = rotations_of(quats / np.linalg.norm(quats, axis=1, keepdims=True))
-    local = rng.standard_normal((len(rows), 3)) * np.exp(state.learned["log_scales"].values[rows])
-    return np.einsum("nij,nj->ni", turns, local).astype(np.float32)
 
 
 @kernel

@@ -390,14 +390,6 @@ def without_views(matched: CornerTracks, views: Array) -> CornerTracks:
     )
 
 
-def readout_delays_s(matched: CornerTracks, shots: RigPhotos, readouts_s: Array, heights: Array) -> Array | None:
-    """(N,) how long after the middle row of its photo each corner was read; None where no camera (C,) reads by rows."""
-    if not readouts_s.any():
-        return None
-    camera_of = shots.camera_of[matched.view_of]
-    return np.asarray(readouts_s[camera_of] * (matched.at[:, 1] / heights[camera_of] - 0.5))
-
-
 def drop_lone_corners(used: Bools, matched: CornerTracks) -> Bools:
     """Without corners whose point has no second one."""
     count = np.bincount(matched.point_of, used, len(matched.starts) - 1)
@@ -482,7 +474,10 @@ def _levenberg_marquardt(
     """Rig and points after some steps of Levenberg-Marquardt."""
     free = sigmas > 0.0
     trust = np.where(free, 1.0 / np.where(free, sigmas, 1.0) ** 2, 0.0)
-    places = _parameter_rows(rig, shots, matched)
+    of_instant = 6 * shots.instant_of[matched.view_of, None] + np.arange(MOUNT)
+    of_camera = N_CAMERA * shots.camera_of[matched.view_of, None] + np.arange(N_CORNER - MOUNT)
+    # (N, 21) rows of the parameters that a corner depends on.
+    places = np.concatenate([of_instant, 6 * len(rig.corrections) + of_camera], axis=1)
     view_of, seen = _views_of_corners(shots, matched)
     damping = DAMPING[0]
     width_px = width * matched.pixel
@@ -526,11 +521,3 @@ def _levenberg_marquardt(
             if damping > DAMPING[2]:
                 break
     return rig, points
-
-
-def _parameter_rows(rig: Rig, shots: RigPhotos, matched: CornerTracks) -> Ints:
-    """(N, 21) rows of the parameters that a corner depends on."""
-    n = 6 * len(rig.corrections)
-    of_instant = 6 * shots.instant_of[matched.view_of, None] + np.arange(MOUNT)
-    of_camera = n + N_CAMERA * shots.camera_of[matched.view_of, None] + np.arange(N_CORNER - MOUNT)
-    return np.concatenate([of_instant, of_camera], axis=1)

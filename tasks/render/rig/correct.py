@@ -21,7 +21,6 @@ from tasks.render.rig.adjust import (
     bundle_adjust,
     corner_rays,
     initial_rig,
-    readout_delays_s,
     reprojection_errors,
     triangulate_points,
     twists_of,
@@ -254,7 +253,9 @@ def correct_rig(
     if len(matched.starts) <= LEAST_POINTS:
         return None
     readouts_s, heights = (np.array([getattr(c, name) for c in cameras]) for name in ("readout_s", "height"))
-    matched = replace(matched, after_s=readout_delays_s(matched, shots, readouts_s, heights))
+    if readouts_s.any():  # how long after the middle row of its photo each corner was read
+        camera_of = shots.camera_of[matched.view_of]
+        matched = replace(matched, after_s=readouts_s[camera_of] * (matched.at[:, 1] / heights[camera_of] - 0.5))
     sigmas = parameter_sigmas(cameras, len(rig.corrections))
     bundle = bundle_adjust(rig, shots, matched, sigmas)
     strangers = _inconsistent_photos(bundle, shots, matched, corners)
@@ -270,7 +271,10 @@ def correct_rig(
     end = replace(bundle.rig, corrections=_interpolate_corrections(bundle, shots, matched, times))
     poses = end.ego_poses(shots)
     start = replace(end, corrections=rig.corrections).ego_poses(shots)
-    middle, scale = poses[:, :3, 3].mean(axis=0), _drive_scale(poses[:, :3, 3], start[:, :3, 3])
+    middle = poses[:, :3, 3].mean(axis=0)  # photos tell no scale, the drive as logged does
+    off, wanted = poses[:, :3, 3] - middle, start[:, :3, 3] - start[:, :3, 3].mean(axis=0)
+    spread = float((off * off).sum())
+    scale = float((off * wanted).sum()) / spread if spread > 1.0 else 1.0
     mounts = end.ego_from_camera.copy()
     mounts[:, :3, 3] *= scale
     end = replace(end, ego_from_camera=mounts)
@@ -305,13 +309,6 @@ def correct_rig(
         float(np.degrees(np.sqrt((of_pose[:, 3:] ** 2).sum(axis=1).mean()))),
         strangers,
     )
-
-
-def _drive_scale(places: Array, given: Array) -> float:
-    """By what places (V, 3) spread less than those given: photos tell no scale, the drive as logged does."""
-    off, wanted = places - places.mean(axis=0), given - given.mean(axis=0)
-    spread = float((off * off).sum())
-    return float((off * wanted).sum()) / spread if spread > 1.0 else 1.0
 
 
 def parameter_sigmas(cameras: Sequence[Camera], n_instants: int) -> Array:

@@ -238,18 +238,15 @@ def from_checkpoint(content: object, traversal: int | None = None) -> SplatCheck
     }
     street = [_gaussians(parts[name], name, traversal) for name in (BACKGROUND, SKY) if name in parts]
     origin = parts[BACKGROUND].config.get("recon2world_translation")
+    # No scene of several parts, whose classes are MTGS's.
+    splatfacto = "pipeline" in content and not any("gaussian_models." in name for name in content["pipeline"])
     return SplatCheckpoint(
         concatenate(street),
         nodes,
         None if origin is None else np.asarray(origin, np.float64).reshape(-1)[:3],
         left_out,
-        None if _is_splatfacto(content) else ANTIALIASED,  # rasterize_mode of mtgs.yaml and of MTGS.py; eps2d as it is
+        None if splatfacto else ANTIALIASED,  # rasterize_mode of mtgs.yaml and of MTGS.py; eps2d as it is
     )
-
-
-def _is_splatfacto(content: Any) -> bool:
-    """No scene of several parts, whose classes are MTGS's."""
-    return "pipeline" in content and not any("gaussian_models." in name for name in content["pipeline"])
 
 
 def to_splatfacto(gaussians: Gaussians) -> dict[str, Any]:
@@ -596,15 +593,11 @@ def _streams(data: bytes, sizes: list[int], zstd: Inflate) -> tuple[Bytes, ...]:
     if ends[-1] != len(data):
         raise ValueError(f"spz: streams: they end at byte {ends[-1]:,} of {len(data):,}")
     pieces = [data[int(end) - int(length) : int(end)] for (length, _), end in zip(table, ends)]
-    found = iter(_inflated(piece, size, zstd) for piece, size in zip(pieces, kept))
-    return tuple(next(found) if size else np.empty(0, np.uint8) for size in sizes)
-
-
-def _inflated(data: bytes, size: int, zstd: Inflate) -> Bytes:
     try:
-        return np.frombuffer(zstd(data, size), np.uint8)
+        found = iter([np.frombuffer(zstd(piece, size), np.uint8) for piece, size in zip(pieces, kept)])
     except OSError as error:
         raise ValueError(f"spz: zstd: {error}") from error
+    return tuple(next(found) if size else np.empty(0, np.uint8) for size in sizes)
 
 
 def _round(values: F32) -> F32:

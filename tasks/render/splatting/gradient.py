@@ -61,7 +61,6 @@ from tasks.render.splatting.raster import (
     alpha_from_exponent,
     exponent,
     fetch_ahead,
-    pair_starts,
 )
 from tasks.world.arrays import F32, Array, Ints
 
@@ -410,7 +409,9 @@ def backward(
     Raises ValueError where shapes are not the view's.
     """
     splats, n = forward.splats, len(forward.splats.index)
-    pair_start = pair_starts(splats.tiles)
+    # Pairs are numbered ellipse by ellipse, the tiles of each row by row.
+    counts = (splats.tiles[:, 1] - splats.tiles[:, 0]) * (splats.tiles[:, 3] - splats.tiles[:, 2])
+    pair_start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     pairs = _pairs(forward, pair_start, d_rgb, d_depth, d_alpha, threads)
     sums = np.empty((n, SUMS_SIZE), np.float32)
     sizes = ((n, 3), (n, 4), (n, 3), (n,), (n, 2))

@@ -81,12 +81,6 @@ def assign_tiles(depths: F32, tiles: ShortInts, width: int, height: int, threads
     return start, pairs
 
 
-def pair_starts(tiles: ShortInts) -> Ints:
-    """Where each ellipse's pairs start (M + 1,) when they are numbered ellipse by ellipse, its tiles row by row."""
-    counts = (tiles[:, 1] - tiles[:, 0]) * (tiles[:, 3] - tiles[:, 2])
-    return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-
-
 @kernel
 def _nearest_first(depths: Any) -> Any:
     """Rows (M,) by depth, equal depths in the order they have: radix sort of the bits, which for positive numbers are
