@@ -247,7 +247,10 @@ class FactoryWork:
         """The pictures; RejectedAttempt where they are no sample's. Raises BadClip."""
         watch, drive, before = Stopwatch(), drive_of(driven), scene_cache_counts()
         with watch.timing("render"):
-            sensed = self._with_sensors(drive)
+            sensed = drive.sampled.scene.clip
+            if self.render.mode is RenderMode.AUTO:
+                now = read_clip(self.reader, drive.ref)
+                sensed = replace(sensed, images=now.images, sweeps=now.sweeps, block=now.block)
             unfit = self.unfit(sensed, drive)
             pictures = {} if unfit is not None else self.imaging.pictures(sensed, drive.candidate, drive.sampled)
         if unfit is not None:
@@ -262,13 +265,6 @@ class FactoryWork:
         if drive.candidate is None or drive.judged is None:
             return None
         return self.imaging.unfit(clip, drive.candidate, drive.judged, drive.shared)
-
-    def _with_sensors(self, drive: Drive) -> Clip:
-        clip = drive.sampled.scene.clip
-        if self.render.mode is not RenderMode.AUTO:
-            return clip
-        now = read_clip(self.reader, drive.ref)
-        return replace(clip, images=now.images, sweeps=now.sweeps, block=now.block)
 
     # All else of the row; the graph writes it.
 

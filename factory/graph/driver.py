@@ -260,16 +260,6 @@ class PendingCommit:
 _C_LIBRARY = ctypes.CDLL(None)
 
 
-def release_free_memory() -> None:
-    """Hand memory that is free, but kept for later, back to the machine: of the C library's many arenas and Arrow's.
-
-    A driver of days would else hold what each of its threads once needed. About a millisecond.
-    """
-    pa.default_memory_pool().release_unused()
-    if hasattr(_C_LIBRARY, "malloc_trim"):  # of glibc
-        _C_LIBRARY.malloc_trim(0)
-
-
 class CommitQueue:
     """Fills the open batch, sends full ones to be written, commits the written ones."""
 
@@ -342,7 +332,11 @@ class CommitQueue:
         self._store.commit(batch.candidates, batch.shards, batch.outcomes, batch.replaced, batch.unlisted, licences)
         self.on_commit(batch.shards, time.perf_counter() - began)
         batch.rows.clear()
-        release_free_memory()
+        # A driver of days would else hold what each of its threads once needed, in the C library's many arenas and
+        # Arrow's. About a millisecond.
+        pa.default_memory_pool().release_unused()
+        if hasattr(_C_LIBRARY, "malloc_trim"):  # of glibc
+            _C_LIBRARY.malloc_trim(0)
 
 
 CLIPS_PER_WORKER = 2  # open at once: one works while the next is being prepared
@@ -505,7 +499,12 @@ class RunDriver:
         last = report.reports[-1] if isinstance(report, BatchReport) else report
         if isinstance(last, Failure) and last.disk_full:
             raise DiskFull(last.disk_full)
-        self._count_machine_failures(last)
+        self._machine_failures += 1
+        if not (isinstance(last, Failure) and last.kind is ErrorKind.MACHINE):
+            self._machine_failures = 0
+        elif self._machine_failures >= max(MACHINE_FAILURES_IN_A_ROW, 3 * self._graph.parallelism):
+            said = last.error.splitlines()[-1]
+            raise MachineFailure(f"the machine failed {self._machine_failures} tasks in a row, the last one by: {said}")
         if self._commits.take_report(ticket, report):
             return
         if self._episodes is not None and self._episodes.take_report(ticket, report):
@@ -517,13 +516,6 @@ class RunDriver:
             self._take_prepared(self._preparing.pop(ticket), ticket.result, report)
         else:
             self._take_attempt(self._trying.pop(ticket), ticket.result, report)
-
-    def _count_machine_failures(self, report: Any) -> None:
-        ill = isinstance(report, Failure) and report.kind is ErrorKind.MACHINE
-        self._machine_failures = self._machine_failures + 1 if ill else 0
-        if self._machine_failures >= max(MACHINE_FAILURES_IN_A_ROW, 3 * self._graph.parallelism):
-            said = report.error.splitlines()[-1]
-            raise MachineFailure(f"the machine failed {self._machine_failures} tasks in a row, the last one by: {said}")
 
     def _take_block(self, build: BlockBuild, report: BlockReport | BlockUnfinished | Failure) -> None:
         if isinstance(report, BlockUnfinished):

@@ -114,7 +114,10 @@ def main(pid: int, folder: Path, stack: Path, alone: bool) -> None:
                 task = json.loads(line) if line else task
                 began, shown = now, now
         if task and (why := _limit_exceeded(task, now - began, resident_gb(pid))):
-            _write_note(folder / f"{task['key']}{OVER}", {**task, "why": why, "stack": _stack_of(pid, stack)})
+            os.kill(pid, signal.SIGUSR1)  # it writes the calls that it is in
+            time.sleep(STACK_S)
+            calls = "\n".join(stack.read_text(errors="replace").strip().splitlines()[:STACK_LINES])
+            _write_note(folder / f"{task['key']}{OVER}", {**task, "why": why, "stack": calls})
             (folder / f"{task['key']}{WORK}").unlink(missing_ok=True)  # before anybody can see that it has ended
             os.kill(pid, signal.SIGKILL)
             task = {}
@@ -154,14 +157,6 @@ def _limit_exceeded(task: dict[str, Any], seconds: float, gb: float) -> str:
     if task.get("seconds") and seconds > task["seconds"]:
         return f"was at work for more than {task['seconds']:.0f} s"
     return ""
-
-
-def _stack_of(pid: int, stack: Path) -> str:
-    """The calls that the process is in."""
-    os.kill(pid, signal.SIGUSR1)
-    time.sleep(STACK_S)
-    lines = stack.read_text(errors="replace").strip().splitlines()
-    return "\n".join(lines[:STACK_LINES])
 
 
 def _write_note(path: Path, document: dict[str, Any]) -> None:

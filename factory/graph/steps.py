@@ -351,18 +351,13 @@ def prepare(
     if result.clip_id != ref.clip_id:
         raise ValueError(f"prepare({ref.clip_id}) returned clip {result.clip_id}")
     _refuse_changed(ref, result.content_digest, wanted_content)
-    uncached = _cache_clip(cache, key, result)
+    uncached = ""
+    try:
+        cache.store(key, result)
+    except OSError as error:  # a result that could not be cached is still a result
+        uncached = f"{cache.location.uri}: {one_line(error)}"
     _keep_scenes(out, result)
     return PrepareReport(replace(result, payload=None, scenes=None), False, note, uncached, result.seconds), result
-
-
-def _cache_clip(cache: ClipCache, key: str, clip: PreparedClip) -> str:
-    """Keep a prepared clip; what stopped that, if anything did: a result that could not be cached is still a result."""
-    try:
-        cache.store(key, clip)
-    except OSError as error:
-        return f"{cache.location.uri}: {one_line(error)}"
-    return ""
 
 
 def _keep_scenes(out: Location, clip: PreparedClip) -> None:

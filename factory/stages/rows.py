@@ -124,7 +124,10 @@ def map_columns(scene: Scene, pose: Array) -> Mapping[str, object]:
     road_map, clip = scene.clip.road_map, scene.clip
 
     def near(line: Array) -> bool:
-        return _distance_m(line, pose) <= MAP_RADIUS_M
+        start, edge = line[:-1, :2], np.diff(line[:, :2], axis=0)
+        square = np.maximum((edge**2).sum(axis=1), 1e-12)  # repeated points make edges of no length
+        share = np.clip(((pose[:2] - start) * edge).sum(axis=1) / square, 0.0, 1.0)
+        return bool(np.hypot(*(start + share[:, None] * edge - pose[:2]).T).min() <= MAP_RADIUS_M)
 
     def local_ring(ring: Array) -> Array:
         return points_to_local(pose, ring[:, :2])
@@ -148,14 +151,6 @@ def map_columns(scene: Scene, pose: Array) -> Mapping[str, object]:
         "route_lane_ids": sorted(clip.route.lane_ids),
         "route_centerline": to_local(pose, scene.centerline),
     }
-
-
-def _distance_m(line: Array, pose: Array) -> float:
-    """To the nearest point of a polyline (P >= 2, >= 2), its long edges included."""
-    start, edge = line[:-1, :2], np.diff(line[:, :2], axis=0)
-    square = np.maximum((edge**2).sum(axis=1), 1e-12)  # repeated points make edges of no length
-    share = np.clip(((pose[:2] - start) * edge).sum(axis=1) / square, 0.0, 1.0)
-    return float(np.hypot(*(start + share[:, None] * edge - pose[:2]).T).min())
 
 
 def _encloses(ring: Array, pose: Array) -> bool:

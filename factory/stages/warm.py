@@ -156,21 +156,17 @@ def _compile_part(name: str, enough: Event) -> None:
     with terminal_signals_blocked():
         part = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)  # noqa: S603 (ours)
     with part:
-        said = _wait_for_part(part, enough)
+        said = None
+        while said is None:  # until it has ended, by itself or because there is enough
+            try:
+                said = part.communicate(timeout=ENOUGH_S)[1]
+            except subprocess.TimeoutExpired:
+                if enough.is_set():
+                    part.terminate()
     if part.returncode == DISK_FULL:
         raise OSError(said.strip().splitlines()[-1])
     if part.returncode != 0:
         raise RuntimeError(f"compiling the kernels of {name} failed: {said[-2000:]}")
-
-
-def _wait_for_part(part: "subprocess.Popen[str]", enough: Event) -> str:
-    """What it said once it has ended, by itself or because there is enough."""
-    while True:
-        try:
-            return part.communicate(timeout=ENOUGH_S)[1]
-        except subprocess.TimeoutExpired:
-            if enough.is_set():
-                part.terminate()
 
 
 def _compile_and_mark(name: str) -> int:
@@ -244,16 +240,6 @@ def compile_render_kernels() -> RenderAsset:
     return build_asset(*_tiny_recording(), AssetSettings(hold_out_every=3))
 
 
-def compile_fit_kernels() -> RenderAsset:
-    """Fits such a scene, each step of the fit at least once."""
-    settings = FitSettings(
-        iterations=4, start_gaussians=200, most_gaussians=300, refine_every=2, refine_from=2, pose_from=0
-    )
-    problem, state = prepare_fit(*_tiny_recording(), settings, held_out=[1])
-    run_iterations(problem, state, settings, settings.iterations)
-    return finish_scene(problem, state)
-
-
 def compile_rig_kernels() -> AdjustedRig:
     """Adjusts a rig of one camera at three places to two points that it sees, and looks for a photo's depth in others.
 
@@ -296,7 +282,12 @@ def _tiny_recording() -> tuple[list[Photo], list[Sweep], AgentTracks]:
 def _compile_fit() -> None:
     """Scenes that are built and drawn, and fitted: in one process, for they share kernels."""
     compile_render_kernels()
-    compile_fit_kernels()
+    settings = FitSettings(  # each step of the fit at least once
+        iterations=4, start_gaussians=200, most_gaussians=300, refine_every=2, refine_from=2, pose_from=0
+    )
+    problem, state = prepare_fit(*_tiny_recording(), settings, held_out=[1])
+    run_iterations(problem, state, settings, settings.iterations)
+    finish_scene(problem, state)
 
 
 PARTS = {

@@ -83,7 +83,10 @@ def attempts_from_tables(samples: pa.Table, outcomes: pa.Table, runs: Sequence[M
     why, whys, task = _reasons(outcomes)
     why = np.concatenate([why, np.zeros(samples.num_rows, np.int32)])
     task = np.concatenate([task, np.full(samples.num_rows, len(ATTEMPT), np.int32)])
-    age = 2 * (_run_numbers(rows, runs) + 1)  # -1: of no record
+    names, number = [name for name in MADE_UNDER if name != "attempt_id"], run_number_lookup(runs)
+    made, at = distinct_texts(rows, names)
+    numbers = np.array([number(dict(zip(names, texts))) for texts in made], np.int32)[at]
+    age = 2 * (numbers + 1)  # -1: of no record
     age[n_outcomes:] += 1
     sizes = len(clip_ids), int(candidate.max(initial=-1)) + 2, n_ages
     newest = _last_of_each(_ordered(expert, list(zip(sizes, (clip, candidate + 1, age)))), n_ages)
@@ -130,15 +133,6 @@ def _reason(kind: str, stage: str, reason: str, error_kind: str) -> str:
     if kind == Kind.EXHAUSTED:
         return EXHAUSTED
     return f"failed.{error_kind}" if kind == Kind.FAILED else f"{stage}.{reason}"
-
-
-def _run_numbers(rows: pa.Table, runs: Sequence[Mapping[str, Any]]) -> Codes:
-    """The number of the run that each row is of (factory.store.samples.run_number_lookup)."""
-    names = [name for name in MADE_UNDER if name != "attempt_id"]
-    found, at = distinct_texts(rows, names)
-    number = run_number_lookup(runs)
-    made = [dict(zip(names, texts)) for texts in found]
-    return np.array([number(row) for row in made], np.int32)[at]
 
 
 # What was planned and what became of it, from the tables alone: planned = accepted + rejected + failed + pending.

@@ -183,14 +183,6 @@ PLAN_SCHEMA = pa.schema(
 PLANS = TableSpec("plans", PLAN_SCHEMA, "plan_id")
 
 
-def plan_table(rounds: Mapping[str, int], clip_ids: Sequence[str]) -> pa.Table:
-    """One plan as a row."""
-    clips, wanted = sorted(clip_ids), dict(sorted(rounds.items()))
-    text = "\x1f".join((*(f"{expert} {n}" for expert, n in wanted.items()), "", *clips))
-    row = {"plan_id": hashlib.sha256(text.encode()).hexdigest()[:16], "rounds": wanted, "clip_ids": clips}
-    return pa.Table.from_pylist([row], schema=PLAN_SCHEMA)
-
-
 def plans_of(table: KeyedTable, clip_ids: Collection[str] | None = None) -> pa.Table:
     """All plans, or as if some clips were all that there are."""
     plans = table.read()
@@ -610,9 +602,13 @@ class Store:
 
         Raises AnotherWriter.
         """
-        rows = plan_table(rounds, clip_ids)
-        if rows["plan_id"][0].as_py() not in self.plans:
-            self.plans.commit([write_shard(self.plans.location, PLANS, rows)])
+        clips, wanted = sorted(clip_ids), dict(sorted(rounds.items()))
+        text = "\x1f".join((*(f"{expert} {n}" for expert, n in wanted.items()), "", *clips))
+        plan_id = hashlib.sha256(text.encode()).hexdigest()[:16]
+        if plan_id not in self.plans:
+            row = {"plan_id": plan_id, "rounds": wanted, "clip_ids": clips}
+            table = pa.Table.from_pylist([row], schema=PLAN_SCHEMA)
+            self.plans.commit([write_shard(self.plans.location, PLANS, table)])
 
     def commit(
         self,
@@ -630,18 +626,15 @@ class Store:
         lists = [write_shard(self.candidates.location, CANDIDATES, candidates_table(candidates))] if candidates else []
         self.candidates.commit(lists, drop=[*unlisted, *(row.clip_id for row in candidates)])
         accepted = [key for shard in shards for key in shard.keys]
-        self._note_licences(licences)
+        # The table's own metadata names every licence of its rows, before the first such row is there.
+        known = self.samples.properties.get(LICENCES_PROPERTY, "")
+        named = "; ".join(sorted({line for line in (*known.split("; "), *licences) if line}))
+        if named != known:
+            self.samples.set_property(LICENCES_PROPERTY, named)
         self.samples.commit(shards, drop=replaced)
         # A failed outcome stands until its attempt succeeds: then it goes, and it never stands twice.
         files = [write_shard(self.outcomes.location, OUTCOMES, outcomes_table(outcomes))] if outcomes else []
         self.outcomes.commit(files, drop=[*accepted, *replaced, *(o.attempt_id for o in outcomes)])
-
-    def _note_licences(self, licences: Collection[str]) -> None:
-        """The table's own metadata names every licence of its rows, before the first such row is there."""
-        known = self.samples.properties.get(LICENCES_PROPERTY, "")
-        named = {line for line in (*known.split("; "), *licences) if line}
-        if "; ".join(sorted(named)) != known:
-            self.samples.set_property(LICENCES_PROPERTY, "; ".join(sorted(named)))
 
 
 def run_number_lookup(records: Sequence[Mapping[str, Any]]) -> Callable[[Mapping[str, Any]], int]:

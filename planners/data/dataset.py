@@ -162,18 +162,14 @@ class SampleStream(IterableDataset[dict[str, Any]]):
         if self._seed is not None:
             groups = groups[stream(self._seed, "stream", int(self._epoch)).permutation(len(groups))]
         ends = np.cumsum(groups[:, 2])
-        first, last = self._share(int(groups[:, 2].sum()))
+        rank, world = self._place()
+        share, worker = int(groups[:, 2].sum()) // world, get_worker_info()
+        number, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        first, last = (rank * share + share * n // workers for n in (number, number + 1))  # of this process's samples
         for (file, group, n_rows), end in zip(groups.tolist(), ends.tolist()):
             start = end - n_rows
             if first < end and start < last:
                 yield from self._data.rows(str(self._paths[file]), group, slice(max(first - start, 0), last - start))
-
-    def _share(self, total: int) -> tuple[int, int]:
-        """First and one behind the last of this process's samples."""
-        rank, world = self._place()
-        share, worker = total // world, get_worker_info()
-        number, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        return rank * share + share * number // workers, rank * share + share * (number + 1) // workers
 
     def _place(self) -> tuple[int, int]:
         """Rank and number of ranks."""

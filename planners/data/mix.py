@@ -155,16 +155,6 @@ def _simulated_in(n_batches: int, batch_size: int, ratio: Fraction) -> int:
     return int(n_batches * batch_size * ratio)  # truncates, which is floor here
 
 
-def fitting_batch(simulated: Bools, mix: MixSettings, batch_size: int, parts: int = 1) -> int:
-    """The largest batch of up to `batch_size`, in equal parts, that a pass over the samples has; 0 for none.
-
-    simulated: (n,) of each sample.
-    """
-    n_first = len(simulated) if mix.ratio is None else int((~simulated).sum())
-    sizes = range(batch_size, 0, -parts)
-    return next((size for size in sizes if batches_in(n_first, size, mix.ratio)), 0)
-
-
 def check_sides(mix: MixSettings, simulated: Bools) -> None:
     """Raises ValueError where there are none of the samples that a ratio takes."""
     if mix.sim_ratio == "natural":

@@ -75,7 +75,11 @@ def paired_interval(
     """
     counts = weights if weights is not None else (np.ones_like(a), np.ones_like(b))
     _check(a, b, counts, confidence, draws)
-    cluster_of_clip, n_clusters = _indices(clusters if clusters is not None else range(a.shape[1]), a.shape[1])
+    own = list(clusters) if clusters is not None else list(range(a.shape[1]))
+    if len(own) != a.shape[1]:
+        raise ValueError(f"clusters must name one for each of {a.shape[1]} clips, got {len(own)}")
+    place = {cluster: i for i, cluster in enumerate(dict.fromkeys(own))}
+    cluster_of_clip, n_clusters = np.array([place[cluster] for cluster in own]), len(place)
     mean_a, mean_b = (float((x * w).sum() / w.sum()) for x, w in zip((a, b), counts))
     if n_clusters == 1 and clusters is not None:
         return Interval(mean_b - mean_a, np.nan, np.nan, mean_a, mean_b, n_clusters)
@@ -102,14 +106,6 @@ def _cluster_influences(scores: Array, weights: Array, cluster_of_clip: Indices)
     """(G,) by how much the scores of each cluster move the weighted mean."""
     off = weights * (scores - (scores * weights).sum() / weights.sum())
     return np.bincount(cluster_of_clip, off.sum(axis=0)) / weights.sum()
-
-
-def _indices(clusters: Sequence[Hashable], n_clips: int) -> tuple[Indices, int]:
-    """The cluster of each clip as a number, in the order in which they first come, and how many there are."""
-    if len(clusters) != n_clips:
-        raise ValueError(f"clusters must name one for each of {n_clips} clips, got {len(clusters)}")
-    place = {cluster: i for i, cluster in enumerate(dict.fromkeys(clusters))}
-    return np.array([place[cluster] for cluster in clusters]), len(place)
 
 
 def _draw_counts(rng: np.random.Generator, size: int, n: int) -> Array:

@@ -25,9 +25,6 @@ class ConstantVelocity(Planner):
     name: ClassVar[str] = "constant_velocity"
     settings_type = ConstantVelocitySettings
 
-    def __init__(self, settings: ConstantVelocitySettings, arrays: Mapping[str, FloatArray]) -> None:
-        super().__init__(settings, arrays)
-
     @property
     def needs(self) -> Needs:
         return Needs()

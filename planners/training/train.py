@@ -27,7 +27,7 @@ from factory.config.compose import ConfigError, compose, fill
 from factory.config.shapes import GIVE, deep_merge, to_plain
 from planners.data.index import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
-from planners.data.mix import MixSettings, fitting_batch
+from planners.data.mix import MixSettings, batches_in
 from planners.models.settings import GtrsDenseSettings, PlannerChoice, settings_class, settings_of
 from planners.training.checkpoint import (
     Keep,
@@ -266,7 +266,9 @@ def _next_text(out: str, looks: bool) -> str:
 def _with_fitting_batch(config: TrainConfig, dataset: Dataset, process: TrainingProcess) -> TrainConfig:
     """With a batch that the samples suffice for; a training that goes on keeps its own. Raises ConfigError."""
     asked, parts = config.training.batch_size, process.size * config.accumulate
-    size = fitting_batch(dataset.rows.simulated, config.mix, asked, parts)
+    n_first = len(dataset) if config.mix.ratio is None else int((~dataset.rows.simulated).sum())
+    sizes = range(asked, 0, -parts)  # in equal parts; 0 where a pass over the samples has no batch
+    size = next((size for size in sizes if batches_in(n_first, size, config.mix.ratio)), 0)
     out = Path(config.out).absolute()
     if size != asked and checkpoints(out):
         size = int(read_record(out)["trained"]["planner.training"]["batch_size"])

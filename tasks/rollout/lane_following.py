@@ -215,7 +215,11 @@ def find_path(index: LaneIndex, pose: Array, log_poses: Array, ahead_m: float) -
     way = ways[0]
     if len(ways) > 1:
         start_costs = _point_costs(distance, difference)[0]
-        scores = _log_costs(index, ways, log_poses) + START_COST_WEIGHT * start_costs[[way[0] for way in ways]]
+        lanes = sorted(set().union(*ways))
+        costs = _point_costs(*lane_distances_and_turns(index, log_poses, lanes))
+        place = {lane: k for k, lane in enumerate(lanes)}
+        nearest_costs = [costs[:, [place[lane] for lane in way]].min(axis=1) for way in ways]
+        scores = np.array(nearest_costs).mean(axis=1) + START_COST_WEIGHT * start_costs[[way[0] for way in ways]]
         way = ways[int(np.argmin(np.round(scores, 6)))]  # rounded: a turned world must not change a tie
     return _path_of(index, _extended(index, way, ahead[way[0]], ahead_m), pose, log_poses, ahead_m)
 
@@ -307,16 +311,6 @@ def _ways(index: LaneIndex, starts: Mapping[int, float], reach: float) -> list[l
             for k in reversed(following):
                 stack.append(([*way, k], length + index.length(k)))
     return ways
-
-
-def _log_costs(index: LaneIndex, ways: list[list[int]], log_poses: Array) -> Array:
-    """(W,) mean cost of a log's poses (K, 3) to the nearest lane of each way."""
-    lanes = sorted(set().union(*ways))
-    costs = _point_costs(*lane_distances_and_turns(index, log_poses, lanes))
-    place = {lane: k for k, lane in enumerate(lanes)}
-    nearest = [costs[:, [place[lane] for lane in way]].min(axis=1) for way in ways]
-    mean: Array = np.array(nearest).mean(axis=1)
-    return mean
 
 
 def _extended(index: LaneIndex, way: list[int], ahead: float, ahead_m: float) -> list[int]:
@@ -532,7 +526,13 @@ def stack_paths(
     xy = np.array([path.xy for path in chosen]).reshape(-1, n_points, 2)
     heading = np.array([path.heading for path in chosen]).reshape(-1, n_points)
     limit = np.array([path.speed_limit_mps for path in chosen]).reshape(-1, n_points)
-    lines = _stop_lines(scene, found, logged_stops)
+    log = scene.clip.agents
+    stopped = log.valid & (np.hypot(*np.moveaxis(log.velocities, -1, 0)) < STANDS_BELOW_MPS)
+    lines = [
+        [*_light_lines(scene, path), *(_logged_stops(scene, path, i, stopped[:, i]) if logged_stops else ())]
+        for i, path in enumerate(found)
+        if path is not None
+    ]
     counts = [len(of_path) for of_path in lines] + [0] * (len(chosen) - len(lines))
     states = [state for of_path in lines for _, state in of_path]
     return Paths(
@@ -557,17 +557,6 @@ def _target_speeds(limit: Array, heading: Array, default: float, decel_max: floa
     square = np.minimum.accumulate((square + fall)[:, ::-1], axis=1)[:, ::-1] - fall
     speeds: Array = np.sqrt(np.maximum(square, 1.0))
     return speeds
-
-
-def _stop_lines(scene: Scene, found: list[LanePath | None], logged: bool) -> list[list[StopLine]]:
-    """Of each path there is: the lights along it, and where the vehicle's log stops if that is wanted (`logged`)."""
-    log = scene.clip.agents
-    stopped = log.valid & (np.hypot(*np.moveaxis(log.velocities, -1, 0)) < STANDS_BELOW_MPS)
-    return [
-        [*_light_lines(scene, path), *(_logged_stops(scene, path, i, stopped[:, i]) if logged else ())]
-        for i, path in enumerate(found)
-        if path is not None
-    ]
 
 
 def _light_lines(scene: Scene, path: LanePath) -> list[StopLine]:

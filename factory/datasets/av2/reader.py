@@ -232,7 +232,10 @@ def whole_poses(path: Path, times_s: Array, poses: Array) -> tuple[Array, Array,
         done.append(Repair("clock", EGO, first, was, "by their stamps", last))
         order = np.argsort(times_s, kind="stable")
         times_s, poses = times_s[order], poses[order]
-    keep = distinct_time_indices(times_s)
+    keep = [0]  # more than 1 ms after the last one kept
+    for i in range(1, len(times_s)):
+        if times_s[i] - times_s[keep[-1]] > MIN_POSE_SPACING_S:
+            keep.append(i)
     times_s, poses = times_s[keep], poses[keep]
     boxes = np.ones((len(poses), 9))
     boxes[:, :3], boxes[:, 3] = poses[:, 4:], headings_of(poses)
@@ -310,15 +313,6 @@ def agents_at(motion: LogMotion, times_s: Array) -> AgentTracks:
         center_z=center_z,
         heights=np.array([track.sizes[0, 2] for track in motion.tracks]),
     )
-
-
-def distinct_time_indices(times_s: Array) -> Indices:
-    """Indices of the times kept when each must stand more than 1 ms after the last one kept."""
-    keep = [0]
-    for i in range(1, len(times_s)):
-        if times_s[i] - times_s[keep[-1]] > MIN_POSE_SPACING_S:
-            keep.append(i)
-    return np.array(keep)
 
 
 def yaw_of(rotation: Rotation) -> Array:
@@ -639,7 +633,8 @@ def read_log(folder: Path) -> AV2Log:
     vector_map = map_file(folder)
     road_map, map_repairs = read_map(vector_map)
     lights, light_repairs = lights_on_map(read_lights(folder, motion, times_s), road_map.lanes)
-    cameras, sensors = read_cameras(folder), folder / "sensors"
+    cameras, sensors, own = read_cameras(folder), folder / "sensors", folder / "LICENSE"
+    lines = own.read_text(encoding="utf-8").splitlines() if own.is_file() else []
     return AV2Log(
         file=str(folder),
         motion=motion,
@@ -651,7 +646,7 @@ def read_log(folder: Path) -> AV2Log:
         cameras=cameras,
         images=tuple(chain(*(_stamped(motion, c.name, sensors / "cameras" / c.name, ".jpg") for c in cameras))),
         sweeps=tuple(_stamped(motion, "lidar", sensors / "lidar", ".feather")),
-        licence=_licence(folder),
+        licence=lines[0].strip() if lines else LICENCE,
         content_digest=content_digest(folder),
         split=folder_split(folder),
         repairs=(*motion.repairs, *map_repairs, *light_repairs),
@@ -717,12 +712,6 @@ def content_digest(folder: Path) -> str:
             content = (folder / name).read_bytes()
             digest.update(f"{name}\x1f{len(content)}\x1f".encode() + content)
     return digest.hexdigest()
-
-
-def _licence(folder: Path) -> str:
-    path = folder / "LICENSE"
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    return lines[0].strip() if lines else LICENCE
 
 
 def _stamped(motion: LogMotion, sensor: str, folder: Path, suffix: str) -> list[SensorFile]:

@@ -35,8 +35,8 @@ from factory.datasets.navsim.frames import (
     sample_pictures,
     split_names,
 )
-from factory.datasets.navsim.pickles import dumps, write_rewards
-from factory.files import atomic_file, naming_disk_errors
+from factory.datasets.navsim.pickles import dumps, reward_arrays, write_pickled_dict
+from factory.files import atomic_file, file_digest, naming_disk_errors
 from factory.store.location import Location, open_parquet
 from factory.store.reader import Sample, read_rows
 from factory.store.schema import LABEL_COLUMNS, canonical_json
@@ -86,13 +86,6 @@ def write_file(root: Path, path: str, data: bytes) -> WrittenFile:
     with atomic_file(root / path, len(data)) as draft:
         draft.write_bytes(data)
     return WrittenFile(path, len(data), hashlib.sha256(data).hexdigest())
-
-
-def checksummed_file(root: Path, path: str) -> WrittenFile:
-    """A file that is there, read through once."""
-    with (root / path).open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256")
-    return WrittenFile(path, (root / path).stat().st_size, digest.hexdigest())
 
 
 class Journal:
@@ -253,12 +246,17 @@ class ExportSummary:
     notes: tuple[str, ...]  # what its user should know
 
 
+def in_this_process(write: WriteGroup, groups: Iterable[RowGroup]) -> Generator[list[WrittenLog], None, None]:
+    """In this process."""
+    yield from map(write, groups)
+
+
 def export(
     table: KeyedTable,
     to: Path,
     settings: ExportSettings,
     trajectories: Array | None = None,
-    each: Each = lambda write, groups: (write(group) for group in groups),
+    each: Each = in_this_process,
     say: Say = print,
 ) -> ExportSummary:
     """Write all samples that `settings` choose below `to`; what a call before has written stays.
@@ -471,8 +469,11 @@ def _reward_files(
         path = root / split.rewards
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(path, 0) as draft:
-            write_rewards(draft, _labelled(table, labelled), before)
-        files.append(checksummed_file(root, split.rewards))
+            # Cumulative: SimScale opens the last round's for each of the rounds (gtrs_agent.py:231-235).
+            rewards = ((token, reward_arrays(row)) for token, row in _labelled(table, labelled))
+            with draft.open("w+b") as file:
+                write_pickled_dict(file, rewards, before)
+        files.append(WrittenFile(split.rewards, path.stat().st_size, file_digest(path)))
         earlier[first["expert"]] = path
     return files, without
 

@@ -208,7 +208,9 @@ def ego_motion(row: Mapping[str, Any]) -> EgoMotion:
     else:  # that log at T is now, and at T+H the last frame
         logged = np.asarray(row["parent_states"])[:, [VX, VY, AX, AY]]
         dynamics[[NOW_FRAME, N_FRAMES - 1]] = logged
-    matrices, quaternions = poses_in_space(poses, stored_poses(row))
+    stored = [] if row["world_from_ego"] is None else [np.asarray(row["world_from_ego"])]  # at now, and of its pictures
+    stored += [np.asarray(image["ego_pose"]).reshape(4, 4) for image in row["images"] or ()]
+    matrices, quaternions = poses_in_space(poses, np.stack(stored) if stored else np.eye(4)[None])
     return EgoMotion(poses, to_local(poses[NOW_FRAME], poses), matrices, quaternions, dynamics, yaw_rates)
 
 
@@ -230,13 +232,6 @@ def derivatives(poses: Array) -> tuple[Array, Array]:
     turned = [np.hstack([c * v[:, :1] + s * v[:, 1:], c * v[:, 1:] - s * v[:, :1]]) for v in (velocity, acceleration)]
     turned[1][:n], turned[1][-n:] = turned[1][n], turned[1][-n - 1]
     return np.hstack(turned), yaw_rate
-
-
-def stored_poses(row: Mapping[str, Any]) -> Array:
-    """(P, 4, 4) every 3-D pose of the ego that the row holds: at now, and of its pictures; level at 0 m without any."""
-    found = [] if row["world_from_ego"] is None else [np.asarray(row["world_from_ego"])]
-    found += [np.asarray(image["ego_pose"]).reshape(4, 4) for image in row["images"] or ()]
-    return np.stack(found) if found else np.eye(4)[None]
 
 
 def poses_in_space(poses: Array, known: Array) -> tuple[Array, Array]:

@@ -123,8 +123,14 @@ def read_geopackage(path: Path) -> dict[str, LayerTable]:
     missing = sorted({*KEYS, "meta"} - known)
     if missing:
         raise BadClip(str(path), f"layer {missing[0]}", "is missing; is this one of nuPlan's maps, copied whole?")
-    target = _projected_system(path)
-    return {layer: _table(path, layer, target) for layer in KEYS}
+    meta, _, _, values = _read(path, "meta", ["key", "value"])
+    found = dict(zip(meta["fields"].tolist(), values))
+    if found.keys() != {"key", "value"}:
+        raise BadClip(str(path), "layer meta", "needs the columns key and value")
+    system = dict(zip(found["key"].tolist(), found["value"].tolist())).get("projectedCoordSystem")
+    if not system:
+        raise BadClip(str(path), "layer meta, key projectedCoordSystem", "is missing: it names the UTM zone")
+    return {layer: _table(path, layer, str(system)) for layer in KEYS}
 
 
 def _read(path: Path, layer: str, columns: list[str] | None) -> tuple[dict[str, Any], Ints, Any, list[Any]]:
@@ -136,17 +142,6 @@ def _read(path: Path, layer: str, columns: list[str] | None) -> tuple[dict[str, 
     except Exception as error:  # see above
         raise BadClip(str(path), f"layer {layer}", f"cannot be read: {error}") from error
     return meta, fids, wkb, values
-
-
-def _projected_system(path: Path) -> str:
-    meta, _, _, values = _read(path, "meta", ["key", "value"])
-    found = dict(zip(meta["fields"].tolist(), values))
-    if found.keys() != {"key", "value"}:
-        raise BadClip(str(path), "layer meta", "needs the columns key and value")
-    systems = dict(zip(found["key"].tolist(), found["value"].tolist()))
-    if not systems.get("projectedCoordSystem"):
-        raise BadClip(str(path), "layer meta, key projectedCoordSystem", "is missing: it names the UTM zone")
-    return str(systems["projectedCoordSystem"])
 
 
 def _table(path: Path, layer: str, target: str) -> LayerTable:
@@ -331,7 +326,12 @@ class City:
         self._polygon_rows = row_of
         of_lane = self._rows_of("baseline_paths", "lane_fid", lanes)
         of_connector = self._rows_of("baseline_paths", "lane_connector_fid", connectors)
-        self._baselines, self._centerlines = np.concatenate([of_lane, of_connector]), _headed(tables["baseline_paths"])
+        lines = tables["baseline_paths"]
+        steps = np.diff(lines.xy, axis=0, append=0.0)
+        heading, last = np.arctan2(steps[:, 1], steps[:, 0]), lines.offsets[0][1:] - 1
+        heading[last] = heading[last - 1]  # each point has that of the segment that starts there
+        self._baselines = np.concatenate([of_lane, of_connector])
+        self._centerlines = np.column_stack([lines.xy, heading])
         sides = [f"{side}_boundary_fid" for side in ("left", "right")]
         self._sides = [self._side(np.concatenate([lanes.columns[s], polygons.columns[s][row_of]])) for s in sides]
         edges = tables["boundaries"].xy
@@ -339,7 +339,11 @@ class City:
         self._blocks = np.concatenate([lanes.columns["lane_group_fid"], connectors.columns["lane_group_connector_fid"]])
         self._speeds = np.concatenate([t.columns["speed_limit_mps"] for t in (lanes, connectors)])
         self._before, self._after = self._graph()
-        self._beside = self._neighbours()
+        # One less and one more `lane_index` in the same lane group; connectors have no neighbours.
+        places = list(zip(lanes.columns["lane_group_fid"].tolist(), lanes.columns["lane_index"].tolist()))
+        at = dict(zip(places, self._ids))
+        self._beside = [(at.get((group, index - 1)), at.get((group, index + 1))) for group, index in places]
+        self._beside += [(None, None)] * (len(self._ids) - len(places))
         self._tree = shapely.STRtree(np.concatenate([lanes.shapes, polygons.shapes[row_of]]))
         self._area_trees = {layer: shapely.STRtree(tables[layer].shapes) for layer in (*AREAS, "crosswalks")}
         self._lanes: dict[int, Lane] = {}
@@ -446,14 +450,6 @@ class City:
                 before[self._index_of[target]].append(self._ids[i])
         return [tuple(ids) for ids in before], [tuple(ids) for ids in after]
 
-    def _neighbours(self) -> list[tuple[str | None, str | None]]:
-        """Left and right neighbour: one less and one more `lane_index` in the same lane group; connectors have none."""
-        lanes = self.tables[LANES]
-        places = list(zip(lanes.columns["lane_group_fid"].tolist(), lanes.columns["lane_index"].tolist()))
-        at = dict(zip(places, self._ids))
-        beside = [(at.get((group, index - 1)), at.get((group, index + 1))) for group, index in places]
-        return beside + [(None, None)] * (len(self._ids) - len(places))
-
     def _lane(self, i: int) -> Lane:
         if i not in self._lanes:
             lines, row = self.tables["baseline_paths"].offsets[0], int(self._baselines[i])
@@ -513,14 +509,6 @@ class City:
 def _near(tree: shapely.STRtree, around: Any, radius_m: float) -> list[int]:
     """Rows within a distance, in file order."""
     return sorted(tree.query(around, predicate="dwithin", distance=radius_m).tolist())
-
-
-def _headed(table: LayerTable) -> Array:
-    """(T, 3) the points of a layer of lines with the direction of the segment that starts there; a last one repeats."""
-    steps = np.diff(table.xy, axis=0, append=0.0)
-    heading, last = np.arctan2(steps[:, 1], steps[:, 0]), table.offsets[0][1:] - 1
-    heading[last] = heading[last - 1]
-    return np.column_stack([table.xy, heading])
 
 
 def _ends(table: LayerTable, rows: NDArray[np.int64]) -> Array:

@@ -89,15 +89,6 @@ def reward_arrays(row: Mapping[str, Any]) -> dict[str, NDArray[np.float16]]:
     }
 
 
-def write_rewards(draft: Path, labelled: Iterable[tuple[str, Mapping[str, Any]]], earlier: Path | None) -> None:
-    """The rewards of tokens and their rows after those of the rounds before.
-
-    A file is cumulative because SimScale opens the last round's for each of the rounds (gtrs_agent.py:231-235).
-    """
-    with draft.open("w+b") as file:
-        write_pickled_dict(file, ((token, reward_arrays(row)) for token, row in labelled), earlier)
-
-
 # A reward pickle of SimScale, {token: {metric: float16 (K,)}}: opened by its index, read token by token.
 #
 # With 65,026 tokens, nine metrics and K = 16,384 one file is 19 GB. So its opcodes are followed once, nothing of it

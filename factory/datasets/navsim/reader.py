@@ -137,7 +137,12 @@ def read_selection(name: str, folder: str | Path | None = None) -> Selection:
         raise ValueError(f"{path}: data_split: expected the name of a folder of logs, not {shown(data_split)}")
     if mapping is not None and not isinstance(mapping, list):
         raise ValueError(f"{path}: reactive_all_mapping: expected a list, not a {type(mapping).__name__}")
-    filter_path = path.parent / SUBFOLDER / f"{_filter_name(content, path)}.yaml"
+    defaults = content.get("defaults")
+    entries = [entry for entry in defaults if isinstance(entry, dict)] if isinstance(defaults, list) else []
+    names = [entry[SUBFOLDER] for entry in entries if isinstance(entry.get(SUBFOLDER), str)]
+    if len(names) != 1 or "/" in names[0]:
+        raise ValueError(f"{path}: defaults: expected one entry `- scene_filter: <name>`")
+    filter_path = path.parent / SUBFOLDER / f"{names[0]}.yaml"
     scene_filter = scene_filter_of(_mapping(filter_path), str(filter_path))
     return Selection(path.stem, scene_filter, data_split, None if mapping is None else tuple(mapping))
 
@@ -163,7 +168,11 @@ def scene_filter_of(content: Mapping[str, Any], file: str) -> SceneFilter:
         elif key == "all_mapping":
             checked[key] = value
         else:
-            checked[key] = _texts(value, f"{file}: {key}")
+            if not isinstance(value, list):
+                raise ValueError(f"{file}: {key}: expected a list of text, not a {type(value).__name__}")
+            if odd := [item for item in value if not isinstance(item, str)]:
+                raise ValueError(f"{file}: {key}: {shown(odd[0])} is no text: put it in quotes")
+            checked[key] = tuple(value)
     return SceneFilter(**checked)
 
 
@@ -181,16 +190,6 @@ def _find(name: str, folder: str | Path | None) -> Path:
             return path
     there = sorted({path.stem for pattern in ("*.yaml", f"{SUBFOLDER}/*.yaml") for path in matching(parent, pattern)})
     raise ValueError(f"{parent}: no {name}.yaml here or in {SUBFOLDER}/; there are {', '.join(there) or 'none'}")
-
-
-def _filter_name(content: Mapping[str, Any], path: Path) -> str:
-    """Of the one entry `scene_filter: <name>` among a split's defaults."""
-    defaults = content.get("defaults")
-    entries = [entry for entry in defaults if isinstance(entry, dict)] if isinstance(defaults, list) else []
-    names = [entry[SUBFOLDER] for entry in entries if isinstance(entry.get(SUBFOLDER), str)]
-    if len(names) != 1 or "/" in names[0]:
-        raise ValueError(f"{path}: defaults: expected one entry `- scene_filter: <name>`")
-    return str(names[0])
 
 
 def _mapping(path: Path) -> dict[str, Any]:
@@ -227,15 +226,6 @@ def _read(path: Path) -> dict[str, Any]:
 def _refuse_unknown(content: Mapping[str, Any], known: frozenset[str], file: str) -> None:
     if unknown := sorted(content.keys() - known):
         raise ValueError(f"{file}: unknown key {', '.join(unknown)}; known: {', '.join(sorted(known))}")
-
-
-def _texts(value: object, where: str) -> tuple[str, ...]:
-    if not isinstance(value, list):
-        raise ValueError(f"{where}: expected a list of text, not a {type(value).__name__}")
-    for item in value:
-        if not isinstance(item, str):
-            raise ValueError(f"{where}: {shown(item)} is no text: put it in quotes")
-    return tuple(value)
 
 
 # Which windows of a folder of logs are clips, found without opening the logs again.

@@ -256,15 +256,6 @@ def _max_filled_gap_s(boxes: ArrowFile, frames_s: Array) -> float:
 CAMERAS = "camera.*.arrow"
 
 
-def read_rig(folder: Path) -> dict[Path, Camera]:
-    """Table -> pinhole camera; fisheyes are left out. Raises BadClip."""
-    mount = open_file(folder / EGO, rows=False).vector("rear_axle_to_imu_se3", 7)
-    rear_from_imu = np.linalg.inv(pose_matrices(folder / EGO, mount[None])[0])
-    files = {path: open_file(path, rows=False) for path in matching(folder, CAMERAS)}
-    pinholes = {path: file for path, file in files.items() if file.value("camera_model", str) == "pinhole"}
-    return {path: _camera(file, rear_from_imu) for path, file in pinholes.items()}
-
-
 def recorded_photos(motion: LogMotion, rig: dict[Path, Camera], sensor_root: Path) -> tuple[SensorFile, ...]:
     """The log's photos, seconds since its first annotated frame, posed as their tables say.
 
@@ -390,7 +381,12 @@ class Py123dReader(LogReader[Py123dLog]):
         around = read_map(map_path, source, driven[:, :2])
         every_light = lights_at(motion, step_times(0, motion.n_steps))
         lights, light_repairs = lights_on_map(every_light, around.road_map.lanes, around.far_lanes)
-        rig, split = read_rig(path), header.value("split", str).rpartition("_")[2]  # <data set>_<split>
+        mount = open_file(path / EGO, rows=False).vector("rear_axle_to_imu_se3", 7)
+        rear_from_imu = np.linalg.inv(pose_matrices(path / EGO, mount[None])[0])
+        tables = {table: open_file(table, rows=False) for table in matching(path, CAMERAS)}
+        pinholes = {table: file for table, file in tables.items() if file.value("camera_model", str) == "pinhole"}
+        rig = {table: _camera(file, rear_from_imu) for table, file in pinholes.items()}  # without fisheyes
+        split = header.value("split", str).rpartition("_")[2]  # <data set>_<split>
         return Py123dLog(
             file=str(path),
             motion=motion,

@@ -5,7 +5,7 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from factory.datasets.town.town import (
     log_name,
     plan_log,
     repair_folder,
-    repair_towns,
+    write_logs,
     write_once,
     write_town,
     write_towns,
@@ -213,7 +213,10 @@ class SyntheticTownsReader(TownLogReader):
 
     def index(self) -> ClipIndex:
         """All windows of all towns; a town that was damaged is mended."""
-        repair_towns(self.towns, self.settings)
+        for town in self.towns:
+            if town.root.is_dir():
+                again = partial(write_logs, indices=town.indices, seed=town.seed, settings=self.settings)
+                repair_folder(town.root, again)
         return super().index()
 
     def path_of(self, ref: ClipRef) -> Path:

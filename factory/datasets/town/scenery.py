@@ -185,7 +185,11 @@ def build_scenery(streets: Streets, rng: np.random.Generator) -> Scenery:
     _furniture(b, streets, rng)
     lamps = tuple(_signal(b, post.pose, post.width) for post in streets.posts)
     groups = np.array([streets.lanes[post.lane_id].light_group for post in streets.posts], np.int64)
-    return Scenery(b.mesh(), _road_marks(streets.roads), lamps, groups)
+    marks = [_marks_of(road) for road in streets.roads]  # rectangles (u along the line, d to its left), see road_paint
+    table = np.full((len(marks), max(map(len, marks)), 9), 1e9)
+    for k, rows in enumerate(marks):
+        table[k, : len(rows)] = rows
+    return Scenery(b.mesh(), table, lamps, groups)
 
 
 def _fan(b: MeshBuilder, middle: list[float], ring: Array, material: int) -> None:
@@ -203,15 +207,6 @@ def _stations(line: Array) -> Ints:
     wanted = np.cumsum(np.concatenate([[0.0], steps]))
     picks = np.searchsorted(wanted, np.arange(0.0, wanted[-1], 1.0))
     return np.unique(np.append(picks, len(line) - 1))
-
-
-def _road_marks(roads: tuple[TownRoad, ...]) -> Array:
-    """(roads, M, 9) paint rectangles in road coordinates (u along the line, d to its left), see shade.road_paint."""
-    tables = [_marks_of(road) for road in roads]
-    out = np.full((len(tables), max(map(len, tables)), 9), 1e9)
-    for k, rows in enumerate(tables):
-        out[k, : len(rows)] = rows
-    return out
 
 
 def _marks_of(road: TownRoad) -> list[list[float]]:

@@ -463,13 +463,6 @@ def write_town_folder(town: TownFolder, settings: TownSettings) -> None:
     write_once(town.root, lambda folder: write_logs(folder, town.indices, town.seed, settings))
 
 
-def repair_towns(towns: Sequence[TownFolder], settings: TownSettings) -> None:
-    """Makes the files of those that are there and damaged again."""
-    for town in towns:
-        if town.root.is_dir():
-            repair_folder(town.root, partial(write_logs, indices=town.indices, seed=town.seed, settings=settings))
-
-
 def write_towns(towns: Sequence[TownFolder], settings: TownSettings) -> None:
     """Writes the towns that are missing, as many at once as there are cores; how far it is goes to stderr.
 
@@ -500,8 +493,12 @@ def write_towns(towns: Sequence[TownFolder], settings: TownSettings) -> None:
             while waiting and len(painting) < at_once:
                 town = waiting.popleft()
                 begun.append(make_unfinished_folder(town.root))
+                paths = {"root": str(town.root), "unfinished": str(begun[-1])}
+                told = {"seed": town.seed, "indices": town.indices, "settings": asdict(settings)} | paths
+                command = [sys.executable, "-m", __name__, json.dumps(told)]
                 with terminal_signals_blocked():
-                    painting[_start_painter(town, begun[-1], settings, lifeline)] = town
+                    child = subprocess.Popen(command, stdin=lifeline, stdout=subprocess.PIPE)  # noqa: S603 - our own
+                painting[child] = town
             for child in [child for child in painting if child.poll() is not None]:
                 town = painting.pop(child)
                 if refused := child.communicate()[0]:
@@ -522,14 +519,6 @@ def write_towns(towns: Sequence[TownFolder], settings: TownSettings) -> None:
             child.communicate()
         for folder in begun:
             shutil.rmtree(folder, ignore_errors=True)  # where its town is whole, it is gone
-
-
-def _start_painter(
-    town: TownFolder, unfinished: Path, settings: TownSettings, lifeline: int
-) -> "subprocess.Popen[bytes]":
-    told = {"seed": town.seed, "indices": town.indices, "root": str(town.root), "settings": asdict(settings)}
-    command = [sys.executable, "-m", __name__, json.dumps(told | {"unfinished": str(unfinished)})]
-    return subprocess.Popen(command, stdin=lifeline, stdout=subprocess.PIPE)  # noqa: S603 - a list, no shell
 
 
 def main(told: str) -> None:

@@ -283,7 +283,8 @@ def correct_rig(
     of_pose = twists_of(np.linalg.inv(start) @ poses)
     of_camera = end.away_from(rig)[6 * len(rig.corrections) :].reshape(-1, N_CAMERA)
     poses[:, :3, 3] += shift
-    before, after = _errors_before_and_after(rig, bundle, shots, matched)
+    found = ((one, triangulate_points(one, shots, matched, bundle.used)[0]) for one in (rig, bundle.rig))
+    before, after = (reprojection_errors(one, shots, matched, seen) * matched.pixel for one, seen in found)
     camera_of = shots.camera_of[matched.view_of]
     changes = []
     for k, camera in enumerate(cameras):
@@ -359,17 +360,6 @@ def _inconsistent_photos(
         if len(mine):
             out += [int(row) for row in mine if elsewhere[row] or agree[row] < STRANGE * np.median(agree[mine])]
     return tuple(sorted(out))
-
-
-def _errors_before_and_after(
-    rig: Rig, bundle: AdjustedRig, shots: RigPhotos, matched: CornerTracks
-) -> tuple[Array, Array]:
-    """(N,) how far corners are from points triangulated from them, through the rig as given and as it is now."""
-    out = []
-    for one in (rig, bundle.rig):
-        points, _ = triangulate_points(one, shots, matched, bundle.used)
-        out.append(reprojection_errors(one, shots, matched, points) * matched.pixel)
-    return out[0], out[1]
 
 
 def _three(row: Array) -> tuple[float, float, float]:

@@ -239,7 +239,8 @@ def from_checkpoint(content: object, traversal: int | None = None) -> SplatCheck
     street = [_gaussians(parts[name], name, traversal) for name in (BACKGROUND, SKY) if name in parts]
     origin = parts[BACKGROUND].config.get("recon2world_translation")
     # No scene of several parts, whose classes are MTGS's.
-    splatfacto = "pipeline" in content and not any("gaussian_models." in name for name in content["pipeline"])
+    pipeline = content.get("pipeline", ()) if isinstance(content, Mapping) else ()
+    splatfacto = bool(pipeline) and not any("gaussian_models." in name for name in pipeline)
     return SplatCheckpoint(
         concatenate(street),
         nodes,
