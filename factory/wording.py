@@ -1,7 +1,7 @@
 """Rates, times and errors as people say them."""
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from itertools import islice
 
 MOST_SHOWN, ITEMS_SHOWN = 80, 4  # characters of a text, items of a container
@@ -73,3 +73,8 @@ def _first(value: Collection[object], inside: int) -> Iterator[object]:
 def _rest(value: Collection[object], inside: int) -> str:
     shown_items = min(len(value), ITEMS_SHOWN if inside > 0 else 0)
     return "" if shown_items == len(value) else f"{', ' if shown_items else ''}..."
+
+
+def listed(names: Sequence[str], most: int = 3) -> str:
+    """The first few names, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -4,7 +4,6 @@ Nothing is downloaded. A planner is built without weights; `load_pretrained` rea
 training begins, so that a checkpoint is opened where those files are not.
 """
 
-import hashlib
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,8 +18,9 @@ from torch.nn import functional as F
 from torch.nn.modules.batchnorm import _BatchNorm
 from torch.utils.checkpoint import checkpoint
 
+from factory.files import file_digest
 from factory.readers.pickles import load_tensors
-from factory.wording import one_line
+from factory.wording import listed, one_line
 from planners.models.settings import STRIDES, BackboneSettings
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of red, green, blue in 0 .. 1
@@ -287,13 +287,8 @@ def load_pretrained(model: nn.Module) -> dict[str, str]:
             path = module.settings.pretrained
             if path is not None:
                 _load(module, Path(path))
-            record[name or "backbone"] = "none" if path is None else f"{Path(path).name} {_digest(Path(path))}"
+            record[name or "backbone"] = "none" if path is None else f"{Path(path).name} {file_digest(Path(path))}"
     return record
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _load(backbone: Backbone, path: Path) -> None:
@@ -304,12 +299,12 @@ def _load(backbone: Backbone, path: Path) -> None:
     named = {key: value for key, value in named.items() if key in own or not key.startswith(CLASSIFIERS)}
     missing, extra = sorted(wanted - set(named)), sorted(set(named) - set(own))
     if missing:
-        raise ValueError(f"{path} lacks {_listed(missing)} of {backbone.settings.name}")
+        raise ValueError(f"{path} lacks {listed(missing, 5)} of {backbone.settings.name}")
     if extra:
-        raise ValueError(f"{path} has {_listed(extra)}, unknown to {backbone.settings.name}: another network's")
+        raise ValueError(f"{path} has {listed(extra, 5)}, unknown to {backbone.settings.name}: another network's")
     wrong = [f"{k} {tuple(named[k].shape)}, not {tuple(own[k].shape)}" for k in named if named[k].shape != own[k].shape]
     if wrong:
-        raise ValueError(f"{path} has other shapes than {backbone.settings.name}: {_listed(wrong)}")
+        raise ValueError(f"{path} has other shapes than {backbone.settings.name}: {listed(wrong, 5)}")
     backbone.load_state_dict(named, strict=False)
 
 
@@ -339,7 +334,3 @@ def _prefix(keys: set[str], weights: Mapping[str, Tensor], path: Path) -> str:
     if len(complete) > 1:
         raise ValueError(f"{path} holds such weights under {complete}: keep those of one network in a file")
     return complete[0] if complete else ""
-
-
-def _listed(names: list[str], most: int = 5) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -25,6 +25,7 @@ from factory.config.compose import ConfigError, compose, fill
 from factory.config.words import SHOW, split_off_cfg
 from factory.files import file_digest
 from factory.readers.pickles import load_tensors
+from factory.wording import listed
 from planners.models.settings import DiffusionDriveSettings, GtrsDenseSettings, LtfSettings, PlannerChoice, settings_of
 from planners.training.checkpoint import FOLDER, put_weights, save_checkpoint
 from planners.training.train import PlannerEntry
@@ -117,7 +118,7 @@ class WeightMoves:
     def check_complete(self) -> None:
         """Raises ConfigError where something was not told of."""
         if self.public:
-            raise ConfigError(f"{self.source} holds {_listed(list(self.public))}, of which this planner knows nothing")
+            raise ConfigError(f"{self.source} holds {listed(list(self.public))}, of which this planner knows nothing")
 
     def _taken(self, name: str) -> Tensor:
         if name not in self.public:
@@ -162,12 +163,8 @@ def unwrapped_weights(content: object, source: str) -> dict[str, Tensor]:
     prefix = found[0]
     other = [name for name in content if not name.startswith(prefix)]
     if other:
-        raise ConfigError(f"{source} holds {_listed(other)} beside the model {prefix.rstrip('.')}")
+        raise ConfigError(f"{source} holds {listed(other)} beside the model {prefix.rstrip('.')}")
     return {name.removeprefix(prefix): value for name, value in content.items()}
-
-
-def _listed(names: list[str], most: int = 3) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def move_fusion(moves: WeightMoves, ours: str) -> None:

@@ -39,26 +39,21 @@ class Roadblocks:
         return shapely.STRtree(list(self.shapes.values()))
 
     @cached_property
-    def _outgoing(self) -> dict[str, list[str]]:
-        out = defaultdict(list)
-        for connector, (before, _) in self.joins.items():
+    def _connectors(self) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
+        """That begin at a group, and that end there."""
+        out, into = defaultdict(list), defaultdict(list)
+        for connector, (before, after) in self.joins.items():
             out[before].append(connector)
-        return out
-
-    @cached_property
-    def _incoming(self) -> dict[str, list[str]]:
-        into = defaultdict(list)
-        for connector, (_, after) in self.joins.items():
             into[after].append(connector)
-        return into
+        return out, into
 
     def outgoing(self, block: str) -> Sequence[str]:
         """Groups or connectors after one, in file order."""
-        return self.joins[block][1:] if block in self.joins else self._outgoing.get(block, ())
+        return self.joins[block][1:] if block in self.joins else self._connectors[0].get(block, ())
 
     def incoming(self, block: str) -> Sequence[str]:
         """Groups or connectors before one, in file order."""
-        return self.joins[block][:1] if block in self.joins else self._incoming.get(block, ())
+        return self.joins[block][:1] if block in self.joins else self._connectors[1].get(block, ())
 
     def around(self, xy: Array) -> list[str]:
         """Those that meet the square of 1 m around a point (2,), else the nearest group and the nearest connector."""
