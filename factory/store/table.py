@@ -35,13 +35,7 @@ from deltalake.transaction import AddAction, RemoveAction
 from numpy.typing import NDArray
 
 from factory.files import DamagedFile, naming_disk_errors
-from factory.store.location import (
-    Location,
-    Shard,
-    read_parquet,
-    with_partition_columns,
-    write_shard,
-)
+from factory.store.location import Location, Shard, read_parquet, with_partition_columns, write_shard
 from factory.store.schema import TableSpec
 from factory.wording import one_line
 from tasks.caches import MOST_DIFFERENT, SEAL_BYTES, Damaged, whole_of_two, with_checksum, without_checksum

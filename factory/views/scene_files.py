@@ -201,11 +201,7 @@ def read_splats(path: Path, traversal: int | None = None, transforms: Path | Non
 
 
 def background_bytes(
-    gaussians: Gaussians,
-    suffix: str,
-    origin: Array,
-    screen: ScreenFilter,
-    vehicles: Sequence[LoggedVehicle] = (),
+    gaussians: Gaussians, suffix: str, origin: Array, screen: ScreenFilter, vehicles: Sequence[LoggedVehicle] = ()
 ) -> bytes:
     """A street's file; a checkpoint is WorldEngine's, `origin` (3,) [m] in the world, and has its `vehicles`.
 

@@ -29,15 +29,7 @@ from tasks.settings import constant
 from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
 
 HUMAN = "human"
-INDEX_COLUMNS = (
-    "attempt_id",
-    "clip_id",
-    "settings_hash",
-    "stage_versions",
-    "image_source",
-    "psnr",
-    "label_vocabulary",
-)
+INDEX_COLUMNS = ("attempt_id", "clip_id", "settings_hash", "stage_versions", "image_source", "psnr", "label_vocabulary")
 OPEN_FILES = 8  # at a time, while their columns are read
 
 Tables = str | tuple[str, ...]

@@ -119,10 +119,7 @@ class EvaluateSettings:
 
 def _told(rules: Rules) -> dict[str, object]:
     """As a record holds them."""
-    return asdict(rules) | {
-        "one_stage": traffic_record(rules.one_stage),
-        "two_stage": traffic_record(rules.two_stage),
-    }
+    return asdict(rules) | {"one_stage": traffic_record(rules.one_stage), "two_stage": traffic_record(rules.two_stage)}
 
 
 def evaluate(benchmark: Benchmark, who: Sequence[EvaluatedPlanner], settings: EvaluateSettings) -> list[SummaryLine]:

@@ -148,11 +148,7 @@ def _plans(benchmark: Benchmark, one: EvaluatedPlanner, prepared: ClipFrames) ->
 
 
 def _shown(
-    benchmark: Benchmark,
-    title: str,
-    keys: Pair[FrameKey],
-    pair: PreparedPair,
-    plans: Mapping[FrameKey, Array],
+    benchmark: Benchmark, title: str, keys: Pair[FrameKey], pair: PreparedPair, plans: Mapping[FrameKey, Array]
 ) -> ReplayStage:
     (scores, drive), _ = score_pair(pair, [plans[key] for key in keys])
     plan = to_world(pair.now.scene.ego_state[: HEADING + 1], plans[keys[0]])

@@ -18,13 +18,7 @@ import numpy as np
 from factory.config.arguments import Refused
 from factory.datasets.navsim.log import Frame, read_frames, read_scene_pickle
 from factory.datasets.navsim.pickles import dumps
-from factory.datasets.navsim.reader import (
-    SceneFilter,
-    Selection,
-    log_files,
-    read_selection,
-    scene_frames,
-)
+from factory.datasets.navsim.reader import SceneFilter, Selection, log_files, read_selection, scene_frames
 from factory.datasets.navsim.window import cameras_with_pictures, sensor_files
 from factory.graph.progress import RateBar
 from factory.readers.base import BadClip
@@ -69,8 +63,7 @@ class ObservedScene:
             raise BadClip(str(self.sensors / now.cameras[0].path), "image", f"missing, of token {self.token}")
         return tuple(
             CameraObservation(
-                replace(camera, name=camera.name.lower()),
-                decode_image(Path(image.uri).read_bytes(), image.uri, camera),
+                replace(camera, name=camera.name.lower()), decode_image(Path(image.uri).read_bytes(), image.uri, camera)
             )
             for camera, image in zip(cameras_with_pictures(now, images, self.file), images)
         )

@@ -52,12 +52,7 @@ class Keep:
 
 
 def save_checkpoint(
-    out: Path,
-    step: int,
-    planner: Planner,
-    record: Mapping[str, Any],
-    training: Mapping[str, Any],
-    keep: Keep = Keep(),
+    out: Path, step: int, planner: Planner, record: Mapping[str, Any], training: Mapping[str, Any], keep: Keep = Keep()
 ) -> Path:
     """Write checkpoint `step` under `out` and remove those that do not stay; returns its folder.
 

@@ -30,9 +30,7 @@ def train_on_ray(train: Callable[[TrainingProcess], None], out: str, processes: 
             train_loop_config={"train": train},
             torch_config=TorchConfig(backend="nccl" if gpu else "gloo"),
             scaling_config=ScalingConfig(
-                num_workers=processes,
-                use_gpu=gpu,
-                resources_per_worker={"CPU": cpus, **({"GPU": gpus} if gpu else {})},
+                num_workers=processes, use_gpu=gpu, resources_per_worker={"CPU": cpus, **({"GPU": gpus} if gpu else {})}
             ),
             run_config=RunConfig(name="ray", storage_path=os.path.abspath(out)),
         )

@@ -86,11 +86,7 @@ def build_optimiser(settings: TrainingSettings, model: nn.Module) -> torch.optim
         learns = groups[0]["params"]
         groups = [
             {"params": [p for p in learns if id(p) not in slow]},
-            {
-                "params": [p for p in learns if id(p) in slow],
-                FACTOR: settings.backbone_rate,
-                "weight_decay": decay,
-            },
+            {"params": [p for p in learns if id(p) in slow], FACTOR: settings.backbone_rate, "weight_decay": decay},
         ]
     return kind(groups, lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True)
 

@@ -50,14 +50,7 @@ from tasks.subscores import (
 )
 from tasks.world.arrays import Array, Bools, Bytes
 from tasks.world.clip import MOVING_KINDS, AgentKind, AgentTracks, Clip, Scene
-from tasks.world.frames import (
-    EGO_STATE_SIZE,
-    HALF_LENGTH,
-    HALF_WIDTH,
-    LARGEST,
-    PACIFICA,
-    REAR_AXLE_TO_CENTER,
-)
+from tasks.world.frames import EGO_STATE_SIZE, HALF_LENGTH, HALF_WIDTH, LARGEST, PACIFICA, REAR_AXLE_TO_CENTER
 from tasks.world.geometry import ego_boxes
 from tasks.world.road_map import LightState, MapLayer, MapPolygon, polygons_near
 
@@ -241,12 +234,7 @@ class Scratch(NamedTuple):
 def rule_context(prepared: PreparedScene, with_history: bool) -> RuleContext:
     """A prepared scene as the kernels take it."""
     history = prepared.history if with_history and prepared.history is not None else np.empty((0, EGO_STATE_SIZE))
-    return RuleContext(
-        prepared.centerline,
-        prepared.map_index,
-        prepared.red_lanes,
-        history,
-    )
+    return RuleContext(prepared.centerline, prepared.map_index, prepared.red_lanes, history)
 
 
 @register_jitable

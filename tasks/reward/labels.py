@@ -8,15 +8,7 @@ from tasks.kernels.compiled import kernel
 from tasks.reward.areas import set_area_flags
 from tasks.reward.centerline import empty_body, place_body
 from tasks.reward.collisions import STOPPED_SPEED_MPS, first_collision, obstacles_of, within_reach
-from tasks.reward.epdms import (
-    PreparedScene,
-    RuleContext,
-    Scores,
-    collision_scores,
-    rule_context,
-    score,
-    select_rows,
-)
+from tasks.reward.epdms import PreparedScene, RuleContext, Scores, collision_scores, rule_context, score, select_rows
 from tasks.reward.label_bytes import ARRAYS, VocabularyLabels
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficScene, roll_out_longer

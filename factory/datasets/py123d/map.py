@@ -24,13 +24,7 @@ from factory.datasets.py123d.arrow import (
     open_file,
     unpack_msgpack,
 )
-from factory.datasets.scenarionet.map import (
-    RawLane,
-    connector_ids,
-    neighbours,
-    paved_areas,
-    resampled_line,
-)
+from factory.datasets.scenarionet.map import RawLane, connector_ids, neighbours, paved_areas, resampled_line
 from factory.readers.base import BadClip, id_text
 from factory.wording import shown
 from tasks.world.arrays import Array, Indices

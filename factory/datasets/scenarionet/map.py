@@ -16,14 +16,7 @@ from factory.readers.base import BadClip, id_text
 from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.repair.records import Repair
-from tasks.world.repair.road import (
-    finite_points,
-    left_out_lanes,
-    line_fault,
-    map_repair,
-    simple_area,
-    simple_crossing,
-)
+from tasks.world.repair.road import finite_points, left_out_lanes, line_fault, map_repair, simple_area, simple_crossing
 from tasks.world.road_map import (
     Lane,
     LightState,
@@ -269,10 +262,7 @@ NEIGHBOUR_VOTES = 2  # of the five probes
 # Waymo's signal states and MetaDrive's four; a flashing red is a stop sign, not a phase.
 _LIGHTS = {
     LightState.GREEN: ("LANE_STATE_GO", "LANE_STATE_ARROW_GO", "TRAFFIC_LIGHT_GREEN"),
-    LightState.YELLOW: (
-        *(f"LANE_STATE_{kind}CAUTION" for kind in ("", "ARROW_", "FLASHING_")),
-        "TRAFFIC_LIGHT_YELLOW",
-    ),
+    LightState.YELLOW: (*(f"LANE_STATE_{kind}CAUTION" for kind in ("", "ARROW_", "FLASHING_")), "TRAFFIC_LIGHT_YELLOW"),
     LightState.RED: ("LANE_STATE_STOP", "LANE_STATE_ARROW_STOP", "TRAFFIC_LIGHT_RED"),
     LightState.UNKNOWN: (None, "None", "LANE_STATE_UNKNOWN", "LANE_STATE_FLASHING_STOP", "TRAFFIC_LIGHT_UNKNOWN"),
 }

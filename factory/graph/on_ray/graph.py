@@ -206,14 +206,7 @@ def _recording(metric: Metric) -> Callable[[float, dict[str, str]], None]:
 class RayGraph(Graph):
     """Graph of Ray tasks. Connects to the cluster of RAY_ADDRESS, else starts one in this machine."""
 
-    def __init__(
-        self,
-        work: Work,
-        out: Location,
-        workers: int | None,
-        claims: Claims,
-        limits: Limits,
-    ) -> None:
+    def __init__(self, work: Work, out: Location, workers: int | None, claims: Claims, limits: Limits) -> None:
         """workers: CPUs of a cluster started here, tasks at once on one that is there already; None: all its CPUs.
 
         More workers than a cluster has CPUs now are what makes one grow that can. A cluster without a GPU is asked for
