@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import numpy as np
+import shapely
 
 from factory.store.schema import AGENT_STEPS, MAP_RADIUS_M, NOW_INDEX
 from tasks.attempt import Judged
@@ -123,17 +124,17 @@ def map_columns(scene: Scene, pose: Array) -> Mapping[str, object]:
     """What of the map is near, the lights of its lanes and the route, in the frame of `pose`."""
     road_map, clip = scene.clip.road_map, scene.clip
 
+    here = shapely.Point(pose[:2])
+
     def near(line: Array) -> bool:
-        start, edge = line[:-1, :2], np.diff(line[:, :2], axis=0)
-        square = np.maximum((edge**2).sum(axis=1), 1e-12)  # repeated points make edges of no length
-        share = np.clip(((pose[:2] - start) * edge).sum(axis=1) / square, 0.0, 1.0)
-        return bool(np.hypot(*(start + share[:, None] * edge - pose[:2]).T).min() <= MAP_RADIUS_M)
+        return bool(shapely.dwithin(shapely.linestrings(line[:, :2]), here, MAP_RADIUS_M))
 
     def local_ring(ring: Array) -> Array:
         return points_to_local(pose, ring[:, :2])
 
     lanes = [lane for lane in road_map.lanes.values() if lane.drives_cars and near(lane.centerline)]
-    areas = [ring for ring in road_map.road_rings if near(ring) or _encloses(ring, pose)]
+    # A large drivable area may have no edge near the ego and hold it all the same.
+    areas = [r for r in road_map.road_rings if near(r) or shapely.contains_xy(shapely.polygons(r[:, :2]), *pose[:2])]
     shown = {lane.lane_id for lane in lanes}
     lights = [i for i, lane_id in enumerate(clip.lights.lane_ids) if lane_id in shown]
     steps = slice(scene.step - NOW_INDEX, scene.step - NOW_INDEX + AGENT_STEPS)
@@ -151,15 +152,6 @@ def map_columns(scene: Scene, pose: Array) -> Mapping[str, object]:
         "route_lane_ids": sorted(clip.route.lane_ids),
         "route_centerline": to_local(pose, scene.centerline),
     }
-
-
-def _encloses(ring: Array, pose: Array) -> bool:
-    """Even-odd rule: a large drivable area may have no corner near the ego and hold it all the same."""
-    a, b = ring[:-1, :2] - pose[:2], ring[1:, :2] - pose[:2]
-    crosses = (a[:, 1] > 0) != (b[:, 1] > 0)
-    a, b = a[crosses], b[crosses]
-    at_x = a[:, 0] - a[:, 1] * (b[:, 0] - a[:, 0]) / (b[:, 1] - a[:, 1])
-    return bool((at_x > 0).sum() % 2)
 
 
 def scene_tags(scene: Scene, command: str) -> list[str]:

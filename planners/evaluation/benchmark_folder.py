@@ -34,7 +34,7 @@ def how_to_make(out: str) -> str:
 
 
 class BenchmarkFolder:
-    """Frames of held-out clips; satisfies planners.evaluation.frames.Benchmark."""
+    """Frames of held-out clips, to plan from and to drive in."""
 
     def __init__(self, path: str) -> None:
         """path: the run's `out`. Reads ids only.

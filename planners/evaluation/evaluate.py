@@ -58,7 +58,7 @@ from planners.evaluation.aggregation import (
 )
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.bootstrap import Interval, cluster_labels_by_level, paired_interval
-from planners.evaluation.frames import Benchmark, FrameKey
+from planners.evaluation.frames import FrameKey
 from planners.evaluation.navsim import write_tables
 from planners.evaluation.planner_names import EvaluatedPlanner, compose_with_planner, find_planners, needs_of
 from planners.evaluation.planning import all_plans
@@ -122,7 +122,9 @@ def _told(rules: Rules) -> dict[str, object]:
     return asdict(rules) | {"one_stage": traffic_record(rules.one_stage), "two_stage": traffic_record(rules.two_stage)}
 
 
-def evaluate(benchmark: Benchmark, who: Sequence[EvaluatedPlanner], settings: EvaluateSettings) -> list[SummaryLine]:
+def evaluate(
+    benchmark: BenchmarkFolder, who: Sequence[EvaluatedPlanner], settings: EvaluateSettings
+) -> list[SummaryLine]:
     """Plan, score, write; the lines of all planners in their order, of those evaluated into `out` before as well.
 
     Raises ConfigError where a planner cannot plan from this benchmark, before any is planned.
@@ -169,7 +171,7 @@ def _done_before(out: Path, shared: Mapping[str, Any]) -> list[str]:
     return [path.parent.name for path in records if is_done(path.parent, shared)]
 
 
-def check_needs(benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[EvaluatedPlanner]) -> None:
+def check_needs(benchmark: BenchmarkFolder, keys: Sequence[FrameKey], who: Sequence[EvaluatedPlanner]) -> None:
     """Raises ConfigError for a planner that needs images of a benchmark that lacks some, naming a frame."""
     blind = [key for key in keys if benchmark.image_source(key) == "none"]
     for one in who if blind else ():
@@ -181,13 +183,13 @@ def check_needs(benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[Ev
             )
 
 
-def _keys(benchmark: Benchmark, limit: int | None) -> list[FrameKey]:
+def _keys(benchmark: BenchmarkFolder, limit: int | None) -> list[FrameKey]:
     clips = list(dict.fromkeys(key.clip_id for key in benchmark.keys))[:limit]
     return [key for key in benchmark.keys if key.clip_id in set(clips)]
 
 
 def _score_clips(
-    benchmark: Benchmark,
+    benchmark: BenchmarkFolder,
     keys: Sequence[FrameKey],
     who: Sequence[EvaluatedPlanner],
     plans: Mapping[str, Plans],

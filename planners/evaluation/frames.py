@@ -5,11 +5,10 @@ A clip has a logged frame now (at T) and one 0.5 s before; and for each follow-u
 Planning reads the samples, scoring the scenes: neither needs the other.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
-from factory.store.reader import Sample
 from tasks.stages import FOLLOW_UP, FOLLOW_UP_BEFORE, HUMAN, HUMAN_BEFORE
 from tasks.world.clip import Scene
 
@@ -60,33 +59,3 @@ class ClipScenes:
     clip_id: str
     logged: FramePair
     follow_ups: Mapping[int, FramePair]  # candidate index -> scenes
-
-
-class Benchmark(Protocol):
-    """Frames to plan from and to drive in, fixed before any planner is scored: what a BenchmarkFolder is."""
-
-    @property
-    def digest(self) -> str: ...
-
-    @property
-    def keys(self) -> Sequence[FrameKey]: ...
-
-    @property
-    def tokens(self) -> Mapping[FrameKey, str]: ...  # NAVSIM's of the frames; none where they are not of NAVSIM
-
-    @property
-    def one_stage(self) -> bool: ...  # has `scene` and `before_of` in place of `scenes`
-
-    def log_of(self, clip_id: str) -> str: ...
-
-    def image_source(self, key: FrameKey) -> str: ...
-
-    def stream(self, columns: Sequence[str]) -> Iterator[tuple[FrameKey, Sample]]: ...
-
-    def sample(self, key: FrameKey) -> Sample: ...
-
-    def scenes(self, clip_id: str) -> ClipScenes: ...
-
-    def scene(self, clip_id: str) -> Scene: ...
-
-    def before_of(self, clip_id: str) -> str | None: ...

@@ -24,7 +24,8 @@ from planners.data.bev import bev_raster
 from planners.data.decode import BatchBuffer, StoredRows
 from planners.data.images import stitch_sample
 from planners.data.index import BEV_COLUMNS
-from planners.evaluation.frames import LOGGED_KINDS, Benchmark, FrameKey
+from planners.evaluation.benchmark_folder import BenchmarkFolder
+from planners.evaluation.frames import LOGGED_KINDS, FrameKey
 from planners.evaluation.planner_names import EvaluatedPlanner, needs_of
 from planners.evaluation.scoring import Plans
 from tasks.trajectories import at_ten_hz
@@ -110,7 +111,7 @@ def plan_samples(made: Any, samples: Samples, device: str = "cpu") -> Array:
 
 
 def all_plans(
-    benchmark: Benchmark,
+    benchmark: BenchmarkFolder,
     keys: Sequence[FrameKey],
     who: Sequence[tuple[EvaluatedPlanner, Path, Mapping[str, Any]]],
     batch_size: int,
@@ -140,7 +141,7 @@ def all_plans(
 
 
 def _planned(
-    benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[EvaluatedPlanner], batch_size: int, device: str
+    benchmark: BenchmarkFolder, keys: Sequence[FrameKey], who: Sequence[EvaluatedPlanner], batch_size: int, device: str
 ) -> dict[str, dict[FrameKey, Array]]:
     made = {one.label: _loaded(one, device) for one in who}
     needs = {label: needs_of(planner) for label, planner in made.items()}

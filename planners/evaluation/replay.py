@@ -29,7 +29,7 @@ from factory.views.pictures import (
 )
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.evaluate import check_needs
-from planners.evaluation.frames import Benchmark, FrameKey, Pair
+from planners.evaluation.frames import FrameKey, Pair
 from planners.evaluation.planner_names import EvaluatedPlanner, compose_with_planner, find_planner
 from planners.evaluation.planning import plan_samples
 from planners.evaluation.scoring import ClipFrames, PreparedPair, Rules, prepare_clip, score_pair
@@ -116,7 +116,7 @@ def _number(value: float) -> str:
 
 
 def replay(
-    benchmark: Benchmark, one: EvaluatedPlanner, clip_id: str, rules: Rules, follow_up: int | None = None
+    benchmark: BenchmarkFolder, one: EvaluatedPlanner, clip_id: str, rules: Rules, follow_up: int | None = None
 ) -> Iterator[Image]:
     """Both stages of one clip, picture by picture. Raises ConfigError for a follow-up that the clip does not have."""
     prepared = prepare_clip(benchmark.scenes(clip_id), rules)
@@ -138,7 +138,7 @@ def replay(
             yield from [last] * HOLD
 
 
-def _plans(benchmark: Benchmark, one: EvaluatedPlanner, prepared: ClipFrames) -> Mapping[FrameKey, Array]:
+def _plans(benchmark: BenchmarkFolder, one: EvaluatedPlanner, prepared: ClipFrames) -> Mapping[FrameKey, Array]:
     if one.privileged is not None:
         return one.privileged(prepared.frames)
     assert one.load is not None
@@ -148,7 +148,7 @@ def _plans(benchmark: Benchmark, one: EvaluatedPlanner, prepared: ClipFrames) ->
 
 
 def _shown(
-    benchmark: Benchmark, title: str, keys: Pair[FrameKey], pair: PreparedPair, plans: Mapping[FrameKey, Array]
+    benchmark: BenchmarkFolder, title: str, keys: Pair[FrameKey], pair: PreparedPair, plans: Mapping[FrameKey, Array]
 ) -> ReplayStage:
     (scores, drive), _ = score_pair(pair, [plans[key] for key in keys])
     plan = to_world(pair.now.scene.ego_state[: HEADING + 1], plans[keys[0]])
@@ -166,7 +166,7 @@ def _nearest(prepared: ClipFrames, plan: Array) -> int | None:
     return min(prepared.follow_ups, key=away, default=None)
 
 
-def find_clip(benchmark: Benchmark, wanted: str) -> str:
+def find_clip(benchmark: BenchmarkFolder, wanted: str) -> str:
     """The clip of that id, beginning of an id, or place. Raises ConfigError."""
     clips = list(dict.fromkeys(key.clip_id for key in benchmark.keys))
     if wanted.isdigit() and int(wanted) < len(clips):

@@ -5,13 +5,13 @@ the loader's position needs to be kept.
 """
 
 import csv
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from itertools import chain, count, islice
 from pathlib import Path
 from threading import Event
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from torch.nn.parallel import DistributedDataParallel
 from factory.exits import Stopped, calling_on_stop_signal
 from factory.graph.progress import RateBar
 from planners.data.batch import Batch
+from planners.data.loader import Loader
 from planners.models.planner import Planner
 from planners.training.checkpoint import (
     Keep,
@@ -107,18 +108,6 @@ SCALER = "scaler"  # in a checkpoint's training state: the scale of the loss and
 SCALING = ("loss_scale", "skipped")  # columns of an fp16 training's losses: the scale it had, 1 for a step left out
 
 
-class Batches(Protocol):
-    """What the loop asks of a loader."""
-
-    def n_batches(self, epoch: int) -> int: ...
-
-    def epoch(self, epoch: int) -> Iterator[Batch]: ...
-
-    def state(self) -> dict[str, Any]: ...
-
-    def resume(self, state: Mapping[str, Any]) -> None: ...
-
-
 @dataclass(frozen=True)
 class StepSettings:
     """How a training runs, beside what it computes."""
@@ -133,14 +122,14 @@ class StepSettings:
     keep: Keep = field(default_factory=Keep)  # checkpoints beside the newest
 
 
-def total_steps(batches: Batches, training: TrainingSettings, steps: int | None) -> int:
+def total_steps(batches: Loader, training: TrainingSettings, steps: int | None) -> int:
     """Optimiser steps of a training: as many as asked for, else those of its epochs."""
     return steps if steps is not None else sum(batches.n_batches(epoch) for epoch in range(training.epochs))
 
 
 def fit(
     planner: Planner,
-    batches: Batches,
+    batches: Loader,
     training: TrainingSettings,
     loop: StepSettings,
     process: TrainingProcess,
@@ -285,7 +274,7 @@ def _is_best(out: Path, measure: str, measured: Mapping[str, float]) -> bool:
 
 
 def _resume(
-    folder: Path, planner: Planner, optimiser: torch.optim.Optimizer, scaler: torch.amp.GradScaler, batches: Batches
+    folder: Path, planner: Planner, optimiser: torch.optim.Optimizer, scaler: torch.amp.GradScaler, batches: Loader
 ) -> int:
     """The steps that are done."""
     state = load_training(folder)
