@@ -238,7 +238,7 @@ def compact(request: FolderRequest) -> None:
     store = open_store(request.out)
     try:
         claim_for_upkeep(store)
-        for merged in merge_shards(store):
-            print(f"{merged.table:<13}{merged.before} files, now {merged.after}")
+        for table, before, after in merge_shards(store):
+            print(f"{table:<13}{before} files, now {after}")
     except (RunInProgress, AnotherWriter, BadLocation) as error:
         raise Refused(str(error)) from error

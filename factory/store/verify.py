@@ -293,15 +293,6 @@ class RunInProgress(RuntimeError):
     """A run writes to the store."""
 
 
-@dataclass(frozen=True)
-class CompactedTable:
-    """What became of the files of one table."""
-
-    table: str
-    before: int  # files
-    after: int
-
-
 def claim_for_upkeep(store: Store) -> None:
     """Before a change: claim the tables as a run does, so that one which was quiet for long commits nothing any more,
     no file that is cleaned away among it. Raises RunGoesOn as `refuse_held` does, BadLocation and AnotherWriter."""
@@ -362,8 +353,9 @@ def old_leftovers(store: Store, older_s: float, now_s: float) -> list[str]:
     )
 
 
-def compact(store: Store) -> Iterator[CompactedTable]:
-    """Merge the small files of each partition of each table. Raises DamagedFile, before anything of its table is done.
+def compact(store: Store) -> Iterator[tuple[str, int, int]]:
+    """Merge the small files of each partition of each table: its name, how many files it had, and has. Raises
+    DamagedFile, before anything of its table is done.
 
     The rows keep their bytes and the times at which they came into the table.
     """
@@ -378,7 +370,7 @@ def compact(store: Store) -> Iterator[CompactedTable]:
             drop += group
         if add:
             table.replace_files(drop, add)
-        yield CompactedTable(table.spec.name, len(facts), len(table.file_facts()))
+        yield table.spec.name, len(facts), len(table.file_facts())
 
 
 def _files_to_merge(table: KeyedTable) -> list[list[str]]:

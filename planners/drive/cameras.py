@@ -64,14 +64,6 @@ class NoCameras:
         return ()
 
 
-@dataclass(frozen=True)
-class Observation:
-    """A look at a scene."""
-
-    images: Images  # of now
-    sample: Callable[[], Sample]  # the row, made when it is asked for
-
-
 class Observer:
     """Looks at one scene after another, 0.5 s apart, and keeps what a sample's earlier pictures are."""
 
@@ -79,12 +71,14 @@ class Observer:
         self._cameras = cameras
         self._seen: deque[tuple[int, Images]] = deque(maxlen=len(cameras.offsets))
 
-    def observe(self, scene: Scene) -> Observation:
-        """At the first scene those before it are looked at too, from where the ego came."""
+    def observe(self, scene: Scene) -> tuple[Images, Callable[[], Sample]]:
+        """The pictures of now, and what makes the row when it is asked for.
+
+        At the first scene those before it are looked at too, from where the ego came."""
         offsets = self._cameras.offsets if not self._seen else (0,)
         self._seen += [(scene.step + offset, self._cameras.images(scene, offset)) for offset in offsets]
         images = [{**image, "time_s": (step - scene.step) * STEP_S} for step, taken in self._seen for image in taken]
-        return Observation(self._seen[-1][1], partial(sample_of, scene, self._cameras, images))
+        return self._seen[-1][1], partial(sample_of, scene, self._cameras, images)
 
 
 def sample_of(scene: Scene, cameras: DriveCameras, images: Images) -> Sample:

@@ -156,13 +156,13 @@ def drive(
     plans: list[Array] = []
     images: list[Images] = []
     while course.ended is None:
-        observed = observer.observe(scene)
-        plan = driver.plan(scene, observed.sample)
+        seen_now, sample = observer.observe(scene)
+        plan = driver.plan(scene, sample)
         if isinstance(plan, DriveEnd):
             course.ended = plan
             break
         plans.append(plan)
-        images.append(observed.images)
+        images.append(seen_now)
         tracked = track(scene.ego_state, plan[None])[0]
         rollout = roll_out(prepare_traffic(scene, settings.traffic), tracked, PLAN_STEPS)
         steps = course.follow(rollout, score(prepare_scene(scene, rollout.agents), tracked[None]))

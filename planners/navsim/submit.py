@@ -58,7 +58,7 @@ class ObservedScene:
         if lacking := [name for name in names if name not in own]:
             raise BadClip(self.file, f"token {self.token}", f"the frame names no picture of {', '.join(lacking)}")
         now = replace(self.frames[-1], cameras=tuple(own[name] for name in names))
-        images = sensor_files([now], self.sensors).images
+        images, _ = sensor_files([now], self.sensors)
         if not images:
             raise BadClip(str(self.sensors / now.cameras[0].path), "image", f"missing, of token {self.token}")
         return tuple(

@@ -141,7 +141,7 @@ def picture_columns(frames: Sequence[Frame], folder: Path, source: ImageSource, 
 
     Raises BadClip. file: whose frames they are, named where they have none.
     """
-    images = sensor_files(frames, folder).images
+    images, _ = sensor_files(frames, folder)
     if not images:
         raise BadClip(file, "cams", f"none of its pictures is in {folder}; pictures=false imports it without")
     now_s = (len(frames) - 1) * FRAME_STEPS * STEP_S

@@ -543,11 +543,10 @@ class NavsimReader:
         cameras: tuple[Camera, ...] = ()
         block: Block | None = None
         if self.sensors is not None:
-            blobs = sensor_files(window, self.sensors)
-            if not blobs.images and not blobs.sweeps:
+            images, sweeps = sensor_files(window, self.sensors)
+            if not images and not sweeps:
                 problem = f"no picture of the frames {start} to {start + WINDOW_FRAMES - 1} of {ref.log_id} is here"
                 raise BadClip(str(self.sensors), "blobs", f"{problem}; clips.sensors=null reads clips without pictures")
-            images, sweeps = blobs.images, blobs.sweeps
             block = self._with_others(ref, self._block(opened, start))
             cameras = cameras_with_pictures(frames[now], block.images, opened.log.file)
         clip = Clip(
@@ -707,14 +706,11 @@ class NavsimReader:
             inside = np.flatnonzero((steps >= other.start) & (steps < other.stop))
             inside = inside[stretch[inside] == stretch[inside[0]]]
             frames = opened.log.frames[inside[0] : inside[-1] + 1]
-            blobs = sensor_files(frames, self.sensors)
-            if blobs.images or blobs.sweeps:
-                cameras = cameras_with_pictures(frames[len(frames) // 2], blobs.images, opened.log.file)
-                others.append(
-                    OtherDrive(
-                        other.log_id, stretch_agents(repaired_frames(frames)[0]), cameras, blobs.images, blobs.sweeps
-                    )
-                )
+            images, sweeps = sensor_files(frames, self.sensors)
+            if images or sweeps:
+                cameras = cameras_with_pictures(frames[len(frames) // 2], images, opened.log.file)
+                agents = stretch_agents(repaired_frames(frames)[0])
+                others.append(OtherDrive(other.log_id, agents, cameras, images, sweeps))
         return with_other_drives(block, others) if others else block
 
     def _block(self, opened: OpenLog, start: int) -> Block:
@@ -722,9 +718,9 @@ class NavsimReader:
         assert self.sensors is not None
         first, stop = _block_frames(opened.table, start)
         frames = opened.log.frames[first:stop]
-        blobs = sensor_files(frames, self.sensors)
+        images, sweeps = sensor_files(frames, self.sensors)
         start_s = float(opened.table.start_ms[first]) / 1000
-        return Block(start_s, stretch_agents(repaired_frames(frames)[0]), blobs.images, blobs.sweeps)
+        return Block(start_s, stretch_agents(repaired_frames(frames)[0]), images, sweeps)
 
 
 def log_files(root: Path) -> dict[str, Path]:

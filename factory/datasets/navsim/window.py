@@ -309,15 +309,7 @@ LIDAR = "lidar"
 FRAME_S = 0.5
 
 
-@dataclass(frozen=True)
-class Blobs:
-    """What the sensors of a run of frames recorded and is on disk."""
-
-    images: tuple[SensorFile, ...]
-    sweeps: tuple[SensorFile, ...]
-
-
-def sensor_files(frames: Sequence[Frame], folder: Path) -> Blobs:
+def sensor_files(frames: Sequence[Frame], folder: Path) -> tuple[tuple[SensorFile, ...], tuple[SensorFile, ...]]:
     """The pictures and sweeps below `folder` of frames 0.5 s apart, times from the first. Raises BadClip."""
     images: list[SensorFile] = []
     sweeps: list[SensorFile] = []
@@ -330,7 +322,7 @@ def sensor_files(frames: Sequence[Frame], folder: Path) -> Blobs:
         images += [SensorFile(name, str(path), FRAME_S * k, frame.world_from_ego) for name, path in there.items()]
         if frame.lidar_path is not None and is_named(sweep := _below(folder, frame.lidar_path)):
             sweeps.append(SensorFile(LIDAR, str(sweep), FRAME_S * k, frame.world_from_ego))
-    return Blobs(tuple(images), tuple(sweeps))
+    return tuple(images), tuple(sweeps)
 
 
 def cameras_with_pictures(frame: Frame, images: Sequence[SensorFile], file: str) -> tuple[Camera, ...]:

@@ -100,7 +100,7 @@ def test_what_was_seen_is_what_a_sample_s_earlier_pictures_are() -> None:
     scene, observer = logged_start(clip).scene, Observer(Counting(offsets=(-15, -10, -5, 0)))
     shown = []
     for step in (NOW, NOW + 5):
-        images = observer.observe(replace(scene, step=step)).sample()["images"]
+        images = observer.observe(replace(scene, step=step))[1]()["images"]
         shown.append([(image["seen"], round(image["time_s"], 6)) for image in images])
     assert shown[0] == [(0, -1.5), (5, -1.0), (10, -0.5), (15, 0.0)]
     assert shown[1] == [(5, -1.5), (10, -1.0), (15, -0.5), (20, 0.0)]
