@@ -188,7 +188,7 @@ def test_every_command_is_one_its_program_takes(
             fill(CompareSettings, compose("compare", arguments), "compare")
         case ["python", "-m", "planners", "replay", *arguments]:
             replay_settings(arguments)
-        case ["python", "-m", "planners", "drive", *arguments] | ["python", "-m", "planners.drive", *arguments]:
+        case ["python", "-m", "planners", "drive", *arguments]:
             drive_settings(arguments)
         case ["python", "-m", "tests.bench.bench_rig" | "tests.bench.bench_front", _, *arguments]:
             assert set(pairs(given(arguments))) <= FIT | {"validate", "adjust", "ground", "matched"}

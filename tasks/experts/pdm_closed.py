@@ -612,9 +612,6 @@ def set_footprint(pose: Array, out: Array) -> None:
         out[1, i] = y + s * along + c * across
 
 
-__all__ = ["PdmClosed", "PdmPlan", "PdmSettings", "plan_for", "plan_pdm_closed"]
-
-
 @dataclass(frozen=True)
 class PdmPlan:
     """What PDM-Closed considered and chose."""
