@@ -65,7 +65,7 @@ test: install
 
 unit: install
 	$(PY) -m factory warm
-	$(PY) -m pytest -n 2 --dist loadfile --ignore tests/real --ignore tests/chaos -m "not ray and not slow and not chaos"
+	$(PY) -m pytest -n 2 --dist loadfile --ignore tests/real --ignore tests/chaos -m "not ray and not slow"
 
 lint: install
 	$(PY) -m ruff check .
@@ -87,7 +87,7 @@ chaos: install
 	$(PY) -m experiments.chaos.kills
 	$(PY) -m tests.chaos.commit_steps
 	$(PY) -m tests.chaos.damaged_logs $(or $(SHARED),../shared) rows=4
-	$(PY) -m pytest -m chaos
+	$(PY) -m experiments.chaos.object_stores
 	$(PY) -m experiments.chaos.full_disks
 	$(PY) -m experiments.chaos.poison
 	$(PY) -m experiments.chaos.long_run hours=$(or $(HOURS),2)

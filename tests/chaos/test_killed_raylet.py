@@ -18,7 +18,6 @@ import pytest
 from factory.exits import INTERRUPTED, calling_on_stop_signal
 from factory.graph.execute import Execution, execute
 from factory.graph.own_process import run_in_own_process
-from factory.run import main as run_main
 from factory.store.samples import Store
 from factory.store.verify import verify
 from tests.chaos.killed_driver import EXPERTS
@@ -54,46 +53,6 @@ store, how = Store(sys.argv[1]), Execution("ray", 1, shard_seconds=0.05)
 ended = rerun_on_new_clusters(lambda: execute(ToyWork(), refs(5), EXPERTS, 2, store, how))
 sys.exit(ended.exit_code)
 """
-START = """
-import os
-import threading
-import time
-from factory.graph.local import ClusterDied
-from factory.graph.on_ray.graph import connect
-from tests.chaos.processes import PROGRAMS, below, kill
-
-def killing():
-    while not (found := [pid for pid, line in below(os.getpid()).items() if PROGRAMS["raylet"] in line]):
-        time.sleep(0.01)
-    kill(found[0])
-
-threading.Thread(target=killing, daemon=True).start()
-try:
-    connect(1)
-except ClusterDied as error:
-    print("our own" if error.is_ours else "another", error)
-"""
-COMMAND = """
-import os
-from pathlib import Path
-from ray._private import worker
-from factory.exits import run_program
-from factory.run import main
-
-done, honest = Path(os.environ["DONE"]), worker.connect
-
-def connect(node, *given, **named):
-    if not done.exists():
-        done.touch()
-        (raylet,) = node.all_processes["raylet"]
-        raylet.process.kill()
-        raylet.process.wait()
-    return honest(node, *given, **named)
-
-worker.connect = connect
-if __name__ == "__main__":
-    run_program(main)
-"""
 TOWN = (
     "clips.n_clips=1",
     "experts=[human]",
@@ -117,24 +76,6 @@ def left_of(mark: str) -> list[str]:
         if not found or time.monotonic() > end:
             return found
         time.sleep(0.1)
-
-
-@pytest.mark.chaos
-@pytest.mark.ray
-@pytest.mark.slow
-def test_a_command_goes_on_where_ray_ends_the_process_whose_raylet_is_gone(tmp_path: Path) -> None:
-    """Ray does so by _exit(1), and leaves what else it had started."""
-    script, out, mark = tmp_path / "run.py", tmp_path / "out", secrets.token_hex(16)
-    script.write_text(COMMAND)
-    words = [sys.executable, str(script), *TOWN, f"out={out}"]
-    environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "MARK": mark, "DONE": str(tmp_path / "done")}
-    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0 and "Traceback" not in done.stderr, (done.returncode, done.stderr)
-    assert done.stdout.count("Ray's raylet died; a new cluster is started, 1 of 3") == 1
-    assert left_of(mark) == []
-    assert run_main([*TOWN, "executor=local", f"out={tmp_path / 'plain'}"]) == 0
-    assert_same_tables(out, tmp_path / "plain")
-    assert verify(Store(out)).damage == ()
 
 
 def ended_by_ray(journal: Path, begun: int, tell: Callable[[str], None]) -> int:
@@ -222,16 +163,6 @@ def test_a_signal_to_the_command_reaches_its_run(tmp_path: Path, number: signal.
     running.send_signal(number)
     assert running.wait(100.0) == code
     assert left_of(mark) == []
-
-
-@pytest.mark.ray
-@pytest.mark.slow
-@pytest.mark.chaos
-def test_a_cluster_that_dies_while_it_is_started_is_one_that_died() -> None:
-    """Ray itself waits half a minute and raises an Exception of no narrower class."""
-    words = [sys.executable, "-c", START]
-    done = subprocess.run(words, cwd=REPOSITORY, capture_output=True, text=True, timeout=300)
-    assert "our own Ray did not begin" in done.stdout and done.returncode == 0, done.stderr
 
 
 @pytest.mark.ray

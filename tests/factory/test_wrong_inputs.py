@@ -130,7 +130,7 @@ WRONG = [
     run(*A_SCENE, "clips.cameras=a_folder", says=["clips.cameras=a_folder: no cameras.json here"]),
     run(*A_SCENE, "clips.camera=a_rig", says=["clips.camera", "did you mean clips.cameras=?"]),
     run(*A_SCENE, says=["recovery table", "a_scene.pkl: pickle: truncated or not a pickle"]),
-    run("vocabulary.file=nowhere.npy", says=["nowhere.npy", "No such file"]),
+    run("executor=ray", "vocabulary.file=nowhere.npy", says=["nowhere.npy", "No such file"]),
     run("vocabulary.file=broken.npy", says=["broken.npy: not readable as a numpy file: it holds no plain numbers"]),
     run("vocabulary.file=shape.npy", says=["shape.npy: trajectories have shape (3, 4), expected (K >= 1, 40, 3)"]),
     run(
@@ -194,10 +194,17 @@ def contents(folder: Path) -> list[tuple[str, int]]:
 
 
 def whole(wrong: Wrong) -> list[str]:
-    """The command line of a row; a run writes nowhere else, and draws nothing that is not asked for."""
+    """The command line of a row; a run writes nowhere else, draws nothing that is not asked for, and is in this process
+    but where Ray is named."""
     if wrong.argv[0] != "run" or any(word.startswith("out=") for word in wrong.argv):
         return list(wrong.argv)
-    return ["run", "render=none", *wrong.argv[1:], "out=here"]
+    return [
+        "run",
+        "render=none",
+        *([] if "executor=ray" in wrong.argv else ["executor=local"]),
+        *wrong.argv[1:],
+        "out=here",
+    ]
 
 
 def unlike(wrong: Wrong, code: int, said: str) -> list[str]:

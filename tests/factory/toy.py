@@ -235,17 +235,3 @@ class DyingWork(ToyWork):
 
     def warm(self, draws: bool = True) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
-
-
-@dataclass(frozen=True)
-class TakesItsNodeAway(ToyWork):
-    """Where its kernels are to be compiled on one node of a Ray cluster, that node dies."""
-
-    doomed: str = ""
-
-    def warm(self, draws: bool = True) -> None:
-        import ray
-
-        if ray.get_runtime_context().get_node_id() == self.doomed:
-            os.kill(os.getppid(), signal.SIGKILL)  # the node's own process, which started this one
-            os.kill(os.getpid(), signal.SIGKILL)

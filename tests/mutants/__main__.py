@@ -64,8 +64,7 @@ class Copy:
         env = {**os.environ, **paths, "NUMBA_DISABLE_JIT": str(int(interpreted))}
         if own_kernels and not interpreted:
             env["NUMBA_CACHE_DIR"] = str(self.kernels)
-        marked = ("-m", "")  # also those of make chaos
-        command = [sys.executable, "-m", "pytest", "-x", "-q", *marked, "-p", "no:cacheprovider", "--no-header", *tests]
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--no-header", *tests]
         with tempfile.TemporaryFile("w+") as said:
             process = subprocess.Popen(
                 command, cwd=self.root, env=env, stdout=said, stderr=said, text=True, start_new_session=True

@@ -12,6 +12,7 @@ import pytest
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.files import DiskFull, naming_disk_errors, why_disk_full, why_unusable
 from factory.graph.execute import Execution, RunSummary, execute, rerun_on_new_clusters
+from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
 from factory.graph.steps import failure_from_error
 from factory.run import main as run_main
 from factory.store.samples import Store
@@ -146,15 +147,29 @@ def test_a_full_disk_under_the_user_s_cache_is_told_with_its_path_and_is_no_wron
     assert str(tmp_path / "cache/driving-data-factory/towns") in told and "run the same command again" in told
 
 
-@pytest.mark.parametrize("executor", ["local", "isolated", pytest.param("ray", marks=pytest.mark.ray)])
+@pytest.mark.parametrize("isolated", [False, True])
 def test_a_machine_that_is_ill_while_kernels_are_compiled_is_no_bug_and_no_wrong_setting(
-    tmp_path: Path, executor: str
+    tmp_path: Path, isolated: bool
 ) -> None:
-    out, where = tmp_path / "out", "ray" if executor == "ray" else "local"
-    work = ColdWork(number=errno.ENOSPC)
-    summary = execute(work, refs(1), ["human"], 1, Store(out), Execution(where, 1, isolated=executor == "isolated"))  # type: ignore[arg-type]
+    stopped_before_any_row(tmp_path / "out", ColdWork(number=errno.ENOSPC), COLD, Execution("local", isolated=isolated))
+
+
+def stopped_before_any_row(out: Path, work: ToyWork, says: str, how: Execution) -> None:
+    summary = execute(work, refs(1), ["human"], 1, Store(out), how)
     assert summary.exit_code == INTERRUPTED and not [*out.rglob("*.parquet")]
-    assert COLD in summary.message and "run the same command again" in summary.message
+    assert says in summary.message and "run the same command again" in summary.message
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_nor_is_it_one_on_ray_where_the_worker_may_die_of_it_as_well(tmp_path: Path) -> None:
+    ray.init(address="local", num_cpus=1, include_dashboard=False, log_to_driver=False)
+    try:
+        stopped_before_any_row(tmp_path / "ill", ColdWork(number=errno.ENOSPC), COLD, Execution("ray", 1))
+        says = "could not get its kernels ready"
+        stopped_before_any_row(tmp_path / "dead", DyingWork(), says, Execution("ray", 1))
+    finally:
+        ray.shutdown()
 
 
 @pytest.fixture
@@ -198,10 +213,3 @@ def test_ray_without_space_for_its_files_is_not_begun_again(
     summary, told = without_ray(disk)
     assert not told
     assert f"its files lie in {disk}: the disk is full, 65,536 bytes are free; free disk space" in summary.message
-
-
-@pytest.mark.ray
-def test_a_worker_that_dies_while_kernels_are_compiled_is_no_wrong_setting(tmp_path: Path) -> None:
-    summary = execute(DyingWork(), refs(1), ["human"], 1, Store(tmp_path / "out"), Execution("ray", 1))
-    assert summary.exit_code == INTERRUPTED and not (tmp_path / "out" / "samples").exists()
-    assert "could not get its kernels ready" in summary.message and "run the same command again" in summary.message

@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -20,7 +19,7 @@ from tasks.stages import ATTEMPT, TASKS
 from tests.factory.noted import NotedWork
 from tests.factory.stages.test_pipeline import work_on
 from tests.factory.tables import assert_same_tables, tables_of
-from tests.factory.toy import TakesItsNodeAway, ToyWork, executed, ran, refs
+from tests.factory.toy import ToyWork, executed, ran, refs
 
 EXPERTS = ["recovery", "pdm_closed", "human"]
 UNFIT = {f"log0:{start}:pdm_closed:{i}:render": "unfit" for start in (0, 2000) for i in range(3)}
@@ -101,8 +100,8 @@ def test_memory_bounds_what_a_node_does_at_once(tmp_path: Path, memory_of_two: N
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Any]:
-    """A node with CPUs and one with a GPU, in name.
+def two_nodes() -> Iterator[dict[str, str]]:
+    """The kinds by id of a node with CPUs and one with a GPU, in name.
 
     The first has more cores than two tasks take: Ray holds a core for a moment after its task of one kind has ended,
     and lends the GPU node's to the next of another kind if no other is free.
@@ -114,33 +113,9 @@ def cluster() -> Iterator[Any]:
     cluster.add_node(num_cpus=1, num_gpus=1)
     ray.init(address=cluster.address, log_to_driver=False)
     cluster.wait_for_nodes()
-    yield cluster
+    yield {node["NodeID"]: "gpu" if node["Resources"].get("GPU") else "cpu" for node in ray.nodes()}
     ray.shutdown()
     cluster.shutdown()
-
-
-@pytest.fixture(scope="module")
-def two_nodes(cluster: Any) -> dict[str, str]:
-    """Their kinds by id."""
-    return {node["NodeID"]: "gpu" if node["Resources"].get("GPU") else "cpu" for node in ray.nodes()}
-
-
-@pytest.mark.chaos
-@pytest.mark.ray
-@pytest.mark.slow
-def test_gpu_nodes_draw_and_cpu_nodes_drive(tmp_path: Path, two_nodes: dict[str, str]) -> None:
-    journal = str(tmp_path / "journal")
-    work = ToyWork(trouble=UNFIT, journal=journal, seconds=0.05)
-    assert run(tmp_path / "out", work, workers=2, claims=Claims(gpu_share=0.5)).exit_code == COMPLETE
-    at = {"render": set(), "attempt": set(), "label": set()}  # type: dict[str, set[str]]
-    for line in Path(journal).read_text().splitlines():
-        word = line.split()[0]
-        if word in at:
-            at[word].add(two_nodes[line.split(" node ")[1].split()[0]])
-    assert at["render"] == {"gpu"}
-    assert at["attempt"] == at["label"] == {"cpu"}
-    run(tmp_path / "local", ToyWork(trouble=UNFIT), executor="local")
-    assert_same_tables(tmp_path / "out", tmp_path / "local")
 
 
 @pytest.mark.ray
@@ -167,16 +142,3 @@ def test_the_town_s_pictures_are_drawn_on_the_gpu_node_and_its_drives_made_on_th
     assert any(min(pictures)[0] < began < max(pictures)[0] for began, _ in drives)
     execute(work, *what, Store(tmp_path / "local"), Execution("local"), say=lambda line: None)
     assert_same_tables(tmp_path / "ray", tmp_path / "local")
-
-
-@pytest.mark.chaos
-@pytest.mark.ray
-@pytest.mark.slow
-def test_a_node_that_leaves_before_the_first_task_is_done_without(tmp_path: Path, cluster: Any) -> None:
-    doomed = cluster.add_node(num_cpus=1, num_gpus=0).node_id
-    cluster.wait_for_nodes()
-    work = TakesItsNodeAway(doomed=doomed)
-    assert run(tmp_path / "out", work, workers=2).exit_code == COMPLETE
-    assert doomed not in {node["NodeID"] for node in ray.nodes() if node["Alive"]}
-    run(tmp_path / "local", ToyWork(), executor="local")
-    assert_same_tables(tmp_path / "out", tmp_path / "local")

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,16 +12,15 @@ from pathlib import Path
 import pytest
 
 from factory.config.run import load_config
-from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
+from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.guard import CRASHED
 from factory.graph.local import MAX_RETRIES, Limits, TaskDurations, notes_folder
 from factory.run import needs_own_process
 from factory.store.samples import Store
-from factory.views.status import status_lines
 from tests.factory.graph.runs import run
 from tests.factory.graph.wild import WildWork
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
-from tests.factory.toy import ToyWork, ran
+from tests.factory.toy import ran
 from tests.pages import REPOSITORY
 
 ONE = "log0:0:recovery:0"
@@ -116,31 +114,6 @@ def test_a_run_that_dies_with_its_plug_in_learns_of_it(tmp_path: Path, plain: Ca
     assert not marker.exists()
     assert run(tmp_path / "out", retry=True).exit_code == COMPLETE
     assert_same_tables(tmp_path / "out", plain())
-
-
-@pytest.mark.chaos
-@pytest.mark.slow
-def test_a_hanging_walk_is_seen_while_it_hangs_and_a_signal_ends_the_run(tmp_path: Path) -> None:
-    journal = tmp_path / "journal"
-    told: list[str] = []
-
-    def ask() -> None:
-        while not (journal.exists() and "loop begins" in journal.read_text()):
-            time.sleep(0.1)
-        time.sleep(11.0)
-        told.extend(status_lines(Store(tmp_path / "out")))
-        os.kill(os.getpid(), signal.SIGTERM)
-        told.append(str(time.monotonic()))
-
-    asking = threading.Thread(target=ask)
-    asking.start()
-    summary = run(tmp_path / "out", WildWork(wild=((ONE, "loop"),), journal=str(journal)), isolated=True)
-    ended = time.monotonic()
-    asking.join()
-    assert summary.exit_code == INTERRUPTED and ended - float(told[-1]) < 30.0
-    (at_work,) = [line for line in told if line.startswith("at work")]
-    assert "candidate 0" in at_work and "s of at most 3000 so far" in at_work
-    assert run(tmp_path / "out", ToyWork()).exit_code == COMPLETE
 
 
 def test_what_tasks_took_so_far_says_what_the_next_may_take() -> None:

@@ -7,6 +7,8 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import chdir
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -115,43 +117,23 @@ def clips_of(make: Make, root: str) -> list[object]:
     return found
 
 
-def behind_a_link(root: Path) -> str:
-    root.rename(root.parent / "elsewhere")
-    root.symlink_to("elsewhere")
-    return str(root)
-
-
 def among_companions(root: Path) -> str:
     add_companions(root)
     return str(root)
 
 
 def all_behind_links(root: Path) -> str:
+    """The root too."""
     put_behind_links(root, root.parent / "elsewhere")
+    root.rename(root.parent / "there")
+    root.symlink_to("there")
     return str(root)
 
 
-def with_a_slash(root: Path) -> str:
-    return f"{root}/"
-
-
-def at_home(root: Path) -> str:
-    os.environ["HOME"] = str(root.parent)
-    return "~/root"
-
-
-def relative(root: Path) -> str:
-    os.chdir(root.parent)
-    return "./root/../root"
-
-
-def commas(root: Path) -> str:
-    return str(root.rename(root.with_name("a,b")))
-
-
-def odd_name(root: Path) -> str:
-    odd = root.with_name("a b=c,d [e] (f) {g} 'h' \"i\" #j %k $l ü~")
-    return str(root.rename(odd))
+def oddly_told(root: Path) -> str:
+    """From the home folder, there and back, with a slash at the end of a name that has what shells and lists mind."""
+    odd = root.rename(root.with_name("a b=c,d [e] (f) {g} 'h' \"i\" #j %k $l ü~"))
+    return f"~/{odd.name}/../{odd.name}/"
 
 
 def upper_case(root: Path) -> str:
@@ -162,35 +144,37 @@ def upper_case(root: Path) -> str:
     return str(root)
 
 
-KINDS = (
-    among_companions,
-    all_behind_links,
-    behind_a_link,
-    with_a_slash,
-    at_home,
-    relative,
-    commas,
-    odd_name,
-    upper_case,
-)
+KINDS = (among_companions, all_behind_links, oddly_told, upper_case)
+COMES_AS = [(make, kind) for make in READERS for kind in KINDS]
+COMES_AS = [pair for pair in COMES_AS if pair[1] is not upper_case or pair[0] in (av2, sidecar, navsim)]
+
+
+@pytest.fixture(scope="module")
+def made(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[Make], tuple[Path, list[object]]]:
+    """A data set's folder, and its clips as they are found there by a path from the folder above."""
+
+    @cache
+    def of(make: Make) -> tuple[Path, list[object]]:
+        root = tmp_path_factory.mktemp(make.__name__) / "root"
+        make(root, street)
+        with chdir(root.parent):
+            return root, clips_of(make, "./root/../root")
+
+    return of
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("make", READERS)
+@pytest.mark.parametrize(("make", "kind"), COMES_AS)
 def test_the_same_clips_are_found_however_their_folder_comes(
     make: Make,
     kind: Kind,
-    street: Path,
+    made: Callable[[Make], tuple[Path, list[object]]],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    root = tmp_path / "root"
+    root, known = made(make)
     monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
-    make(root, street)
-    known = clips_of(make, str(root))
-    assert clips_of(make, kind(root)) == known
+    assert clips_of(make, kind(shutil.copytree(root, tmp_path / "root", symlinks=True))) == known
 
 
 LINKED = {  # what a clip is made of, were it there
@@ -248,7 +232,7 @@ def test_the_digest_is_the_clip_s_and_follows_the_log(make: Make, file: str, str
         reader.digest(ClipRef(reader.name, "gone", 0))
 
 
-@pytest.mark.parametrize("kind", KINDS[:2])
+@pytest.mark.parametrize("kind", (all_behind_links, among_companions))
 def test_simscale_s_logs_and_rewards_are_found_behind_links_and_among_companions(kind: Kind, tmp_path: Path) -> None:
     for number in (1, 2):
         simscale_writer.write_log(tmp_path / "root", SIMULATED, number, 0)

@@ -125,12 +125,6 @@ def test_a_reader_s_settings_tell_whether_photos_may_come_without_lidar(words: l
     assert photos_alone(load_config([*words, "out=somewhere"])) is alone
 
 
-def test_a_run_without_images_needs_no_renderer(tmp_path: Path, towns: str) -> None:
-    before, after = run_with_these(["judge", "plan", "drive"], tmp_path, *TOWN, *BLIND, towns, "executor=local")
-    assert after == before
-    assert not any(name.startswith("tasks/render/") for name in after)
-
-
 def test_replayed_traffic_needs_no_idm(tmp_path: Path, towns: str) -> None:
     replay = ("traffic=replay", "reward.labels=none")
     before, after = run_with_these(["judge", "plan"], tmp_path, *TOWN, *BLIND, *replay, towns, "executor=local")
@@ -139,7 +133,10 @@ def test_replayed_traffic_needs_no_idm(tmp_path: Path, towns: str) -> None:
 
 
 @pytest.mark.ray
-def test_arrays_out_of_ray_s_store_need_no_forms_of_their_own(tmp_path: Path, towns: str) -> None:
+def test_a_run_without_images_needs_no_renderer_and_arrays_out_of_ray_s_store_no_forms_of_their_own(
+    tmp_path: Path, towns: str
+) -> None:
     """They cannot be written, which is another type to numba."""
     before, after = run_with_these(["judge", "plan", "drive"], tmp_path, *TOWN, *BLIND, towns, "workers=1")
     assert after == before
+    assert not any(name.startswith("tasks/render/") for name in after)

@@ -1,13 +1,13 @@
 """From NAVSIM's folders to a planner that is scored in them, by the commands: every link held against the one before.
 
 A town's log as OpenScene with a GeoPackage, sweeps and the JPEGs of bent lenses -> a run that reconstructs the street
-and renders where the simulated ego was -> its export, read by the independent reader -> a training step -> the agent
-before the exported logs -> our scorer. Brought back as samples: tests/factory/imports.
+and renders where the simulated ego was -> its export (frame by frame: tests/factory/datasets/navsim) -> a training step
+-> the agent before the exported logs -> our scorer. Brought back as samples: tests/factory/imports.
 """
 
 import json
+import pickle
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,10 +31,10 @@ from planners.training.checkpoint import load_planner, newest_checkpoint
 from planners.training.train import main as train
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import Clip
-from tasks.world.frames import to_world
+from tasks.world.frames import to_local, to_world
 from tests.factory.datasets.navsim.navsim_town import frames_of, write_town
-from tests.factory.datasets.navsim.openscene_reader import Scene, read_scenes, read_split
 from tests.factory.datasets.navsim.openscene_writer import Sensed, sensed_by_town
+from tests.factory.datasets.navsim.test_navsim_frames import Frames, poses_of
 from tests.planners.navsim import agent_inputs
 from tests.planners.navsim.agent_inputs import DISTORTION, AgentInput, Cameras, EgoStatus
 
@@ -74,15 +74,13 @@ class Chain:
     def rows(self) -> list[dict[str, Any]]:
         return sorted(SampleTable(self.run), key=lambda row: (row["expert"], row["round"]))
 
-    def scenes(self) -> dict[tuple[str, int], Scene]:
-        """By expert and round, found as a training finds them: by the splits' files."""
+    def exported(self) -> dict[tuple[str, int], Frames]:
+        """The frames of each row's log, by expert and round."""
         found = {}
         for row in self.rows():
-            who = "navtrain_human" if row["expert"] == "human" else f"navtrain_reaction_pdm_v1.0-{row['round']}"
-            devkit = self.to / "devkit/navsim/planning/script/config/common/train_test_split"
-            folder, chosen = read_split(devkit / f"{who}.yaml")
-            scenes = read_scenes(self.to / "navsim_logs" / folder, self.to / "sensor_blobs" / folder, chosen)
-            (found[row["expert"], row["round"]],) = scenes.values()
+            who = "navtrain_human" if row["expert"] == "human" else f"synthetic_reaction_pdm_v1.0-{row['round']}"
+            (log,) = (self.to / "navsim_logs" / who).iterdir()
+            found[row["expert"], row["round"]] = pickle.loads(log.read_bytes())
         return found
 
 
@@ -165,53 +163,10 @@ def _inner(pixels: np.ndarray) -> np.ndarray:
     return pixels[5:40, 10:70].astype(float)
 
 
-@pytest.mark.slow
-def test_the_independent_reader_finds_in_the_export_what_the_rows_say(chain: Chain) -> None:
-    road_map, scenes = _clip(chain).road_map, chain.scenes()
-    connectors = {int(name) for name, lane in road_map.lanes.items() if lane.is_intersection}
-    lit: set[int] = set()
-    for row in chain.rows():
-        scene = scenes[row["expert"], row["round"]]
-        first, second = row["frame_tokens"]
-        assert scene.token == (first if row["expert"] == "human" else f"{second}-{row['round']:03d}")
-        assert scene.simulated == (row["expert"] != "human") and not scene.second_stage
-        assert len(scene.frames) == 12 and scene.n_history == 4 and scene.map_name == TOWN
-        np.testing.assert_allclose(scene.history(), row["ego_history_2hz"], atol=1e-5)
-        np.testing.assert_allclose(scene.future(), row["label_2hz"], atol=1e-5)
-        np.testing.assert_allclose(scene.status()[4:], row["ego_status"], atol=1e-6)
-        assert ("left", "straight", "right", "unknown")[int(np.argmax(scene.status()[:4]))] == row["command"]
-        assert scene.now.roadblock_ids == tuple(row["route_roadblock_ids"])
-        assert set(map(int, scene.now.roadblock_ids)) & set(map(int, road_map.roadblock_of.values()))
-        lit |= {number for number, _ in scene.now.traffic_lights}
-        there = np.asarray(row["agent_valid"])[:, 15]
-        assert sorted(scene.now.track_tokens) == sorted(np.asarray(row["agent_ids"])[there])
-        _same_pictures(row, scene)
-    assert lit and lit <= connectors
-
-
 def _logged(chain: Chain) -> list[dict[str, Any]]:
     """The frames of NAVSIM's log, written as NumPy 1 names its parts."""
     (file,) = chain.logs.glob("*.pkl")
     return frames_of(file)
-
-
-def _same_pictures(row: Mapping[str, Any], scene: Scene) -> None:
-    """Each is the row's, 24 times as large, with its colours in the middle of each of its pixels, and of the same rays.
-
-    Between them it is interpolated: its mean over a pixel is off by as much as that is unlike its neighbours.
-    """
-    rig = {camera["name"].lower(): camera for camera in row["cameras"]}
-    for image in row["images"]:
-        name = image["camera"].lower()
-        shot = scene.frames[round(2.0 * image["time_s"]) + 3].cameras[name]
-        middles = shot.image().reshape(45, 24, 80, 24, 3)[:, 11:13, :, 11:13].mean(axis=(1, 3))
-        # Grey levels: the export's JPEG and a 48th of the way to the next pixel, 0.3; 1.3 where it is 2 pixels aside.
-        assert np.abs(middles - decode_stored_image(image)).mean() < 1.0
-        scale = np.diag([1920 / 80, 1080 / 45, 1.0])
-        np.testing.assert_allclose(shot.intrinsics, scale @ rig[name]["intrinsics"].reshape(3, 3))
-        pose = rig[name]["ego_from_camera"].reshape(4, 4)
-        np.testing.assert_allclose(shot.rotation, pose[:3, :3], atol=1e-9)
-        np.testing.assert_allclose(shot.translation, pose[:3, 3], atol=1e-9)
 
 
 @pytest.mark.slow
@@ -221,19 +176,21 @@ def test_a_planner_of_one_step_drives_as_an_agent_in_the_exported_logs_and_is_sc
     out = chain.root / "trained"
     assert train(["planner=ltf_small", cameras, *data, "steps=1", f"out={out}"]) == 0
     assert json.loads((newest_checkpoint(out) / "record.json").read_text())["step"] == 1
-    scenes, rows, clip = chain.scenes(), chain.rows(), _clip(chain)
+    logs, rows, clip = chain.exported(), chain.rows(), _clip(chain)
+    shown = {key: agent_input(frames, chain.to / "sensor_blobs") for key, frames in logs.items()}
     expected = plan_samples(load_planner(out), rows)
     remote = RemotePlanner(str(out), sys.executable)
-    plans = {key: remote.plan(agent_input(scene), 40) for key, scene in scenes.items()}
+    plans = {key: remote.plan(one, 40) for key, one in shown.items()}
     remote.close()
     for row, of_row in zip(rows, expected):  # pictures are other JPEGs, decoded smaller
         np.testing.assert_allclose(plans[row["expert"], row["round"]], of_row, atol=0.3)
     still = AgentPlanner("constant_velocity")
-    steady = still.plan(observation_of(agent_input_arrays(agent_input(scenes["human", 0]), ()), ()), 8)
+    steady = still.plan(observation_of(agent_input_arrays(shown["human", 0], ()), ()), 8)
     speed = rows[0]["ego_status"][0]
     straight = np.array([[0.5 * speed * k, 0.0, 0.0] for k in range(1, 9)])
     np.testing.assert_allclose(steady, straight, atol=0.1)
-    driven = [scenes["human", 0].future(), rows[0]["label_2hz"], steady, straight, plans["human", 0][4::5]]
+    ahead = local_poses(logs["human", 0])[4:]
+    driven = [ahead, rows[0]["label_2hz"], steady, straight, plans["human", 0][4::5]]
     scores = score_trajectories(clip, np.stack(driven)).pdm_score
     assert scores[0] == pytest.approx(scores[1], abs=1e-5) and scores[2] == pytest.approx(scores[3], abs=0.01)
     assert ((scores >= 0.0) & (scores <= 1.0)).all() and scores[0] > 0.8
@@ -246,13 +203,21 @@ def _clip(chain: Chain) -> Clip:
     return reader.read(ref)
 
 
-def agent_input(scene: Scene) -> AgentInput:
-    """What NAVSIM would show an agent of a scene, decoded by PIL, with the front cameras at now alone."""
-    status = scene.status()
-    egos = [EgoStatus(pose, status[4:6], status[6:], status[:4].astype(int)) for pose in scene.history()]
-    shot = {}
+def local_poses(frames: Frames) -> np.ndarray:
+    """(12, 3) in the ego frame at now, by the public code's heading."""
+    poses = poses_of(frames)
+    return to_local(poses[3], poses)
+
+
+def agent_input(frames: Frames, blobs: Path) -> AgentInput:
+    """What NAVSIM would show an agent of a log, with the front cameras at now alone."""
+    egos, shot = [], {}
+    for pose, frame in zip(local_poses(frames)[:4].astype(np.float32), frames):
+        motion = np.array(frame["ego_dynamic_state"], np.float32)
+        egos.append(EgoStatus(pose, motion[:2], motion[2:], frame["driving_command"].astype(int)))
+    keys = ("sensor2lidar_rotation", "sensor2lidar_translation", "cam_intrinsic", "distortion")
     for name in FRONT:
-        camera = scene.now.cameras[name]
-        calibration = camera.rotation, camera.translation, camera.intrinsics, camera.distortion
-        shot[name] = agent_inputs.Camera(camera.image(), *calibration)
+        camera = frames[3]["cams"][name.upper()]
+        (file,) = blobs.glob(f"*/{camera['data_path']}")
+        shot[name] = agent_inputs.Camera(cv2.imread(str(file))[..., ::-1], *(camera[key] for key in keys))
     return AgentInput(egos, [Cameras(), Cameras(), Cameras(), Cameras(**shot)])

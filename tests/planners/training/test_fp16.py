@@ -16,7 +16,7 @@ from planners.models.planner import Planner
 from planners.training.checkpoint import load_training, newest_checkpoint
 from planners.training.fit import LOSSES, SCALER, StepSettings, fit
 from planners.training.optim import TrainingSettings
-from tests.planners.models import test_diffusiondrive, test_gtrs_dense, test_ltf
+from tests.planners.models import test_gtrs_dense, test_ltf
 from tests.planners.toy import Toy, ToyBatches, ToySettings
 from tests.planners.training.test_fit import ALONE, Interrupted, rows
 
@@ -104,13 +104,12 @@ class Again(ToyBatches):
 
 LEARNERS: dict[str, Callable[[], tuple[Planner, Batch]]] = {
     "ltf": lambda: (test_ltf.planner(), test_ltf.batch(8)),
-    "diffusiondrive": lambda: (test_diffusiondrive.planner(), test_diffusiondrive.scene_batch(8)),
     "gtrs_dense": lambda: (test_gtrs_dense.planner(), test_gtrs_dense.labelled(8)[0]),
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ltf", pytest.param("diffusiondrive", marks=pytest.mark.chaos), "gtrs_dense"])
+@pytest.mark.parametrize("name", ["ltf", "gtrs_dense"])
 def test_the_loss_follows_that_of_fp32(tmp_path: Path, name: str) -> None:
     """Within 0.1 % at the start and 6 % behind 30 steps, the first few of which are left out to find the scale."""
     curves = []

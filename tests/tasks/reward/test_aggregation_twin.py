@@ -3,6 +3,7 @@
 from dataclasses import fields
 
 import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from tasks.reward.aggregate import (
     columns_of,
     follow_up_weights,
     frame_scores,
+    group_scores,
     means_of,
 )
 from tasks.reward.epdms import Normalise, Scores, human_filtered, relative_progress
@@ -127,3 +129,17 @@ def slow_follow_ups(end: tuple[float, float], follow_ups: list[tuple]) -> tuple[
     """Weights, columns."""
     weights = slow.follow_up_weights(end, [start for _, _, start in follow_ups])
     return weights, [slow.frame(row, None, ec)[0] for row, ec, _ in follow_ups]
+
+
+def test_frames_to_score_are_one_plan_each_and_a_group_has_follow_ups() -> None:
+    one, two = (scores_of([dict.fromkeys(slow.SUB_SCORES, 1.0)] * n) for n in (1, 2))
+    with pytest.raises(ValueError, match="scores must be one row"):
+        frame_scores(two, None)
+    with pytest.raises(ValueError, match="human must be one row"):
+        frame_scores(one, two)
+    with pytest.raises(ValueError, match="frames"):
+        means_of([])
+    with pytest.raises(ValueError, match="follow-up"):
+        group_scores(Group(frame_scores(one, None), np.zeros(2), np.zeros((0, len(COLUMNS))), np.zeros((0, 2))))
+    with pytest.raises(ValueError, match="nothing"):
+        aggregate([])

@@ -153,12 +153,14 @@ def drive(
     ego_boxes: Array,
     ego_velocities: Array,
     driver: IdmDriver,
-    yielding: Yielding | None,
+    yields: bool,
+    yielding: Yielding,
 ) -> tuple[Array, Array, NDArray[np.bool_], Array, NDArray[np.bool_]]:
     """Boxes (T, N, 5), velocities (T, N, 2), valid (T, N), centre z (T, N) and who was driven (N,).
 
     start: the clip's step of row 0; log: the clip's tracks over all its steps; now: the agents at `start`;
-    ego_boxes (T, 5), ego_velocities (T, 2): the ego's box (true centre) and world velocity, T = 41.
+    ego_boxes (T, 5), ego_velocities (T, 2): the ego's box (true centre) and world velocity, T = 41; `yielding` is
+    looked at where drivers give way alone (of one type, so that all this is compiled once).
     """
     n_rows, n = ego_boxes.shape[0], now.valid.shape[0]
     n_log = log.valid.shape[0]
@@ -201,7 +203,7 @@ def drive(
             if m >= 0:
                 mode[i], path[i], travelled[i] = DRIVEN, m, 0.0
                 s[i], offset[i], turn[i], speed[i] = _start_on(paths, m, boxes[t, i], velocities[t, i], driver)
-                if yielding is not None:
+                if yields:
                     turn[i] = (turn[i] - turned_on(yielding, m, s[i]) + math.pi) % (2.0 * math.pi) - math.pi
                 k = min(max(round(s[i] / PATH_SPACING_M), 0), paths.heading.shape[1] - 1)
                 base_z[i] = center_z[t, i] - paths.height[m, k]
@@ -228,7 +230,7 @@ def drive(
                 k = min(max(round(s[i] / PATH_SPACING_M), 0), paths.heading.shape[1] - 1)
                 free = free_acceleration(speed[i], paths.target_speed[m, k], driver)
                 accel = following_acceleration(free, speed[i], np.inf, 0.0, driver)
-                if yielding is not None:
+                if yields:
                     accel = intended(
                         yielding,
                         m,
@@ -256,7 +258,7 @@ def drive(
                         v = ego_velocities[t] if j == n else velocities[t, j]
                         lead_speed = v[0] * math.cos(h) + v[1] * math.sin(h)
                         accel = min(accel, following_acceleration(free, speed[i], gap, lead_speed, driver))
-                if yielding is not None:
+                if yields:
                     for z in range(yielding.zone_start[m], yielding.zone_start[m + 1]):
                         j = yielding.zone_agent[z]
                         gap = waits_before(
@@ -272,7 +274,7 @@ def drive(
             travelled[i] += step_m
             speed[i] = new_speed
             x, y, h = pose_on_path(paths, m, s[i], travelled[i], offset[i], turn[i], driver.blend_length_m)
-            if yielding is not None:
+            if yields:
                 h += turned_on(yielding, m, s[i])
             k = min(max(round(s[i] / PATH_SPACING_M), 0), paths.heading.shape[1] - 1)
             if step_m == 0.0:
@@ -343,7 +345,7 @@ def drive(
                 far = math.hypot(box[0] - ego[0], box[1] - ego[1]) >= ENTER_CLEARANCE_M
                 others = np.where(roles.first_part == roles.first_part[i], ABSENT, mode)
                 free = _is_free(box, boxes[t + 1], others, ego, driver.min_gap_m)
-                if yielding is not None:
+                if yields:
                     free = _has_room(
                         box, log.velocities[k, i], boxes[t + 1], velocities[t + 1], others, ego, ego_velocities[t + 1],
                         driver,

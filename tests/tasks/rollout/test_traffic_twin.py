@@ -51,7 +51,8 @@ def slow_roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
         np.column_stack([x, y, heading, size]),
         np.column_stack([cos * speed, sin * speed]),
         driver,
-        traffic.yielding,
+        traffic.yielding is not None,
+        traffic.yielding or prepare_traffic(scene, IDM).yielding,  # type: ignore[arg-type]
     )
     agents = replace(window, boxes=boxes, velocities=velocities, valid=valid, center_z=center_z)
     return Rollout(scene.step, ego_states, agents, driven)

@@ -1,1 +1,0 @@
-"""Programs that measure the house itself: what a run gives, column by column, and what one clip's life runs through."""
