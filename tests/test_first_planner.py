@@ -6,9 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from factory.__main__ import main as factory
+from factory.run import main as run
 from factory.setup.vocabulary import load_recovery_table
+from planners.__main__ import main as planners
 from tasks.kernels.compiled import cache_dir
-from tests.first_planner import main, page_commands
+from tests.first_planner import page_commands
 
 TENTH = [
     "clips.n_towns=2",
@@ -19,6 +22,7 @@ TENTH = [
     "perturbed=0",
     "workers=1",
 ]
+PROGRAMS = {"factory": factory, "factory.run": run, "planners": planners}  # in this process
 NUMBER = r"([\d.]+)(?: %)?"
 CLAIM = rf"{NUMBER} against {NUMBER}, ([+-][\d.]+) \(95 % over 2 towns: .*?\), (?:better|worse|no difference .*?)"
 
@@ -31,7 +35,8 @@ def test_the_page_s_own_commands_end_with_a_sentence(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache_dir().parent))  # a cache of its own, but no second compilation
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    assert main(TENTH) == 0, capfd.readouterr().err
+    for _, _, program, *words in page_commands(TENTH):
+        assert not PROGRAMS[program](words), capfd.readouterr().err
     last = capfd.readouterr().out.splitlines()[-1]
     said = re.fullmatch(rf"mixed against real: two-stage EPDMS {CLAIM}; routes driven cleanly {CLAIM}", last)
     assert said, last

@@ -223,7 +223,7 @@ def test_a_crafted_file_that_a_command_reads_itself_is_refused_by_name_in_one_li
     for what, (write, argv, _) in DRIVER_READS.items():
         (folder := tmp_path / what).mkdir()
         write(folder)
-        words = ("clips.root=logs", "out=out", "render=none") if argv[1] == "run" else ()
+        words = ("clips.root=logs", "out=out", "render=none", "executor=local") if argv[1] == "run" else ()
         asked.append((str(folder), [*argv, *words]))
     command(tmp_path, "-c", EACH, json.dumps(asked))
     for what, (_, argv, named) in DRIVER_READS.items():

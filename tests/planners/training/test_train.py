@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from factory.run import main as run_factory
+from planners.__main__ import main as planners
 from planners.drive.settings import settings_of as drive_settings
 from planners.evaluation.evaluate import settings_of as evaluate_settings
 from planners.training.checkpoint import load_planner, newest_checkpoint, read_record
@@ -79,7 +80,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     small += ["render.fit.iterations=20", "render.fit.start_gaussians=2000", "render.fit.most_gaussians=2500"]
     small += ["render.fit.start_every=2", "render.fit.stereo_photos=2", "render.psnr_min=0"]
     small += ["render.gate.enabled=false", "vocabulary.k=64", "rounds=1", "limit=3"]
-    small += ["clips.settings.lidar_beams=16", "clips.settings.lidar_azimuths=180"]
+    small += ["clips.settings.lidar_beams=16", "clips.settings.lidar_azimuths=180", "clips.settings.steps_per_photo=5"]
     assert run_factory(["preset=demo", "executor=local", *small, f"out={home / 'runs/demo'}"]) == 0
     return home
 
@@ -93,22 +94,22 @@ def documented(page: str) -> list[str]:
     return words[1:]
 
 
-def trained(home: Path, *words: str) -> tuple[list[str], dict[str, Any]]:
-    """What a training in `home` notes, and its record."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [sys.executable, *words], cwd=home, env=environment, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
-    out = next(word for word in reversed(words) if word.startswith("out="))
-    return [line for line in done.stdout.splitlines() if line.startswith("note: ")], read_record(home / out[4:])
+def noted(said: str) -> list[str]:
+    return [line for line in said.splitlines() if line.startswith("note: ")]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", ["README.md", "docs/training.md"])
-def test_the_documented_first_trainings_take_the_demo_s_table(page: str, demo: Path) -> None:
+def test_the_documented_first_trainings_take_the_demo_s_table(
+    page: str, demo: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Of nine samples: the batch is as large as there are. Of three: below, by two processes."""
-    (note,), record = trained(demo, *documented(page), "steps=2")
+    monkeypatch.chdir(demo)
+    words = documented(page)[2:]
+    assert planners([*words, "steps=2"]) == 0, capsys.readouterr().err
+    (note,) = noted(capsys.readouterr().out)
+    (out,) = (word.removeprefix("out=") for word in words if word.startswith("out="))
+    record = read_record(demo / out)
     assert note.startswith("note: planner.training.batch_size=32 -> 9: "), note
     assert (record["step"], record["trained"]["planner.training"]["batch_size"]) == (2, 9)
 
@@ -119,10 +120,12 @@ def test_two_processes_of_torchrun_share_the_batch_that_the_demo_s_samples_fill(
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    torchrun = ["-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", str(port)]
-    more = ["steps=2", "device=cpu", "out=runs/two"]
-    notes, record = trained(demo, *torchrun, *documented("docs/extend.md"), *more)
-    (note,) = notes
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", str(port)]
+    words = [*torchrun, *documented("docs/extend.md"), "steps=2", "device=cpu", "out=runs/two"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(words, cwd=demo, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    (note,), record = noted(done.stdout), read_record(demo / "runs/two")
     assert note.startswith("note: planner.training.batch_size=64 -> 2: "), note
     assert (record["step"], record["trained"]["planner.training"]["batch_size"]) == (2, 2)
     assert record["trained"]["processes"] == 2
