@@ -58,6 +58,9 @@ demo: $(VENV)/.run
 first-planner: install
 	$(PY) -m tests.first_planner $(ARGS)
 
+# Bytecode is kept in any case: the tests start hundreds of processes that import the same sources.
+unexport PYTHONDONTWRITEBYTECODE
+
 # Kernels are compiled once before two test processes would both do it.
 test: install
 	$(PY) -m factory warm
