@@ -1,20 +1,14 @@
 """Exactly once: two-step commits, unique keys, one writer, damage that is found."""
 
-import io
-import threading
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-import factory.store.table as table_module
 from factory.store.location import Location, Shard, write_shard
-from factory.store.schema import SAMPLES, Stamp, TableSpec, sample_rows_to_table
+from factory.store.schema import TableSpec
 from factory.store.table import DuplicateKey, KeyedTable
-from tests.factory.toy import row_of, stream
 
 SPEC = TableSpec(
     "things",
@@ -76,23 +70,6 @@ def test_replacing_rows_is_one_transaction_that_keeps_their_neighbours(location:
     assert content(location)["d"] == 3.0
 
 
-def test_an_object_stores_files_are_read_side_by_side_and_come_in_order(
-    location: Location, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    KeyedTable(location, SPEC).commit([shard(location, key, round_=i) for i, key in enumerate("abcd")])
-    table = KeyedTable(Location(f"file://{location.uri}"), SPEC)
-    two, plainly = threading.Barrier(2), table_module.read_parquet
-
-    def with_another(*args: Any) -> pa.Table:
-        two.wait(timeout=30)  # for ever alone, were they read one after the other
-        return plainly(*args)
-
-    monkeypatch.setattr(table_module, "read_parquet", with_another)
-    found = list(table.files())
-    assert [path for path, _ in found] == sorted(path for path, _ in found)
-    assert [rows["key"].to_pylist() for _, rows in found] == [["a"], ["b"], ["c"], ["d"]]
-
-
 def test_a_damaged_file_of_an_object_store_is_named(location: Location) -> None:
     KeyedTable(location, SPEC).commit([shard(location, "a"), shard(location, "b", round_=1)])
     table = KeyedTable(Location(f"file://{location.uri}"), SPEC)
@@ -127,44 +104,3 @@ def test_row_groups_stay_below_4_mb(location: Location) -> None:
     metadata = pq.ParquetFile(f"{location.uri}/{written.path}").metadata
     sizes = [metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups)]
     assert metadata.num_row_groups == 3 and big.slice(0, metadata.row_group(0).num_rows).nbytes <= 4 * 2**20, sizes
-
-
-class Counting(io.FileIO):
-    """A file that counts the bytes read from it."""
-
-    n_bytes = 0
-
-    def read(self, size: int | None = -1) -> bytes:  # type: ignore[override]
-        data = super().read(-1 if size is None else size)
-        self.n_bytes += len(data)
-        return data
-
-
-@pytest.mark.slow
-def test_a_query_on_scores_reads_kilobytes_of_a_shard(location: Location) -> None:
-    rng = stream("images")
-    made = []
-    for i in range(40):
-        image = {"camera": "front", "time_s": 0.0, "ego_pose": np.eye(4).ravel(), "jpeg": rng.bytes(2**20)}
-        stamp = Stamp(f"id{i:02d}", "recovery", "d", 0, i, "v", "s", "{}")
-        made.append(row_of(rng) | vars(stamp) | {"images": [image]})
-    written = write_shard(location, SAMPLES, sample_rows_to_table(made))
-    assert written.size > 40 * 2**20
-    counting = Counting(f"{location.uri}/{written.path}")
-    scores = pq.ParquetFile(pa.PythonFile(counting, "r")).read(["attempt_id", "stage2_score"])
-    assert scores.num_rows == 40 and counting.n_bytes < 300 * 2**10, counting.n_bytes
-
-
-def test_jpegs_are_stored_as_they_are_and_all_else_with_dictionaries_and_zstd(location: Location) -> None:
-    image = {"camera": "front", "time_s": 0.0, "ego_pose": np.eye(4).ravel(), "jpeg": bytes(10_000)}
-    stamp = Stamp("id", "recovery", "d", 0, 0, "v", "s", "{}")
-    row = row_of(stream("images")) | vars(stamp) | {"images": [image]}
-    written = write_shard(location, SAMPLES, sample_rows_to_table([row]))
-    group = pq.ParquetFile(f"{location.uri}/{written.path}").metadata.row_group(0)
-    leaves = {leaf.path_in_schema: leaf for leaf in map(group.column, range(group.num_columns))}
-    (jpeg,) = (leaves.pop(path) for path in SAMPLES.packed)
-    assert jpeg.compression == "UNCOMPRESSED" and "RLE_DICTIONARY" not in jpeg.encodings
-    assert 10_000 < jpeg.total_compressed_size < 10_100
-    assert {leaf.compression for leaf in leaves.values()} == {"ZSTD"}
-    flags = {path for path, leaf in leaves.items() if leaf.physical_type == "BOOLEAN"}  # have no dictionaries
-    assert {path for path, leaf in leaves.items() if "RLE_DICTIONARY" not in leaf.encodings} == flags

@@ -3,16 +3,15 @@
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from factory.stages.rows import label_columns
-from factory.store.reader import SampleTable, labels_of, row_group_sizes
+from factory.store.reader import SampleTable, labels_of
 from factory.store.schema import COLUMNS, LABEL_COLUMNS
 from planners.data.batch import COMMANDS, BevLayout, ImageLayout, Needs
 from planners.data.bev import bev_raster, nearest_vehicles
 from planners.data.decode import BatchBuffer, StoredRows, count_labels
-from planners.data.files import Footers, files_of, group_bytes, leaf_paths
+from planners.data.files import files_of, leaf_paths
 from planners.data.images import stitch_sample
 from planners.data.index import BEV_COLUMNS, PLAN_COLUMNS
 from tasks.reward.label_bytes import VocabularyLabels
@@ -72,14 +71,6 @@ def test_every_column_is_read_as_the_sample_reader_reads_it(table: Path) -> None
                 assert np.array_equal(one, other, equal_nan=one.dtype.kind == "f"), name
             else:
                 assert one == other, name
-
-
-def test_a_raster_is_drawn_once(table: Path) -> None:
-    rows, other = stored(table, list(BEV_COLUMNS)), BevLayout(cell_m=4.0)
-    for number, expected in enumerate(SampleTable(table)):
-        first = rows.raster(number, BEV)
-        assert np.array_equal(first, bev_raster(expected, BEV)) and rows.raster(number, BEV) is first
-        assert np.array_equal(rows.raster(number, other), bev_raster(expected, other))
 
 
 def test_a_batch_is_what_its_rows_say(table: Path) -> None:
@@ -150,40 +141,3 @@ def test_of_a_struct_single_members_are_read(table: Path) -> None:
     assert [path.split(".")[-1] for path in leaf_paths(parquet, ["images"])] == ["camera", "time_s", "element", "jpeg"]
     with pytest.raises(ValueError, match=r"columns images\.png, label_4hz are missing"):
         leaf_paths(parquet, ["images.png", "label_2hz", "label_4hz"])
-
-
-def test_sizes_are_those_of_the_footer(table: Path) -> None:
-    (file,) = files_of(table)
-    parquet = file.open()
-    metadata = pq.ParquetFile(file.path).metadata.row_group(0)
-    size = {metadata.column(i).path_in_schema: metadata.column(i).total_uncompressed_size for i in range(60)}
-    sizes = group_bytes(parquet, ["label_2hz", "ego_status"])
-    assert sizes.tolist() == [[size["label_2hz.list.element.list.element"], size["ego_status.list.element"]]]
-    assert row_group_sizes(parquet).tolist() == [3]
-
-
-def test_a_footer_is_parsed_once(table: Path) -> None:
-    (file,) = files_of(table)
-    (again,) = files_of(table)
-    first = file.open()
-    content = Path(file.path).read_bytes()
-    Path(file.path).write_bytes(content[:-8] + bytes(8))  # no reader would find the footer now
-    try:
-        assert again.open().metadata == first.metadata
-        assert again.open().read_row_group(0, columns=leaf_paths(first, PLAN_COLUMNS)).num_rows == 3
-    finally:
-        Path(file.path).write_bytes(content)
-
-
-def test_footers_are_kept_up_to_their_bytes_and_the_last_used_stay(table: Path) -> None:
-    (file,) = files_of(table)
-    footer = file.open().metadata
-    footers = Footers(2 * footer.serialized_size)
-    for name in "ab":
-        footers.put(name, footer)
-    assert footers.get("a") is footer
-    footers.put("c", footer)
-    assert [footers.get(name) for name in "abc"] == [footer, None, footer]
-    small = Footers(footer.serialized_size - 1)
-    small.put("a", footer)
-    assert small.get("a") is None

@@ -3,7 +3,6 @@
 import json
 import pickle
 import threading
-import tracemalloc
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
@@ -16,7 +15,6 @@ import torch
 
 from planners.data.batch import Batch, ImageLayout, Needs
 from planners.data.files import SampleFile
-from planners.data.images import stitch
 from planners.data.index import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings, make_order
@@ -208,57 +206,6 @@ def test_what_fits_is_read_once_and_stays(data: Dataset, monkeypatch: pytest.Mon
     assert len(reads) == n_groups(data)
 
 
-def counted_pictures(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Grows by one whenever a picture is decoded."""
-    decoded: list[int] = []
-
-    def watched(*arguments: Any) -> None:
-        decoded.append(1)
-        stitch(*arguments)
-
-    monkeypatch.setattr("planners.data.loader.stitch", watched)
-    return decoded
-
-
-def test_pictures_that_fit_are_decoded_once(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    anew = [list(Loader(data, NEEDS, MixSettings(), BATCH).epoch(epoch)) for epoch in range(3)]
-    decoded = counted_pictures(monkeypatch)
-    loader = Loader(data, NEEDS, MixSettings(), BATCH, workers=2)
-    assert "of pictures stay decoded" in loader.text()
-    for epoch in range(3):
-        for batch, expected in zip(loader.epoch(epoch), anew[epoch], strict=True):
-            assert_same(batch, expected)
-    assert len(decoded) == len(data)
-
-
-@pytest.mark.usefixtures("windows")
-def test_pictures_that_do_not_fit_are_decoded_in_every_pass(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    decoded = counted_pictures(monkeypatch)
-    three_mb = Needs(image=ImageLayout(width=512, height=32))
-    loader = Loader(data, three_mb, MixSettings(shuffle_mb=2), BATCH)
-    assert "pictures" not in loader.text()
-    for epoch in range(2):
-        assert sum(1 for _ in loader.epoch(epoch)) == 8
-    assert len(decoded) == 2 * len(data)
-
-
-def test_windows_read_a_row_group_once_a_pass(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    small_windows(monkeypatch)
-    reads = counted_reads(monkeypatch)
-    loader = Loader(data, NEEDS, MixSettings(), BATCH)
-    for epoch in range(2):
-        assert sum(1 for _ in loader.epoch(epoch)) == 8
-        assert len(reads) == (epoch + 1) * n_groups(data)
-
-
-def test_batches_larger_than_several_windows_are_read_all_the_same(
-    data: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    small_windows(monkeypatch)
-    (batch,) = Loader(data, NEEDS, MixSettings(), 64).epoch(0)
-    assert sorted(numbers(batch)) == list(range(64))
-
-
 def test_a_loader_that_was_read_goes_to_another_process_and_reads_the_same_there(data: Dataset) -> None:
     loader = Loader(data, NEEDS, MixSettings(), BATCH)
     read = [numbers(batch) for batch in loader.epoch(0)]
@@ -289,22 +236,6 @@ def test_damaged_labels_are_named(tmp_path: Path) -> None:
     data = open_data(DataSettings(real=str(tmp_path)))
     with pytest.raises(ValueError, match=rf"{tmp_path}: sample attempt0000.*checksum"):
         list(Loader(data, Needs(labels="vocabulary-1"), MixSettings(), 2).epoch(0))
-
-
-def test_labels_are_decoded_anew_and_never_kept(tmp_path: Path) -> None:
-    """200 samples of K = 4,096: decoded they would be 52 MB."""
-    n, k = 200, 4096
-    kinds = [labels(seed, k) for seed in range(6)]
-    write_table(tmp_path, [sample(i, **kinds[i % 6]) for i in range(n)], group_rows=100)
-    loader = Loader(open_data(DataSettings(real=str(tmp_path))), Needs(labels="vocabulary-1"), MixSettings(), 20)
-    tracemalloc.start()
-    try:
-        for batch in loader.epoch(0):
-            assert batch.labels is not None and batch.labels["ep"].shape == (20, k)
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert peak < 15e6
 
 
 def test_what_is_seen_is_said_in_plain_lines(data: Dataset) -> None:

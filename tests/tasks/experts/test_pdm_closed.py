@@ -19,11 +19,6 @@ RNG = np.random.default_rng(0)
 CAR = (4.5, 1.9)
 
 
-def test_every_proposal_brakes_at_its_hardest_for_the_first_tenth_of_a_second(road: Road) -> None:
-    speed = plan_for(road(speed=8.0)).proposals.progress_velocity[:, :, 1]
-    np.testing.assert_allclose(speed[:, 1], 8.0 - 0.3, atol=1e-12)
-
-
 def test_corrected_the_first_tenth_of_a_second_follows_the_model_on_the_road_it_sees(road: Road) -> None:
     start, limit, fractions = 8.0, 10.0, np.array(PdmSettings().speed_fractions)
     settings = PdmSettings(brakes_at_first_step=False)
@@ -50,29 +45,6 @@ def test_a_stop_before_an_oncoming_car_overshoots_as_published_and_corrected_it_
     assert (np.diff(motion[..., 0], axis=1) >= 0.0).all()
 
 
-def test_on_a_free_road_speeds_tend_to_their_fraction_of_the_limit(road: Road) -> None:
-    limit = 10.0
-    speed = plan_for(road(speed=6.0, limit=limit)).proposals.progress_velocity[:5, :, 1]
-    wanted = limit * np.array(PdmSettings().speed_fractions)
-    assert (np.diff(speed[:, 40]) > 0).all()
-    assert abs(speed[2, 50] - wanted[2]) < 0.2, "0.6 of the limit is the speed it came with"
-    assert speed[4, 50] > 8.0
-    assert (speed[:3, 50] < 6.5).all()
-
-
-def test_without_a_speed_limit_fifteen_metres_per_second_stand_in(road: Road) -> None:
-    np.testing.assert_array_equal(
-        plan_for(road(limit=None)).proposals.poses, plan_for(road(limit=15.0)).proposals.poses
-    )
-
-
-def test_positive_offsets_lie_to_the_left(road: Road) -> None:
-    poses = plan_for(road()).proposals.poses
-    np.testing.assert_allclose(poses[0:5, :, 1], 0.0, atol=1e-12)
-    np.testing.assert_allclose(poses[5:10, :, 1], -1.0, atol=1e-12)
-    np.testing.assert_allclose(poses[10:15, :, 1], 1.0, atol=1e-12)
-
-
 def test_idm_keeps_the_speed_where_the_closed_form_says_so() -> None:
     settings = PdmSettings()
     speed, target = 8.0, 15.0
@@ -80,44 +52,6 @@ def test_idm_keeps_the_speed_where_the_closed_form_says_so() -> None:
     gap = wanted / np.sqrt(1.0 - (speed / target) ** settings.exponent)  # equal speeds: dv/dt = 0 at this gap
     after = idm_step(3.0, speed, np.array([3.0 + gap, speed, 0.0]), target, driver(settings))
     np.testing.assert_allclose(after, [3.8, speed], atol=1e-12)
-
-
-def test_a_standing_car_ahead_stops_every_proposal_on_its_path(road: Road, objects: Objects) -> None:
-    blocked = road(speed=8.0, agents=objects([[85.0, 0.0, 0.0, *CAR]], [0.0], [AgentKind.VEHICLE]))
-    plan = plan_for(blocked)
-    front = plan.proposals.poses[:, 50, 0] + PACIFICA.front_length
-    assert (front < 85.0 - CAR[0] / 2.0).all()
-    assert (plan.proposals.progress_velocity[4::5, 50, 1] < 2.0).all(), "the eager ones have braked by then"
-
-
-def test_of_equally_good_proposals_the_first_is_the_plan(road: Road, objects: Objects) -> None:
-    """Behind a car that stands nobody gets 5 m far, so that progress is the same for all who keep the rules."""
-    blocked = road(speed=0.5, agents=objects([[59.0, 0.0, 0.0, CAR[0], 12.0]], [0.0], [AgentKind.VEHICLE]))
-    plan = plan_for(blocked)
-    best = np.flatnonzero(plan.scores.pdm_score == plan.scores.pdm_score.max())
-    assert len(best) > 1 and plan.chosen == best[0]
-
-
-def test_a_leading_car_at_its_speed_is_followed_not_stopped_for(road: Road, objects: Objects) -> None:
-    led = road(speed=8.0, agents=objects([[85.0, 0.0, 0.0, *CAR]], [8.0], [AgentKind.VEHICLE]))
-    assert plan_for(led).proposals.progress_velocity[4, 50, 1] > 6.5
-
-
-def test_only_the_nearest_fifty_vehicles_within_a_hundred_metres_count(objects: Objects) -> None:
-    boxes = [[5.0 + 2.0 * i, 8.0, 0.0, 1.0, 1.0] for i in range(60)]
-    seen = forecast(np.zeros(11), objects(boxes, [0.0] * 60, [AgentKind.VEHICLE] * 60).window(15, 16))
-    assert len(seen.track) == 49  # the 49th is 99.9 m from the ego's centre, the 50th 101.8 m
-    assert (np.diff(np.hypot(seen.boxes[:, 0] - 1.461, seen.boxes[:, 1])) > 0).all()
-    close = [[5.0 + i, 8.0, 0.0, 0.5, 0.5] for i in range(60)]
-    seen = forecast(np.zeros(11), objects(close, [0.0] * 60, [AgentKind.VEHICLE] * 60).window(15, 16))
-    np.testing.assert_array_equal(np.sort(seen.track), np.arange(50))
-
-
-def test_what_touches_the_ego_at_the_start_is_ignored_for_good(road: Road, objects: Objects) -> None:
-    touching = objects([[50.0 + PACIFICA.front_length + 1.0, 0.0, 0.0, *CAR]], [0.0], [AgentKind.VEHICLE])
-    with_it, without = plan_for(road(agents=touching)), plan_for(road())
-    np.testing.assert_array_equal(with_it.proposals.poses, without.proposals.poses)
-    np.testing.assert_array_equal(with_it.scores.pdm_score, without.scores.pdm_score)
 
 
 def test_a_red_light_is_a_standing_lead_and_running_it_scores_nothing(road: Road) -> None:
@@ -207,8 +141,3 @@ def test_a_speed_limit_of_zero_is_an_error_and_not_a_division(road: Road) -> Non
 def test_settings_that_make_no_sense_are_named(wrong: dict[str, Any], named: str) -> None:
     with pytest.raises(ValueError, match=f"pdm {named} must be"):
         PdmSettings(**wrong)
-
-
-def test_the_digest_changes_with_every_setting() -> None:
-    assert PdmClosed().digest() == PdmClosed().digest()
-    assert PdmClosed(PdmSettings(headway_s=2.0)).digest() != PdmClosed().digest()

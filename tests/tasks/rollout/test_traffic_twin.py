@@ -148,20 +148,3 @@ def test_the_random_worlds_reach_every_rule() -> None:
                 kept_out += int((logged.valid & ~agents.valid).any(axis=0).sum())
                 answers += agents.boxes.tobytes() != rollouts[0].agents.boxes.tobytes()
     assert min(braked, waited, kept_out, answers) > 20
-
-
-def test_replay_answers_no_ego() -> None:
-    scene = worlds.random_scene(1)
-    (ego,) = worlds.random_egos(scene, 1, 1)
-    rollout = roll_out(prepare_traffic(scene, TrafficSettings(mode="replay")), ego)
-    assert np.shares_memory(rollout.agents.boxes, scene.agents.boxes) and not rollout.simulated.any()
-    np.testing.assert_array_equal(rollout.agents.boxes, scene.agents.boxes[NOW : NOW + 41])
-
-
-def test_states_that_are_none_are_refused_by_name() -> None:
-    scene = worlds.random_scene(0)
-    traffic, egos = prepare_traffic(scene, IDM), worlds.random_egos(scene, 0, 2)
-    egos[1, 3, X] = np.nan
-    for one in (egos[1], egos[0, :40], egos[0, :, :10]):
-        with pytest.raises(ValueError, match="ego_states"):
-            roll_out(traffic, one)
