@@ -2,11 +2,11 @@
 
     python -m tests.bench.bench_decoding [samples=48] [cores=<all>] [cameras=3] [width=2048] [height=512]
 
-The photos are the 1920 x 1080 of a real NAVSIM rig where they are at hand, else made of noise. Three tables: where a
+The photos are the 1920 x 1080 of a real NAVSIM rig where they are at hand, else made of noise. Two tables: where a
 picture's time goes, on one thread; the loader with 1, 2, ... workers up to all cores, with pictures decoded in full
-(the public code's), at half their size (`reduced`), and kept on disk (`data.pictures`); and what a lossless compression
-of kept pictures would save and cost. CPU time is this process's, in all its threads; "a core" is
-samples by CPU second, which other programs' load spares, where samples by the clock are what this machine gave.
+(the public code's), at half their size (`reduced`), and kept on disk (`data.pictures`). CPU time is this process's, in
+all its threads; "a core" is samples by CPU second, which other programs' load spares, where samples by the clock are
+what this machine gave.
 """
 
 import os
@@ -19,7 +19,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pyarrow as pa
 import simplejpeg
 import torch
 
@@ -39,11 +38,10 @@ LEFT_TO_RIGHT = ("CAM_L1", "CAM_L0", "CAM_F0", "CAM_R0", "CAM_R1")
 YAWS = dict(zip(LEFT_TO_RIGHT, np.deg2rad([110.0, 55.0, 0.0, -55.0, -110.0]).tolist()))
 BATCH = 16
 PASSES = 3
-PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
 def main(samples: int = 48, cores: int | None = None, cameras: int = 3, width: int = 2048, height: int = 512) -> None:
-    """Prints the three tables."""
+    """Prints both tables."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     names = LEFT_TO_RIGHT[1 : 1 + cameras] if cameras < len(LEFT_TO_RIGHT) else LEFT_TO_RIGHT
@@ -56,7 +54,6 @@ def main(samples: int = 48, cores: int | None = None, cameras: int = 3, width: i
     with tempfile.TemporaryDirectory() as folder:
         split(photos, layout, Path(folder) / "one")
         rates(photos, names, layout, samples, cores or os.cpu_count() or 1, folder)
-    compressed(photos, layout)
 
 
 def photographed(names: Sequence[str]) -> list[list[Bytes]]:
@@ -178,53 +175,6 @@ def row(number: int, names: Sequence[str], jpegs: Sequence[Bytes]) -> dict[str, 
     ]
     cameras = [camera(name, YAWS[name], 1920, 1080) for name in names]
     return sample(number, cameras=cameras, images=images, image_source="photo")
-
-
-def compressed(photos: Sequence[Sequence[Bytes]], layout: ImageLayout) -> None:
-    """Size and CPU time of lossless ways to keep a picture, read and written from memory."""
-    pictures: list[Bytes] = []
-    for jpegs in photos[:8]:
-        out = np.empty((layout.height, layout.width, 3), np.uint8)
-        stitch(jpegs, layout, out)
-        pictures.append(out)
-
-    def left(picture: Bytes) -> Bytes:
-        """Differences to the left neighbour."""
-        return np.diff(picture, axis=1, prepend=np.zeros((layout.height, 1, 3), np.uint8))
-
-    def back(data: pa.Buffer) -> Bytes:
-        flat = np.frombuffer(data, np.uint8).reshape(layout.height, layout.width, 3)
-        return np.asarray(np.add.accumulate(flat, axis=1, dtype=np.uint8))
-
-    def show(name: str, sizes: Sequence[int], write: Callable[[], object], read: Callable[[], object]) -> None:
-        share = sum(sizes) / sum(picture.nbytes for picture in pictures)
-        write_ms, read_ms = (least_and_median_cpu_ms(call, PASSES)[0] / len(pictures) for call in (write, read))
-        print(f"| {name} | {100 * share:.0f} % | {write_ms:.1f} ms | {read_ms:.1f} ms |", flush=True)
-
-    print("| lossless | size | to write | to read |\n|---|---|---|---|")
-    size = pictures[0].nbytes
-    for codec in (pa.Codec("lz4"), pa.Codec("zstd", compression_level=1)):
-        plain = [codec.compress(picture) for picture in pictures]
-        show(
-            codec.name,
-            [packed.size for packed in plain],
-            lambda: [codec.compress(picture) for picture in pictures],  # noqa: B023
-            lambda: [codec.decompress(packed, size) for packed in plain],  # noqa: B023
-        )
-        packed = [codec.compress(left(picture)) for picture in pictures]
-        show(
-            f"{codec.name} of differences",
-            [one.size for one in packed],
-            lambda: [codec.compress(left(picture)) for picture in pictures],  # noqa: B023
-            lambda: [back(codec.decompress(one, size)) for one in packed],  # noqa: B023
-        )
-    encoded = [cv2.imencode(".png", picture, PNG)[1] for picture in pictures]
-    show(
-        "PNG",
-        [one.size for one in encoded],
-        lambda: [cv2.imencode(".png", picture, PNG) for picture in pictures],
-        lambda: [cv2.imdecode(one, cv2.IMREAD_COLOR) for one in encoded],
-    )
 
 
 if __name__ == "__main__":

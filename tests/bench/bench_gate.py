@@ -6,7 +6,6 @@ likeness (SSIM at half of 160 pixels' width, tasks/render/gate.py) inside the ou
 `share` of the picture or more (0.02, the gate's own); the worst counts. Limits were chosen on the first seeds and are
 reported on the others. Options: chosen=0,1 held=2 clips=9 share=0.02 out=out/bench_gate, drives=4 of each clip and
 expert, every=2 of the gate's instants. A later call with the same `out` reads <out>/labels-<seed>.csv and only prints.
-Pictures beside their truths, the worst first: <out>/labels-<seed>.png.
 """
 
 import csv
@@ -16,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from factory.config.run import load_config
@@ -30,14 +28,13 @@ from tasks.render.gate import GateSettings, VehiclePhotos, check_drive_pictures,
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.settings import STEPS_OF, Frames
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip
-from tests.bench.gate_truth import Painted, Shown, Simulated, drives, verdicts
+from tests.bench.gate_truth import Painted, Simulated, drives, verdicts
 
 BAD, GOOD = 0.7, 0.8  # likeness to the truth: below, something is torn or smeared; from there on, nothing is
 LIMITS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8)
 EXPERTS = ("pdm_closed", "recovery")
 NUMBERS = ("likeness", "share", "expected", "beside")
 STORED = [NOW + HORIZON_STEPS + offset for offset in STEPS_OF[Frames.HISTORY]]  # steps of a clip
-SHEET = 60  # pictures of a sheet
 
 
 @dataclass(frozen=True)
@@ -56,14 +53,13 @@ class Labelled:
 
 
 def labelled(seed: int, clips: int, most: int, every: int, share_min: float, out: Path) -> list[Labelled]:
-    """Runs the seed's towns, writes the labels and the sheet."""
+    """Runs the seed's towns."""
     overrides = [f"clips.seed={seed}", f"clips.n_clips={clips}", f"out={out}/town{seed}", "render.psnr_gate=mark"]
     config = load_config(["preset=demo", *overrides])
     gate = replace(config.render.gate, vehicle_share=share_min)
     work = assemble(replace(config, render=replace(config.render, gate=gate))).work
     settings, began = work.render.gate, time.perf_counter()
     rows: list[Labelled] = []
-    worst: list[tuple[float, Shown]] = []
     costs: list[list[float]] = []
     for ref in work.reader.index().refs:
         prepared = work.prepare(ref)
@@ -85,15 +81,12 @@ def labelled(seed: int, clips: int, most: int, every: int, share_min: float, out
                 likeness, share = shown.label(settings.vehicle_share)
                 fault, *alike = verdicts(shown, drive, asset, album, settings)
                 rows.append(Labelled(ref.log_id, name, shown.camera, shown.step, likeness, share, fault, *alike))
-                if share > 0.0:
-                    worst = sorted([*worst, (likeness, shown)], key=lambda found: found[0])[:SHEET]
         print(
             f"{ref.log_id} at {ref.start_ms} ms: {len(rows)} pictures, {time.perf_counter() - began:.0f} s", flush=True
         )
     whole = np.array([pair for pair in costs if np.isfinite(pair).all()])
     without, held = whole.mean(axis=0)
     print(f"gate of {len(whole)} drives that pass: {without:.0f} CPU ms a drive without photos, {held:.0f} with")
-    cv2.imwrite(str(out / f"labels-{seed}.png"), cv2.cvtColor(sheet(worst), cv2.COLOR_RGB2BGR))
     return rows
 
 
@@ -105,17 +98,6 @@ def cpu_ms(drive: Simulated, asset: RenderAsset, clip: Clip, work: FactoryWork, 
         asset, cameras, drive.poses, drive.agents, drive.steps, size, render.gate, album=album, stored=STORED
     )
     return 1e3 * (time.process_time() - began) if found is None else float("nan")
-
-
-def sheet(worst: Sequence[tuple[float, Shown]]) -> np.ndarray:
-    """Renderings beside their truths, three pairs a row, each with its label."""
-    tiles = []
-    for likeness, shown in worst:
-        tile = np.rint(255.0 * np.hstack([shown.picture, shown.truth])).astype(np.uint8)
-        cv2.putText(tile, f"{likeness:.2f}", (2, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 0, 0), 1)
-        tiles.append(tile)
-    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % 3)
-    return np.vstack([np.hstack(tiles[k : k + 3]) for k in range(0, len(tiles), 3)])
 
 
 def kept(path: Path, rows: Sequence[Labelled]) -> None:

@@ -2,7 +2,6 @@
 
     python -m tests.bench.bench_scale                                the same run on 1, 2 and 4 nodes of this machine
     python -m tests.bench.bench_scale nodes=1 attempts=100000 wait_ms=0      a long run, as fast as it goes
-    python -m tests.bench.bench_scale nodes=1 wait_ms=0 profile=true         what the driver's own time goes into
 
 Nodes are Ray's own (`ray start` on loopback), with `cpus` each in name; stages sleep, so that the cores of this machine
 are no limit before the graph is. A row carries `row_kb` of incompressible bytes for its pictures. `ideal` is the time
@@ -10,10 +9,8 @@ that all the sleeping takes on so many CPUs. Memory and CPU time are the driver'
 takes to find that all is done.
 """
 
-import cProfile
 import json
 import math
-import pstats
 import re
 import resource
 import sys
@@ -21,7 +18,6 @@ import tempfile
 import time
 import zlib
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,12 +35,6 @@ from tasks.stages import Rejected
 from tests.factory.toy import ToyWork, any_row
 
 EXPERTS = ("pdm_closed", "recovery")
-WAITS = ("_private/worker.py:wait",)
-PARTS = (  # of a profile, from the outside in; they hold one another
-    *("on_ray/graph.py:submit", "ray/remote_function.py:_remote", "_private/worker.py:get", "graph/progress.py:_add"),
-    *("graph/plan.py:stamp", "graph/plan.py:outcome", "graph/plan.py:next_step", "graph/driver.py:add"),
-    *("graph/driver.py:send_if_due", "graph/driver.py:_commit", "store/samples.py:candidates_table"),
-)
 CANDIDATES = 16  # of a clip; where half of them are accepted, five rounds take ten
 
 
@@ -58,7 +48,6 @@ class Request:
     wait_ms: int = 200  # of a stage
     rounds: int = 5
     row_kb: int = 20
-    profile: bool = False
     accepted: float = 0.5  # share of the attempts; the others cost a worker hardly anything
 
     def __post_init__(self) -> None:
@@ -131,11 +120,7 @@ def measured(request: Request, nodes: int) -> str:
 def _row(request: Request, nodes: int, refs: Sequence[ClipRef], work: WaitingWork, out: Path) -> str:
     ray.get([_warm.remote() for _ in range(4 * nodes * request.cpus)])  # worker processes, that take seconds to start
     before, began = _cpu_s(), time.perf_counter()
-    profiler = cProfile.Profile()
-    with profiler if request.profile else nullcontext():
-        summary = execute(work, refs, EXPERTS, request.rounds, Store(out), Execution("ray"), say=lambda line: None)
-    if request.profile:
-        print(_shares(profiler))
+    summary = execute(work, refs, EXPERTS, request.rounds, Store(out), Execution("ray"), say=lambda line: None)
     took, cpu_s = time.perf_counter() - began, _cpu_s() - before
     if summary.exit_code != COMPLETE:
         raise RuntimeError(f"the run ended with {summary.exit_code}: {summary.message} {summary.counts}")
@@ -153,20 +138,6 @@ def _row(request: Request, nodes: int, refs: Sequence[ClipRef], work: WaitingWor
     return (f"{nodes:5d}{attempts:10d}{len(store.samples):9d}{took:9.1f}{ideal:8.1f}{100 * ideal / took:11.1f}%"
             f"{attempts / took:8.1f}{1000 * cpu_s / attempts:15.2f}{peak:11.0f}{_commits(out):9d}{len(files):7d}"
             f"{size:8.0f}{again_s:9.1f}")  # fmt: skip
-
-
-def _shares(profiler: cProfile.Profile) -> str:
-    """Functions of the driver by their share of its main thread's time, with what they call; without what it waits."""
-    stats: Any = pstats.Stats(profiler)
-    named = {
-        f"{Path(file).parent.name}/{Path(file).name}:{name}": times for (file, _, name), times in stats.stats.items()
-    }
-    own_s = stats.total_tt - sum(named[wait][3] for wait in WAITS if wait in named)
-    lines = [f"{own_s:.2f} s of the driver's main thread, less what it waited, of which"]
-    for name in PARTS:
-        if name in named:
-            lines.append(f"{100 * named[name][3] / own_s:5.1f} %  {named[name][0]:7d} calls  {name}")
-    return "\n".join(lines)
 
 
 @ray.remote(num_cpus=1)

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -57,7 +56,6 @@ SETTINGS = FitSettings(
     pose_from=1_000_000,
 )
 CENTRE = "ring_front_center"
-SHOWN = 6  # pictures of each kind
 CLASSES = ("road", "vehicles", "rest")
 
 
@@ -98,19 +96,8 @@ def by_class(views: Sequence[Compared], name: str) -> str:
     return f"{np.mean([view.psnr_db_in(view.classes[name]) for view in shown]):.2f}" if shown else ""
 
 
-def picture(views: Sequence[Compared]) -> NDArray[np.uint8]:
-    """Truth, rendering and four times their difference side by side, one view below the other."""
-    chosen = [views[i] for i in np.linspace(0, len(views) - 1, min(SHOWN, len(views))).astype(int)]
-    rows = []
-    for view in chosen:
-        off = np.clip(4.0 * np.abs(view.picture - view.truth), 0.0, 1.0)
-        shown = [view.truth, view.picture, off if view.inside is None else np.where(view.inside[..., None], off, 0.3)]
-        rows.append(np.hstack(shown))
-    return np.rint(255.0 * np.vstack(rows)).astype(np.uint8)
-
-
 def main() -> None:
-    """Writes the log, trains, prints a table, writes pictures."""
+    """Writes the log, trains, prints a table."""
     options = dict(option.split("=", 1) for option in sys.argv[1:])
     log, threads = int(options.pop("log", "0")), int(options.pop("threads", "2"))
     width, height = int(options.pop("width", "320")), int(options.pop("height", "180"))
@@ -169,8 +156,6 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|")
     for name, compared in kinds_of_view.items():
         print(row(name, compared))
-        path = out / f"log{log}-{name.replace(' ', '-').replace(',', '')}.png"
-        cv2.imwrite(str(path), cv2.cvtColor(picture(compared), cv2.COLOR_RGB2BGR))
     print()
     for told in camera_rows(asset.views):
         print(f"{told.camera}, against the JPEG photos: {told.text}")
