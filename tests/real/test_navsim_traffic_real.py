@@ -5,19 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import shapely
 from reference_scenes import SCENES, loader, logged_tracks
 
-from factory.datasets.av2.reader import AV2Reader, log_folders, read_log
-from factory.readers.base import ClipRef
-from tasks.rollout.navsim import box_polygons
+from factory.datasets.av2.reader import read_log
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
-from tasks.world.clip import HISTORY_STEPS, NOW, AgentKind, AgentTracks, Clip, Scene, scene_of_clip
+from tasks.world.clip import HISTORY_STEPS, Clip, Scene
 from tasks.world.road_map import RoadMap, Route
 
 EGOS = 3
-WHOLE = SCENES[:3]  # the log holds a whole clip there
-SHARED_M2 = 0.01
 
 
 @cache
@@ -67,32 +62,3 @@ def test_the_traffic_answers_as_the_public_code_was_recorded_to(shared_root: Pat
             found = getattr(ours.agents, field)[:, rows]
             np.testing.assert_allclose(found[there], theirs[there], rtol=0, atol=1e-9)
         assert ours.simulated.sum() > 10
-
-
-@pytest.mark.slow
-def test_cars_that_were_apart_run_into_each_other_more_often_than_in_our_own_traffic(shared_root: Path) -> None:
-    """The numbers of docs/reward.md: three scenes, the logged human as ego."""
-    reader = AV2Reader(shared_root / "data/av2/sensor/val")
-    found = dict.fromkeys(("replay", "idm", "navsim"), 0)
-    for name in WHOLE:
-        log, frame = name.split("_")
-        log_id = next(log_id for log_id in log_folders(reader.root) if log_id.startswith(log))
-        scene = scene_of_clip(reader.read(ClipRef("av2", log_id, (int(frame) - NOW) * 100)))
-        human = loader(shared_root).simulated(name, 256)[0]
-        for mode in found:
-            agents = roll_out(prepare_traffic(scene, TrafficSettings(mode=mode)), human).agents  # type: ignore[arg-type]
-            found[mode] += len(_meeting(agents))
-    assert found == {"replay": 6, "idm": 1, "navsim": 8}
-
-
-def _meeting(agents: AgentTracks) -> set[tuple[int, int]]:
-    """Pairs with a vehicle in them that share more than SHARED_M2 at a later step, but not at the first."""
-    vehicle = np.array([kind == AgentKind.VEHICLE for kind in agents.kinds])
-    pairs = []
-    for boxes, valid in zip(agents.boxes, agents.valid):
-        here = np.flatnonzero(valid)
-        shapes = box_polygons(boxes[here])
-        shared = shapely.area(shapely.intersection(shapes[:, None], shapes[None])) > SHARED_M2
-        shared &= vehicle[here][:, None] | vehicle[here][None]
-        pairs.append({(int(here[i]), int(here[j])) for i, j in np.argwhere(np.triu(shared, 1))})
-    return set().union(*pairs[1:]) - pairs[0]

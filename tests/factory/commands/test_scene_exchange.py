@@ -83,20 +83,6 @@ def checkpoint(path: Path, parts: dict[str, Gaussians]) -> Path:
     return path
 
 
-def test_a_checkpoint_of_mtgs_brings_its_vehicles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    street, car, walker = some(20, 3, 1), some(5, 0, 2), some(5, 0, 3)
-    file = checkpoint(
-        tmp_path / "step.ckpt", {"background": street, "rigid_object_7f": car, "deformable_node_88": walker}
-    )
-    to = tmp_path / "new.safetensors"
-    assert main(["import", str(file), f"to={to}", "origin=5,6,7"]) == 0
-    said = capsys.readouterr().out
-    assert "node        7f: 5 Gaussians" in said and "left out    deformable_node_88" in said
-    found = read_scene(to)
-    assert found.origin.tolist() == [5.0, 6.0, 7.0] and list(found.nodes) == ["7f"]
-    assert max(apart(street, found.background).values()) < 1e-3 and max(apart(car, found.nodes["7f"]).values()) < 1e-5
-
-
 class Trap:
     """Runs something when it is read as a pickle may."""
 

@@ -13,15 +13,12 @@ import pytest
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph import local
-from factory.graph.driver import EpisodeSettings
 from factory.graph.execute import Execution
 from factory.graph.local import Claims
 from factory.graph.on_ray import graph
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
 from factory.store.samples import Store
 from factory.store.verify import verify
-from factory.views.sample_text import prepared_episode
-from tests.factory.filmed import FilmedWork
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
 from tests.factory.toy import ToyWork, executed, ran, refs
 
@@ -84,17 +81,6 @@ def test_local_and_ray_with_one_and_two_workers_make_identical_rows(tmp_path: Pa
     assert ray.is_initialized(), "a cluster that the run found must stay"
     assert_same_tables(tmp_path / "local", tmp_path / "one")
     assert_same_tables(tmp_path / "local", tmp_path / "two")
-
-
-def test_workers_write_the_same_episodes_as_one_process(tmp_path: Path, two_cpus: None) -> None:
-    for executor in ("local", "ray"):
-        how = Execution(executor, 2, episodes=EpisodeSettings(1, prepared_episode))  # type: ignore[arg-type]
-        executed(FilmedWork(), refs(3), EXPERTS, 2, Store(tmp_path / executor), how)
-    local, ray_s = (
-        {path.name: path.read_bytes() for path in (tmp_path / executor / "episodes").iterdir()}
-        for executor in ("local", "ray")
-    )
-    assert local == ray_s and len(local) == len(Store(tmp_path / "ray").samples)
 
 
 def test_a_cluster_without_a_gpu_is_waited_for_and_then_named(

@@ -127,12 +127,3 @@ def test_names_labels_and_units_are_documented() -> None:
     ]
     table = DOCS.read_text().split("| --- | --- | --- | --- | --- |\n", 1)[1].split("\n\n", 1)[0]
     assert table.splitlines() == rows
-
-
-def test_metrics_have_the_prefix_one_name_each_and_rising_buckets() -> None:
-    names = [metric.name for metric in METRICS]
-    assert len(set(names)) == len(names)
-    for metric in METRICS:
-        assert metric.name.startswith("factory_") and "run" not in metric.labels
-        assert (metric.type is Type.HISTOGRAM) == bool(metric.buckets)
-        assert list(metric.buckets) == sorted(set(metric.buckets))

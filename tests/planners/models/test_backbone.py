@@ -31,6 +31,34 @@ def test_four_maps_at_their_strides(name: str) -> None:
     assert [m.shape for m in maps] == [(2, c, 96 // s, 352 // s) for c, s in zip(model.channels, STRIDES)]
 
 
+"Backbones by the names of their weights, and weights from files."
+
+
+import pytest
+from torch import nn
+
+from planners.models.backbones import Backbone
+from planners.models.settings import BackboneSettings
+
+SMALL = BackboneSettings(name="small", widths=(4, 8, 12, 16))
+
+
+def on_meta(settings: BackboneSettings) -> Backbone:
+    with torch.device("meta"):
+        return build_backbone(settings)
+
+
+def parameters(model: nn.Module) -> int:
+    return sum(p.numel() for p in model.parameters())
+
+
+@pytest.mark.parametrize("name", ["resnet34", "vovnet99", "small"])
+def test_four_maps_at_their_strides(name: str) -> None:
+    model = on_meta(BackboneSettings(name=name))  # type: ignore[arg-type]
+    maps = model(torch.zeros(2, 3, 96, 352, dtype=torch.uint8, device="meta"))
+    assert [m.shape for m in maps] == [(2, c, 96 // s, 352 // s) for c, s in zip(model.channels, STRIDES)]
+
+
 def by_hand(weights: dict[str, Tensor], image: Tensor, stem_stride: int) -> list[Tensor]:
     """A residual network in evaluation, written from its weights' names."""
 
@@ -58,41 +86,6 @@ def by_hand(weights: dict[str, Tensor], image: Tensor, stem_stride: int) -> list
             x = (x + y).relu()
         maps.append(x)
     return maps
-
-
-@pytest.mark.parametrize("name", ["resnet34", "small"])
-def test_a_residual_network_is_what_its_names_say(name: str) -> None:
-    torch.manual_seed(0)
-    model = build_backbone(BackboneSettings(name=name)).eval()  # type: ignore[arg-type]
-    for module in model.modules():
-        if isinstance(module, nn.BatchNorm2d):
-            assert module.running_mean is not None and module.running_var is not None
-            nn.init.uniform_(module.running_mean, -0.1, 0.1)
-            nn.init.uniform_(module.running_var, 0.5, 1.5)
-    image = torch.randint(0, 256, (1, 3, 32, 64), dtype=torch.uint8)
-    with torch.no_grad():
-        for got, expected in zip(
-            model(image), by_hand(dict(model.state_dict()), image, 2 if name == "resnet34" else 4)
-        ):
-            torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_vovnet_takes_blue_first_and_gates_every_channel() -> None:
-    torch.manual_seed(0)
-    model = build_backbone(BackboneSettings(name="vovnet99")).eval()
-    image = torch.randint(0, 256, (1, 3, 32, 32), dtype=torch.uint8)
-    with torch.no_grad():
-        red, stem = model.enter(image), model.state_dict()["stem.stem_1/conv.weight"]
-        stem[:, [0, 2]] = stem[:, [2, 0]]
-        flipped = model.get_submodule("stem")(model.normalised(image))
-        torch.testing.assert_close(red, flipped)
-        gate = model.get_submodule("stage5.OSA5_3.ese")
-        gate.fc.weight.zero_()  # type: ignore[union-attr]
-        gate.fc.bias.fill_(-3.0)  # type: ignore[union-attr, operator]
-        last = model.get_submodule("stage5.OSA5_3")
-        x = torch.randn(1, 1024, 2, 2)
-        torch.testing.assert_close(last(x), x)  # a gate that is shut leaves the shortcut
 
 
 @pytest.mark.parametrize("suffix", ["safetensors", "pth"])

@@ -9,20 +9,13 @@ from factory.datasets.town.draw import (
     REAR_AXLE_Z_M,
     SHADOW_SIZE,
     build_rig,
-    camera_view,
     cast_shadows,
     paint,
-    rasterise_view,
     scan_lidar,
     sun_over,
     world_from_ego,
 )
-from factory.datasets.town.drive import GREEN as GREEN_LIGHT
-from factory.datasets.town.drive import RED as RED_LIGHT
-from factory.datasets.town.drive import YELLOW as YELLOW_LIGHT
 from factory.datasets.town.raster import LitScene, MeshBuilder
-from factory.datasets.town.scenery import _signal as signal_mast
-from factory.datasets.town.scenery import lamps_lit
 from factory.datasets.town.settings import CAMERA_NAMES
 
 FRONT = build_rig(("ring_front_center",), 320, 180)[0]
@@ -109,18 +102,6 @@ def test_what_stands_in_the_sun_casts_a_shadow() -> None:
     assert dark[170:].astype(float).mean() < 0.75 * bright
 
 
-def test_leaves_leave_gaps() -> None:
-    builder = MeshBuilder()
-    corners = np.array([[(8, 0.85, 0.8), (8, -0.85, 0.8), (8, -0.85, 2.5), (8, 0.85, 2.5)]], float)
-    uv = np.array([[(-0.85, -0.85), (0.85, -0.85), (0.85, 0.85), (-0.85, 0.85)]])
-    builder.quads(corners, uv, tx.LEAVES, (0.2, 0.4, 0.1), 3)
-    scene = staged(builder)
-    view, _rays = camera_view(FRONT.intrinsics, world_from_ego(np.zeros(3)) @ FRONT.ego_from_camera)
-    covered = (rasterise_view(scene, view, 320, 180)[0] >= 0).sum()
-    whole = (1.7 / (8 - 1.62) * FRONT.intrinsics[0, 0]) ** 2
-    assert 0.15 * whole < covered < 0.9 * whole
-
-
 def test_the_lidar_measures_the_road_and_a_wall_where_they_are() -> None:
     builder = MeshBuilder()
     lawn(builder)
@@ -136,23 +117,3 @@ def test_the_lidar_measures_the_road_and_a_wall_where_they_are() -> None:
     assert np.hypot(*(points[ground] - MOUNT_M)[:, :2].T).min() > 3.0
     assert sweep.laser_number.max() < 24
     assert (np.diff(sweep.offset_ns[sweep.laser_number == 3]) > 0).all()
-
-
-@pytest.mark.parametrize(("state", "height"), [(RED_LIGHT, 3.38), (YELLOW_LIGHT, 3.0), (GREEN_LIGHT, 2.62)])
-def test_a_signal_shows_one_lamp_red_above_yellow_above_green(state: int, height: float) -> None:
-    lamps = lamps_lit(signal_mast(MeshBuilder(), np.zeros(3), 3.5), state)
-    bright = lamps.colour.max(axis=1) > 0.5
-    heights = lamps.vertices[bright][..., 2].mean(axis=1)
-    assert bright.sum() == len(lamps.material) / 3
-    assert np.abs(heights - height).min() < 0.1
-    assert {round(float(h), 1) for h in heights[:10]} <= {round(height + d, 1) for d in (-0.1, 0.0, 0.1)}
-
-
-def test_cameras_look_where_their_names_say() -> None:
-    ahead = {camera.name: camera.ego_from_camera[:3, 2] for camera in build_rig(CAMERA_NAMES, 64, 36)}
-    assert ahead["ring_front_center"] == pytest.approx([1, 0, 0])
-    assert ahead["ring_side_left"][1] > 0.9
-    assert ahead["ring_side_right"][1] < -0.9
-    assert ahead["ring_rear_center"] == pytest.approx([-1, 0, 0], abs=1e-9)
-    with pytest.raises(ValueError, match="unknown cameras"):
-        build_rig(("front",), 64, 36)

@@ -56,12 +56,6 @@ def test_boundaries_lie_on_their_sides_of_the_driving_direction(streets: Streets
             assert sign * (np.cos(heading) * (near[1] - y) - np.sin(heading) * (near[0] - x)) > 0.5
 
 
-def test_vehicle_lanes_lie_on_drivable_surface(streets: Streets) -> None:
-    surface = streets.surface().buffer(0.05)
-    for lane in streets.lanes.values():
-        assert shapely.contains_xy(surface, lane.center[:, 0], lane.center[:, 1]).all()
-
-
 def test_the_town_has_every_kind_of_street_that_it_promises(streets: Streets) -> None:
     kinds = {scenario.kind for scenario in SCENARIOS[:7]}
     assert kinds == {
@@ -115,13 +109,6 @@ def test_nobody_touches_anybody_and_the_ego_stays_on_the_road(index: int) -> Non
     corners = box_corners(ego).reshape(-1, 2)
     assert shapely.contains_xy(town.streets.surface(), corners[:, 0], corners[:, 1]).all()
     assert log.ego_speed.min() > 1.0
-
-
-def test_overlap_is_found_for_crossed_boxes_and_not_for_neighbours() -> None:
-    box = np.array([[0.0, 0.0, 0.3, 4.0, 2.0]])
-    others = np.array([[[0.5, 0.5, 1.5, 4.0, 2.0], [0.0, 2.3, 0.3, 4.0, 2.0], [np.nan] * 5]])
-    assert overlaps(box, others, 0.0).tolist() == [[True, False, False]]
-    assert overlaps(box, others, 0.3).tolist() == [[True, True, False]]
 
 
 @pytest.mark.slow

@@ -6,9 +6,9 @@ import slow_raster
 import torch
 from numpy.typing import NDArray
 
-from tasks.render.splatting.gaussians import Gaussians, moved, quats_of, rotations_of
+from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.project import CLASSIC, FITTED, MIN_ALPHA, ScreenFilter
-from tasks.render.splatting.raster import backproject, forward, project_and_sort
+from tasks.render.splatting.raster import forward
 
 INTRINSICS = np.array([[60.0, 0.0, 37.0], [0.0, 58.0, 22.0], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 75, 45  # no multiple of a tile
@@ -88,34 +88,3 @@ def test_what_is_smaller_than_a_pixel_sheds_the_light_that_its_area_does(metres:
         area = px.prod() if screen.keeps_light else np.sqrt(np.prod(px**2 + 4.0))
         least = 2.0 * np.pi * np.sqrt(np.prod(px**2 + 4.0)) * MIN_ALPHA  # cut off around
         assert alpha.sum() == pytest.approx(max(2.0 * np.pi * 0.99 * area - least, 0.0), rel=0.03)
-
-
-def test_a_gaussian_lands_where_the_pinhole_equation_says() -> None:
-    view = forward(one((1.5, -0.7, 8.0), 0.05, 0.9, (1, 1, 1)), INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).view
-    weight = view.alpha.astype(np.float64)
-    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    assert (weight * u).sum() / weight.sum() == pytest.approx(60.0 * 1.5 / 8.0 + 37.0, abs=0.05)
-    assert (weight * v).sum() / weight.sum() == pytest.approx(58.0 * -0.7 / 8.0 + 22.0, abs=0.05)
-
-
-def test_moving_scene_and_camera_together_changes_nothing() -> None:
-    scene, motion = cloud(300, seed=5), pose(0.7, (12.0, -3.0, 40.0))
-    here = forward(scene, INTRINSICS, pose(0.1, (0.1, 0.0, 0.0)), WIDTH, HEIGHT, BLACK).view
-    there = forward(moved(scene, motion), INTRINSICS, motion @ pose(0.1, (0.1, 0, 0)), WIDTH, HEIGHT, BLACK).view
-    assert np.abs(here.rgb - there.rgb).max() <= 2.0 / 255.0
-
-
-def test_quaternions_and_rotations_are_inverse() -> None:
-    quats = cloud(200, seed=7).quats
-    rotations = rotations_of(quats)
-    np.testing.assert_allclose(rotations_of(quats_of(rotations)), rotations, atol=1e-6)
-
-
-def test_gathering_white_gives_the_blending_weights() -> None:
-    scene = cloud(500, seed=8)
-    splats = project_and_sort(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT)
-    white = np.ones((HEIGHT, WIDTH, 3), np.float32)
-    sums, weights = backproject(splats, white)
-    np.testing.assert_allclose(sums, np.repeat(weights[:, None], 3, 1), rtol=1e-5)
-    alpha = forward(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).view.alpha
-    assert weights.sum() == pytest.approx(alpha.sum(), rel=1e-4)
