@@ -7,7 +7,6 @@ import pytest
 import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from planners.models.backbones import Backbone, build_backbone, load_pretrained
 from planners.models.settings import STRIDES, BackboneSettings
@@ -29,63 +28,6 @@ def test_four_maps_at_their_strides(name: str) -> None:
     model = on_meta(BackboneSettings(name=name))  # type: ignore[arg-type]
     maps = model(torch.zeros(2, 3, 96, 352, dtype=torch.uint8, device="meta"))
     assert [m.shape for m in maps] == [(2, c, 96 // s, 352 // s) for c, s in zip(model.channels, STRIDES)]
-
-
-"Backbones by the names of their weights, and weights from files."
-
-
-import pytest
-from torch import nn
-
-from planners.models.backbones import Backbone
-from planners.models.settings import BackboneSettings
-
-SMALL = BackboneSettings(name="small", widths=(4, 8, 12, 16))
-
-
-def on_meta(settings: BackboneSettings) -> Backbone:
-    with torch.device("meta"):
-        return build_backbone(settings)
-
-
-def parameters(model: nn.Module) -> int:
-    return sum(p.numel() for p in model.parameters())
-
-
-@pytest.mark.parametrize("name", ["resnet34", "vovnet99", "small"])
-def test_four_maps_at_their_strides(name: str) -> None:
-    model = on_meta(BackboneSettings(name=name))  # type: ignore[arg-type]
-    maps = model(torch.zeros(2, 3, 96, 352, dtype=torch.uint8, device="meta"))
-    assert [m.shape for m in maps] == [(2, c, 96 // s, 352 // s) for c, s in zip(model.channels, STRIDES)]
-
-
-def by_hand(weights: dict[str, Tensor], image: Tensor, stem_stride: int) -> list[Tensor]:
-    """A residual network in evaluation, written from its weights' names."""
-
-    def norm(x: Tensor, name: str) -> Tensor:
-        mean, var, scale, shift = (weights[f"{name}.{p}"] for p in ("running_mean", "running_var", "weight", "bias"))
-        return (x - mean[:, None, None]) / (var[:, None, None] + 1e-5).sqrt() * scale[:, None, None] + shift[
-            :, None, None
-        ]
-
-    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
-    x = (image / 255 - mean[:, None, None]) / std[:, None, None]
-    x = norm(F.conv2d(x, weights["conv1.weight"], stride=stem_stride, padding=3), "bn1").relu()
-    if stem_stride == 2:
-        x = F.max_pool2d(x, 3, 2, 1)
-    maps = []
-    for layer in range(1, 5):
-        for block in range(100):
-            name, stride = f"layer{layer}.{block}", 2 if layer > 1 and block == 0 else 1
-            if f"{name}.conv1.weight" not in weights:
-                break
-            y = norm(F.conv2d(x, weights[f"{name}.conv1.weight"], stride=stride, padding=1), f"{name}.bn1").relu()
-            y = norm(F.conv2d(y, weights[f"{name}.conv2.weight"], padding=1), f"{name}.bn2")
-            if f"{name}.downsample.0.weight" in weights:
-                x = norm(F.conv2d(x, weights[f"{name}.downsample.0.weight"], stride=stride), f"{name}.downsample.1")
-            x = (x + y).relu()
-        maps.append(x)
-    return maps
 
 
 @pytest.mark.parametrize("suffix", ["safetensors", "pth"])
