@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import yaml
 
-from factory.__main__ import main as door_main
 from factory.config.compose import ConfigError, build, conf_dir, fill
 from factory.config.plugins import group_choices
 from factory.config.run import PerturbSources, RewardSettings, RunConfig, compose_run, load_config, settings_classes
@@ -24,7 +23,6 @@ from factory.setup.settings import (
     refuse_missing_backend,
     simulates,
 )
-from tasks.caches import user_cache
 from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.render.settings import RenderMode, RenderSettings, SceneDtype
 from tasks.rollout.simulate import TrafficSettings
@@ -117,26 +115,6 @@ def test_companions_of_files_of_configuration_are_no_choices(tmp_path: Path) -> 
     add_companions(tmp_path)
     assert group_choices("render", [tmp_path]) == ["mine"]
     assert load_config([f"--config-dir={tmp_path}", "render=mine"]).render.mode is RenderMode.MAP
-
-
-@pytest.mark.slow
-def test_a_run_takes_its_files_from_the_home_folder(
-    small_town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    clips = ["clips=av2", f"clips.root={small_town}", "clips.split=train"]
-    at_home = ["vocabulary.file=~/v.npy", "reward.label_vocabulary=~/v.npy", "expert.recovery.table=~/t.npz"]
-    settings = ["experts=[recovery]", "render=none", "perturb.epdms_min=0", "executor=local", "out=~/out"]
-    monkeypatch.setenv("XDG_CACHE_HOME", str(user_cache().parent))
-    monkeypatch.setenv("HOME", str(tmp_path))
-    for words in (
-        ["vocabulary", "out=~/v.npy", "kinematic=true", "k=64"],
-        ["vocabulary", "table=~/t.npz", "vocabularies=[~/v.npy]", *clips],
-        ["run", *clips, *at_home, *settings],
-    ):
-        assert door_main(words) == 0
-    assert (
-        f"64 trajectories ({tmp_path}/v.npy" in capsys.readouterr().out and (tmp_path / "out" / "report.html").is_file()
-    )
 
 
 def test_a_plug_in_s_key_is_led_home_too_and_a_stranger_s_home_is_told(

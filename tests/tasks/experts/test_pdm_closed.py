@@ -71,6 +71,14 @@ def test_an_ego_that_stands_within_the_red_connector_is_not_held_by_it(road: Roa
     assert plan_for(inside).proposals.poses[4, 50, 0] > 115.0
 
 
+def test_of_equally_good_proposals_the_first_is_the_plan(road: Road, objects: Objects) -> None:
+    """Behind a car that stands nobody gets 5 m far, so that progress is the same for all who keep the rules."""
+    blocked = road(speed=0.5, agents=objects([[59.0, 0.0, 0.0, CAR[0], 12.0]], [0.0], [AgentKind.VEHICLE]))
+    plan = plan_for(blocked)
+    best = np.flatnonzero(plan.scores.pdm_score == plan.scores.pdm_score.max())
+    assert len(best) > 1 and plan.chosen == best[0]
+
+
 def test_the_plan_is_the_first_best_proposal_and_sees_nothing_of_the_future(road: Road, objects: Objects) -> None:
     scene = road(agents=objects([[80.0, 0.0, 0.0, *CAR]], [6.0], [AgentKind.VEHICLE]))
     plan = plan_for(scene)

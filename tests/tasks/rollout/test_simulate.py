@@ -340,27 +340,6 @@ def test_a_pedestrian_made_late_in_the_first_rollout_stays_late_in_the_second() 
     assert second.agents.boxes == pytest.approx(expected)
 
 
-def test_a_read_only_scene_gives_the_same_rollout() -> None:
-    """As a shared object store hands it out."""
-    expected = run(busy_scene())
-    scene = busy_scene()
-    prepared = prepare_traffic(scene, IDM)
-    assert prepared.roles is not None and prepared.paths is not None
-    agents, ego = scene.agents, scene.clip.ego_states
-    for array in (
-        *prepared.roles,
-        *prepared.paths,
-        agents.boxes,
-        agents.velocities,
-        agents.valid,
-        agents.center_z,
-        ego,
-    ):
-        array.flags.writeable = False
-    for rollout in (roll_out(prepared, expected.ego_states), run(scene)):
-        assert np.array_equal(rollout.agents.boxes, expected.agents.boxes, equal_nan=True)
-
-
 def test_settings_that_mean_nothing_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match="headway_s"):
         TrafficSettings(headway_s=0.0)

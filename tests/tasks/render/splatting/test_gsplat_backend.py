@@ -12,10 +12,9 @@ from tasks.render.gate import check_drive_pictures
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Backend, agents_at_time, render, require_backend
 from tasks.render.settings import GateSettings
-from tasks.render.splatting import gsplat_backend, sh
+from tasks.render.splatting import gsplat_backend
 from tasks.render.splatting.gaussians import Gaussians
-from tasks.render.splatting.gsplat_backend import BackendMissing, arguments, drawn_by, require, view_of
-from tasks.render.splatting.project import CLASSIC, FITTED, NEAR_M
+from tasks.render.splatting.gsplat_backend import BackendMissing, require, view_of
 from tasks.render.splatting.raster import View, forward
 from tasks.render.views import render_views
 from tasks.world.clip import Camera, Pinhole
@@ -37,34 +36,6 @@ def cloud(n: int, count: int) -> Gaussians:
     )
 
 
-@pytest.mark.parametrize(("count", "degree"), [(0, None), (3, 1), (8, 2), (15, 3)])
-def test_it_is_given_the_cameras_the_scales_and_all_coefficients(count: int, degree: int | None) -> None:
-    scene = cloud(20, count)
-    aside = replace(FRONT, world_from_camera=street.ego_pose(0.0, -1.0) @ street.EGO_FROM_CAMERA)
-    given = arguments(scene, [FRONT, aside])
-    assert {name: value.shape for name, value in given.items() if isinstance(value, np.ndarray)} == {
-        "means": (20, 3),
-        "quats": (20, 4),
-        "scales": (20, 3),
-        "opacities": (20,),
-        "colors": (20, 3) if degree is None else (20, count + 1, 3),
-        "viewmats": (2, 4, 4),
-        "Ks": (2, 3, 3),
-    }
-    assert all(value.dtype == np.float32 for value in given.values() if isinstance(value, np.ndarray))
-    np.testing.assert_allclose(given["scales"], np.exp(scene.log_scales), rtol=1e-6)
-    np.testing.assert_allclose(
-        given["viewmats"] @ [FRONT.world_from_camera, aside.world_from_camera], [np.eye(4)] * 2, atol=1e-6
-    )
-    assert (given["width"], given["height"], given["sh_degree"]) == (street.WIDTH, street.HEIGHT, degree)
-    assert (given["near_plane"], given["eps2d"], given["render_mode"]) == (NEAR_M, FITTED.dilation_px2, "RGB+ED")
-    assert given["rasterize_mode"] == "antialiased"
-    classic = arguments(scene, [FRONT], CLASSIC)
-    assert (classic["eps2d"], classic["rasterize_mode"]) == (0.3, "classic")
-    plain = given["colors"] if degree is None else 0.5 + sh.C0 * given["colors"][:, 0]
-    np.testing.assert_allclose(plain, scene.colours, atol=1e-6)
-
-
 def test_its_colours_stand_before_the_sky_and_its_depth_only_where_something_is() -> None:
     drawn, alpha = np.full((2, 3, 4), 0.25, np.float32), np.zeros((2, 3, 1), np.float32)
     drawn[..., 3] = 7.0
@@ -74,31 +45,6 @@ def test_its_colours_stand_before_the_sky_and_its_depth_only_where_something_is(
     np.testing.assert_array_equal(view.rgb[1], np.full((3, 3), 1.25))
     np.testing.assert_array_equal(view.depth, [[7.0] * 3, [0.0] * 3])
     np.testing.assert_array_equal(view.alpha, alpha[..., 0])
-
-
-def test_cameras_of_one_size_are_one_call_and_every_view_is_where_its_camera_was() -> None:
-    """What is drawn is told by the camera's place; three sizes between each other, packed or not as asked."""
-    scene, calls = cloud(20, 0), []
-
-    def draw(given: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        calls.append((len(given["viewmats"]), given["width"], given["packed"]))
-        x = np.linalg.inv(given["viewmats"])[:, 0, 3]
-        shape = (len(x), given["height"], given["width"])
-        return np.broadcast_to(x[:, None, None, None], (*shape, 4)), np.ones((*shape, 1), np.float32)
-
-    sizes, places = [(8, 6), (4, 3), (8, 6), (5, 3), (4, 3), (8, 6)], np.arange(6.0)
-    cameras = []
-    for (width, height), x in zip(sizes, places):
-        pose = np.eye(4)
-        pose[0, 3] = x
-        cameras.append(Pinhole(street.INTRINSICS, pose, width, height))
-    sky = [np.zeros((c.height, c.width, 3), np.float32) for c in cameras]
-    for packed in (True, False):
-        calls.clear()
-        views = drawn_by(draw, scene, cameras, sky, packed=packed)
-        assert calls == [(3, 8, packed), (2, 4, packed), (1, 5, packed)]
-        assert [view.rgb.shape[:2] for view in views] == [(height, width) for width, height in sizes]
-        np.testing.assert_allclose([view.rgb.mean() for view in views], places, atol=1e-6)
 
 
 def test_the_rig_s_views_of_an_instant_are_asked_for_at_once(
