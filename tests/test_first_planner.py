@@ -18,7 +18,7 @@ TENTH = [
     "clips.logs_per_town=2",
     "rounds=1",
     "executor=local",
-    "steps=50",
+    "steps=10",
     "perturbed=0",
     "workers=1",
 ]

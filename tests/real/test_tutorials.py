@@ -25,9 +25,10 @@ PROGRAMS: dict[str, Callable[[list[str]], int | None]] = {
 LEFT_OUT = {"runs/demo", "preset=demo", "root=/data/nuscenes", "clips.cameras=/data/photos"}  # tests/test_readme.py
 HERE = "executor=local"
 TINY_TOWN = f"{HERE} clips.n_clips=1 clips.settings.cameras=[ring_front_center] clips.settings.width=64 "
-TINY_TOWN += "clips.settings.height=36 clips.settings.lidar_azimuths=200"
+TINY_TOWN += "clips.settings.height=36 clips.settings.lidar_azimuths=200 clips.settings.steps_per_photo=5"
 TINY = f"{HERE} limit=1 rounds=1 render.width=64 render.height=36 render.fit.iterations=20 render.psnr_min=0 "
-TINY += "render.gate.enabled=false render.cameras=[] vocabulary.k=64"
+TINY += "render.gate.enabled=false render.cameras=[] vocabulary.k=64 render.fit.start_gaussians=2000 "
+TINY += "render.fit.most_gaussians=2500 render.fit.start_every=2 render.fit.stereo_photos=2"
 CHEAPER = {  # of a command with these words; the others are run as they are, and what they print is compared
     "rounds=3": f"{HERE} limit=2",
     "clips=synthetic": TINY_TOWN,
@@ -58,6 +59,7 @@ class Follower:
     def runs(self, command: Command, folders: dict[str, Path]) -> None:
         _, _, program, *words = command.words
         more = next((given for named, given in CHEAPER.items() if named in str(command)), "").split()
+        more += ["graph.isolated=never"] if program == "factory.run" else []  # a process more for each
         for named, there in folders.items():
             words = [word.replace(named, str(there)) for word in words]
         last = {word.partition("=")[0]: word for word in (*words, *more)}

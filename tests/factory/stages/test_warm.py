@@ -17,7 +17,7 @@ from tasks.render.settings import Adjust, RenderMode, RenderSettings, RigSetting
 pytestmark = pytest.mark.slow
 
 REPOSITORY = Path(__file__).resolve().parents[3]
-TOWN = ("clips=synthetic", "clips.n_clips=1", "vocabulary.k=512")
+TOWN = ("clips=synthetic", "clips.n_clips=1", "vocabulary.k=64")
 BLIND = ("clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none")
 
 
