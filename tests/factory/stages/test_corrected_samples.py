@@ -44,6 +44,15 @@ def judged(clip: Clip) -> Judged:
     return drive_under_log_replay(scene_of_clip(clip), Human(), PdmSettings(), np.random.default_rng(0))
 
 
+@pytest.fixture(scope="module")
+def human(clip: Clip, judged: Judged, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The human sample's columns, and the folder that the corrected rig is kept in."""
+    folder = tmp_path_factory.mktemp("imaged")
+    row = Imaging(SETTINGS, str(folder)).pictures(clip, None, judged)
+    assert not list(folder.glob("*.safetensors")), "the rig alone is enough for it"
+    return folder, dict(row)
+
+
 def stored(camera: Camera, row: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """Intrinsics and mount that a row has of a camera."""
     (mine,) = (one for one in row["cameras"] if one["name"] == camera.name)
@@ -52,20 +61,17 @@ def stored(camera: Camera, row: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]
 
 @pytest.mark.slow
 def test_photos_and_pictures_of_a_corrected_block_have_one_calibration_the_one_the_photos_ask_for(
-    clip: Clip, judged: Judged, tmp_path: Path
+    clip: Clip, judged: Judged, human: tuple[Path, dict[str, Any]]
 ) -> None:
-    imaging = Imaging(SETTINGS, str(tmp_path))
-    human = imaging.pictures(clip, None, judged)
-    assert human["image_source"] == "photo"
-    assert not list(tmp_path.glob("*.safetensors"))  # the rig alone is enough for it
+    folder, row = human
     candidate = Candidate(0, np.zeros(3), (0, 0), 1.0, 1.0, judged.scores, judged.rollout)
-    simulated = imaging.pictures(clip, candidate, judged)
-    assert simulated["image_source"] == "render"
+    simulated = Imaging(SETTINGS, str(folder)).pictures(clip, candidate, judged)
+    assert (row["image_source"], simulated["image_source"]) == ("photo", "render")
     for camera in clip.cameras:
-        for a, b in zip(stored(camera, human), stored(camera, simulated)):
+        for a, b in zip(stored(camera, row), stored(camera, simulated)):
             np.testing.assert_array_equal(a, b)
     # And it is what the photos were taken with: the left camera as the front one has it.
-    (front, left), true = (stored(camera, human)[1] for camera in clip.cameras), CAMERAS
+    (front, left), true = (stored(camera, row)[1] for camera in clip.cameras), CAMERAS
     apart = np.linalg.inv(true[0].ego_from_camera) @ true[1].ego_from_camera
     (twist,) = twists_of((np.linalg.inv(apart) @ np.linalg.inv(front) @ left)[None])
     assert np.degrees(np.linalg.norm(twist[3:])) < 0.35 < 1.97
@@ -73,17 +79,17 @@ def test_photos_and_pictures_of_a_corrected_block_have_one_calibration_the_one_t
 
 @pytest.mark.slow
 def test_photos_are_cut_by_the_camera_and_stand_at_the_poses_that_the_rig_s_file_says(
-    clip: Clip, judged: Judged, tmp_path: Path
+    clip: Clip, judged: Judged, human: tuple[Path, dict[str, Any]]
 ) -> None:
-    row = Imaging(SETTINGS, str(tmp_path)).pictures(clip, None, judged)
-    (said,) = tmp_path.glob(f"block-*{RIG_SUFFIX}")
+    folder, row = human
+    (said,) = folder.glob(f"block-*{RIG_SUFFIX}")
     told = parse_json_with_checksum(said.read_bytes())
     used = {one["name"]: {key: np.array(value) for key, value in one.items() if key != "name"} for one in told["used"]}
     cameras = [replace(camera, **used[camera.name]) for camera in clip.cameras]  # type: ignore[arg-type]
     taken = {(camera, round(time_s, 3)): pose for camera, time_s, _, pose in told["taken"]}
     assert len(taken) == len(clip.block.images)  # type: ignore[union-attr]
     now_s = NOW * STEP_S
-    for image in row["images"]:  # type: ignore[attr-defined]
+    for image in row["images"]:
         at_s = now_s + image["time_s"]
         np.testing.assert_array_equal(image["ego_pose"], taken[image["camera"], round(at_s + LATER_S, 3)])
         (file,) = (f for f in clip.images if f.sensor == image["camera"] and abs(f.time_s - at_s) < 1e-6)
@@ -91,7 +97,7 @@ def test_photos_are_cut_by_the_camera_and_stand_at_the_poses_that_the_rig_s_file
         assert np.abs(decode_stored_image(image).astype(float) - photo.rgb).mean() < 1.0  # JPEG
         off = decode_stored_image(image).astype(float) - photo.rgb
         assert np.abs(off @ [0.299, 0.587, 0.114]).mean() < 1.0  # JPEG, which halves the size of colours
-    again = Imaging(SETTINGS, str(tmp_path)).pictures(clip, None, judged)
+    again = Imaging(SETTINGS, str(folder)).pictures(clip, None, judged)
     assert json.dumps(again["cameras"], default=list) == json.dumps(row["cameras"], default=list)
 
 
