@@ -60,7 +60,8 @@ def write_all(folder: Path) -> None:
     convert(next(path for path in sorted(folder.glob("towns/*/*")) if path.is_dir()), folder / "123d")
     scenarionet_scenarios.save(scenarionet_scenarios.nuscenes(), folder / "scenarionet")
     write_frames(folder, "mini", NAME, [frame(k) for k in range(24)])
-    scene_pickles.write_scene(folder, scene_pickles.scene())
+    around = [frame(k) for k in range(20)]
+    scene_pickles.write_scene(folder, scene_pickles.scene_of_log(around, 11, "0000000000005a00c", cameras=True))
     (folder / "filter.yaml").write_text(FILTER)
     save_vocabulary(folder / "vocabulary.npy", Vocabulary(kinematic_trajectories(9, 0)), {})
     save_recovery_table(folder / "table.npz", RecoveryTable(kinematic_trajectories(9, 0)), {})

@@ -18,7 +18,6 @@ import yaml
 from tests.factory.datasets.navsim.openscene_writer import numpy_1_pickle
 
 STATE = "nuplan.common.actor_state.state_representation"
-TOKEN, ORIGINAL, BEFORE = "0000000000005a00c", "000000000000a00c", "000000000000a004"
 CAMERAS = ("cam_f0", "cam_l0", "cam_l1", "cam_l2", "cam_r0", "cam_r1", "cam_r2", "cam_b0")
 
 
@@ -107,73 +106,6 @@ def _new(name: str, **fields: Any) -> Any:
     return next(kind for words, kind in TYPES.items() if words.endswith(f" {name}"))(**fields)
 
 
-def ego_pose(i: int) -> np.ndarray:
-    """Of frame i, 8 m/s northwards and turning."""
-    return np.array([331_000.0, 4_690_000.0 + 4.0 * i, 1.5 + 0.01 * i])
-
-
-def world_box(i: int, k: int) -> np.ndarray:
-    """x, y, heading of object k at frame i."""
-    return np.array([331_002.0 + 3.0 * k, 4_690_020.0 + (2.0 - k) * i, 1.4 + 0.1 * k])
-
-
-def scene(n_future: int = 8) -> dict[str, Any]:
-    """The dictionary that is pickled: a vehicle, a pedestrian and a cone."""
-    return {
-        "scene_metadata": {
-            "log_name": "2021.05.12.19.36.12_veh-35_00005_00204",
-            "scene_token": TOKEN,
-            "map_name": "us-ma-boston",
-            "initial_token": TOKEN,
-            "num_history_frames": 4,
-            "num_future_frames": 0,
-            "corresponding_original_scene": ORIGINAL,
-            "corresponding_original_initial_token": BEFORE,
-        },
-        "frames": [_frame(i) for i in range(4)],
-        "extended_traffic_light_data": [_lights(i) for i in range(4, 4 + n_future)],
-        "extended_detections_tracks": [_tracks(i) for i in range(4, 4 + n_future)],
-    }
-
-
-def _frame(i: int) -> dict[str, Any]:
-    pose = ego_pose(i)
-    camera = {
-        "data_path": Path("veh-35") / "CAM_F0" / f"{i:016x}.jpg",
-        "sensor2lidar_rotation": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
-        "sensor2lidar_translation": np.array([1.6, 0.0, 1.5]),
-        "cam_intrinsic": np.array([[1545.0, 0.0, 960.0], [0.0, 1545.0, 560.0], [0.0, 0.0, 1.0]]),
-        "distortion": np.zeros(5),
-    }
-    return {
-        "token": TOKEN if i == 3 else f"{0x5A000 + i:016x}",
-        "timestamp": 1_620_000_000_000_000 + 500_000 * i,
-        "roadblock_ids": ["10", "20"],
-        "traffic_lights": [(21, False)],
-        "annotations": {
-            "boxes": np.array([[20.0, 1.0, 0.8, 4.6, 1.9, 1.6, 0.1]]),
-            "names": np.array(["vehicle"]),
-            "velocity_3d": np.array([[5.0, 0.0, 0.0]]),
-            "instance_tokens": [f"{0xB000 + i:016x}"],
-            "track_tokens": [f"{0xC000:016x}"],
-        },
-        "ego_status": {
-            "ego_pose": pose,
-            "ego_velocity": np.array([8.0, 0.1], np.float32),
-            "ego_acceleration": np.array([0.2, -0.1], np.float32),
-            "driving_command": np.array([0, 1, 0, 0]),
-            "in_global_frame": True,
-        },
-        "lidar_path": None,
-        "camera_dict": {name: camera if name == "cam_f0" else {} for name in CAMERAS},
-    }
-
-
-def _lights(i: int) -> Any:
-    status = [TrafficLightStatusType.GREEN, TrafficLightStatusType.YELLOW, TrafficLightStatusType.RED]
-    return _statuses([(21 + k, s) for k, s in enumerate(status)], 1_620_000_000_000_000 + 500_000 * i)
-
-
 def _statuses(lights: list[tuple[int, TrafficLightStatusType]], stamp_us: int) -> Any:
     stamp = TimePoint(stamp_us)
     return _new(
@@ -183,15 +115,6 @@ def _statuses(lights: list[tuple[int, TrafficLightStatusType]], stamp_us: int) -
             for lane_id, s in lights
         ],
     )
-
-
-def _tracks(i: int) -> Any:
-    """A vehicle, a pedestrian and a cone."""
-    things = [
-        (number, f"{0xC000 + k:016x}", world_box(i, k), (4.0, 2.0, 1.5), (0.5 * k, 3.0))
-        for k, number in enumerate((0, 1, 3))
-    ]
-    return _detections(things, f"{0xB000 + i:016x}")
 
 
 def _detections(things: list[tuple[int, str, np.ndarray, Any, Any]], token: str) -> Any:

@@ -13,34 +13,73 @@ from factory.datasets.navsim.log import read_scene_pickle
 from factory.readers.base import BadClip
 from factory.readers.pickles import Record, load_plain, load_records
 from tasks.world.clip import AgentKind
-from tasks.world.frames import to_world
+from tasks.world.frames import to_local, to_world
 from tests.factory.datasets.navsim import scene_pickles
+from tests.factory.datasets.navsim.logs import frame
+
+TOKEN, NOW = "0000000000005a00c", 11
+
+
+def ego_pose(k: int) -> np.ndarray:
+    """Of frame k, 8 m/s northwards and turning."""
+    return np.array([331_000.0, 4_690_000.0 + 4.0 * k, 1.5 + 0.01 * k])
+
+
+def world_boxes(k: int) -> np.ndarray:
+    """x, y, heading of a vehicle, a pedestrian and a cone at frame k."""
+    return np.array([[331_002.0 + 3.0 * i, 4_690_060.0 + (2.0 - i) * k, 1.4 + 0.1 * i] for i in range(3)])
+
+
+def log_frame(k: int) -> dict[str, Any]:
+    pose, names = ego_pose(k), ["vehicle", "pedestrian", "traffic_cone"]
+    x, y, heading = to_local(pose, world_boxes(k)).T
+    velocities = to_local(np.array([0.0, 0.0, pose[2]]), np.array([[0.0, 3.0, 0.0], [0.5, 3.0, 0.0], [0.0, 0.0, 0.0]]))
+    motion = {
+        "ego2global_translation": np.array([*pose[:2], 12.0]),
+        "ego2global_rotation": np.array([np.cos(pose[2] / 2), 0.0, 0.0, np.sin(pose[2] / 2)]),
+        "ego_dynamic_state": [8.0, 0.1, 0.2, -0.1],
+    }
+    anns = {
+        "gt_boxes": np.column_stack([x, y, np.full(3, 0.8), np.tile([4.0, 2.0, 1.5], (3, 1)), heading]),
+        "gt_names": np.array(names),
+        "gt_velocity_3d": velocities * [1.0, 1.0, 0.0],
+        "instance_tokens": names,
+        "track_tokens": names,
+    }
+    return frame(k, **motion, anns=anns, traffic_lights=[(21, False), (22, False), (23, True)])
+
+
+def made() -> dict[str, Any]:
+    """The dictionary that is pickled; its second light is yellow."""
+    scene = scene_pickles.scene_of_log([log_frame(k) for k in range(20)], NOW, TOKEN, cameras=True)
+    for lights in scene["extended_traffic_light_data"]:
+        lights.traffic_lights[1].status = scene_pickles.TrafficLightStatusType.YELLOW
+    return scene
 
 
 def test_a_scene_is_its_history_and_what_others_do_after_it(tmp_path: Path) -> None:
-    found = read_scene_pickle(scene_pickles.write_scene(tmp_path, scene_pickles.scene()))
+    found = read_scene_pickle(scene_pickles.write_scene(tmp_path, made()))
     assert not [name for name in sys.modules if name.split(".")[0] == "nuplan"]
-    assert (found.token, found.original_scene) == (scene_pickles.TOKEN, scene_pickles.ORIGINAL)
-    assert len(found.frames) == 12
-    now = found.frames[3]
-    np.testing.assert_array_equal(now.pose, scene_pickles.ego_pose(3))
+    now, original = found.frames[3], log_frame(NOW)
+    assert (found.token, found.original_scene, len(found.frames)) == (TOKEN, original["token"], 12)
+    np.testing.assert_allclose(now.pose, ego_pose(NOW), rtol=0, atol=1e-9)
     np.testing.assert_array_equal(now.dynamic_state, np.float32([8.0, 0.1, 0.2, -0.1]))
-    assert now.command == "straight" and now.lights == (("21", False),) and now.roadblock_ids == ("10", "20")
-    (camera,) = now.cameras  # the seven others were not saved
-    assert (camera.name, camera.path) == ("CAM_F0", "veh-35/CAM_F0/0000000000000003.jpg")
+    assert now.command == "straight" and now.lights[::2] == (("21", False), ("23", True))
+    assert now.roadblock_ids == ("10", "20", "30") and len(now.cameras) == 8
+    assert now.cameras[0].path == original["cams"][now.cameras[0].name]["data_path"]
 
 
 def test_later_objects_stand_where_the_world_has_them(tmp_path: Path) -> None:
-    found = read_scene_pickle(scene_pickles.write_scene(tmp_path, scene_pickles.scene()))
-    for i, frame in enumerate(found.frames[4:], 4):
-        assert frame.boxes is not None
-        assert frame.boxes.kinds == (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.TRAFFIC_CONE)
-        world = to_world(frame.pose, frame.boxes.boxes[:, [0, 1, 6]])
-        np.testing.assert_allclose(world, [scene_pickles.world_box(i, k) for k in range(3)], atol=1e-8)
-        c, s = np.cos(frame.pose[2]), np.sin(frame.pose[2])
-        velocity = frame.boxes.velocities[:, :2] @ np.array([[c, s], [-s, c]])
+    found = read_scene_pickle(scene_pickles.write_scene(tmp_path, made()))
+    for k, later in enumerate(found.frames[4:], NOW + 1):
+        assert later.boxes is not None
+        assert later.boxes.kinds == (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.TRAFFIC_CONE)
+        world = to_world(later.pose, later.boxes.boxes[:, [0, 1, 6]])
+        np.testing.assert_allclose(world, world_boxes(k), atol=1e-8)
+        c, s = np.cos(later.pose[2]), np.sin(later.pose[2])
+        velocity = later.boxes.velocities[:, :2] @ np.array([[c, s], [-s, c]])
         np.testing.assert_allclose(velocity, [[0.0, 3.0], [0.5, 3.0], [0.0, 0.0]], atol=1e-12)
-        assert frame.lights == (("21", False), ("22", False), ("23", True))  # yellow is not red
+        assert later.lights == (("21", False), ("22", False), ("23", True))  # yellow is not red
 
 
 def _no_future(scene: dict[str, Any]) -> None:
@@ -75,7 +114,7 @@ def _the_ego(scene: dict[str, Any]) -> None:
     ],
 )
 def test_what_is_no_scene_is_named(harm: Callable[[dict[str, Any]], None], said: str, tmp_path: Path) -> None:
-    scene = scene_pickles.scene()
+    scene = made()
     harm(scene)
     with pytest.raises(BadClip) as error:
         read_scene_pickle(scene_pickles.write_scene(tmp_path, scene))
@@ -87,7 +126,7 @@ def test_only_the_named_classes_are_records_and_nothing_of_them_runs(tmp_path: P
         def __reduce__(self) -> tuple[Any, tuple[str]]:
             return len, ("run",)  # and not print, which Ray replaces by its own
 
-    path = scene_pickles.write_scene(tmp_path, scene_pickles.scene())
+    path = scene_pickles.write_scene(tmp_path, made())
     with pytest.raises(BadClip, match="refused"):
         load_plain(path.read_bytes(), "file")
     with pytest.raises(BadClip, match="refused global"):
