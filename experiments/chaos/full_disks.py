@@ -33,6 +33,7 @@ from typing import NoReturn
 import numpy as np
 import pyarrow.compute as pc
 
+from experiments.chaos.processes import below, kill, put_away
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph.execute import Execution, Executor, execute, rerun_on_new_clusters
 from factory.graph.steps import PreparedClip
@@ -42,7 +43,6 @@ from factory.store.samples import Store
 from factory.store.verify import verify
 from tasks.caches import user_cache
 from tasks.stages import Rejected
-from tests.chaos.processes import below, kill, put_away
 from tests.chaos.trials import Findings, leave_by, untold
 from tests.factory.tables import assert_same_rows, tables_of
 from tests.factory.toy import ToyWork, ran, refs

@@ -29,9 +29,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from experiments.chaos.killed_run import CLIPS, drive, leave
+from experiments.chaos.processes import PROGRAMS, below, kill, put_away, workers_below
 from factory.exits import COMPLETE
 from factory.store.samples import Store
-from tests.chaos.processes import PROGRAMS, below, kill, put_away, workers_below
 from tests.chaos.trials import assert_same_stores
 from tests.pages import REPOSITORY
 

@@ -24,8 +24,8 @@ from typing import IO
 
 from experiments.chaos.kills import Told, compare
 from experiments.chaos.memory import Flatness, Held, draw, flatness, read, rss_mb, write
+from experiments.chaos.processes import PROGRAMS, below, kill, put_away, workers_below
 from factory.exits import COMPLETE
-from tests.chaos.processes import PROGRAMS, below, kill, put_away, workers_below
 from tests.pages import REPOSITORY
 
 WORDS = (

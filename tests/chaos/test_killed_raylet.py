@@ -21,7 +21,6 @@ from factory.graph.own_process import run_in_own_process
 from factory.store.samples import Store
 from factory.store.verify import verify
 from tests.chaos.killed_driver import EXPERTS
-from tests.chaos.processes import command
 from tests.factory.tables import assert_same_tables
 from tests.factory.toy import ToyWork, refs
 from tests.pages import REPOSITORY
@@ -71,7 +70,7 @@ def left_of(mark: str) -> list[str]:
         for folder in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):  # gone meanwhile
                 if mark.encode() in (folder / "environ").read_bytes():
-                    found.append(command(int(folder.name)))
+                    found.append((folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace"))
         found = [line for line in found if "resource_tracker" not in line]
         if not found or time.monotonic() > end:
             return found

@@ -325,33 +325,6 @@ def test_completion_knows_commands_keys_groups_and_choices() -> None:
     assert not list(completions(["nothing"], ""))
 
 
-def test_completion_knows_those_of_planners_too() -> None:
-    assert set(completions([], "", "planners")) == set(PLANNERS)
-    assert set(completions(["train"], "mix=", "planners")) == {"mix=half", "mix=natural", "mix=rewards_only"}
-    assert {"data.real=", "planner=", "resume="} <= set(completions(["train"], "", "planners"))
-    assert "clips.root=" in completions(["drive", "clips=av2"], "", "planners")
-    assert "traffic@two_stage_traffic=idm" in completions(["evaluate"], "traffic@two_stage_traffic=", "planners")
-    assert "planner=ltf" not in completions(["evaluate"], "planner=", "planners")
-    assert {"split=", "authors="} <= set(completions(["submit"], "", "planners"))
-
-
-@pytest.mark.parametrize(
-    ("line", "found"),
-    [
-        ("planners comp", ["compare"]),
-        ("/venv/bin/planners sub", ["submit"]),
-        ("python -m planners compare conf", ["confidence="]),
-        ("python3 -m planners.drive executor=", ["executor=local", "executor=ray"]),
-        ("python -m factory.run on_change=k", ["on_change=keep"]),
-    ],
-)
-def test_every_way_to_begin_a_command_is_completed(
-    line: str, found: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["complete", line]) == 0
-    assert capsys.readouterr().out.split() == found
-
-
 @pytest.mark.parametrize("package", DOORS)
 def test_no_command_does_several_runs_at_once(package: str, capsys: pytest.CaptureFixture[str]) -> None:
     door = {"factory": main, "planners": planners_main}[package]
@@ -390,10 +363,3 @@ def test_bash_completes_the_end_of_the_line(tmp_path: Path) -> None:
     env = os.environ | {"PYTHONPATH": str(REPOSITORY)}
     done = subprocess.run(["bash", str(script)], env=env, capture_output=True, text=True)
     assert done.stdout.splitlines() == ["status", "local", "scenarionet", "", "demo", "evaluate"], done.stderr
-
-
-def test_completion_is_quick_and_another_shell_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    done = light("from factory.commands.completion import complete; complete(['factory run clips='])")
-    assert done.returncode == 0 and "clips=av2" in done.stdout, done.stderr
-    assert ask(capsys, "completion", "fish")[0] == 2
-    assert "compdef _factory_complete factory" in ask(capsys, "completion", "zsh")[1]

@@ -9,7 +9,6 @@ from factory.config.compose import ConfigError
 from factory.config.run import RunConfig, load_config
 from factory.setup.calibrate import (
     differences_from_paper,
-    differences_in_every_preset,
     paper_deviations_line,
     plan_text,
 )
@@ -32,21 +31,6 @@ def test_the_preset_has_the_paper_s_settings(vocabulary: Vocabulary) -> None:
     assert (config.rounds, config.vocabulary.k, config.render.width, config.render.height) == (5, 16384, 1920, 1080)
     assert (config.render.psnr_min, config.render.camera_psnr_min) == (27.0, 0.0)
     assert (config.perturb.epdms_min, config.reward.progress_above) == (0.8, 0.5)
-
-
-def test_what_no_preset_makes_the_paper_s_is_said_in_a_line(vocabulary: Vocabulary) -> None:
-    assert paper_deviations_line(paper(), vocabulary) == (
-        "set-up: not the paper's (in brackets; preset=paper comes nearest): walks that go on to the next candidate "
-        "until one is accepted (the rates fit one draw a round), IDM along the lane graph (the public code's brakes "
-        "for each lane's end: traffic=navsim), render.frames=history (all of T .. T+2H), no picture gate (unstable "
-        "renderings are left out, by a rule that is not published)"
-    )
-
-
-def test_what_a_run_has_not_is_not_said_of_it() -> None:
-    (walks,) = differences_in_every_preset(paper("render=none", "traffic=navsim"))
-    assert walks.startswith("walks that go on")
-    assert "the project's own picture gate (unstable" in differences_in_every_preset(load_config([]))[-1]
 
 
 @pytest.mark.parametrize(
@@ -92,11 +76,6 @@ def test_every_setting_of_the_paper_s_table_is_watched(vocabulary: Vocabulary) -
         "pdm=corrected": "pdm.speed_below_zero=False (True)",
     }
     assert set(others.values()) <= set(differences_from_paper(paper(*others), vocabulary))
-
-
-def test_of_pictures_and_experts_that_are_not_there_nothing_is_said(vocabulary: Vocabulary) -> None:
-    assert differences_from_paper(paper("render=none", "render.width=320"), vocabulary) == ["render.mode=none (auto)"]
-    assert differences_from_paper(paper("experts=[pdm_closed]", "expert.recovery.smooth=true"), vocabulary) == []
 
 
 def test_the_preset_asks_for_the_human_vocabulary(tmp_path: Path) -> None:

@@ -73,27 +73,6 @@ def test_a_ring_of_cameras_agrees_all_around_and_one_that_shares_nothing_keeps_i
     np.testing.assert_allclose(light_of / light_of.mean(), 1.0, atol=0.03)
 
 
-def test_groups_of_cameras_that_share_nothing_with_each_other_keep_their_own_brightness() -> None:
-    light = street()
-    colours = np.array([0.5, 0.7, 1.0, 1.4])[:, None, None] * light
-    seen = np.zeros((4, POINTS), bool)
-    seen[:2, :2000], seen[2:, 2000:] = True, True
-    back = [1.0 + invert_exposure(row)[[0, 4, 8]].mean() for row in found(colours, seen)]
-    assert np.mean(back[:2]) == pytest.approx(1.0, abs=0.01) and np.mean(back[2:]) == pytest.approx(1.0, abs=0.01)
-
-
-def test_moments_of_two_sets_of_points_add_up_to_those_of_both() -> None:
-    colours, seen = RNG.uniform(0, 1, (3, 50, 3)), RNG.uniform(size=(3, 50)) < 0.6
-    both = shared_colours(colours[:, :20], seen[:, :20]) + shared_colours(colours[:, 20:], seen[:, 20:])
-    for name in ("count", "first", "second"):
-        np.testing.assert_allclose(getattr(both, name), getattr(shared_colours(colours, seen), name))
-    c, d = 0, 2
-    mine = colours[c, seen[c] & seen[d]]
-    assert both.count[c, d] == len(mine) and not both.count.diagonal().any()
-    np.testing.assert_allclose(both.first[c, d], mine.sum(axis=0))
-    np.testing.assert_allclose(both.second[c, d], mine.T @ mine)
-
-
 def test_a_handful_of_points_moves_little() -> None:
     """Seven say nothing; ten change the brightness, hardly the contrast."""
     light = street()
