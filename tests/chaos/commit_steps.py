@@ -38,9 +38,7 @@ from tests.factory.toy import ToyWork, refs
 
 EXPERTS = ["recovery", "human"]
 INTERVAL = 10  # commits from one checkpoint of a log to the next; delta-rs's own are 100
-TABLES = ("plans", "candidates", "samples", "outcomes")
 COMMIT = re.compile(r"(\w+)/_delta_log/(\d{20})\.json")
-COPY = re.compile(r"(\w+)/_commits/(\d{20})\.json")
 FINE = ("old", "new", "went on")
 Rows = tuple[str, ...]  # a digest of each, in the order of their keys
 NONE = -1  # the version of a table that is not there yet

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from planners.evaluation.navsim import read_table
 from planners.study.compare import main
-from tasks.reward.aggregate import COLUMNS, FrameScores, columns_of, means_over
+from tasks.reward.aggregate import COLUMNS, columns_of, means_over
 from tasks.reward.epdms import Scores
 from tasks.subscores import RECORDS
 
@@ -67,11 +67,6 @@ def formula(table: Array) -> Array:
     made = Scores(**zeros | sub_scores | {"multiplier": multiplier, "pdm_score": multiplier * weighted / 14})
     scores: Array = columns_of(made, table[:, EC])[:, SCORE]
     return scores
-
-
-def frames_of(table: Array) -> list[FrameScores]:
-    """As one would score them: filtered columns beside the unfiltered score, which is what the files hold."""
-    return [FrameScores(row, np.append(row[:-1], np.nan)) for row in table]
 
 
 @pytest.mark.parametrize("name", NAVHARD)

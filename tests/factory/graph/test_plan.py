@@ -113,16 +113,3 @@ def test_a_walk_with_a_gap_is_not_complete(broken: str) -> None:
     walk = [("accepted", True), (broken, True), ("accepted", True)]
     history = rows_of([walk, []] * 3, [None] * 3, False)
     assert history.complete_walks("recovery", 0, 2) == {}
-
-
-def test_complete_walks_are_not_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
-    walk = [("rejected", True), ("accepted", True), ("accepted", True)]
-    history = rows_of([walk, [("accepted", True)]] * 3, [None] * 3, False)
-    assert history.complete_walks("recovery", 0, 2) == {ref.clip_id: (2, 3) for ref in CLIPS}
-    assert history.complete_walks("human", -1, 1) == {ref.clip_id: (1, 1) for ref in CLIPS}
-
-    def unpacked(*given: object) -> None:
-        raise AssertionError("a walk was unpacked")
-
-    monkeypatch.setattr(History, "past_attempts", unpacked)
-    assert [clip.ref for clip in plan_of(history, 2).done] == list(CLIPS)

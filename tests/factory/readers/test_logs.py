@@ -1,6 +1,5 @@
 """The base of log readers, through the smallest reader that there is: a street, its logs a few numbers each."""
 
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -114,13 +113,6 @@ def test_what_a_caller_does_to_a_clip_does_not_reach_the_next(reader: StreetRead
     ref = ClipRef("street", "a_whole", 0)
     reader.read(ref).ego_states[:] = 0.0
     assert reader.read(ref).ego_states[-1, VX] == SPEED_MPS
-
-
-def test_two_logs_are_kept_and_none_travels(reader: StreetReader) -> None:
-    for log_id in ("a_whole", "b_late", "c_gap"):
-        reader.read(ClipRef("street", log_id, 0 if log_id != "b_late" else 1400))
-    assert list(reader._logs) == ["b_late", "c_gap"]
-    assert not pickle.loads(pickle.dumps(reader))._logs
 
 
 @pytest.mark.parametrize(

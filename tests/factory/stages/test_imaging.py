@@ -14,7 +14,7 @@ from factory.graph.steps import HUMAN_CANDIDATE, PreparedClip, SampleColumns, ru
 from factory.pipeline import FactoryWork
 from factory.readers.base import BadClip
 from factory.setup.settings import assemble
-from factory.stages.imaging import nearest_photo, scene_cache_counts, scene_in_clip_time
+from factory.stages.imaging import nearest_photo, scene_in_clip_time
 from factory.stages.sensors import block_of
 from tasks.render.scene.asset import Exposure, RenderAsset
 from tasks.render.scene.sky import SkyMap
@@ -103,18 +103,3 @@ def test_a_clip_is_drawn_with_what_its_cameras_made_of_the_light_in_its_own_time
     asset = RenderAsset(np.zeros(3), EMPTY, {}, SkyMap(np.zeros((2, 4, 3), np.float32)), 30.0, exposures=gains)
     scene = scene_in_clip_time(replace(clip, block=block), asset)
     assert [float(scene.affine_of("front", time_s)[0, 0]) for time_s in (0.0, 0.5, 1.0)] == [1.5, 1.0, 0.5]
-
-
-@pytest.mark.slow
-def test_a_worker_reads_a_block_s_scene_once_for_all_its_clips(tmp_path: Path) -> None:
-    town = SyntheticReader(tmp_path / "town", 1, 0, replace(SMALL, lidar_beams=8))
-    town.index()
-    overrides = ["clips=av2", f"clips.root={town.root}", f"out={tmp_path / 'out'}", *SIZE]
-    work = assemble(load_config(overrides)).work
-    before = scene_cache_counts()
-    refs = work.reader.index().refs
-    for ref in refs:
-        assert work.imaging.block_verdict(work.reader.read(ref)) is None
-    hits, misses = scene_cache_counts()
-    assert len(refs) == 3
-    assert (hits - before[0], misses - before[1]) == (2, 1)

@@ -19,7 +19,6 @@ from factory.stages.warm import compile_kernels, compiling_ahead
 from tasks.kernels.compiled import cache_dir, kernel_sources, remove_unused_caches, sources_digest
 
 REPOSITORY = Path(__file__).resolve().parents[3]
-DECORATORS = {"njit", "jit", "kernel", "inlined", "inner_kernel", "hidden_kernel", "numpy_division_kernel"}
 
 
 @pytest.mark.slow

@@ -8,8 +8,8 @@ import pytest
 
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
-from planners.data.batch import BevLayout, ImageLayout, Needs
-from planners.data.index import Dataset, DataSettings, make_feed, open_data, order_inputs
+from planners.data.batch import ImageLayout, Needs
+from planners.data.index import Dataset, DataSettings, make_feed, open_data
 from planners.data.mix import MixSettings
 from tests.planners.samples import FRONT_YAWS, grey_pictures, jpeg, pictures, plain, sample, write_table
 
@@ -209,22 +209,3 @@ def test_a_mix_that_the_samples_do_not_allow_is_refused(out: str) -> None:
         open_data(DataSettings(real=out), mix=MixSettings(sim_ratio=0.5))
     with pytest.raises(ValueError, match="n_agents=3"):
         make_feed(open_data(DataSettings(real=out)), Needs(n_agents=3))
-
-
-def test_a_sample_takes_what_stays_in_memory_of_it(tmp_path: Path) -> None:
-    """Of eight pictures of four cameras at two instants three, and other columns only where they are needed."""
-    noise = np.random.default_rng(0).integers(0, 256, (90, 160, 3), dtype=np.uint8)
-    shot, rows = jpeg(noise), []
-    for number in range(4):
-        columns = pictures(dict.fromkeys((*FRONT_YAWS, "rear"), shot), {**FRONT_YAWS, "rear": np.pi})
-        for i, image in enumerate(columns["images"]):
-            image["jpeg"] = shot + bytes([number, i])  # no two are stored as one
-        rows.append(sample(number, **columns))
-    write_table(tmp_path, rows, group_rows=2)
-    data = open_data(DataSettings(real=str(tmp_path)))
-    plans, with_pictures, seen = (make_feed(data, needs).size for needs in (Needs(), PICTURE, Needs(bev=BevLayout())))
-    extra = with_pictures - plans - 3 * (len(shot) + 2)
-    assert extra.min() >= 0 and extra.max() < 300, "lengths, names and times"
-    assert 640 <= plans.max() < 2000 and (seen - plans).min() > 1000
-    groups = order_inputs(make_feed(data, Needs())).group
-    assert groups.tolist() == [0, 0, 1, 1]

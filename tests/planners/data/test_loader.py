@@ -198,14 +198,6 @@ def n_groups(data: Dataset) -> int:
     return len(np.unique(np.stack([data.rows.file, data.rows.group]), axis=1).T)
 
 
-def test_what_fits_is_read_once_and_stays(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    reads = counted_reads(monkeypatch)
-    loader = Loader(data, NEEDS, MixSettings(sim_ratio=0.5), BATCH)
-    for epoch in range(3):
-        assert sum(1 for _ in loader.epoch(epoch)) > 2
-    assert len(reads) == n_groups(data)
-
-
 def test_a_loader_that_was_read_goes_to_another_process_and_reads_the_same_there(data: Dataset) -> None:
     loader = Loader(data, NEEDS, MixSettings(), BATCH)
     read = [numbers(batch) for batch in loader.epoch(0)]

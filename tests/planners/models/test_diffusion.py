@@ -8,9 +8,11 @@ import torch
 
 from planners.data.batch import BevLayout
 from planners.models.diffusiondrive import (
+    add_noise,
     alphas_cumprod,
     checked_anchors,
     cluster_anchors,
+    ddim_step,
     grid_coordinates,
     sinusoids,
 )
@@ -59,6 +61,16 @@ def test_the_noise_schedule_is_the_product_of_scaled_linear_betas() -> None:
     assert levels[1].item() == pytest.approx((1 - 1e-4) * (1 - second))
     assert (levels.diff() < 0).all()
     assert 1 - levels[49].item() == pytest.approx(0.0085, rel=0.05)  # what is left out of 1 where training stops
+
+
+def test_a_step_with_the_truth_leads_to_the_same_noise_at_the_earlier_level() -> None:
+    torch.manual_seed(0)
+    truth, noise, levels = torch.rand(3, 8, 2) * 2 - 1, torch.randn(3, 8, 2), alphas_cumprod()
+    there = add_noise(truth, noise, levels[40])
+    torch.testing.assert_close(
+        ddim_step(there, truth, levels[40], levels[20]), add_noise(truth, noise, levels[20]), atol=1e-5, rtol=0
+    )
+    torch.testing.assert_close(ddim_step(there, truth, levels[40], torch.ones(())), truth)
 
 
 def test_points_fall_into_the_same_cells_of_a_raster_that_is_turned() -> None:

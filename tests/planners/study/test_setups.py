@@ -2,13 +2,8 @@
 
 import re
 from dataclasses import replace
-from itertools import groupby
-
-import pytest
 
 from planners.study.setups import Comparison, Setup, completed_comparisons, words_of
-from planners.study.sweep import BATCH, EVALUATED_TOGETHER, batches, shares_of
-from planners.training.many import Training
 
 BEGIN = Setup("ltf", "begin", 0, "epochs")
 REAL = Setup("ltf", "real", 0, "steps")
@@ -62,30 +57,3 @@ def test_comparisons_so_far_have_the_seeds_that_both_sides_have() -> None:
     without = [label for label in second if label != REAL.label_of(1)]
     assert completed_comparisons(WANTED, [*begun, *first, *without]) == whole, "means of other seeds would stand beside"
     assert completed_comparisons(WANTED, second) == []
-
-
-def units(*counts: tuple[str, int, int]) -> list[Training]:
-    return [Training(f"{part}-{i}-{seed}", unit=(part, seed)) for part, seed, n in counts for i in range(n)]
-
-
-def test_small_units_are_trained_at_once_but_never_with_what_they_begin_with() -> None:
-    everyone = units(("begin", 0, 3), ("main", 0, 20), ("main", 1, 20), ("control", 0, 20), ("control", 1, 20))
-    found = batches(everyone)
-    assert [one for batch in found for one in batch] == everyone
-    assert [[unit for unit, _ in groupby(batch, key=lambda one: one.unit)] for batch in found] == [
-        [("begin", 0)],
-        [("main", 0), ("main", 1), ("control", 0)],
-        [("control", 1)],
-    ]
-    assert len(found[1]) >= BATCH
-
-
-@pytest.mark.parametrize(("n", "processes"), [(0, 0), (1, 1), (16, 2), (48, 2), (49, 4)])
-def test_processes_evaluate_all_planners_and_as_many_of_each_kind(n: int, processes: int) -> None:
-    who = [Training(f"{'slow' if i < n / 2 else 'fast'}-{i}") for i in range(n)]
-    shares = shares_of(who, 2)
-    assert len(shares) == processes
-    assert sorted(one.label for share in shares for one in share) == sorted(one.label for one in who)
-    assert all(len(share) <= EVALUATED_TOGETHER for share in shares)
-    slow = [sum(one.label.startswith("slow") for one in share) for share in shares]
-    assert not slow or max(slow) - min(slow) <= 1

@@ -77,25 +77,6 @@ def test_polygons_with_the_same_rings_are_one_region_that_plays_all_parts() -> N
     assert parts == [1 << LANE | 1 << ON_ROUTE | 1 << DRIVABLE | 1 << INTERSECTION, 1 << DRIVABLE, 0]
 
 
-def test_a_map_far_larger_than_the_grid_gets_larger_cells() -> None:
-    polygons = [square("far", 4e5, -3e5, 2.0), square("here", 0.0, 0.0, 2.0), square("wide", -1.0, -1.0, 1e5)]
-    index = index_map(polygons, NOBODY)
-    assert index.cell_m > 100.0 and index.cells.size < 2_000_000
-    points = np.array([[1.0, 1.0], [4e5 + 1.0, 1.0 - 3e5], [2.5, 1.0], [-1.5, 0.0], [4e5 - 0.5, 1.0 - 3e5]])
-    assert held(index, points)[:, :3].tolist() == [[0, 1, 1], [1, 0, 0], [0, 0, 1], [0, 0, 0], [0, 0, 0]]
-
-
-def test_the_grid_moves_when_an_edge_runs_through_the_middle_of_a_cell() -> None:
-    frame = square("frame", 0.0, 0.0, 20.0)
-    first = index_map([frame], NOBODY)
-    x, y = first.low_x + 10.5 * first.cell_m, first.low_y + 12.5 * first.cell_m
-    ring = np.array([[x - 3.0, y], [x + 3.0, y], [x, y + 2.0]])
-    moved = index_map([frame, MapPolygon("through", MapLayer.LANE, ring)], NOBODY)
-    assert (moved.low_x, moved.low_y) != (first.low_x, first.low_y)
-    points = np.array([[x, y + 0.1], [x, y - 0.1], [x - 2.0, y + 0.1], [x + 2.9, y + 0.2]])
-    assert held(moved, points)[:, 1].tolist() == [True, False, True, False]
-
-
 def test_a_point_is_in_a_ring_that_touches_itself_where_it_is_enclosed_once() -> None:
     two_squares = np.array([[0, 0], [1, 0], [1, 1], [2, 1], [2, 2], [1, 2], [1, 1], [0, 1]], dtype=float)
     keyhole = np.array([[0, 0], [6, 0], [6, 6], [0, 6], [0, 3], [2, 3], [3, 2], [4, 3], [3, 4], [2, 3], [0, 3]])

@@ -23,7 +23,6 @@ from tasks.render.views import pinhole
 from tests.factory.datasets.navsim.navsim_samples import SIZE, TOKENS, K, exported, pictures, quiet, tree
 from tests.planners.samples import write_table
 
-ROOT = Path(__file__).resolve().parents[4]
 CONFIG = "devkit/navsim/planning/script/config"
 SPLITS = ("pdm_v1.0-0", "pdm_v1.0-1", "recovery_v1.0-0")
 SOURCE = "2021.05.12_veh-35_00005_00204"

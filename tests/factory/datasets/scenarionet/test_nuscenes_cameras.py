@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from factory.__main__ import main
-from factory.datasets.scenarionet.nuscenes_cameras import CHUNK, import_cameras, on_scenarionet_clock, rows_of
+from factory.datasets.scenarionet.nuscenes_cameras import import_cameras, on_scenarionet_clock, rows_of
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import BadClip
 from factory.stages.assets import Sensing, block_sensing
@@ -129,15 +129,6 @@ def test_the_clock_is_the_identity_where_keyframes_are_half_a_second_apart_and_g
     np.testing.assert_allclose(on_scenarionet_clock(KEYFRAMES_US, KEYFRAMES_US.tolist()), 0.5 * np.arange(25))
     with pytest.raises(ValueError, match="1 keyframes has no clock"):
         on_scenarionet_clock(stamps, [START_US])
-
-
-def test_rows_come_one_by_one_however_the_table_is_cut(tmp_path: Path) -> None:
-    rows = [{"token": f"{k}", "text": 'a ] } , "' * 4000} for k in range(50)]
-    (tmp_path / "t.json").write_text(json.dumps(rows, indent=1))
-    assert (tmp_path / "t.json").stat().st_size > CHUNK
-    assert list(rows_of(tmp_path / "t.json")) == rows
-    (tmp_path / "t.json").write_text("[]")
-    assert not list(rows_of(tmp_path / "t.json"))
 
 
 @pytest.mark.parametrize(

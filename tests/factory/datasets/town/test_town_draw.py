@@ -19,7 +19,6 @@ from factory.datasets.town.raster import LitScene, MeshBuilder
 from factory.datasets.town.settings import CAMERA_NAMES
 
 FRONT = build_rig(("ring_front_center",), 320, 180)[0]
-SIDE = build_rig(("ring_side_left",), 320, 180)[0]
 RED = (1.0, 0.0, 0.0)
 GREEN = (0.0, 1.0, 0.0)
 

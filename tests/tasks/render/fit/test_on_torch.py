@@ -9,13 +9,10 @@ import street
 import torch
 
 from tasks.render.fit.backend import CpuBackend, Derivatives
-from tasks.render.fit.losses import photo_loss as photo_loss_by_hand
-from tasks.render.fit.losses import photo_target
-from tasks.render.fit.on_torch import LearnedTensor, TorchBackend, lay_flat, photo_loss
+from tasks.render.fit.on_torch import TorchBackend
 from tasks.render.fit.reconstruct import finish_scene, run_iterations
 from tasks.render.fit.start import FitProblem, prepare_fit
-from tasks.render.fit.state import AdamArray, FitState, fit_road
-from tasks.render.fit.state import lay_flat as lay_flat_by_hand
+from tasks.render.fit.state import FitState
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gradient import Gradients
 from tasks.render.splatting.tensors import splatted
@@ -137,78 +134,3 @@ def test_what_is_taken_is_a_copy(prepared: tuple[FitProblem, FitState]) -> None:
     state = fresh(prepared[1])
     TENSORS.load(state).learned["means"].values[:] = 0.0
     assert state.learned["means"].values.any()
-
-
-def test_adam_steps_tensors_as_it_steps_arrays() -> None:
-    rng = np.random.default_rng(1)
-    start = rng.normal(size=(20, 3)).astype(np.float32)
-    array = AdamArray.unstepped(start)
-    tensor = LearnedTensor(
-        *(torch.tensor(getattr(AdamArray.unstepped(start), each.name)) for each in fields(AdamArray))
-    )
-    for _ in range(8):
-        rows = np.sort(rng.choice(20, 7, replace=False))
-        gradient = rng.normal(size=(7, 3)).astype(np.float32)
-        scale = rng.uniform(0.5, 2.0, 7).astype(np.float32)
-        array.step(rows, gradient, 0.1, scale)
-        tensor.step(torch.tensor(rows), torch.tensor(gradient), 0.1, torch.tensor(scale))
-    for each in fields(AdamArray):
-        np.testing.assert_allclose(getattr(tensor, each.name).numpy(), getattr(array, each.name), rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("ssim_weight", [0.0, 0.3, 1.0])
-def test_the_loss_of_a_picture_is_the_one_written_by_hand(ssim_weight: float) -> None:
-    rng = np.random.default_rng(2)
-    photo, ignored = rng.integers(0, 256, (23, 31, 3), dtype=np.uint8), rng.random((23, 31)) < 0.2
-    picture = rng.uniform(-0.1, 1.1, (23, 31, 3)).astype(np.float32)
-    target = photo_target(photo, ignored)
-    loss, gradient = photo_loss_by_hand(picture, target, ssim_weight)
-    given = torch.tensor(picture, requires_grad=True)
-    found = photo_loss(given, torch.tensor(target.rgb), torch.tensor(target.weight), ssim_weight)
-    assert found.item() == pytest.approx(loss, rel=1e-5)
-    (by_picture,) = torch.autograd.grad(found, given)
-    np.testing.assert_allclose(by_picture.numpy(), gradient, atol=1e-4 * np.abs(gradient).max())
-
-
-@pytest.mark.parametrize(("background", "boxes"), [(0.0, 2.0), (3.0, 0.0), (1.0, 1.5), (0.0, 0.0)])
-def test_sides_keep_to_their_longest_in_arrays_and_in_tensors(
-    prepared: tuple[FitProblem, FitState], background: float, boxes: float
-) -> None:
-    """Of the rows that are named alone, and of no Gaussian on the road."""
-    state = fresh(prepared[1])
-    rng = np.random.default_rng(4)
-    sizes = state.learned["log_scales"].values
-    sizes += rng.normal(0.0, 1.0, sizes.shape).astype(np.float32)
-    before, rows = sizes.copy(), np.arange(0, len(state), 2)
-    held = TENSORS.load(state)
-    held.keep_round(torch.tensor(rows), background, boxes)
-    state.keep_round(rows, background, boxes)
-    np.testing.assert_allclose(held.learned["log_scales"].values.numpy(), sizes, atol=1e-6)
-    np.testing.assert_array_equal(sizes[1::2], before[1::2])
-    np.testing.assert_array_equal(sizes[state.road], before[state.road])
-    np.testing.assert_array_equal(sizes.max(axis=1), before.max(axis=1))
-    for most, mine in ((background, (state.owner < 0) & ~state.road), (boxes, state.owner >= 0)):
-        stretch = np.exp(np.ptp(sizes[rows[mine[rows]]], axis=1))
-        assert mine[rows].sum() > 50
-        assert (stretch.max() <= most + 1e-4) if most else (stretch.max() > 10.0)
-
-
-def test_tensors_are_laid_on_the_road_as_arrays_are() -> None:
-    """A road that rises and bends; Gaussians on it, off it, and beyond its ends."""
-    rng = np.random.default_rng(3)
-    at = rng.uniform([-10.0, -6.0], [40.0, 6.0], (20000, 2))
-    ground = np.column_stack([at, 0.05 * at[:, 0] + 0.3 * np.sin(0.1 * at[:, 0]) - 0.02 * at[:, 1]])
-    eyes = np.column_stack([np.arange(0.0, 30.0, 2.0), np.zeros(15), 0.05 * np.arange(0.0, 30.0, 2.0) + 1.6])
-    road = fit_road(ground, eyes)
-    assert road is not None
-    means = rng.uniform([-30.0, -20.0, -1.0], [60.0, 20.0, 3.0], (500, 3)).astype(np.float32)
-    quats = rng.normal(size=(500, 4)).astype(np.float32)
-    log_scales = rng.normal(-4.0, 2.0, (500, 3)).astype(np.float32)
-    rows = np.arange(0, 500, 2)
-    tensors = [torch.tensor(array) for array in (means, quats, log_scales)]
-    lay_flat(*tensors, torch.tensor(rows), road)
-    before = means.copy()
-    lay_flat_by_hand(means, quats, log_scales, rows, road)
-    assert 50 < (means[rows] != before[rows]).any(axis=1).sum() < len(rows)
-    for tensor, array in zip(tensors, (means, quats, log_scales)):
-        np.testing.assert_allclose(tensor.numpy(), array, atol=2e-6)

@@ -8,7 +8,6 @@ import pytest
 import street
 from numpy.typing import NDArray
 
-from tasks.render.fit import start
 from tasks.render.fit.reconstruct import (
     REFINE_UNTIL,
     draw_photo,
@@ -53,28 +52,6 @@ def prepared() -> tuple[FitProblem, FitState]:
 
 def fresh(state: FitState) -> FitState:
     return FitState.from_arrays(state.arrays())
-
-
-@pytest.mark.slow
-def test_what_of_the_photos_does_not_fit_into_memory_is_made_anew_each_time(
-    prepared: tuple[FitProblem, FitState], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(start, "KEPT_BYTES", 2 * start.COMPARED_BYTES * few()[0][0].rgb[..., 0].size)
-    photos, sweeps = few()
-    problem, state = prepare_fit(photos, sweeps, street.tracks(), SETTINGS, held_out=[2])
-    assert [shot.kept is None for shot in prepared[0].train] == [False] * 4
-    assert [shot.kept is None for shot in problem.train] == [False, False, True, True]
-    other = fresh(prepared[1])
-    run_iterations(problem, state, SETTINGS, 8)
-    run_iterations(prepared[0], other, SETTINGS, 8)
-    for name, array in state.arrays().items():
-        np.testing.assert_array_equal(array, other.arrays()[name], err_msg=name)
-
-
-def test_what_is_kept_of_a_pixel_is_counted(prepared: tuple[FitProblem, FitState]) -> None:
-    kept = prepared[0].train[0].compared
-    arrays = (kept.target.rgb, kept.target.mean, kept.target.variance, kept.target.weight, kept.ground)
-    assert sum(a.nbytes for a in arrays) == start.COMPARED_BYTES * kept.ground.size
 
 
 def test_a_held_out_photo_comes_out_better_with_every_round(prepared: tuple[FitProblem, FitState]) -> None:

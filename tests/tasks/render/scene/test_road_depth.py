@@ -6,7 +6,6 @@ import pytest
 from tasks.render.scene.features import driven_road, road_depth
 from tasks.render.scene.stereo import FAR_M
 
-K = np.array([[100.0, 0.0, 64.0], [0.0, 100.0, 36.0], [0.0, 0.0, 1.0]])
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # world from camera, looking along x
 
 
