@@ -92,9 +92,9 @@ def test_memory_bounds_what_a_node_does_at_once(tmp_path: Path, memory_of_two: N
 
     for claimed_gb, at_once in ((1.0, 2), (9.0, 1)):
         journal = tmp_path / f"journal{at_once}"
-        work = Timed(journal=str(journal), seconds=0.2)
-        claims = Claims(memory_gb={task.name: claimed_gb for task in TASKS})
-        assert run(tmp_path / f"out{at_once}", work, workers=4, claims=claims).exit_code == COMPLETE
+        work, store = Timed(journal=str(journal), seconds=0.4), Store(tmp_path / f"out{at_once}")
+        how = Execution(workers=4, claims=Claims(memory_gb={task.name: claimed_gb for task in TASKS}))
+        assert executed(work, refs(5), ["human"], 1, store, how).exit_code == COMPLETE
         spans = [[float(t) for t in line.split()[1:]] for line in journal.read_text().splitlines() if line[:3] == "at "]
         assert max(sum(began <= start < ended for began, ended in spans) for start, _ in spans) == at_once
 
