@@ -265,6 +265,8 @@ class Handler(BaseHTTPRequestHandler):
 
     def _answer(self) -> Answer:
         names = self.server.host_names
+        if len(self.headers.get_all("Host", [])) > 1:
+            return _json({"error": "more than one header Host"}, 400)
         try:
             asked = (urlsplit(f"//{self.headers.get('Host', '')}").hostname or "").lower()
         except ValueError:
@@ -281,10 +283,14 @@ class Handler(BaseHTTPRequestHandler):
         self.send_header("Cache-Control", answer.cache)
         if self.close_connection:
             self.send_header("Connection", "close")
-        for name, value in HEADERS.items():
-            self.send_header(name, value)
         self.end_headers()
         self.wfile.write(answer.body)
+
+    def end_headers(self) -> None:
+        """Also of the pages that the standard library answers a broken request with."""
+        for name, value in HEADERS.items():
+            self.send_header(name, value)
+        super().end_headers()
 
     def log_message(self, format: str, *args: object) -> None:
         """Only what went wrong is said."""

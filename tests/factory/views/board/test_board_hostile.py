@@ -39,6 +39,7 @@ MALFORMED = {
     "bracket": b"GET //[x/y HTTP/1.1\r\n" + HOST,
     "bracket in Host": b"GET / HTTP/1.1\r\nHost: [x\r\n\r\n",
     "no Host": b"GET / HTTP/1.1\r\n\r\n",
+    "two Hosts": b"GET / HTTP/1.1\r\nHost: evil.example\r\n" + HOST,
     "huge numbers": b"GET /api/samples?page=99999999&size=99999999 HTTP/1.1\r\n" + HOST,
     "unknown filter": b"GET /api/samples?order=%27&expert=%00 HTTP/1.1\r\n" + HOST,
     "large body": b"POST /api/samples HTTP/1.1\r\nContent-Length: 10000000\r\n" + HOST + b"x" * 10_000_000,
@@ -87,6 +88,7 @@ def test_what_is_malformed_is_refused(at: At, name: str, capfd: pytest.CaptureFi
     back = sent(at, MALFORMED[name])
     heads = [line for line in back.split(b"\r\n") if line.startswith(b"HTTP/1.1 ")]
     assert len(heads) <= 1 and not any(head[9:10] == b"2" for head in heads if name not in ("bad percent", "bytes"))
+    assert all(back.count(b"Content-Security-Policy: default-src 'none'") == 1 for _ in heads)
     assert b"root:" not in back and "Traceback" not in capfd.readouterr().err
     assert is_answered(at)
 
