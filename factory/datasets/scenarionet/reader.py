@@ -206,7 +206,7 @@ class LoggedTrack:
 
 
 @dataclass(frozen=True)
-class Frames:
+class FrameClock:
     """The T frames of a log whose stamps are in order, and the S steps of 0.1 s among them."""
 
     rows: Ints  # (T,) their numbers in the file
@@ -216,7 +216,7 @@ class Frames:
     repairs: tuple[Repair, ...]
 
 
-def frames_of(metadata: Mapping[str, Any], n_frames: int, file: str) -> Frames:
+def frames_of(metadata: Mapping[str, Any], n_frames: int, file: str) -> FrameClock:
     """The clock of a log. Raises BadClip for missing, too sparse and mostly unordered stamps."""
     if "ts" not in metadata:
         raise BadClip(file, "metadata.ts", "missing")
@@ -246,7 +246,7 @@ def frames_of(metadata: Mapping[str, Any], n_frames: int, file: str) -> Frames:
         at = np.interp(STEP_S * np.arange(int(np.floor(times_s[-1] / STEP_S + 1e-6)) + 1), times_s, at)
     before = np.minimum(at.astype(int), len(apart) - 1)
     known = (at == np.floor(at)) | (apart[before] <= MAX_GAP_S)
-    return Frames(rows, times_s, at, known, (*clock_repairs(times_s), *unordered))
+    return FrameClock(rows, times_s, at, known, (*clock_repairs(times_s), *unordered))
 
 
 def _longest_increasing(stamps: Array) -> Ints:
@@ -286,7 +286,7 @@ def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, fi
     return LoggedTrack(position, heading, valid, sizes)
 
 
-def ground_height(ego: LoggedTrack, frames: Frames, file: str) -> Array:
+def ground_height(ego: LoggedTrack, frames: FrameClock, file: str) -> Array:
     """(S,) height of the road under the ego: below Waymo's box centre; 0 where the file keeps the ego at z = 0."""
     if not ego.position[ego.valid, 2].any():
         return np.zeros(len(frames.at))
@@ -296,7 +296,7 @@ def ground_height(ego: LoggedTrack, frames: Frames, file: str) -> Array:
 
 
 def observed_agents(
-    tracks: Mapping[Any, Any], sdc_id: str, n_frames: int, frames: Frames, file: str
+    tracks: Mapping[Any, Any], sdc_id: str, n_frames: int, frames: FrameClock, file: str
 ) -> tuple[ObservedTracks, tuple[Repair, ...]]:
     """All tracks but the ego at the log's T frames; those that name no id, no class or no states are left out.
 
@@ -339,7 +339,7 @@ def observed_agents(
     return ObservedTracks(frames.times_s, ids, kinds, boxes, rows), tuple(done)
 
 
-def agent_tracks(seen: ObservedTracks, frames: Frames, ground: Array) -> AgentTracks:
+def agent_tracks(seen: ObservedTracks, frames: FrameClock, ground: Array) -> AgentTracks:
     """Tracks at the steps (S,), heights above `ground` (S,)."""
     valid = np.zeros((len(frames.at), len(seen)), bool)
     boxes, z = np.full((*valid.shape, 5), np.nan), np.full(valid.shape, np.nan)
@@ -365,7 +365,7 @@ def agent_tracks(seen: ObservedTracks, frames: Frames, ground: Array) -> AgentTr
     )
 
 
-def resampled(track: LoggedTrack, frames: Frames) -> tuple[Array, Array, Bools]:
+def resampled(track: LoggedTrack, frames: FrameClock) -> tuple[Array, Array, Bools]:
     """(S, 3) position, (S,) heading in [-pi, pi), (S,) valid: both frames around a step must be, and near it."""
     before = np.floor(frames.at).astype(int)
     after = np.minimum(before + 1, len(track.valid) - 1)
@@ -403,7 +403,7 @@ def fitted_velocities(xy: Array, valid: Bools) -> Array:
     return slope
 
 
-def ego_segments(track: LoggedTrack, source: Source, frames: Frames) -> tuple[Array, Ints]:
+def ego_segments(track: LoggedTrack, source: Source, frames: FrameClock) -> tuple[Array, Ints]:
     """Ego states (S, 11), and (S,) the number of the continuous drive that a step belongs to; NaN and -1: none.
 
     Columns 7..10 (steering and rates) are 0, as NAVSIM initialises an ego.

@@ -8,7 +8,7 @@ from shapely.geometry import Point, Polygon
 from factory.datasets.scenarionet.map import pieces
 from factory.datasets.scenarionet.reader import (
     SLOPE_STEPS,
-    Frames,
+    FrameClock,
     LoggedTrack,
     ScenarioNetReader,
     fitted_velocities,
@@ -248,7 +248,7 @@ def test_frames_where_the_ego_is_invalid_are_filled_up_to_half_a_second_and_else
 
 
 def test_a_gap_in_a_log_costs_the_windows_across_it_and_no_others(tmp_path):
-    """Frames 120 to 139 of 300 are gone: 2.1 s without any, with 12 s before and 16 s behind them."""
+    """FrameClock 120 to 139 of 300 are gone: 2.1 s without any, with 12 s before and 16 s behind them."""
     left = np.setdiff1d(np.arange(300), np.arange(120, 140))
     scenario = town.waymo(300)
     scenario["length"], scenario["metadata"]["ts"] = len(left), scenario["metadata"]["ts"][left]
@@ -296,7 +296,7 @@ def test_between_two_frames_a_track_turns_the_short_way_round() -> None:
     positions = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     headings = np.array([np.pi - 0.1, -np.pi + 0.1])
     track = LoggedTrack(positions, headings, np.ones(2, bool), np.ones(3))
-    frames = Frames(np.arange(2), np.array([0.0, 0.4]), np.array([0.0, 0.25, 0.5]), np.ones(3, bool), ())
+    frames = FrameClock(np.arange(2), np.array([0.0, 0.4]), np.array([0.0, 0.25, 0.5]), np.ones(3, bool), ())
     position, heading, valid = resampled(track, frames)
     np.testing.assert_allclose(position[:, 0], [0.0, 0.5, 1.0])
     np.testing.assert_allclose(heading, [np.pi - 0.1, np.pi - 0.05, -np.pi], atol=1e-12)
