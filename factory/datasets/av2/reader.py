@@ -32,6 +32,7 @@ from factory.readers.logs import (
 )
 from factory.readers.points import read_feather
 from factory.readers.signs import stamps_sign
+from factory.wording import shown
 from tasks.world.arrays import Array, Bools, Indices, Ints
 from tasks.world.clip import MOVING_KINDS, STEP_S, AgentKind, AgentTracks, Camera, SensorFile
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, X, Y, wrap_angle
@@ -632,7 +633,8 @@ def read_log(folder: Path) -> AV2Log:
     ego_states = ego_states_at(motion, times_s)
     vector_map = map_file(folder)
     road_map, map_repairs = read_map(vector_map)
-    lights, light_repairs = lights_on_map(read_lights(folder, motion, times_s), road_map.lanes)
+    every_light, state_repairs = read_lights(folder, motion, times_s)
+    lights, light_repairs = lights_on_map(every_light, road_map.lanes)
     cameras, sensors, own = read_cameras(folder), folder / "sensors", folder / "LICENSE"
     lines = own.read_text(encoding="utf-8").splitlines() if own.is_file() else []
     return AV2Log(
@@ -649,7 +651,7 @@ def read_log(folder: Path) -> AV2Log:
         licence=lines[0].strip() if lines else LICENCE,
         content_digest=content_digest(folder),
         split=folder_split(folder),
-        repairs=(*motion.repairs, *map_repairs, *light_repairs),
+        repairs=(*motion.repairs, *map_repairs, *state_repairs, *light_repairs),
     )
 
 
@@ -682,26 +684,34 @@ def read_cameras(folder: Path) -> tuple[Camera, ...]:
     return tuple(cameras)
 
 
-def read_lights(folder: Path, motion: LogMotion, times_s: Array) -> TrafficLights:
-    """Light phases at times (S,), of all lanes that are named; no lanes where the log has none. Raises BadClip."""
+def read_lights(folder: Path, motion: LogMotion, times_s: Array) -> tuple[TrafficLights, tuple[Repair, ...]]:
+    """Light phases at times (S,), of all lanes that are named; no lanes where the log has none.
+
+    A state that is none is unknown, and told. Raises BadClip, also where most are none.
+    """
     path = folder / LIGHTS
     if not is_named(path):
-        return TrafficLights((), np.zeros((len(times_s), 0), np.int8))
+        return TrafficLights((), np.zeros((len(times_s), 0), np.int8)), ()
     table = read_feather(path, ("timestamp_ns", "lane_id", "state"))
     lanes, names = table["lane_id"].astype(str), table["state"].astype(str)
-    unknown = set(names.tolist()) - LightState.__members__.keys()
-    if unknown:
-        raise BadClip(str(path), "state", f"unknown state {sorted(unknown)}")
+    unknown = ~np.isin(names, list(LightState.__members__))
+    if unknown.sum() > MOST * len(names):
+        raise BadClip(str(path), "state", f"unknown state {sorted(set(names[unknown].tolist()))}")
+    done: list[Repair] = []
     changed_at = seconds_since(motion.start_ns, stamps(path, table))
     lane_ids = tuple(sorted(set(lanes.tolist())))
     states = np.full((len(times_s), len(lane_ids)), LightState.UNKNOWN, np.int8)
     for column, lane_id in enumerate(lane_ids):
         rows = np.flatnonzero(lanes == lane_id)
         rows = rows[np.argsort(changed_at[rows], kind="stable")]
-        phase = np.array([LightState[name] for name in names[rows]], np.int8)
+        phase = np.array([LightState.__members__.get(name, LightState.UNKNOWN) for name in names[rows]], np.int8)
+        until = np.append(changed_at[rows][1:], np.inf)
+        for k in np.flatnonzero(unknown[rows]):
+            was = f"the state {shown(str(names[rows[k]]))}"
+            done.append(Repair("light", lane_id, float(changed_at[rows[k]]), was, "unknown", float(until[k])))
         latest = np.searchsorted(changed_at[rows], times_s + SAME_FRAME_S) - 1
         states[latest >= 0, column] = phase[latest[latest >= 0]]
-    return TrafficLights(lane_ids, states)
+    return TrafficLights(lane_ids, states), tuple(done)
 
 
 def content_digest(folder: Path) -> str:

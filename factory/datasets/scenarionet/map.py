@@ -17,6 +17,7 @@ from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.repair.records import Repair
 from tasks.world.repair.road import finite_points, left_out_lanes, line_fault, map_repair, simple_area, simple_crossing
+from tasks.world.repair.tracks import MOST
 from tasks.world.road_map import (
     Lane,
     LightState,
@@ -360,9 +361,13 @@ def _beside(lanes: list[RawLane], side: float) -> dict[str, str]:
     return {lanes[row].lane_id: lanes[beside].lane_id for row, (_, beside) in best.items()}
 
 
-def traffic_lights(states: Mapping[str, Any], n_steps: int, file: str) -> TrafficLights:
-    """Lights over the log's own steps; two lights of one lane count as the more restrictive. Raises BadClip."""
+def traffic_lights(states: Mapping[str, Any], times_s: Array, file: str) -> tuple[TrafficLights, tuple[Repair, ...]]:
+    """Lights over the log's own frames, at times (T,); two lights of one lane count as the more restrictive.
+
+    A state that is none is unknown, and told. Raises BadClip, also where most of a light's are none.
+    """
     of_lane: dict[str, NDArray[np.int8]] = {}
+    done: list[Repair] = []
     for key, light in states.items():
         field = f"dynamic_map_states[{id_text(key) or shown(key)}]"
         try:
@@ -372,15 +377,21 @@ def traffic_lights(states: Mapping[str, Any], n_steps: int, file: str) -> Traffi
             raise BadClip(file, field, f"no lane or no state.object_state ({said})") from error
         if lane_id is None:
             raise BadClip(file, field, f"its lane is {shown(light['lane'])}, expected an id")
-        if len(names) != n_steps:
-            raise BadClip(file, f"{field}.state.object_state", f"{len(names)} steps, the log has {n_steps}")
-        unknown = [name for name in names if not isinstance(name, str | None) or name not in LIGHT_STATES]
-        if unknown:
-            raise BadClip(file, f"{field}.state.object_state", f"unknown light states, first {shown(unknown[0])}")
-        row = np.array([LIGHT_STATES[name] for name in names], np.int8)
+        if len(names) != len(times_s):
+            raise BadClip(file, f"{field}.state.object_state", f"{len(names)} steps, the log has {len(times_s)}")
+        of_names = [LIGHT_STATES.get(name) if isinstance(name, str | None) else None for name in names]
+        unknown = [k for k, state in enumerate(of_names) if state is None]
+        if len(unknown) > MOST * len(names):
+            raise BadClip(
+                file, f"{field}.state.object_state", f"unknown light states, first {shown(names[unknown[0]])}"
+            )
+        for k in unknown:
+            done.append(Repair("light", lane_id, float(times_s[k]), f"the state {shown(names[k])}", "unknown"))
+        row = np.array([LightState.UNKNOWN if state is None else state for state in of_names], np.int8)
         of_lane[lane_id] = np.maximum(of_lane[lane_id], row) if lane_id in of_lane else row
     columns = list(of_lane.values())
-    return TrafficLights(tuple(of_lane), np.stack(columns, axis=1) if columns else np.zeros((n_steps, 0), np.int8))
+    stacked = np.stack(columns, axis=1) if columns else np.zeros((len(times_s), 0), np.int8)
+    return TrafficLights(tuple(of_lane), stacked), tuple(done)
 
 
 def _drivable_areas(

@@ -738,12 +738,13 @@ def read_log(path: Path) -> ScenarioLog:
     motion = read_motion(scenario, file)
     name, source = _source(scenario, file)
     n_frames, metadata = int(scenario["length"]), scenario["metadata"]
-    every_light = traffic_lights(scenario["dynamic_map_states"], n_frames, file)
+    frames = frames_of(metadata, n_frames, file)
+    times_s = np.interp(np.arange(n_frames), frames.rows, frames.times_s)
+    every_light, state_repairs = traffic_lights(scenario["dynamic_map_states"], times_s, file)
     location = id_text(metadata.get("map")) or ""
     lanes, map_repairs = road_map(scenario["map_features"], every_light.lane_ids, name, location, file)
     lights, light_repairs = lights_on_map(every_light, lanes.lanes)
     route = route_of_drive(lanes, motion.ego_states[motion.segment >= 0, :3], file, "map_features")
-    frames = frames_of(metadata, n_frames, file)
     return ScenarioLog(
         file=file,
         motion=motion,
@@ -755,5 +756,5 @@ def read_log(path: Path) -> ScenarioLog:
         licence=source.licence,
         content_digest=digest,
         split=folder_split(path) or nuscenes_split(path.stem) or waymo_split(metadata.get("source_file")),
-        repairs=(*motion.repairs, *map_repairs, *light_repairs),
+        repairs=(*motion.repairs, *map_repairs, *state_repairs, *light_repairs),
     )

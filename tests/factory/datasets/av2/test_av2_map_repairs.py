@@ -11,6 +11,7 @@ from factory.datasets.av2.reader import AV2Reader
 from factory.readers.base import BadClip
 from tasks.world.clip import Clip
 from tasks.world.repair.records import LEFT_OUT, RepairCount, repair_counts
+from tasks.world.road_map import LightState
 from tests.factory.datasets.av2.test_av2 import START_NS, boundary, edit_map, write_log, write_table
 
 NAN = float("nan")
@@ -128,3 +129,19 @@ def test_where_no_lane_for_cars_is_left_the_log_is_refused_with_the_reason(tmp_p
     edit_map(log, lambda content: [lane.update(left_lane_boundary=[]) for lane in lanes_of(content).values()])
     with pytest.raises(BadClip, match=r"no VEHICLE or BUS lane; left out: 1 \(no point in its left boundary\)"):
         read(log)
+
+
+def test_a_state_that_no_light_has_is_unknown_until_the_next_and_told(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log-a")
+    stamps = [START_NS + round(t * 1e9) for t in (0.0, 2.0, 4.0)]
+    rows = {"timestamp_ns": stamps, "lane_id": [2] * 3, "state": ["GREEN", "PURPLE", "RED"]}
+    write_table(log / "traffic_lights.feather", rows)
+    clip = read(log)
+    states = clip.lights.states[:, 0]
+    assert [*np.unique(states[:20]), *np.unique(states[20:40]), *np.unique(states[40:])] == [
+        LightState.GREEN,
+        LightState.UNKNOWN,
+        LightState.RED,
+    ]
+    (told,) = (repair for repair in clip.repairs if repair.what == "light")
+    assert (told.thing, told.time_s, told.until_s, told.now) == ("2", 2.0, 4.0, "unknown") and "PURPLE" in told.was

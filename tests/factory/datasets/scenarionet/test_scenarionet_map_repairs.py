@@ -6,6 +6,7 @@ import shapely
 
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from tasks.world.repair.records import LEFT_OUT
+from tasks.world.road_map import LightState
 from tests.factory.datasets.scenarionet import scenarionet_scenarios as town
 
 NAN = float("nan")
@@ -115,3 +116,16 @@ def test_a_lane_whose_polygon_has_no_area_is_as_wide_as_one_without(tmp_path):
     clip = read(scenario, tmp_path, "sd_flat.pkl")
     assert shapely.Polygon(clip.road_map.lanes["E1"].ring).area == pytest.approx(100.0 * 3.5)
     assert [(repair.what, repair.thing) for repair in clip.repairs] == [("lane", "E1")]
+
+
+def test_a_state_that_no_light_has_is_unknown_in_that_frame_and_told(tmp_path):
+    scenario = town.nuscenes()
+    states = ["LANE_STATE_STOP"] * town.N_FRAMES
+    states[20] = "PURPLE"
+    scenario["dynamic_map_states"]["x"] = {"lane": "C2", "state": {"object_state": states}}
+    clip = read(scenario, tmp_path, "sd_purple.pkl")
+    red = clip.lights.states[:, clip.lights.lane_ids.index("C2")]
+    assert np.flatnonzero(red == LightState.UNKNOWN).tolist() == [20] and (np.delete(red, 20) == LightState.RED).all()
+    (told,) = (repair for repair in clip.repairs if repair.what == "light")
+    assert (told.thing, told.was, told.now) == ("C2", "the state 'PURPLE'", "unknown")
+    assert told.time_s == pytest.approx(2.0)
