@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import BadClip, ClipReader
+from tests.writable import load_writable
 
 BOXES, POSES = "annotations.feather", "city_SE3_egovehicle.feather"
 MOUNTS, INTRINSICS = "calibration/egovehicle_SE3_sensor.feather", "calibration/intrinsics.feather"
@@ -148,7 +149,7 @@ SCENARIONET: dict[str, tuple[Callable[[Scenario], object], str]] = {
 def test_scenarionet_of_another_meaning_is_told(shared_root: Path, tmp_path: Path, kind: str) -> None:
     change, said = SCENARIONET[kind]
     source = next((shared_root / "data" / "scenarionet").rglob("sd_*0061.pkl"))
-    scenario = pickle.loads(source.read_bytes())
+    scenario = load_writable(source)
     change(scenario)
     (tmp_path / source.name).write_bytes(pickle.dumps(scenario))
     with pytest.raises(BadClip, match=said):

@@ -19,6 +19,7 @@ from factory.datasets.scenarionet.reader import read_log as read_scenario_log
 from tasks.world.clip import AgentKind
 from tasks.world.frames import HEADING, PACIFICA, X, Y
 from tasks.world.repair.records import LEFT_OUT, RepairCount, repair_counts
+from tests.writable import load_writable
 
 STEP_S = 0.1
 
@@ -142,7 +143,7 @@ def test_one_object_of_an_impossible_length_is_left_out_and_counted_and_costs_no
     shared_root: Path, scene: Path, tmp_path: Path
 ) -> None:
     mutate(shared_root / "trials/05-one-bad-box", scene, tmp_path / scene.name)
-    tracks = pickle.loads(scene.read_bytes())["tracks"]
+    tracks = load_writable(scene)["tracks"]
     vehicles = [name for name, track in tracks.items() if name != "ego" and track["type"] == "VEHICLE"]
     longest = max(vehicles, key=lambda name: tracks[name]["state"]["valid"].sum())
     found, sound = both(scene, tmp_path / scene.name)
@@ -171,7 +172,7 @@ def test_the_ego_listed_among_the_agents_is_no_agent(shared_root: Path, scene: P
 
 @pytest.mark.slow
 def test_an_identity_that_jumps_is_two_people_who_walk(scene: Path, tmp_path: Path) -> None:
-    scenario = pickle.loads(scene.read_bytes())
+    scenario = load_writable(scene)
     walkers = [name for name, track in scenario["tracks"].items() if track["type"] == "PEDESTRIAN"]
     longest = max(walkers, key=lambda name: scenario["tracks"][name]["state"]["valid"].sum())
     scenario["tracks"][longest]["state"]["position"][60:, 0] += 8.0
