@@ -170,6 +170,8 @@ def _table(path: Path, layer: str, target: str) -> LayerTable:
             log.warning("%s: layer %s, fid %d: encloses no area, left out", path, layer, fid)
         fids, wkb, columns = fids[whole], wkb[whole], {name: column[whole] for name, column in columns.items()}
     shapes = _projected(path, layer, meta["crs"], target, fids, wkb)
+    if layer in LINES:  # a point that stands twice has no heading
+        shapes = shapely.remove_repeated_points(shapes)
     if "was_m2" in MADE.get(layer, ()):
         shapes, columns["was_m2"] = _ordered(shapes)
     rows, parts = _parts(path, layer, fids, shapes)
@@ -246,7 +248,7 @@ def _parts(path: Path, layer: str, fids: Ints, shapes: NDArray[np.object_]) -> t
 
 # A city's tables on disk, in the user's cache: read from the GeoPackage once, then within a fraction of a second.
 
-FORMAT = 4  # raise by hand whenever a GeoPackage gives other tables, or they are kept otherwise
+FORMAT = 5  # raise by hand whenever a GeoPackage gives other tables, or they are kept otherwise
 
 
 def cached_tables_path(path: Path) -> Path:

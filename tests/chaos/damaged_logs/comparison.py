@@ -137,14 +137,14 @@ def differing(a: AgentTracks, b: AgentTracks) -> set[str]:
 def is_far(found: AgentTracks, thing: str, truth: AgentTracks, true_thing: str, *, as_long: bool) -> bool:
     """Whether a thing is away from where it is in truth at a step that both have.
 
-    as_long: where both are seen at the same steps alone. As NAVSIM's public code has it, a thing of which one frame of
-    the 4 s is left stands there for all of them.
+    as_long: where both are seen at the same steps, in one piece. As NAVSIM's public code has it, a thing of which one
+    frame of the 4 s is left stands there for all of them.
     """
     if not {thing} <= {*found.track_ids} or not {true_thing} <= {*truth.track_ids}:
         return False
     n, m = found.track_ids.index(thing), truth.track_ids.index(true_thing)
     both = found.valid[:, n] & truth.valid[:, m]
-    if as_long and not np.array_equal(found.valid[:, n], truth.valid[:, m]):
+    if as_long and (f"{thing}#2" in found.track_ids or not np.array_equal(found.valid[:, n], truth.valid[:, m])):
         return False
     off = found.boxes[both, n] - truth.boxes[both, m]
     turned = np.abs((off[:, 2] + np.pi) % (2 * np.pi) - np.pi)
@@ -159,11 +159,15 @@ def thing_of(name: str) -> str:
 
 
 def _tells(repair: Repair, thing: str, inside: Sequence[Damage]) -> bool:
-    """Whether a repair is of the thing or names it, or is of a frame, the ego or a nameless box at a damage's time."""
-    if thing_of(repair.thing) == thing or thing in repair.was:
+    """Whether a repair is of the thing or names it, or is of a frame, the ego or a nameless box at a damage's time.
+
+    Of two things with one token the repair names one.
+    """
+    together = {name for d in inside if d.kind == "token of another" and thing in d.things for name in d.things}
+    if thing_of(repair.thing) in {thing, *together} or thing in repair.was:
         return True
     last_s = max(repair.time_s, repair.until_s)
-    nameless = repair.thing in ("", EGO) or repair.thing.startswith(("box ", "frame "))
+    nameless = repair.thing in ("", EGO) or repair.what == "token" or repair.thing.startswith("frame ")
     return nameless and any(
         np.isnan(repair.time_s) or (d.first_s - 1.5 * STEP_S <= last_s and repair.time_s <= d.last_s + STEP_S)
         for d in inside
@@ -316,10 +320,17 @@ def rows_of(words: Sequence[str], out: Path) -> dict[tuple[int, str], dict[str, 
 
 
 def unequal_rows(data: DataSet, seed: int) -> tuple[int, list[str]]:
-    """Rows of a run on a log that lie outside of its one damage, and those that the run on the damaged log has not."""
+    """Rows of a run on a log that lie outside of its one damage, and those that the run on the damaged log has not.
+
+    Not what is done to nuScenes' ego, which is smoothed as a whole.
+    """
     path = data.logs[seed % len(data.logs)]
-    rng, log, as_it_is = np.random.default_rng(seed), data.opened(path), data.opened(path)
-    damages = injected(log, rng, short=True)
+    rng, as_it_is = np.random.default_rng(seed), data.opened(path)
+    while True:
+        log = data.opened(path)
+        damages = injected(log, rng, short=True)
+        if not (isinstance(log, NuscenesLog) and any(damage.ego for damage in damages)):
+            break
     with tempfile.TemporaryDirectory() as folder:
         places = [Path(folder) / name for name in ("a", "b")]
         for place in places:

@@ -112,7 +112,10 @@ def _jitter(log: DamagedLog, rng: Rng) -> Damage:
     off_s[[0, -1]] = 0.0
     order = np.argsort(known, kind="stable")
     log.warp(lambda t: t + np.interp(t, known[order], off_s[order]))
-    return Damage("clock jitters", frozenset({ALL}), ego=True, quiet=True)
+    smoothed = isinstance(
+        log, NuscenesLog
+    )  # whose windows begin where its ego's drive does, some frame later or sooner
+    return Damage("clock jitters", frozenset({ALL}), ego=True, quiet=True, loses=smoothed)
 
 
 def _out_of_order(log: DamagedLog, rng: Rng) -> Damage:

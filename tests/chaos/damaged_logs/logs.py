@@ -306,6 +306,7 @@ class AV2Files(DamagedLog):
             column[[row, row + 5]] = column[[row + 5, row]]
 
     def misname(self, thing: str, frame: int, name: str | float | None) -> tuple[float, float]:
+        name = name if isinstance(name, str) else None  # a column of texts holds no NaN
         self.boxes["track_uuid"][self._rows(thing, np.array([frame]))] = name
         return float(self.times_s[frame]), float(self.times_s[frame])
 
@@ -405,6 +406,10 @@ class NuscenesLog(DamagedLog):
         for lane in sorted(map(str, self.lanes()))[:LIT_LANES]:
             states = np.array(["TRAFFIC_LIGHT_GREEN", "TRAFFIC_LIGHT_RED"])[red].tolist()
             self.lights[f"light {lane}"] = {"lane": lane, "state": {"object_state": states}}
+
+    def frames_left(self) -> np.ndarray:
+        """The last second tells the ego's clock, by which all windows of a log begin."""
+        return np.arange(2, len(self.times_s) - 12)
 
     @property
     def tracks(self) -> dict[Any, Any]:
