@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import shapely
 
+from factory.datasets.navsim.maps import City, read_geopackage
 from tasks.world.clip import Clip
 from tasks.world.repair.records import LEFT_OUT
 from tests.factory.datasets.navsim.geopackage_writer import CITIES, ORIGIN, stub_rows, write_geopackage
@@ -64,3 +65,15 @@ def test_a_light_of_no_lane_of_the_city_is_left_out_and_told(tmp_path: Path) -> 
     clip = read(tmp_path, [(3, True), (77, True)])
     assert clip.lights.lane_ids == ("3",)
     assert [(repair.what, repair.thing, repair.now) for repair in clip.repairs] == [("light", "77", LEFT_OUT)]
+
+
+def test_points_that_stand_twice_in_a_lane_s_line_give_it_no_other_heading(tmp_path: Path) -> None:
+    lines = []
+    for name in ("sound", "doubled"):
+        rows = stub_rows()
+        for row in rows["baseline_paths"] if name == "doubled" else ():
+            row["shape"] = shapely.LineString(np.repeat(shapely.get_coordinates(row["shape"]), 2, axis=0))
+        path = tmp_path / name / "map.gpkg"
+        write_geopackage(path, rows, CITIES[CITY][1])
+        lines.append(City(CITY, path, read_geopackage(path)).centerline("1"))
+    assert np.array_equal(*lines)
