@@ -21,7 +21,7 @@ from tasks.world.arrays import Array
 from tasks.world.clip import AgentKind
 from tasks.world.frames import to_local, wrap_angle
 from tasks.world.repair.records import LEFT_OUT, Repair
-from tasks.world.repair.tracks import MOST
+from tasks.world.repair.tracks import MOST, whole_frames
 
 # Values out of a pickled dict, checked one by one: what is wrong names file, frame and key.
 
@@ -198,17 +198,24 @@ def parse_frames(value: Any, path: Path, whole: bool = True) -> LogFrames:
     for i, problem in _out_of_place(frames, path):
         wrong[i] = problem
         frames.pop(i, None)
+    for i in _away(frames) if not whole else ():
+        wrong[i] = BadClip(file, f"frames[{i}].ego2global_translation", "the ego lies away from the frames around it")
+        frames.pop(i)
     if wrong and (whole or len(wrong) > MOST * len(value)):
         raise wrong[min(wrong)]
     if len({frame.map_location for frame in frames.values()}) > 1:
         raise BadClip(file, "map_location", "changes within the log")
     known = np.array(sorted(frames))
+    stamps = np.array([frames[i].timestamp_us for i in known])
     for i in sorted(wrong):
+        k = int(np.searchsorted(known, i))
+        if 0 < k < len(known) and stamps[k] - stamps[k - 1] < FRAME_US * (known[k] - known[k - 1] - 0.5):
+            continue  # no frame is missing between those around it, as where one stands twice
         at = int(known[np.argmin(np.abs(known - i))])
         near, stamp = frames[at], frames[at].timestamp_us + FRAME_US * (i - at)
         named = replace(near, token=f"unreadable-{i}", timestamp_us=stamp, unreadable=str(wrong[i]))
         frames[i] = replace(named, cameras=(), lidar_path=None, boxes=None)
-    return LogFrames(file, path.stem, tuple(frames[i] for i in range(len(value))))
+    return LogFrames(file, path.stem, tuple(frames[i] for i in sorted(frames)))
 
 
 def _out_of_place(frames: Mapping[int, Frame], path: Path) -> Iterator[tuple[int, BadClip]]:
@@ -228,6 +235,15 @@ def _out_of_place(frames: Mapping[int, Frame], path: Path) -> Iterator[tuple[int
             yield i, BadClip(file, "token", f"{frame.token} stands twice")
         else:
             seen.add(frame.token)
+
+
+def _away(frames: Mapping[int, Frame]) -> list[int]:
+    """The frames whose ego cannot have come from the one before and go on to the next."""
+    order = np.array(sorted(frames), int)
+    boxes = np.ones((len(order), 9))
+    boxes[:, :2] = np.array([frames[i].pose[:2] for i in order]).reshape(-1, 2)
+    left, _ = whole_frames(np.array([frames[i].timestamp_us / 1e6 for i in order]), boxes)
+    return [int(i) for i in order[~left]]
 
 
 def _out_of_time(stamps: Sequence[int]) -> list[int]:

@@ -233,7 +233,7 @@ def _refuse_unknown(content: Mapping[str, Any], known: frozenset[str], file: str
 # A log of OpenScene takes a second to open, and navtrain names 1,192 of them. So what the choice needs is kept, a
 # small table a log, in the user's cache; it is made again where the log's size or time of change is another.
 
-TABLE_VERSION = 7  # of the tables kept
+TABLE_VERSION = 8  # of the tables kept
 FRAME_S, SLACK_S = 0.5, 0.05  # between two frames; more or less is a gap
 GAP, SHORT_HISTORY, SHORT_FUTURE = "gap_in_frames", "short_history", "short_future"
 NO_ROUTE, NO_BOXES, STANDING, ABSENT = "no_route", "not_annotated", "ego_standing", "absent_token"

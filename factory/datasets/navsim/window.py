@@ -37,7 +37,7 @@ from tasks.world.clip import (
     Camera,
     SensorFile,
 )
-from tasks.world.frames import AX, EGO_STATE_SIZE, HEADING, PACIFICA, VX, X, wrap_angle
+from tasks.world.frames import AX, EGO_STATE_SIZE, HEADING, LARGEST, PACIFICA, VX, X, wrap_angle
 from tasks.world.geometry import ego_boxes, touching
 from tasks.world.repair.records import Repair
 from tasks.world.repair.tracks import HEADING as BOX_HEADING
@@ -73,10 +73,9 @@ def repaired_frames(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], Repairs
     counts = [0 if frame.boxes is None else len(frame.boxes.kinds) for frame in frames]
     for frame in frames:
         if frame.boxes is not None:
-            linear = _in_world(frame)
-            boxes.append(
-                np.column_stack([linear[:, [0, 1, HEIGHT_AT, 2]], frame.boxes.boxes[:, 3:6], linear[:, VELOCITY]])
-            )
+            linear, own = _in_world(frame), frame.boxes.boxes
+            linear[np.abs(own[:, 6]) > LARGEST, 2] = np.nan  # wrapped it would look like any other
+            boxes.append(np.column_stack([linear[:, [0, 1, HEIGHT_AT, 2]], own[:, 3:6], linear[:, VELOCITY]]))
             ids += frame.boxes.track_tokens
             kinds += frame.boxes.kinds
     seen, _ = observed(times_s, times_s[np.repeat(np.arange(len(frames)), counts)], ids, kinds, np.concatenate(boxes))
