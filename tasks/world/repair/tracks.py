@@ -45,6 +45,7 @@ LARGEST_ACCEL_MPS2 = 10.0
 NOISE_M = 2.5  # from one frame to the next: boxes are corrected as more of a thing comes into view
 AT_ONCE = 1 << 18  # pairs of boxes that are looked at in one go
 ONE_PLACE = 0.5  # of what two boxes cover together both cover: two things cannot, but one listed twice
+SAME_M = 0.1  # nor have two things, however small, their centres as near
 
 
 @dataclass(frozen=True)
@@ -482,19 +483,20 @@ def _pairs_inside(tracks: ObservedTracks) -> Iterable[tuple[int, int, int]]:
 
     half = np.where(tracks.seen, np.hypot(tracks.boxes[..., LENGTH], tracks.boxes[..., WIDTH]) / 2.0, 0.0).max(axis=0)
     pairs = _pairs_near(tracks, half)
-    reach = half[pairs].max(axis=1)  # of the centre of the smaller, which is in the larger
+    reach = np.maximum(half[pairs].max(axis=1), SAME_M)  # of the centre of the smaller, which is in the larger
     counts = np.zeros(len(pairs), int)
     for start in range(0, len(tracks.times_s), block := max(1, AT_ONCE // max(len(pairs), 1))):
         seen, boxes = tracks.seen[start : start + block], tracks.boxes[start : start + block]
         (dx, dy), (first, second) = (boxes[:, pairs[:, 0], k] - boxes[:, pairs[:, 1], k] for k in (X, Y)), pairs.T
         frame, pair = np.nonzero(seen[:, first] & seen[:, second] & (dx**2 + dy**2 <= reach**2))
         one, other = boxes[frame, first[pair]], boxes[frame, second[pair]]
-        inside = _center_inside(one, other)
+        inside = _center_inside(one, other) | (np.hypot(*(one - other)[:, :2].T) <= SAME_M)
         one, other, pair = one[inside], other[inside], pair[inside]
         if len(pair):
             shapes = [shapely.polygons(box_corners(b[:, [X, Y, HEADING, LENGTH, WIDTH]])) for b in (one, other)]
             shared = shapely.area(shapely.intersection(*shapes))
             together = shared >= ONE_PLACE * (shapely.area(shapes[0]) + shapely.area(shapes[1]) - shared)
+            together |= np.hypot(*(one - other)[:, :2].T) <= SAME_M
             counts += np.bincount(pair[together], minlength=len(pairs))
     return [(n, m, together) for (n, m), together in zip(pairs.tolist(), counts.tolist()) if together]
 

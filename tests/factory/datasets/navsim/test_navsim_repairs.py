@@ -98,6 +98,7 @@ def test_a_fault_of_one_box_is_put_right_or_left_out_and_told_and_nothing_else_c
     [
         lambda frame: frame.update(ego2global_translation=np.array([np.nan, 0.0, 0.0])),
         lambda frame: frame.update(ego2global_rotation=np.zeros(4)),
+        lambda frame: frame.update(ego2global_translation=frame["ego2global_translation"] + np.array([0.0, 60.0, 0.0])),
         lambda frame: frame.update(timestamp=0),
         lambda frame: frame.update(timestamp=2 * frame["timestamp"]),
         lambda frame: frame.pop("anns") and frame["cams"].clear(),
@@ -121,6 +122,23 @@ def test_a_frame_that_cannot_be_read_costs_the_windows_it_is_in(
     assert f"(1 such frames, which cost {len(lost)} windows)" in caplog.text and f"{log}: " in caplog.text
     reader.read(index.refs[0])
     assert [ref for ref in sound.refs if not ref.start_ms <= 12_500 <= ref.start_ms + 9_500] == list(index.refs)
+
+
+def test_a_frame_that_stands_twice_is_read_once_and_costs_no_window(tmp_path: Path) -> None:
+    frames = road_frames(n=60)
+    write_city(tmp_path)
+    log = write_log(tmp_path, frames)
+    sound = reader_of(tmp_path, sensors=None)
+    before = sound.index().refs
+    clips = {ref: sound.read(ref) for ref in (before[0], before[-1])}
+    assert write_log(tmp_path, [*frames[:25], frames[25], *frames[25:]]) == log
+    reader = reader_of(tmp_path, sensors=None, cache_dir=tmp_path / "again")
+    index = reader.index()
+    assert index.refs == before and not index.broken and not index.dropped
+    for ref, whole in clips.items():
+        clip = reader.read(ref)
+        np.testing.assert_array_equal(clip.ego_states, whole.ego_states)
+        np.testing.assert_array_equal(clip.agents.boxes, whole.agents.boxes)
 
 
 def test_a_log_of_which_most_frames_cannot_be_read_is_refused_by_the_first(tmp_path: Path) -> None:

@@ -204,7 +204,8 @@ def without_doubles_twin(tracks: ObservedTracks, _: np.ndarray) -> Things:
             together = 0
             for frame in things[one].keys() & things[other].keys():
                 a, b = footprint(things[one][frame]), footprint(things[other][frame])
-                together += a.intersection(b).area >= a.union(b).area / 2
+                near = math.dist(things[one][frame][:2], things[other][frame][:2]) <= 0.1
+                together += near or a.intersection(b).area >= a.union(b).area / 2
             pairs.append((one, other, together))
     gone: set[str] = set()
     for one, other, together in pairs:
@@ -562,6 +563,12 @@ def test_two_boxes_that_share_less_than_half_or_are_of_two_kinds_are_two_things(
     for other in (thing(CAR, 4.6 * 0.34, 0.0), thing(RIDER, 0.0, 0.0)):
         assert not without_doubles(tracks_of(TIMES_S, a=thing(CAR, 0.0, 0.0), b=other), far_ego(40))[1]
     assert without_doubles(tracks_of(TIMES_S, a=thing(CAR, 0.0, 0.0), b=thing(CAR, 4.6 * 0.33, 0.0)), far_ego(40))[1]
+
+
+def test_a_bollard_listed_twice_a_little_aside_is_found_though_the_boxes_share_little() -> None:
+    tracks = tracks_of(TIMES_S, a=thing(CONE, 0.0, 0.0), b=thing(CONE, 0.06, 0.06))
+    tracks.boxes[..., LENGTH : LENGTH + 2] = 0.12, 0.12
+    assert [r.what for r in without_doubles(tracks, far_ego(40))[1]] == ["twice"]
 
 
 def test_a_barrier_listed_twice_that_is_wider_than_long_is_found() -> None:
