@@ -262,7 +262,7 @@ class CommitCopies:
             if problem:
                 problems.append(DamagedPart(f"{LOG}/{name}", problem))
         known = set(self._copies.names())
-        last = max((name for name in known if name.endswith(".json")), default="")
+        last = max((name for name in known if NUMBERED.fullmatch(name) and name.endswith(".json")), default="")
         absent = (name for name in there if NUMBERED.fullmatch(name) and name < last and name not in known)
         return problems + [DamagedPart(f"{COPIES}/{name}", "is missing") for name in sorted(absent)]
 
