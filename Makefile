@@ -61,15 +61,14 @@ first-planner: install
 # Bytecode is kept in any case: the tests start hundreds of processes that import the same sources.
 unexport PYTHONDONTWRITEBYTECODE
 
-# Kernels are compiled once before several test processes would all do it. Three of them fill two cores: a quarter of
-# the time is waiting.
+# Kernels are compiled once before two test processes would both do it.
 test: install
 	$(PY) -m factory warm
-	$(PY) -m pytest -n 3 --dist loadfile
+	$(PY) -m pytest -n 2 --dist loadfile
 
 unit: install
 	$(PY) -m factory warm
-	$(PY) -m pytest -n 3 --dist loadfile --ignore tests/real --ignore tests/chaos -m "not ray and not slow"
+	$(PY) -m pytest -n 2 --dist loadfile --ignore tests/real --ignore tests/chaos -m "not ray and not slow"
 
 lint: install
 	$(PY) -m ruff check .
