@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.datasets.navsim.log import LogFrames, parse_frames, read_frames
+from factory.datasets.navsim.log import Frame, LogFrames, parse_frames, read_frames
 from factory.datasets.navsim.maps import DOWNLOAD, map_file
 from factory.datasets.navsim.settings import NavsimClips
 from factory.datasets.navsim.window import (
@@ -68,6 +68,7 @@ from tasks.world.clip import NOW, Block, Camera, Clip, SensorFile
 from tasks.world.repair.articulated import articulated
 from tasks.world.repair.records import later
 from tasks.world.repair.road import lights_on_map
+from tasks.world.repair.tracks import Repairs
 
 # NAVSIM's scene filters and splits: the YAML files that name which windows of which logs count.
 #
@@ -415,6 +416,7 @@ def usable_windows(table: FrameTable, windows: list[int], choice: WindowChoice) 
 
 LICENCE = "CC BY-NC-SA 4.0 (nuPlan via OpenScene)"
 BLOCK_FRAMES, BLOCK_STRIDE_FRAMES = 40, 20  # of the stretches that are reconstructed
+FRAMES_AROUND = 4  # of a window: as many tell a thing's usual speed, and what lies elsewhere for a frame or two
 SPLIT_OF = {  # by how the name of the filter, or of the logs' folder, begins; others: by the hash of the log's id
     "navtrain": "train",
     "synthetic_reaction": "train",  # SimScale's, made of navtrain
@@ -533,7 +535,7 @@ class NavsimReader:
         window, now = frames[start : start + WINDOW_FRAMES], start + FRAMES_BEFORE
         if any(frame.boxes is None for frame in window):
             raise BadClip(opened.log.file, f"frames[{start}].anns", "missing: nobody annotated the window")
-        window, repairs = repaired_frames(window)
+        window, repairs = _repaired(opened, start, start + WINDOW_FRAMES)
         states = ego_states(window)
         road = road_around(self.maps, frames[now], states[:, :2], states[NOW, :3], opened.log.file, now)
         lights, light_repairs = lights_on_map(traffic_lights(window), road.road_map.lanes, road.city_lanes)
@@ -709,7 +711,7 @@ class NavsimReader:
             images, sweeps = sensor_files(frames, self.sensors)
             if images or sweeps:
                 cameras = cameras_with_pictures(frames[len(frames) // 2], images, opened.log.file)
-                agents = stretch_agents(repaired_frames(frames)[0])
+                agents = stretch_agents(_repaired(opened, int(inside[0]), int(inside[-1]) + 1)[0])
                 others.append(OtherDrive(other.log_id, agents, cameras, images, sweeps))
         return with_other_drives(block, others) if others else block
 
@@ -720,7 +722,7 @@ class NavsimReader:
         frames = opened.log.frames[first:stop]
         images, sweeps = sensor_files(frames, self.sensors)
         start_s = float(opened.table.start_ms[first]) / 1000
-        return Block(start_s, stretch_agents(repaired_frames(frames)[0]), images, sweeps)
+        return Block(start_s, stretch_agents(_repaired(opened, first, stop)[0]), images, sweeps)
 
 
 def log_files(root: Path) -> dict[str, Path]:
@@ -750,6 +752,14 @@ def _frame_at(ref: ClipRef, table: FrameTable, file: str) -> int:
     if start < 0 or start + WINDOW_FRAMES > len(table) or stretch[start] != stretch[start + WINDOW_FRAMES - 1]:
         raise BadClip(file, "start_ms", f"no window of {ref.window} starts at {ref.start_ms} ms")
     return start
+
+
+def _repaired(opened: OpenLog, first: int, stop: int) -> tuple[tuple[Frame, ...], Repairs]:
+    """The frames first..stop-1 of a log as of `repaired_frames`, seen with those around them."""
+    stretch = np.flatnonzero(opened.table.stretch == opened.table.stretch[first])
+    begin = max(first - FRAMES_AROUND, int(stretch[0]))
+    end = min(stop + FRAMES_AROUND, int(stretch[-1]) + 1)
+    return repaired_frames(opened.log.frames[begin:end], first - begin, stop - begin)
 
 
 def _block_frames(table: FrameTable, start: int) -> tuple[int, int]:

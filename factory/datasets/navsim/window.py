@@ -39,7 +39,7 @@ from tasks.world.clip import (
 )
 from tasks.world.frames import AX, EGO_STATE_SIZE, HEADING, LARGEST, PACIFICA, VX, X, wrap_angle
 from tasks.world.geometry import ego_boxes, touching
-from tasks.world.repair.records import Repair
+from tasks.world.repair.records import Repair, repairs_within
 from tasks.world.repair.tracks import HEADING as BOX_HEADING
 from tasks.world.repair.tracks import Repairs, observed, repaired
 from tasks.world.road_map import CenterlineFinder, LightState, NoRoute, RoadMap, Route, TrafficLights
@@ -66,14 +66,19 @@ class SeenBoxes:
         return np.isfinite(self.linear[..., 0])
 
 
-def repaired_frames(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], Repairs]:
-    """Frames 0.5 s apart with their boxes repaired, and what was done, timed since the first of them."""
+def repaired_frames(frames: Sequence[Frame], first: int, stop: int) -> tuple[tuple[Frame, ...], Repairs]:
+    """frames[first:stop] of frames 0.5 s apart with their boxes repaired, and what was done, timed since `first`.
+
+    The frames around them say what two or three at an edge cannot, as whether a thing jumps there.
+    """
     times_s = np.arange(len(frames), dtype=np.float64) * (STEP_S * FRAME_STEPS)
     boxes, ids, kinds = [np.zeros((0, 9))], list[str](), list[AgentKind]()
     counts = [0 if frame.boxes is None else len(frame.boxes.kinds) for frame in frames]
     for frame in frames:
         if frame.boxes is not None:
-            linear, own = _in_world(frame), frame.boxes.boxes
+            own = frame.boxes.boxes
+            with np.errstate(invalid="ignore"):  # of headings that are none: the passes leave those boxes out
+                linear = _in_world(frame)
             linear[np.abs(own[:, 6]) > LARGEST, 2] = np.nan  # wrapped it would look like any other
             boxes.append(np.column_stack([linear[:, [0, 1, HEIGHT_AT, 2]], own[:, 3:6], linear[:, VELOCITY]]))
             ids += frame.boxes.track_tokens
@@ -81,23 +86,31 @@ def repaired_frames(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], Repairs
     seen, _ = observed(times_s, times_s[np.repeat(np.arange(len(frames)), counts)], ids, kinds, np.concatenate(boxes))
     seen, repairs = repaired(seen, np.array([frame.pose for frame in frames]))
     at_parse = (replace(one, time_s=float(t)) for frame, t in zip(frames, times_s) for one in frame.repairs)
-    first = np.cumsum([0, *counts])
+    row_of = np.cumsum([0, *counts])
     out = []
-    for i, frame in enumerate(frames):
+    for i, frame in enumerate(frames[first:stop], start=first):
         if frame.boxes is None:
             out.append(frame)
             continue
         rows = seen.rows[i]
         here = np.flatnonzero(rows >= 0)
         here = here[np.argsort(rows[here])]
-        at = rows[here] - first[i]
+        at = rows[here] - row_of[i]
         own = frame.boxes.boxes[at]
         turned = np.cos(seen.boxes[i, here, BOX_HEADING] - frame.pose[2] - own[:, 6]) < 0.0
         own[turned, 6] = wrap_angle(own[turned, 6] + np.pi)
         tokens = tuple(seen.track_ids[n] for n in here)
         kept = FrameBoxes(own, tuple(seen.kinds[n] for n in here), frame.boxes.velocities[at], tokens)
         out.append(replace(frame, boxes=kept))
-    return tuple(out), (*at_parse, *repairs)
+    return tuple(out), _within((*at_parse, *repairs), times_s[first], times_s[stop - 1])
+
+
+def _within(repairs: Repairs, first_s: float, last_s: float) -> Repairs:
+    """Those that show from first_s to last_s, on a clock that begins at first_s."""
+    return tuple(
+        replace(one, time_s=max(one.time_s, first_s) - first_s, until_s=min(one.until_s, last_s) - first_s)
+        for one in repairs_within(repairs, first_s, last_s)
+    )
 
 
 def n_steps(n_frames: int) -> int:

@@ -577,7 +577,7 @@ BREAKS: Sequence[Callable[[dict[str, Any]], Any]] = (
 class NavsimLog(DamagedLog):
     """A log's list of frames, and the map beside it."""
 
-    around_s = 0.0  # a window is made of its own frames
+    around_s = 0.0  # nothing in a window is fitted to frames around it
 
     def __init__(self, path: Path, rows: dict[str, list[Row]], city: str) -> None:
         """rows: of the map, which is written when it is damaged. Raises OSError."""

@@ -93,6 +93,25 @@ def test_a_fault_of_one_box_is_put_right_or_left_out_and_told_and_nothing_else_c
         assert len(clip.agents.boxes) * STEP_S == pytest.approx(9.6)
 
 
+@pytest.mark.parametrize("at", [1, 2, 4, 8, 18, 20, 23])
+def test_an_identity_that_jumps_is_two_things_also_at_the_edge_of_a_window(tmp_path: Path, at: int) -> None:
+    """8 m at 2 Hz: a car may drive so fast, and only its other frames say that this one does not."""
+    frames = road_frames(n=28)
+    for frame in frames[4 + at :]:
+        frame["anns"]["gt_boxes"] = frame["anns"]["gt_boxes"] + np.array([0.0, 8.0, 0, 0, 0, 0, 0])
+    write_city(tmp_path)
+    write_log(tmp_path, frames)
+    reader = reader_of(tmp_path, sensors=None)
+    ref = next(ref for ref in reader.index().refs if ref.start_ms == 2000)
+    clip = reader.read(ref)
+    told = {r.thing: r.now for r in clip.repairs if r.what == "jump"}
+    assert len(told) == (2 if at < 20 else 0)
+    for name, seen in zip(clip.agents.track_ids, clip.agents.valid.T):
+        assert seen[: 5 * at].any() != (name in told.values())
+    sideways = np.abs(np.diff(clip.agents.boxes[..., 1], axis=0))
+    assert np.nanmax(sideways) < 1e-6, "nothing jumps, nor slides from the one place to the other"
+
+
 @pytest.mark.parametrize(
     "spoil",
     [
