@@ -30,7 +30,7 @@ sys.exit(sys.version.split()[0] != sys.argv[1])
 endef
 export FITS IS_WHOLE
 
-.PHONY: install demo first-planner test unit lint format docs chaos mutants bench gpu-check dist clean
+.PHONY: install demo first-planner warm test unit lint format docs chaos mutants bench gpu-check dist clean
 
 install: $(VENV)/.installed
 
@@ -61,13 +61,16 @@ first-planner: install
 # Bytecode is kept in any case: the tests start hundreds of processes that import the same sources.
 unexport PYTHONDONTWRITEBYTECODE
 
-# Kernels are compiled once before two test processes would both do it.
-test: install
+# Kernels are compiled once before two test processes would both do it, while PyTorch and the rest are installed.
+warm: $(VENV)/.run
 	$(PY) -m factory warm
+
+test:
+	@$(MAKE) --no-print-directory -j 2 install warm
 	$(PY) -m pytest -n 2 --dist loadfile
 
-unit: install
-	$(PY) -m factory warm
+unit:
+	@$(MAKE) --no-print-directory -j 2 install warm
 	$(PY) -m pytest -n 2 --dist loadfile --ignore tests/real --ignore tests/chaos -m "not ray and not slow"
 
 lint: install
@@ -103,8 +106,7 @@ docs: install
 
 # The kept bugs of tests/mutants, each against the tests that should notice; a release has at least 97 % of them noticed.
 # ONLY=planners (or tasks/reward, or a bug's id; several with commas), J=<how many at a time, a core each>; goes on where it stopped.
-mutants: install
-	$(PY) -m factory warm
+mutants: install warm
 	$(PY) -m tests.mutants --only "$(ONLY)" -j $(or $(J),2)
 
 # All quick tables, or NAME=reward (or another tests/bench/bench_*.py) ARGS="its own": render's scene

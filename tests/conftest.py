@@ -3,6 +3,7 @@
 `--hypothesis-profile=search` looks for new examples instead.
 """
 
+import gc
 import signal
 from pathlib import Path
 
@@ -17,6 +18,12 @@ settings.load_profile("repeatable")
 # Commands that tests start heed these, also where a shell or nohup has begun the suite itself with them ignored.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_finish() -> None:
+    """Takes the thousands of tests out of what the garbage collector looks through again and again: 4 % of the time."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
