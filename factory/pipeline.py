@@ -27,7 +27,16 @@ from factory.stages.imaging import Imaging, scene_cache_counts
 from factory.stages.rows import label_columns, sample_row
 from factory.store.samples import MOST_RECORDS, CandidateRow
 from factory.store.schema import UNLISTED, RunIdentity
-from tasks.attempt import ExpertGate, Judged, Timed, attempt, drive_under_log_replay, has_route, perturbed_scene
+from tasks.attempt import (
+    ExpertGate,
+    Judged,
+    Timed,
+    attempt,
+    drive_under_log_replay,
+    has_route,
+    perturbed_scene,
+    vocabulary_labels,
+)
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Expert, Human, drives_once_per_clip
 from tasks.hard_scenes import BEFORE_STEPS, BenchmarkClip, drive_follow_up, frame_digest, seen_half_a_second_earlier
@@ -35,7 +44,6 @@ from tasks.perturb import NO_STARTS, Candidate, Perturbation, PerturbSettings, e
 from tasks.render.scene.engine import require_backend
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.render.splatting.gsplat_backend import BackendMissing
-from tasks.reward.labels import vocabulary_labels
 from tasks.rollout.simulate import TrafficSettings, check_same_policy
 from tasks.stages import FOLLOW_UP_BEFORE, HUMAN_BEFORE, Rejected
 from tasks.subscores import OF_ONE_PLAN

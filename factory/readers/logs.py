@@ -38,9 +38,18 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from factory.readers.apart import ProcessFunction
-from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, failures_as_bad_clip, split_of, validate_clip
+from factory.readers.base import (
+    SPLITS,
+    BadClip,
+    ClipIndex,
+    ClipRef,
+    failures_as_bad_clip,
+    map_sign,
+    motion_sign,
+    split_of,
+    validate_clip,
+)
 from factory.readers.settings import LogClips, WindowSettings, check_traversals
-from factory.readers.signs import map_sign, motion_sign
 from tasks.world.arrays import Array, Ints
 from tasks.world.clip import (
     CLIP_STEPS,
@@ -55,8 +64,8 @@ from tasks.world.clip import (
     SensorFile,
 )
 from tasks.world.frames import VX, VY, X, Y
-from tasks.world.repair.articulated import articulated
 from tasks.world.repair.records import Repair, repairs_within
+from tasks.world.repair.tracks import articulated
 from tasks.world.road_map import CenterlineFinder, NoRoute, RoadMap, Route, TrafficLights, route_of_log
 
 # Several logs of one place: which other drives lead through a block, and the block with what they saw.

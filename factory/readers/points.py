@@ -1,4 +1,4 @@
-"""Files of points: binary PCD, nuScenes' rows, feather.
+"""Files of points: binary PCD, nuScenes' rows.
 
 PCD files are the merged lidar sweeps of nuPlan and OpenScene. A text header of ten keys, then POINTS packed little-
 endian records. Only what nuplan-devkit @ e924167 reads (nuplan/database/utils/pointclouds/pointcloud.py:96-180) is
@@ -10,11 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.feather
 from numpy.typing import NDArray
 
-from factory.files import broken_link
 from factory.readers.base import BadClip, bytes_of
 
 KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
@@ -105,32 +102,3 @@ def read_points(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
         raise BadClip(str(path), "points", f"{len(data)} bytes are not rows of {len(COLUMNS)} float32; truncated?")
     rows = np.frombuffer(data, "<f4").reshape(-1, len(COLUMNS))
     return _finite({name: rows[:, COLUMNS.index(name)].copy() for name in columns}, str(path))
-
-
-# Feather files: columns of numbers and texts, as Argoverse 2 has them.
-
-
-def read_feather(path: Path, columns: tuple[str, ...], whole: bool = True) -> dict[str, NDArray[np.generic]]:
-    """Named columns as writable arrays; whole: nulls, NaN and infinity are refused, else they are NaN and None.
-
-    Raises BadClip.
-    """
-    try:
-        table = pyarrow.feather.read_table(path)
-        table.validate(full=True)
-    except FileNotFoundError as error:
-        raise BadClip(str(path), "file", broken_link(path) or "missing") from error
-    except (pa.ArrowException, OSError, ValueError) as error:  # a name that is no text
-        raise BadClip(str(path), "file", f"cannot be read as feather, truncated? {error}") from error
-    if table.num_rows == 0:
-        raise BadClip(str(path), "file", "holds no rows")
-    out = {}
-    for name in columns:
-        if name not in table.column_names:
-            raise BadClip(str(path), name, "column is missing")
-        if whole and table[name].null_count:
-            raise BadClip(str(path), name, "holds nulls")
-        out[name] = np.array(table[name].to_numpy())
-        if whole and out[name].dtype.kind == "f" and not np.isfinite(out[name]).all():
-            raise BadClip(str(path), name, "holds NaN or infinity")
-    return out

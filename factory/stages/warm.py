@@ -18,7 +18,7 @@ import numpy as np
 from factory.exits import ignore_terminal_signals, terminal_signals_blocked
 from factory.files import locked
 from factory.graph.steps import NotReady
-from tasks.attempt import drive_and_judge
+from tasks.attempt import drive_and_judge, hit_after_s, vocabulary_labels
 from tasks.caches import Damaged, with_checksum, without_checksum
 from tasks.experts.pdm_closed import forecast, proposals
 from tasks.experts.protocol import Plan
@@ -33,7 +33,6 @@ from tasks.render.scene.stereo import choose_partners, wide_baseline_depth
 from tasks.render.settings import FitSettings, RenderMode, RenderSettings, SceneFrom
 from tasks.render.splatting.sh import rotate_coefficients
 from tasks.reward.epdms import INDEX_FROM_ROWS, prepare_scene, score
-from tasks.reward.labels import hit_after_s, vocabulary_labels
 from tasks.rollout.simulate import SeenTraffic, TrafficSettings, prepare_traffic, simulate
 from tasks.settings import PdmSettings
 from tasks.world.arrays import Array

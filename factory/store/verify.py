@@ -21,6 +21,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from factory.files import DamagedFile, why_no_hard_links
+from factory.store.commit_copies import COPIES, LOG, CommitCopies, DamagedPart
 from factory.store.episodes import EPISODES_FOLDER, check_episode, episode_name
 from factory.store.location import (
     BadCacheFile,
@@ -33,17 +34,7 @@ from factory.store.location import (
     write_shard,
 )
 from factory.store.samples import CURRENT_RUN, FACTS, IMPORTED, LAST_RUN, QUIET_S, RUN_COPY, RUN_FILE, Store
-from factory.store.table import (
-    COPIES,
-    LOG,
-    CommitCopies,
-    DamagedPart,
-    KeyedTable,
-    LiveFile,
-    fixed_bytes,
-    packed_tables,
-    text_codes,
-)
+from factory.store.table import KeyedTable, LiveFile, fixed_bytes, packed_tables, text_codes
 from tasks.caches import Damaged, parse_json_with_checksum, whole_of_two
 
 TABLES = ("plans", "candidates", "samples", "outcomes")

@@ -14,8 +14,7 @@ from tasks.attempt import Judged
 from tasks.perturb import Candidate, ConsideredTrajectories
 from tasks.world.arrays import Array, Bytes, Image, ShortInts
 from tasks.world.clip import NOW, AgentKind, Clip
-from tasks.world.frames import HEADING, PACIFICA, box_corners, points_to_local, to_local
-from tasks.world.geometry import ego_boxes
+from tasks.world.frames import HEADING, PACIFICA, box_corners, ego_boxes, points_to_local, to_local
 from tasks.world.road_map import LightState
 
 Colour = tuple[int, int, int]  # RGB

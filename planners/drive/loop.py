@@ -19,8 +19,7 @@ from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentTracks, Rollout
-from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y
-from tasks.world.geometry import ego_boxes, touching
+from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y, ego_boxes, touching
 from tasks.world.road_map import CenterlineFinder, arc_lengths
 
 # The road ahead of a drive: how far along it a place lies, and where it ends.

@@ -25,9 +25,8 @@ from tasks.settings import PDM_DEFAULTS, PdmSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bools, Indices, Ints
 from tasks.world.clip import AgentKind, AgentTracks, Scene
-from tasks.world.frames import HALF_LENGTH, HALF_WIDTH, PACIFICA, REAR_AXLE_TO_CENTER, VX, X, Y, box_corners
+from tasks.world.frames import HALF_LENGTH, HALF_WIDTH, PACIFICA, REAR_AXLE_TO_CENTER, VX, X, Y, box_corners, ego_boxes
 from tasks.world.geometry import (
-    ego_boxes,
     nearest_on_edge,
     ring_contains,
     rings_distance,

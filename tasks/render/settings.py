@@ -83,7 +83,6 @@ class FitSettings:
     most_gaussians: int = 250_000  # of a scene
     start_opacity: float = 0.5  # of every Gaussian
     stereo_photos: int = 4  # neighbours compared where lidar does not reach
-    sh_degree: int = constant(0)  # 0 to 3
     # Loss.
     ssim_weight: float = 0.1  # loss = (1 - w) L1 + w (1 - SSIM)
     opaque_weight: float = constant(0.1)  # of the mean light that passes where a photo looks at the ground
@@ -109,8 +108,6 @@ class FitSettings:
     refine_every: int = constant(100)  # iterations
     refine_from: int = constant(300)  # iteration
     growth: float = constant(0.03)  # share of Gaussians added each time
-    # Road.
-    road: bool = constant(True)  # Gaussians of the road lie flat on what lidar knows of it
 
     def __post_init__(self) -> None:
         for name in (

@@ -50,8 +50,15 @@ from tasks.subscores import (
 )
 from tasks.world.arrays import Array, Bools, Bytes
 from tasks.world.clip import MOVING_KINDS, AgentKind, AgentTracks, Clip, Scene
-from tasks.world.frames import EGO_STATE_SIZE, HALF_LENGTH, HALF_WIDTH, LARGEST, PACIFICA, REAR_AXLE_TO_CENTER
-from tasks.world.geometry import ego_boxes
+from tasks.world.frames import (
+    EGO_STATE_SIZE,
+    HALF_LENGTH,
+    HALF_WIDTH,
+    LARGEST,
+    PACIFICA,
+    REAR_AXLE_TO_CENTER,
+    ego_boxes,
+)
 from tasks.world.road_map import LightState, MapLayer, MapPolygon, polygons_near
 
 # Everything the reward asks of a scene, made once and used for any number of ego trajectories (docs/reward.md 2).

@@ -118,7 +118,7 @@ class Roles(NamedTuple):
     moving_kind: Bools  # (N,) vehicle, pedestrian or bicycle: does not walk into a driven car
     enters_clear: Bools  # (N,) vehicles that may only enter with clearance to the ego
     first_part: Ints  # (N,) of the vehicle it is a part of, which moves it; itself where nothing tows it
-    trails: Array  # (N, K, 2) where the way behind that led, newest first (tasks.rollout.towing); NaN where it ends
+    trails: Array  # (N, K, 2) where the way behind that led, newest first (trails_behind); NaN where it ends
 
 
 class Yielding(NamedTuple):

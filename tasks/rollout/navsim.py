@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from tasks.settings import TrafficSettings
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Scene
-from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y
-from tasks.world.geometry import ego_boxes
+from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y, ego_boxes
 from tasks.world.road_map import Lane, RoadMap, with_headings
 
 # The public traffic's paths: a lane's baseline, and where along it a vehicle is.

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.world.arrays import Array
+from tasks.world.arrays import Array, Bools
 
 
 def wrap_angle(angle: Array) -> Array:
@@ -47,17 +47,6 @@ def planar_matrices(poses: Array) -> Array:
     out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1] = c, -s, s, c
     out[:, :2, 3] = poses[:, :2]
     return out
-
-
-def box_corners(boxes: Array) -> Array:
-    """Corners (..., 4, 2) of boxes (..., 5) = centre x, y, heading, length, width; order FL, RL, RR, FR."""
-    c, s = np.cos(boxes[..., 2]), np.sin(boxes[..., 2])
-    half_length, half_width = boxes[..., 3] / 2.0, boxes[..., 4] / 2.0
-    along = np.stack([half_length, -half_length, -half_length, half_length], axis=-1)
-    across = np.stack([half_width, half_width, -half_width, -half_width], axis=-1)
-    x = boxes[..., 0, None] + c[..., None] * along - s[..., None] * across
-    y = boxes[..., 1, None] + s[..., None] * along + c[..., None] * across
-    return np.stack([x, y], axis=-1)
 
 
 # Columns of an ego state row (docs/reward.md 0). The pose is the REAR AXLE in the world frame;
@@ -115,6 +104,48 @@ def pose_on_ground(logged: Array, ego_states: Array) -> Array:
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     out[:, :3, 0], out[:, :3, 1], out[:, :3, 2] = forward, np.cross(up, forward), up
     return out
+
+
+# Oriented boxes in the plane, arrays whose last axis is centre x [m], centre y [m], heading [rad], length [m], width
+# [m], as in AgentTracks: where the ego's body is, and which boxes touch.
+
+
+def box_corners(boxes: Array) -> Array:
+    """Corners (..., 4, 2) of boxes (..., 5) = centre x, y, heading, length, width; order FL, RL, RR, FR."""
+    c, s = np.cos(boxes[..., 2]), np.sin(boxes[..., 2])
+    half_length, half_width = boxes[..., 3] / 2.0, boxes[..., 4] / 2.0
+    along = np.stack([half_length, -half_length, -half_length, half_length], axis=-1)
+    across = np.stack([half_width, half_width, -half_width, -half_width], axis=-1)
+    x = boxes[..., 0, None] + c[..., None] * along - s[..., None] * across
+    y = boxes[..., 1, None] + s[..., None] * along + c[..., None] * across
+    return np.stack([x, y], axis=-1)
+
+
+def ego_boxes(states: Array, vehicle: Vehicle) -> Array:
+    """The ego's body (..., 5) at states (..., 11); the state's pose is the rear axle."""
+    heading, shift = states[..., HEADING], vehicle.rear_axle_to_center
+    boxes = np.empty((*heading.shape, 5))
+    boxes[..., 0] = states[..., X] + shift * np.cos(heading)
+    boxes[..., 1] = states[..., Y] + shift * np.sin(heading)
+    boxes[..., 2], boxes[..., 3], boxes[..., 4] = heading, vehicle.length, vehicle.width
+    return boxes
+
+
+def touching(first: Array, second: Array) -> Bools:
+    """Whether boxes (..., 5) intersect pairwise, touching included (separating axes).
+
+    A pair with a NaN does not touch.
+    """
+    dx, dy = second[..., 0] - first[..., 0], second[..., 1] - first[..., 1]
+    turn = second[..., 2] - first[..., 2]
+    c, s = np.abs(np.cos(turn)), np.abs(np.sin(turn))
+    near: Bools = np.ones(dx.shape, dtype=bool)
+    for one, other in ((first, second), (second, first)):
+        along = np.cos(one[..., 2]) * dx + np.sin(one[..., 2]) * dy
+        across = np.cos(one[..., 2]) * dy - np.sin(one[..., 2]) * dx
+        near &= 2.0 * np.abs(along) <= one[..., 3] + other[..., 3] * c + other[..., 4] * s
+        near &= 2.0 * np.abs(across) <= one[..., 4] + other[..., 3] * s + other[..., 4] * c
+    return near
 
 
 # How large a number of a scene may be: no road has a length [m], heading [rad] or speed [m/s] like it; kernels number

@@ -22,8 +22,7 @@ from factory.graph.steps import HUMAN_CANDIDATE
 from factory.pipeline import FactoryWork
 from factory.readers.base import ClipRef
 from factory.setup.settings import assemble
-from tasks.attempt import Judged, end_verdict, verdict
-from tasks.reward.labels import hit_after_s
+from tasks.attempt import Judged, end_verdict, hit_after_s, verdict
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffic
 from tasks.settings import ExpertGate
 from tasks.stages import END_FAULTS, Rejected

@@ -28,8 +28,7 @@ from factory.readers.base import ClipReader
 from tasks.rollout.lane_following import stands_always
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentKind, AgentTracks, Clip, Rollout, scene_of_clip
-from tasks.world.frames import PACIFICA
-from tasks.world.geometry import ego_boxes
+from tasks.world.frames import PACIFICA, ego_boxes
 from tasks.world.road_map import RoadMap
 from tests.bench.realism import (
     FEATURES,

@@ -23,8 +23,7 @@ from factory.datasets.town.reader import SyntheticReader
 from tasks.reward.epdms import N_TIMES, PAST_STEPS, PreparedScene, Scores, prepare, score
 from tasks.rollout.lqr import track
 from tasks.world.clip import NOW, scene_of_clip
-from tasks.world.frames import PACIFICA, to_world
-from tasks.world.geometry import ego_boxes
+from tasks.world.frames import PACIFICA, ego_boxes, to_world
 from tasks.world.road_map import polygons_near
 from tasks.world.vocabulary import kinematic_trajectories
 from tests.bench.peer import BenchScene, Beside, beside, peer_python

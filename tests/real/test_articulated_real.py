@@ -14,7 +14,7 @@ from factory.readers.logs import LogReader, only_present
 from tasks.rollout.simulate import TrafficSettings, next_scene, simulate
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, Clip, scene_of_clip
 from tasks.world.frames import wrap_angle
-from tasks.world.repair.articulated import couplings
+from tasks.world.repair.tracks import couplings
 
 LOG = "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
 

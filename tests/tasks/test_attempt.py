@@ -6,12 +6,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.attempt import ExpertGate, Judged, attempt, drive_under_log_replay, perturbed_scene, verdict
+from tasks.attempt import (
+    BRAKING_MPS2,
+    ExpertGate,
+    Judged,
+    attempt,
+    drive_under_log_replay,
+    hit_after_s,
+    perturbed_scene,
+    verdict,
+)
 from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.experts.protocol import Expert, Human, Plan
 from tasks.experts.recovery import RecoveryExpert, RecoveryTable
 from tasks.reward.epdms import Scores
-from tasks.reward.labels import BRAKING_MPS2, hit_after_s
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.stages import END_FAULTS, STAGES, Rejected
 from tasks.subscores import JUDGED

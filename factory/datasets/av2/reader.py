@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from factory.datasets.av2 import ANNOTATIONS, EXTRINSICS, INTRINSICS, POSES, log_folders
 from factory.files import broken_link, is_named, matching, why_unread
-from factory.readers.base import BadClip, ClipRef, folder_split, id_text
+from factory.readers.base import BadClip, ClipRef, folder_split, id_text, read_feather, stamps_sign
 from factory.readers.logs import (
     STEP_MS,
     LoggedDrive,
@@ -30,8 +30,6 @@ from factory.readers.logs import (
     files_within,
     route_of_drive,
 )
-from factory.readers.points import read_feather
-from factory.readers.signs import stamps_sign
 from factory.wording import shown
 from tasks.world.arrays import Array, Bools, Indices, Ints
 from tasks.world.clip import MOVING_KINDS, STEP_S, AgentKind, AgentTracks, Camera, SensorFile

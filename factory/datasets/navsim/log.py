@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from factory.readers.base import BadClip, bytes_of, id_text
+from factory.readers.base import BadClip, bytes_of, id_text, stamps_sign
 from factory.readers.pickles import Record, load_plain, load_records
-from factory.readers.signs import stamps_sign
 from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.clip import AgentKind

@@ -65,10 +65,9 @@ from tasks.caches import user_cache, with_checksum, without_checksum
 from tasks.kernels.compiled import write_whole
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import NOW, Block, Camera, Clip, SensorFile
-from tasks.world.repair.articulated import articulated
 from tasks.world.repair.records import later
 from tasks.world.repair.road import lights_on_map
-from tasks.world.repair.tracks import Repairs
+from tasks.world.repair.tracks import Repairs, articulated
 
 # NAVSIM's scene filters and splits: the YAML files that name which windows of which logs count.
 #

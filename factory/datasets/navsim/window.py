@@ -37,8 +37,7 @@ from tasks.world.clip import (
     Camera,
     SensorFile,
 )
-from tasks.world.frames import AX, EGO_STATE_SIZE, HEADING, LARGEST, PACIFICA, VX, X, wrap_angle
-from tasks.world.geometry import ego_boxes, touching
+from tasks.world.frames import AX, EGO_STATE_SIZE, HEADING, LARGEST, PACIFICA, VX, X, ego_boxes, touching, wrap_angle
 from tasks.world.repair.records import Repair, repairs_within
 from tasks.world.repair.tracks import HEADING as BOX_HEADING
 from tasks.world.repair.tracks import Repairs, observed, repaired

@@ -51,7 +51,7 @@ from factory.datasets.py123d.arrow import (
 from factory.datasets.py123d.map import read_map
 from factory.datasets.scenarionet.reader import FIT_STEPS, MAX_GAP_S, smooth_drive
 from factory.files import broken_link, file_digest, is_named, matching, matching_below, named_once
-from factory.readers.base import SPLITS, BadClip, ClipRef, id_text
+from factory.readers.base import SPLITS, BadClip, ClipRef, id_text, stamps_sign
 from factory.readers.logs import (
     STEP_MS,
     LoggedDrive,
@@ -62,7 +62,6 @@ from factory.readers.logs import (
     files_within,
     route_of_drive,
 )
-from factory.readers.signs import stamps_sign
 from factory.wording import shown
 from tasks.world.arrays import Array, Indices
 from tasks.world.clip import STEP_S, AgentKind, Camera, SensorFile

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from factory.files import broken_link, is_named, why_unread
-from factory.readers.base import BadClip
+from factory.readers.base import BadClip, camera_sign, stamps_sign
 from factory.readers.pictures import frame_uri
-from factory.readers.signs import camera_sign, stamps_sign
 from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.clip import ROTATION_SLACK, STEP_S, Camera, Fisheye, SensorFile

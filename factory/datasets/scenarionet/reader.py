@@ -40,6 +40,7 @@ from factory.readers.base import (
     folder_split,
     id_text,
     nuscenes_split,
+    stamps_sign,
     waymo_split,
 )
 from factory.readers.logs import (
@@ -53,7 +54,6 @@ from factory.readers.logs import (
     route_of_drive,
 )
 from factory.readers.pickles import load_plain
-from factory.readers.signs import stamps_sign
 from factory.wording import shown
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import CLIP_STEPS, STEP_S, AgentKind, AgentTracks

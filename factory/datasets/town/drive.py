@@ -14,8 +14,7 @@ from factory.datasets.town.streets import Streets, TownRoad
 from tasks.rollout.lqr import track
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS
-from tasks.world.frames import AX, AY, EGO_STATE_SIZE, PACIFICA, VX, box_corners
-from tasks.world.geometry import ego_boxes, touching
+from tasks.world.frames import AX, AY, EGO_STATE_SIZE, PACIFICA, VX, box_corners, ego_boxes, touching
 from tasks.world.road_map import arc_lengths
 
 # Agents that drive: lights with phases, lane paths, and a driver that follows its path, its leader and the lights.

@@ -123,7 +123,7 @@ def prepare_fit(
     alike = with_common_exposure(looked_at, exposures[sorted(first_seen)])
     background, nodes = build_surfaces(alike, seen, tracks)
     eyes = np.stack([p.world_from_camera[:3, 3] for p in train])
-    surface = fit_road(points.every, eyes) if settings.road else None
+    surface = fit_road(points.every, eyes)
     cars = [nodes.get(i) for i in tracks.ids]
     bodies = _unseen_bodies(cars, tracks, [p.time_s for p in train])
     state = _first_state(

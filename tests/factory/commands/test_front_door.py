@@ -19,8 +19,8 @@ from factory.config.arguments import ComposedCommand
 from factory.exits import EXIT_CODE_TEXT
 from factory.graph.driver import EpisodeSettings
 from factory.graph.execute import Execution
+from factory.store.commit_copies import COPIES
 from factory.store.samples import CURRENT_RUN, Store
-from factory.store.table import COPIES
 from factory.views.sample_text import prepared_episode
 from factory.views.status import failure_summary
 from planners.__main__ import main as planners_main

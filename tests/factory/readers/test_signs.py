@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from factory.readers.base import BadClip, read_clip
-from factory.readers.signs import camera_sign, motion_sign, stamps_sign
+from factory.readers.base import BadClip, camera_sign, motion_sign, read_clip, stamps_sign
 from tasks.world.clip import Camera, Clip, SensorFile
 from tasks.world.frames import HEADING, VX, X
 from tests.factory.readers.test_validate import REF, OneClip, a_clip

@@ -242,7 +242,7 @@ def test_another_size_or_window_is_another_block(clip: Clip) -> None:
     assert block_id(clip, replace(SETTINGS, jpeg_quality=50)) == block_id(clip, SETTINGS)
 
 
-FIT = FitSettings(iterations=20, hold_out_every=3, start_gaussians=400, most_gaussians=500, stereo_photos=2, road=False)
+FIT = FitSettings(iterations=20, hold_out_every=3, start_gaussians=400, most_gaussians=500, stereo_photos=2)
 FITTED = RenderSettings(width=48, height=32, scene=SceneFrom.FIT, fit=FIT)
 
 

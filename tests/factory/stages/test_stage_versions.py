@@ -17,7 +17,7 @@ from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.stages.rows import label_columns, sample_row
 from factory.store.schema import SCHEMA
-from tasks.attempt import Judged, perturbed_scene
+from tasks.attempt import BRAKING_MPS2, Judged, hit_after_s, perturbed_scene, route_ahead_m
 from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.experts.protocol import Human, Plan
 from tasks.experts.recovery import RecoveryExpert, RecoveryTable
@@ -28,7 +28,6 @@ from tasks.render.scene.engine import NOBODY, render
 from tasks.render.views import draw_map_views, pinhole, render_views
 from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.reward.label_bytes import VocabularyLabels
-from tasks.reward.labels import BRAKING_MPS2, hit_after_s, route_ahead_m
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.stages import STAGES, stage_versions
 from tasks.world.clip import HORIZON_STEPS, NOW, Camera, Clip, Pinhole, Rollout, Scene, random_stream, scene_of_clip

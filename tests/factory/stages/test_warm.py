@@ -129,7 +129,7 @@ def test_replayed_traffic_needs_no_idm(tmp_path: Path, towns: str) -> None:
     replay = ("traffic=replay", "reward.labels=none")
     before, after = run_with_these(["judge", "plan"], tmp_path, *TOWN, *BLIND, *replay, towns, "executor=local")
     assert after == before
-    assert not any(name.startswith("tasks/rollout/traffic") for name in after)
+    assert not any(name.startswith("tasks/rollout/simulate") for name in after)
 
 
 @pytest.mark.ray

@@ -12,12 +12,13 @@ from factory.commands.table import COMMANDS
 from factory.exits import BAD_CONFIG, COMPLETE, DAMAGED
 from factory.graph.driver import EpisodeSettings
 from factory.graph.execute import Execution, execute
+from factory.store.commit_copies import CommitCopies
 from factory.store.episodes import Message, episode_bytes
 from factory.store.location import Location, write_shard
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.schema import SAMPLES
-from factory.store.table import AnotherWriter, CommitCopies
+from factory.store.table import AnotherWriter
 from factory.store.verify import damaged_logs, restore_logs, verify
 from tasks.caches import json_with_checksum
 from tests.factory.damage import damaged

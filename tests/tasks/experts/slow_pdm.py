@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from tasks.settings import PDM_DEFAULTS, PdmSettings
 from tasks.world.clip import MOVING_KINDS, AgentKind, AgentTracks
-from tasks.world.frames import PACIFICA, VX, Vehicle, X, Y, box_corners, wrap_angle
-from tasks.world.geometry import ego_boxes
+from tasks.world.frames import PACIFICA, VX, Vehicle, X, Y, box_corners, ego_boxes, wrap_angle
 
 Array = NDArray[np.float64]
 STEP_S = 0.1

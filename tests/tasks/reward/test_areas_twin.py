@@ -15,8 +15,7 @@ from tasks.reward.centerline import (
     empty_body,
     place_body,
 )
-from tasks.world.frames import HEADING, PACIFICA, Vehicle, X, Y
-from tasks.world.geometry import ego_boxes
+from tasks.world.frames import HEADING, PACIFICA, Vehicle, X, Y, ego_boxes
 from tasks.world.road_map import MapLayer, MapPolygon
 from tests.tasks.reward.slow.areas import EgoAreas, ego_areas
 from tests.tasks.reward.slow.prepare import _regions

@@ -18,8 +18,7 @@ from tasks.reward.collisions import (
     with_index,
     within_reach,
 )
-from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y, box_corners, to_world
-from tasks.world.geometry import ego_boxes, touching
+from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y, box_corners, ego_boxes, to_world, touching
 from tasks.world.road_map import MapLayer, MapPolygon
 from tests.tasks.reward.slow import collisions as slow
 from tests.tasks.reward.slow.areas import EgoAreas

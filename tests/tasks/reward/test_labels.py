@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.attempt import Judged, drive_and_judge, drive_under_log_replay, perturbed_scene
+from tasks.attempt import Judged, drive_and_judge, drive_under_log_replay, perturbed_scene, vocabulary_labels
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Human, Plan
 from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
-from tasks.reward.labels import vocabulary_labels
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.world.clip import NOW, Scene, scene_of_clip
@@ -92,7 +91,7 @@ def test_a_human_sample_meets_the_log(human: Judged) -> None:
 
 def test_chunks_leave_every_label_as_it_is(simulated: Judged, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = labelled(simulated)
-    monkeypatch.setattr("tasks.reward.labels.TRAJECTORIES_AT_ONCE", 7)
+    monkeypatch.setattr("tasks.attempt.TRAJECTORIES_AT_ONCE", 7)
     chunked = labelled(simulated)
     for name in KEPT:
         np.testing.assert_array_equal(getattr(chunked, name), getattr(whole, name))

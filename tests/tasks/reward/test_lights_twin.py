@@ -8,8 +8,7 @@ from test_areas_twin import EXACT, drives, lattice_states
 
 from tasks.reward.areas import first_red, index_red_lanes
 from tasks.reward.centerline import empty_body, place_body
-from tasks.world.frames import PACIFICA, Vehicle, X, Y
-from tasks.world.geometry import ego_boxes
+from tasks.world.frames import PACIFICA, Vehicle, X, Y, ego_boxes
 from tasks.world.road_map import MapLayer, MapPolygon
 from tests.tasks.reward.slow.collisions import traffic_light_compliance
 from tests.tasks.reward.slow.prepare import RedLanes, _shape

@@ -15,8 +15,7 @@ from tasks.reward.collisions import (
     obstacles_of,
     with_index,
 )
-from tasks.world.frames import PACIFICA
-from tasks.world.geometry import touching
+from tasks.world.frames import PACIFICA, touching
 
 PERIOD_M = CELLS_PER_SIDE * CELL_M
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from tasks.reward.labels import NEAR_M, NEAR_RAD, route_ahead_m
+from tasks.attempt import NEAR_M, NEAR_RAD, route_ahead_m
 from tasks.world.clip import Clip
 from tests.tasks.streets import LANE_M, street_clip
 

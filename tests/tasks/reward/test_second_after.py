@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tasks.attempt import BRAKING_MPS2, extrapolate, hit_after_s
 from tasks.reward.epdms import prepare_scene
-from tasks.reward.labels import BRAKING_MPS2, extrapolate, hit_after_s
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentKind, Scene, scene_of_clip
 from tasks.world.frames import HEADING, PACIFICA, STEERING, VX, YAW_RATE, X, Y, to_world

@@ -33,7 +33,7 @@ from tasks.rollout.idm import (
     needed_deceleration,
     stop_line_gap,
 )
-from tasks.rollout.towing import hitch, towed_pose
+from tasks.rollout.lane_following import hitch, towed_pose
 from tasks.world.clip import STEP_S
 from tests.tasks.rollout.slow_yielding import has_way, intended, turned_on, waits_before
 

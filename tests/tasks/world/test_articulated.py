@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, AgentKind, AgentTracks
 from tasks.world.frames import box_corners
-from tasks.world.repair.articulated import articulated, couplings, first_parts
+from tasks.world.repair.tracks import articulated, couplings, first_parts
 from tests.tasks.rollout import worlds
 from tests.tasks.rollout.worlds import Track
 

@@ -3,8 +3,7 @@
 import numpy as np
 import shapely
 
-from tasks.world.frames import PACIFICA, box_corners
-from tasks.world.geometry import ego_boxes, touching
+from tasks.world.frames import PACIFICA, box_corners, ego_boxes, touching
 
 
 def test_separating_axes_agree_with_polygon_intersection():

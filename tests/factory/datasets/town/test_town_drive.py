@@ -24,8 +24,7 @@ from factory.datasets.town.streets import Streets, build_streets
 from factory.datasets.town.town import WINDOWS_PER_LOG, plan_log, write_town
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW
-from tasks.world.frames import PACIFICA, box_corners, to_local
-from tasks.world.geometry import ego_boxes
+from tasks.world.frames import PACIFICA, box_corners, ego_boxes, to_local
 from tasks.world.road_map import arc_lengths
 
 BLIND = TownSettings(cameras=(), lidar_beams=0)

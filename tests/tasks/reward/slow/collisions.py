@@ -11,8 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tasks.world.frames import HEADING, VX, VY, X, Y, box_corners
-from tasks.world.geometry import touching
+from tasks.world.frames import HEADING, VX, VY, X, Y, box_corners, touching
 from tests.tasks.reward.slow.areas import EgoAreas
 from tests.tasks.reward.slow.prepare import Obstacles, RedLanes
 

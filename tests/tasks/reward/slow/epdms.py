@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.reward.epdms import Normalise, Scores, relative_progress
-from tasks.world.geometry import ego_boxes
+from tasks.world.frames import ego_boxes
 from tests.tasks.reward.slow.areas import ego_areas
 from tests.tasks.reward.slow.collisions import no_at_fault_collision, time_to_collision, traffic_light_compliance
 from tests.tasks.reward.slow.comfort import history_comfort

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from tasks.reward.comfort import interpolated_history
 from tasks.world.clip import HORIZON_STEPS, MOVING_KINDS, AgentTracks
-from tasks.world.frames import PACIFICA, Vehicle, box_corners
-from tasks.world.geometry import ego_boxes, touching
+from tasks.world.frames import PACIFICA, Vehicle, box_corners, ego_boxes, touching
 from tasks.world.road_map import MapLayer, MapPolygon
 
 Array = NDArray[np.float64]
