@@ -90,11 +90,11 @@ def decode_rgb(data: bytes | Bytes, wanted: Size | None = None, camera: str = "i
     return np.asarray(cv2.cvtColor(_decoded(data, cv2.IMREAD_COLOR, wanted, camera), cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def decode_grey(data: bytes | Bytes, wanted: Size | None = None, camera: str = "its camera") -> Bytes:
+def decode_grey(data: bytes | Bytes, wanted: Size) -> Bytes:
     """The same in grey (H, W)."""
     import cv2
 
-    return _decoded(data, cv2.IMREAD_GRAYSCALE, wanted, camera)
+    return _decoded(data, cv2.IMREAD_GRAYSCALE, wanted, "its camera")
 
 
 def without_exif(jpeg: bytes) -> bytes:

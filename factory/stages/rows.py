@@ -85,13 +85,13 @@ def label_columns(labels: VocabularyLabels) -> dict[str, object]:
     }
 
 
-def score_columns(prefix: str, scores: Scores, row: int = 1) -> dict[str, object]:
-    """Sub-scores, EPDMS (/14: there is no earlier plan to compare comfort with) and first failing times."""
-    columns: dict[str, object] = {f"{prefix}_score": float(scores.pdm_score[row])}
+def score_columns(prefix: str, scores: Scores) -> dict[str, object]:
+    """Of row 1: sub-scores, EPDMS (/14: there is no earlier plan to compare comfort with) and first failing times."""
+    columns: dict[str, object] = {f"{prefix}_score": float(scores.pdm_score[1])}
     for name in SUBSCORES:
-        columns[f"{prefix}_{name}"] = float(getattr(scores, name)[row]) if name in OF_ONE_PLAN else None
+        columns[f"{prefix}_{name}"] = float(getattr(scores, name)[1]) if name in OF_ONE_PLAN else None
     for name, indices in scores.first_failures.items():
-        index = float(indices[row])
+        index = float(indices[1])
         columns[f"{prefix}_{name}_fails_s"] = index * STEP_S if np.isfinite(index) else None
     return columns
 

@@ -20,7 +20,7 @@ from tasks.world.arrays import Array
 from tasks.world.clip import AgentKind
 from tasks.world.frames import to_local, wrap_angle
 from tasks.world.repair.records import LEFT_OUT, Repair
-from tasks.world.repair.tracks import MOST, whole_frames
+from tasks.world.repair.tracks import MOST, increasing, whole_frames
 
 # Values out of a pickled dict, checked one by one: what is wrong names file, frame and key.
 
@@ -221,11 +221,11 @@ def _out_of_place(frames: Mapping[int, Frame], path: Path) -> Iterator[tuple[int
     """The frames that do not belong where they stand, and why."""
     file = str(path)
     order = sorted(frames)
-    late = {order[k] for k in _out_of_time([frames[i].timestamp_us for i in order])}
+    in_time = {order[k] for k in increasing(np.array([frames[i].timestamp_us for i in order], np.float64))}
     seen: set[str] = set()
     for i in order:
         frame = frames[i]
-        if i in late:
+        if i not in in_time:
             yield i, BadClip(file, f"frames[{i}].timestamp", "time does not go on")
         elif frame.log_name != path.stem:  # NAVSIM finds logs by the one and scenes by the other
             problem = f"is {shown(frame.log_name)}, but the file is named {path.stem!r}: rename the file"
@@ -243,18 +243,6 @@ def _away(frames: Mapping[int, Frame]) -> list[int]:
     boxes[:, :2] = np.array([frames[i].pose[:2] for i in order]).reshape(-1, 2)
     left, _ = whole_frames(np.array([frames[i].timestamp_us / 1e6 for i in order]), boxes)
     return [int(i) for i in order[~left]]
-
-
-def _out_of_time(stamps: Sequence[int]) -> list[int]:
-    """Which stamps to leave out so that the others increase: first those that most of the others speak against."""
-    clash = np.triu(np.less_equal.outer(np.array(stamps), np.array(stamps)).T, 1)
-    clash |= clash.T
-    out = []
-    while clash.any():
-        worst = len(clash) - 1 - int(np.argmax(clash.sum(axis=0)[::-1]))
-        clash[worst] = clash[:, worst] = False
-        out.append(worst)
-    return out
 
 
 def parse_frame(item: Any, file: str, place: str, whole: bool = True) -> Frame:

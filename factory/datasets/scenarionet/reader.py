@@ -7,7 +7,6 @@ to the database).
 """
 
 import hashlib
-from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -66,6 +65,7 @@ from tasks.world.repair.tracks import (
     UNSEEN,
     ObservedTracks,
     clock_repairs,
+    increasing,
     repaired,
     whole_frames,
 )
@@ -226,7 +226,7 @@ def frames_of(metadata: Mapping[str, Any], n_frames: int, file: str) -> FrameClo
     stamps = _numbers(stored, (n_frames,), file, "metadata.ts").copy()
     twice = np.flatnonzero(np.diff(stamps) == 0.0)
     stamps[[*twice, *(twice + 1)]] = np.nan  # nothing tells which of the two it is of
-    rows = _longest_increasing(stamps)
+    rows = increasing(stamps)
     if len(rows) <= MOST * n_frames:
         raise BadClip(file, "metadata.ts", "time is not finite and increasing in most of the frames")
     if sign := stamps_sign(stamps[rows], "s"):
@@ -247,20 +247,6 @@ def frames_of(metadata: Mapping[str, Any], n_frames: int, file: str) -> FrameClo
     before = np.minimum(at.astype(int), len(apart) - 1)
     known = (at == np.floor(at)) | (apart[before] <= MAX_GAP_S)
     return FrameClock(rows, times_s, at, known, (*clock_repairs(times_s), *unordered))
-
-
-def _longest_increasing(stamps: Array) -> Ints:
-    """Indices of the most stamps that increase strictly, of finite ones."""
-    ends, last, before = list[float](), list[int](), dict[int, int]()  # smallest end of a run of each length
-    for k in np.flatnonzero(np.isfinite(stamps)).tolist():
-        length = bisect_left(ends, stamps[k])
-        before[k] = last[length - 1] if length else -1
-        ends[length : length + 1], last[length : length + 1] = [float(stamps[k])], [k]
-    chosen, k = list[int](), last[-1] if last else -1
-    while k >= 0:
-        chosen.append(k)
-        k = before[k]
-    return np.array(chosen[::-1], int)
 
 
 def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, file: str) -> LoggedTrack:

@@ -184,7 +184,7 @@ def overlaps(boxes: Array, others: Array, margin_m: float) -> Bools:
     return touching((boxes + 2 * margin_m * np.array([0.0, 0.0, 0.0, 1.0, 1.0]))[:, None], others)
 
 
-def endangers(ego: Array, speeds: Array, others: Array, margin_m: float = 0.15) -> Bools:
+def endangers(ego: Array, speeds: Array, others: Array) -> Bools:
     """(J,): would the ego (S, 5), straight on for up to 0.9 s, touch that track? Stricter than docs/reward.md 2g."""
     danger = np.zeros(others.shape[1], bool)
     for ahead in (0, 3, 6, 9):
@@ -192,7 +192,7 @@ def endangers(ego: Array, speeds: Array, others: Array, margin_m: float = 0.15) 
         travel = speeds[: len(moved)] * ahead * STEP_S
         moved[:, 0] += travel * np.cos(moved[:, 2])
         moved[:, 1] += travel * np.sin(moved[:, 2])
-        danger |= overlaps(moved, others[ahead:], margin_m).any(axis=0)
+        danger |= overlaps(moved, others[ahead:], 0.15).any(axis=0)
     return danger
 
 

@@ -5,6 +5,7 @@ is left out, named anew, turned round or put between its neighbours. Then which 
 """
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, wraps
@@ -288,6 +289,20 @@ def clock_repairs(frame_times_s: Array) -> tuple[Repair, ...]:
     for k in np.flatnonzero((steps > 1.5 * usual) & (steps <= FILLED_S + 1e-6)):
         done.append(Repair("gap", "", float(frame_times_s[k]), f"no frame for {steps[k]:.2f} s", "filled in"))
     return tuple(done)
+
+
+def increasing(stamps: Array) -> Ints:
+    """Indices of the most stamps (F,) that increase strictly, of finite ones; of as many the first in the file."""
+    ends, last, after = list[float](), list[int](), dict[int, int]()  # latest beginning of a run of each length
+    for k in np.flatnonzero(np.isfinite(stamps))[::-1].tolist():
+        length = bisect_left(ends, -stamps[k])
+        after[k] = last[length - 1] if length else -1
+        ends[length : length + 1], last[length : length + 1] = [-float(stamps[k])], [k]
+    chosen, k = list[int](), last[-1] if last else -1
+    while k >= 0:
+        chosen.append(k)
+        k = after[k]
+    return np.array(chosen, int)
 
 
 def whole_frames(times_s: Array, boxes: Array) -> tuple[Bools, Repairs]:
