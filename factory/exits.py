@@ -110,6 +110,20 @@ def terminal_signals_blocked(*signals: signal.Signals) -> Iterator[None]:
             signal.raise_signal(number)
 
 
+def end_with_parent(code: int) -> None:
+    """From now on this process, one of multiprocessing's, ends by an exit code once the one that began it has ended."""
+    import multiprocessing  # here alone: most programs begin no process
+
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(code)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def ignore_broken_output() -> None:
     """From now on standard output and error are dropped once nobody reads them: `... | head`, a closed terminal.
 
@@ -148,9 +162,23 @@ class _Output(io.FileIO):
             return super().write(data)
 
 
-def stop_signals() -> list[signal.Signals]:
-    """The signals that ask this process to stop: STOP_SIGNALS, less a SIGHUP that is ignored, as by nohup."""
-    return [number for number in STOP_SIGNALS if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN]
+@contextmanager
+def handling_stop_signals(handle: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """STOP_SIGNALS are handled so, but for a SIGHUP that is ignored, as by nohup.
+
+    Changes nothing off the main thread: the signals of a Ray worker are Ray's.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    heeded = [n for n in STOP_SIGNALS if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]
+    before = {number: signal.signal(number, handle) for number in heeded}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if signal.getsignal(number) == handle:
+                signal.signal(number, handler)
 
 
 @contextmanager
@@ -158,12 +186,8 @@ def calling_on_stop_signal(stop: Callable[[], object]) -> Iterator[None]:
     """The first SIGINT, SIGTERM or SIGHUP calls `stop`, a second one raises KeyboardInterrupt.
 
     A SIGHUP is never a second one, and is ignored after the first: a terminal that closes sends it, and its shell once
-    more. Where it is ignored from the start, as by nohup, it stays so. Changes nothing off the main thread: the signals
-    of a Ray worker are Ray's.
+    more. Where it is ignored from the start, as by nohup, it stays so. Nothing is called off the main thread.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     asked = threading.Event()
 
     def handle(number: int, frame: FrameType | None) -> None:
@@ -175,10 +199,5 @@ def calling_on_stop_signal(stop: Callable[[], object]) -> Iterator[None]:
         elif number != signal.SIGHUP:
             raise _Interrupt
 
-    before = {number: signal.signal(number, handle) for number in stop_signals()}
-    try:
+    with handling_stop_signals(handle):
         yield
-    finally:
-        for number, handler in before.items():
-            if signal.getsignal(number) == handle:
-                signal.signal(number, handler)

@@ -70,11 +70,6 @@ def needs_own_process(config: RunConfig) -> bool:
     return config.graph.isolated == "always" or (config.graph.isolated == "auto" and foreign)
 
 
-def minutes_left(minutes: float | None, began: float) -> float | None:
-    """Of so many minutes since then, on the monotonic clock."""
-    return None if minutes is None else max(0.0, minutes - (time.monotonic() - began) / 60.0)
-
-
 def run(asked: CommandLine, only_plan: bool) -> int:
     """Plan, execute, commit, report; or plan alone. The command line is checked before anything heavy is imported.
 
@@ -173,7 +168,7 @@ def _run(
                     on_change=config.on_change,
                     retry=config.retry_failed,
                     shard_seconds=config.shard_seconds,
-                    minutes=minutes_left(config.minutes, since),
+                    minutes=config.minutes and max(0.0, config.minutes - (time.monotonic() - since) / 60.0),
                     episodes=EpisodeSettings(config.one_episode_in, prepared_episode)
                     if config.one_episode_in
                     else None,

@@ -9,15 +9,21 @@ import os
 import signal
 import socket
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import FrameType
 
-from factory.exits import INTERRUPTED, run_for_exit_code, stop_signals, terminal_signals_blocked
+from factory.exits import (
+    INTERRUPTED,
+    end_with_parent,
+    handling_stop_signals,
+    run_for_exit_code,
+    terminal_signals_blocked,
+)
 
 AGAIN = "run the same command again to go on"
 ANSWER_S = 10.0  # for a cluster's port to be reached, and to say what it speaks
@@ -38,7 +44,7 @@ def run_in_own_process(run: Run, is_ours: bool, say: Callable[[str], None]) -> i
     while True:
         ours, theirs = context.Pipe(duplex=False)
         process = context.Process(target=_child_main, args=(theirs, run, begun))
-        with _passing_signals(process):
+        with handling_stop_signals(partial(_pass_on, process)):
             with terminal_signals_blocked():
                 process.start()
             theirs.close()
@@ -95,14 +101,7 @@ def new_cluster_text(said: str, number: int) -> str:
 def _child_main(pipe: Connection, run: Run, begun: int) -> None:
     """The other process: a session of its own, so that a terminal's signals come by way of the command's alone."""
     os.setsid()
-    command = multiprocessing.parent_process()
-    assert command is not None
-
-    def watch() -> None:
-        command.join()
-        os._exit(BY_RAY)
-
-    threading.Thread(target=watch, daemon=True).start()
+    end_with_parent(BY_RAY)
     code = 1
     try:
         code = run_for_exit_code(lambda: run(begun, pipe.send))
@@ -121,23 +120,11 @@ def _read_messages(pipe: Connection) -> tuple[list[str], int | None]:
     return lines, None
 
 
-@contextmanager
-def _passing_signals(process: BaseProcess) -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def pass_on(number: int, frame: FrameType | None) -> None:
-        if process.pid is not None:
-            with suppress(ProcessLookupError):
-                os.kill(process.pid, number)
-
-    before = {number: signal.signal(number, pass_on) for number in stop_signals()}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def _pass_on(process: BaseProcess, number: int, frame: FrameType | None) -> None:
+    """A signal to a process that has begun."""
+    if process.pid is not None:
+        with suppress(ProcessLookupError):
+            os.kill(process.pid, number)
 
 
 def _end_session(session: int) -> None:

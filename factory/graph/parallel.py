@@ -2,14 +2,13 @@
 
 import multiprocessing
 import os
-import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from itertools import islice
 from typing import Literal, ParamSpec, TypeVar
 
-from factory.exits import calling_on_stop_signal, ignore_terminal_signals, terminal_signals_blocked
+from factory.exits import calling_on_stop_signal, end_with_parent, ignore_terminal_signals, terminal_signals_blocked
 from factory.graph.steps import TaskStopped
 from factory.store.location import Location
 
@@ -104,11 +103,4 @@ def _detach_worker() -> None:
     """A worker process out of reach of what is sent to all of a terminal, that ends when its driver was killed."""
     ignore_terminal_signals()
     os.setpgrp()
-    driver = multiprocessing.parent_process()
-    assert driver is not None
-
-    def watch() -> None:
-        driver.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+    end_with_parent(1)

@@ -79,7 +79,7 @@ NEAR_M = 12.0  # between two drives on one street, on lanes of either direction
 LEAST_M = 20.0  # of another drive beside the block's, or it is left out
 SAMPLE_STEPS = 5  # a place of a drive is kept every 0.5 s
 BROKEN_STEPS = 20  # as long may another drive be farther away in between
-LONGEST_STEPS = 200  # of another drive, as of blocks
+BLOCK_STEPS = 200  # 20 s, of a stretch that is reconstructed, and at most of another drive through it
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def traversals(paths: Mapping[str, DrivenPath], log_id: str, start: int, stop: i
             for run in np.split(near, np.flatnonzero(np.diff(other.steps[near]) > BROKEN_STEPS) + 1)
         )
         if length >= LEAST_M:
-            found.append((-length, Traversal(other_id, -first, min(last + 1, -first + LONGEST_STEPS))))
+            found.append((-length, Traversal(other_id, -first, min(last + 1, -first + BLOCK_STEPS))))
     return tuple(traversal for _, traversal in sorted(found, key=lambda row: (row[0], row[1].log_id))[:most])
 
 
@@ -281,6 +281,7 @@ class LogReader(ABC, Generic[Log]):
     data_set: ClassVar[str]  # name where none is given
     untrusted: ClassVar[bool] = False  # the format can bring a reader down: the index reads it in another process
     length_is: ClassVar[str] = "long"  # "12.3 s ..." of a log that is too short
+    block_stride_steps: ClassVar[int | None] = None  # between the stretches that are blocks; None: a window is one
 
     def __init__(
         self,
@@ -334,7 +335,14 @@ class LogReader(ABC, Generic[Log]):
 
     def block_steps(self, start: int) -> tuple[int, int]:
         """Steps first..stop-1 of a log that the block of the window from step `start` on takes, where it has them."""
-        return start, start + CLIP_STEPS
+        if self.block_stride_steps is None:
+            return start, start + CLIP_STEPS
+        first = start // self.block_stride_steps * self.block_stride_steps
+        return first, first + BLOCK_STEPS
+
+    def block_name(self, ref: ClipRef) -> str:
+        """Log and second at which the block begins that a clip is rendered from."""
+        return f"{ref.log_id}@{self.block_steps(ref.start_ms // STEP_MS)[0] * STEP_S:g}s"
 
     def log_digest(self, path: Path) -> str:
         """The content digest of the log at a path; readers that need not load it for that override. Raises BadClip."""

@@ -192,15 +192,8 @@ def score_lone(lone: LoneFrame, plans: Plans, before: Array | None) -> tuple[Fra
     poses, start = _checked(lone.key, plans), lone.frame.scene.ego_state[: HEADING + 1]
     driven = drive(lone.frame, poses)
     ec = np.nan if before is None else float(extended_comfort(driven.states[None], before[None], INTERVAL_S).ec[0])
-    row = FrameRow(
-        stage="one_stage",
-        key=lone.key,
-        scores=frame_scores(driven.scores, lone.frame.human, ec),
-        progress_m=float(driven.scores.ep_raw_m[0]),
-        start=start,
-        end=to_world(start, poses[-1]),
-    )
-    return row, driven.states
+    scores = frame_scores(driven.scores, lone.frame.human, ec)
+    return FrameRow("one_stage", lone.key, scores, *_way(driven, start, poses)), driven.states
 
 
 def score_clip(clip: ClipFrames, plans: Plans) -> list[FrameRow]:
@@ -234,16 +227,14 @@ def _pair_rows(stage: ScoreStage, keys: Pair[FrameKey], pair: PreparedPair, plan
     made = [_checked(key, plans) for key in keys]
     scored = score_pair(pair, made)
     return [
-        FrameRow(
-            stage=stage,
-            key=key,
-            scores=scores,
-            progress_m=float(driven.scores.ep_raw_m[0]),
-            start=start,
-            end=to_world(start, poses[-1]),
-        )
+        FrameRow(stage, key, scores, *_way(driven, start, poses))
         for key, start, poses, (scores, driven) in zip(keys, starts, made, scored)
     ]
+
+
+def _way(driven: ScoredDrive, start: Array, poses: Array) -> tuple[float, Array, Array]:
+    """Progress [m], and where a plan (40, 3) from a pose (3,) starts and ends in the world."""
+    return float(driven.scores.ep_raw_m[0]), start, to_world(start, poses[-1])
 
 
 def _checked(key: FrameKey, plans: Plans) -> Array:

@@ -21,7 +21,6 @@ from factory.datasets.av2 import ANNOTATIONS, EXTRINSICS, INTRINSICS, POSES, log
 from factory.files import broken_link, is_named, matching, why_unread
 from factory.readers.base import BadClip, ClipRef, folder_split, id_text, read_feather, stamps_sign
 from factory.readers.logs import (
-    STEP_MS,
     LoggedDrive,
     LogReader,
     WholeLog,
@@ -551,7 +550,6 @@ def _crossing(key: str, raw: Any) -> tuple[Array | None, tuple[Repair, ...]]:
 
 LICENCE = "CC BY-NC-SA 4.0 (Argoverse 2)"
 LIGHTS = "traffic_lights.feather"
-BLOCK_STEPS, BLOCK_STRIDE_STEPS = 200, 100  # of the stretches that are reconstructed
 BEFORE_CITY, AFTER_CITY = "____", "_city_"  # log_map_archive_<log>____PIT_city_57819.json
 
 
@@ -569,6 +567,7 @@ class AV2Reader(LogReader[AV2Log]):
     """Clips of a folder of Argoverse 2 sensor logs, of one of its train/val/test folders, or of one log."""
 
     data_set = "av2"
+    block_stride_steps = 100
 
     def logs(self) -> dict[str, Path]:
         """Log id -> folder. Raises ValueError where the root holds no log."""
@@ -601,16 +600,9 @@ class AV2Reader(LogReader[AV2Log]):
         """The city, as the name of the log's map has it. Raises BadClip."""
         return map_file(path).stem.partition(BEFORE_CITY)[2].partition(AFTER_CITY)[0]
 
-    def block_steps(self, start: int) -> tuple[int, int]:
-        """20 s that begin at a multiple of 10 s."""
-        first = start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
-        return first, first + BLOCK_STEPS
-
     def block(self, ref: ClipRef) -> str | None:
-        """Log and second at which the block begins that the clip is rendered from; None where the log has no photos."""
-        if ref.log_id not in self._photographed:
-            return None
-        return f"{ref.log_id}@{self.block_steps(ref.start_ms // STEP_MS)[0] * STEP_S:g}s"
+        """The block that the clip is rendered from; None where the log has no photos."""
+        return self.block_name(ref) if ref.log_id in self._photographed else None
 
     @cached_property
     def _photographed(self) -> frozenset[str]:

@@ -12,8 +12,6 @@ import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
 from factory.datasets.av2.reader import (
-    BLOCK_STEPS,
-    BLOCK_STRIDE_STEPS,
     EGO_FIT_HALF_WINDOW_S,
     FILLED_S,
     MIN_POSE_SPACING_S,
@@ -53,7 +51,6 @@ from factory.datasets.scenarionet.reader import FIT_STEPS, MAX_GAP_S, smooth_dri
 from factory.files import broken_link, file_digest, is_named, matching, matching_below, named_once
 from factory.readers.base import SPLITS, BadClip, ClipRef, id_text, stamps_sign
 from factory.readers.logs import (
-    STEP_MS,
     LoggedDrive,
     LogReader,
     WholeLog,
@@ -327,6 +324,7 @@ class Py123dReader(LogReader[Py123dLog]):
     """
 
     data_set = "py123d"
+    block_stride_steps = 100
 
     def __init__(
         self,
@@ -417,18 +415,12 @@ class Py123dReader(LogReader[Py123dLog]):
         shares = not header.metadata["map_metadata"].get("map_is_per_log")
         return self._map_file(header).stem if shares else None
 
-    def block_steps(self, start: int) -> tuple[int, int]:
-        """20 s that begin at a multiple of 10 s."""
-        first = start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
-        return first, first + BLOCK_STEPS
-
     def block(self, ref: ClipRef) -> str | None:
-        """Log and second at which the block begins that the clip is rendered from; None where there are no photos."""
+        """The block that the clip is rendered from; None where there are no photos."""
         tables = [] if self.sensor_root is None else matching(self.path_of(ref), CAMERAS)
         if not any(pa.types.is_string(_data_type(open_file(path, rows=False))) for path in tables):  # of files' names
             return None
-        first, _ = self.block_steps(ref.start_ms // STEP_MS)
-        return f"{ref.log_id}@{first * STEP_S:g}s"
+        return self.block_name(ref)
 
     def recorded(self, log: Py123dLog, start: int, stop: int) -> WindowSensors:
         """Poses, rig and photos of a window, and the block that it is rendered from."""

@@ -43,6 +43,7 @@ from factory.readers.base import (
     waymo_split,
 )
 from factory.readers.logs import (
+    BLOCK_STEPS,
     STEP_MS,
     LoggedDrive,
     LogReader,
@@ -466,11 +467,7 @@ def _numbers(value: object, shape: tuple[int, ...], file: str, field: str) -> Ar
 
 
 SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"
-# Of the stretches that are reconstructed: 20 s, as far apart as any clip still lies in one, so that a scene of
-# nuScenes, 20 s and no more, is one.
-BLOCK_STEPS = 200
 GROUND_M = 0.0  # of the ego's frame, in sidecars and in the plane of the log: it stands on the road
-BLOCK_STRIDE_STEPS = BLOCK_STEPS - CLIP_STEPS
 
 
 @dataclass(frozen=True)
@@ -490,6 +487,8 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
     data_set = "scenarionet"
     untrusted = True
     length_is = "of driving"
+    # As far apart as any clip still lies in one, so that a scene of nuScenes, 20 s and no more, is one.
+    block_stride_steps = BLOCK_STEPS - CLIP_STEPS
 
     def __init__(
         self,
@@ -560,15 +559,8 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
         return _digest(digest, load_sidecar(self._sidecars[path])[1]) if path in self._sidecars else digest
 
     def block(self, ref: ClipRef) -> str | None:
-        """Log and second at which the block begins that the clip is rendered from; None where the log has no photos."""
-        if self.path_of(ref) not in self._sidecars:
-            return None
-        return f"{ref.log_id}@{self.block_steps(ref.start_ms // STEP_MS)[0] * STEP_S:g}s"
-
-    def block_steps(self, start: int) -> tuple[int, int]:
-        """20 s, which hold every window that begins in their first half."""
-        first = start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
-        return first, first + BLOCK_STEPS
+        """The block that the clip is rendered from; None where the log has no photos."""
+        return self.block_name(ref) if self.path_of(ref) in self._sidecars else None
 
     def recorded(self, log: ScenarioLog, start: int, stop: int) -> WindowSensors:
         """The ego's poses, photos and sweeps of a window. Raises BadClip where the ego's drive is broken."""
