@@ -4,10 +4,14 @@ VENV   := .venv
 PY     := $(VENV)/bin/python
 DEMO   := runs/demo
 
+# All that is installed is pinned with its hashes in locks/; the checkout itself comes last, editable.
+PIN := -m pip install -q --require-hashes --no-deps --no-build-isolation -r
+
 # PyTorch, which the planners and the tests need, the factory does not. On Linux its CPU build, 200 MB instead of
 # gigabytes of CUDA: PyPI has no version with the label +cpu, so nothing but TORCH_INDEX, or a wheel that pip's own
-# configuration points to, can satisfy it. With CUDA: make test TORCH=torch==2.13.0, or another label and its index.
-TORCH       ?= torch==2.13.0$(if $(filter Linux,$(shell uname -s)),+cpu)
+# configuration points to, can satisfy it. With CUDA and gsplat: make test TORCH="-r locks/planners.lock". Another
+# version, without hashes: TORCH=torch==<version>, and its index.
+TORCH       ?= -r locks/torch_cpu.lock
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 # Says in one line what keeps PYTHON from being used, before anything is made from it; old versions run it too. Its
@@ -30,25 +34,27 @@ sys.exit(sys.version.split()[0] != sys.argv[1])
 endef
 export FITS IS_WHOLE
 
-.PHONY: install demo first-planner warm test unit lint format docs chaos mutants bench gpu-check dist clean
+.PHONY: install demo first-planner warm test unit lint format docs chaos mutants bench gpu-check locks dist clean
 
 install: $(VENV)/.installed
 
 # What a run needs; make demo installs no more.
-$(VENV)/.run: pyproject.toml constraints.txt
+$(VENV)/.run: pyproject.toml locks/build.lock locks/run.lock
 	@command -v $(PYTHON) >/dev/null || { echo "no $(PYTHON): give another by PYTHON=python$(OLDEST)" >&2; exit 1; }
 	@$(PYTHON) -c "$$FITS"
 	@$(PY) -c "$$IS_WHOLE" $$($(PYTHON) -c "import sys; print(sys.version.split()[0])") 2>/dev/null || \
 		$(PYTHON) -m venv --clear $(VENV)
-	$(PY) -m pip install -q --upgrade pip
-	$(PY) -m pip install -q -c constraints.txt -e ".[run]"
+	$(PY) $(PIN) locks/build.lock
+	$(PY) $(PIN) locks/run.lock
+	$(PY) -m pip install -q --no-deps --no-build-isolation -e .
 	touch $@
 
-# PyTorch comes by itself (what it needs, with the rest); its index, where out of reach, is given up within a minute.
-$(VENV)/.installed: $(VENV)/.run
-	$(PY) -m pip install -q -c constraints.txt --no-deps --retries 2 --timeout 15 --extra-index-url $(TORCH_INDEX) $(TORCH) || \
+# PyTorch's index, where out of reach, is given up within a minute.
+$(VENV)/.installed: $(VENV)/.run locks/dev.lock locks/torch_cpu.lock
+	$(PY) $(PIN) locks/dev.lock
+	$(PY) -m pip install -q --retries 2 --timeout 15 $(addprefix --extra-index-url ,$(TORCH_INDEX)) $(TORCH) || \
 		{ echo "no $(TORCH): give TORCH= and TORCH_INDEX= (see the Makefile)"; exit 1; }
-	$(PY) -m pip install -q -c constraints.txt -e ".[dev]"
+	$(PY) -m pip check
 	touch $@
 
 demo: $(VENV)/.run
@@ -114,30 +120,66 @@ mutants: install warm
 bench: install
 	$(if $(filter reward,$(NAME)),OMP_NUM_THREADS=1) $(PY) -m tests.bench$(if $(NAME),.bench_$(NAME)) $(ARGS)
 
-# Where there is a GPU: whether render.backend=gsplat agrees with the CPU, and how fast it is beside plain gsplat. PyTorch
-# with CUDA comes by TORCH=torch==2.13.0; gsplat compiles its kernels the first time (needs nvcc, some minutes).
-$(VENV)/.gpu: $(VENV)/.installed
-	$(PY) -m pip install -q -c constraints.txt -e ".[gpu]"
-	touch $@
-
-gpu-check: $(VENV)/.gpu
+# Where there is a GPU: whether render.backend=gsplat agrees with the CPU, and how fast it is beside plain gsplat.
+# Installed with TORCH="-r locks/planners.lock"; gsplat compiles its kernels the first time (needs nvcc, some minutes).
+gpu-check: install
 	$(PY) -m tests.bench.gpu_check $(ARGS)
 
+build/tools/.installed: locks/build.lock locks/tools.lock
+	$(PYTHON) -m venv --clear build/tools
+	build/tools/bin/python $(PIN) locks/build.lock
+	build/tools/bin/python $(PIN) locks/tools.lock
+	touch $@
+
+# The lock files anew from pyproject.toml, for every Python from 3.11.5 (mkdocs-material's oldest) and every platform.
+# Pins that still fit stay; newer ones: UPGRADE=--upgrade, or UPGRADE="--upgrade-package ray". planners.lock has
+# PyTorch with CUDA, dev.lock none: its CPU build is in torch_cpu.lock.
+COMPILE = build/tools/bin/uv pip compile -q --universal --generate-hashes --no-annotate --no-header \
+	--python-version 3.11.5 $(UPGRADE)
+locks: build/tools/.installed
+	$(COMPILE) --group build -o locks/build.lock
+	$(COMPILE) --group tools -c locks/build.lock -o locks/tools.lock
+	$(COMPILE) pyproject.toml --extra planners --extra gpu -c locks/build.lock -o locks/planners.lock
+	$(COMPILE) pyproject.toml --extra run -c locks/planners.lock -o locks/run.lock
+	$(COMPILE) pyproject.toml --extra dev -c locks/planners.lock -o locks/dev.lock
+	awk '/^[^ ]/ {kept = !/^(torch|triton|cuda-|nvidia-)/} kept' locks/dev.lock >build/dev.lock
+	mv build/dev.lock locks/dev.lock
+	sed -n "s/^\(torch==[0-9.]*\).*/\1+cpu ; sys_platform == 'linux'\n\1 ; sys_platform != 'linux'/p" \
+		locks/planners.lock | $(COMPILE) --no-deps --default-index $(TORCH_INDEX) - -o locks/torch_cpu.lock
+
+# Whether an SBOM names what a lock file pins, in the versions of this Python and platform.
+define NAMES
+import json, re, sys
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+parts = json.load(open(sys.argv[1]))["components"]
+pins = map(Requirement, re.findall(r"^[^ ].*(?= \\$$)", open(sys.argv[2]).read(), re.M))
+pinned = {pin.name + str(pin.specifier) for pin in pins if not pin.marker or pin.marker.evaluate()}
+lacks = pinned - {canonicalize_name(part["name"]) + "==" + part["version"] for part in parts}
+sys.exit("%s: not in the SBOM" % sorted(lacks) if lacks or not pinned else 0)
+endef
+export NAMES
+
 # What a release hands out, into dist/, of the last commit: built and checked, then installed from the built file with
-# its extra [run] into an environment of its own, where it makes the demo's samples. An upload is nobody's but yours.
-dist:
+# what locks/run.lock pins into an environment of its own, where it makes the demo's samples; an SBOM (CycloneDX) of
+# that environment. An upload is nobody's but yours.
+dist: build/tools/.installed
 	rm -rf dist build/release build/tried
 	mkdir -p build/release
 	git archive HEAD | tar x -C build/release
-	$(PYTHON) -m venv build/tools
-	build/tools/bin/pip install -q build twine cffconvert
-	build/tools/bin/cffconvert --validate -i build/release/CITATION.cff
-	build/tools/bin/python -m build -o dist build/release >build/dist.log
+	build/tools/bin/check-jsonschema --builtin-schema vendor.citation-file-format build/release/CITATION.cff
+	build/tools/bin/python -m build --no-isolation -o dist build/release >build/dist.log
 	build/tools/bin/twine check --strict dist/*
 	$(PYTHON) -m venv build/tried
-	build/tried/bin/pip install -q "$$(ls dist/*.whl)[run]"
-	build/tried/bin/pip check
+	build/tried/bin/python $(PIN) locks/build.lock
+	build/tried/bin/python $(PIN) locks/run.lock
+	build/tried/bin/python -m pip install -q --no-index "$$(ls dist/*.whl)[run]"
+	build/tried/bin/python -m pip check
 	cd build/tried && bin/factory run preset=demo out=demo
+	build/tools/bin/cyclonedx-py environment build/tried --output-reproducible \
+		-o "$$(echo dist/*.whl | sed 's/-py3-none-any.whl/.cdx.json/')"
+	sed -i 's#"file://[^"]*/#"#' dist/*.cdx.json
+	build/tools/bin/python -c "$$NAMES" dist/*.cdx.json locks/run.lock
 
 clean:
 	rm -rf $(VENV) runs build dist *.egg-info

@@ -1,13 +1,20 @@
 """Manifests say what Ray, Kubernetes and KubeRay understand, and agree with each other and with the project."""
 
 import json
+import os
 import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 import pytest
 import yaml
+
+from tasks.caches import user_cache
+from tests.factory.test_packaging import TINY
 
 ray_autoscaler = pytest.importorskip("ray.autoscaler")
 kubernetes_validate = pytest.importorskip("kubernetes_validate", reason="an extra of [dev]")
@@ -125,7 +132,6 @@ def test_gpus_are_asked_for_by_one_group_and_the_head_runs_no_tasks() -> None:
         (container,) = group["template"]["spec"]["containers"]
         asks = "nvidia.com/gpu" in container["resources"]["requests"]
         assert asks == (group.get("groupName") == "gpu") == container["image"].endswith(":cuda")
-        assert container["envFrom"] == [{"secretRef": {"name": "factory-object-store"}}]
         assert {"name": "metrics", "containerPort": 8080} in container["ports"]
     kinds = loaded("ray_cluster.yaml")["available_node_types"]
     assert {name for name, kind in kinds.items() if kind["resources"].get("GPU")} == {"gpu"}
@@ -141,10 +147,98 @@ def test_the_command_of_the_job_is_one_that_the_factory_takes() -> None:
     assert config.workers is not None, "a cluster that begins with no worker has no cores to count"
 
 
-def test_versions_are_those_of_the_constraints() -> None:
-    pinned = re.search(r"^ray==(.*)$", (ROOT / "constraints.txt").read_text(), re.M)
+def test_versions_are_those_of_the_lock_files() -> None:
+    pinned = re.search(r"^ray==(\S+)", (ROOT / "locks/run.lock").read_text(), re.M)
     assert pinned is not None
     assert {cluster_spec(name)["rayVersion"] for name in CLUSTERS} == {pinned[1]}
+
+
+def pods(name: str) -> list[dict[str, Any]]:
+    """Of the head, the groups of workers and, where there is one, the submitter."""
+    submitter = loaded(name)["spec"].get("submitterPodTemplate")
+    return [*(group["template"] for group in groups(cluster_spec(name))), *([submitter] if submitter else [])]
+
+
+@pytest.mark.parametrize("name", CLUSTERS)
+def test_pods_fit_the_security_level_restricted_with_a_root_that_is_read_only(name: str) -> None:
+    """https://kubernetes.io/docs/concepts/security/pod-security-standards/"""
+    locked = {"allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"]}}
+    autoscaler = cluster_spec(name)["autoscalerOptions"]
+    assert autoscaler["securityContext"] == locked
+    for pod in (template["spec"] for template in pods(name)):
+        user = pod["securityContext"]
+        assert user["runAsNonRoot"] and user["runAsUser"] and user["seccompProfile"] == {"type": "RuntimeDefault"}
+        assert not {"hostNetwork", "hostPID", "hostIPC", "initContainers"} & set(pod)
+        assert all({"emptyDir", "persistentVolumeClaim"} & set(volume) for volume in pod["volumes"])
+        for container in (*pod["containers"], autoscaler):
+            assert container["securityContext"] == locked
+            assert {"/tmp", "/home/ubuntu"} <= {mount["mountPath"] for mount in container["volumeMounts"]}
+
+
+@pytest.mark.parametrize("name", CLUSTERS)
+def test_the_containers_of_ray_alone_have_the_cloud_s_keys_and_the_autoscaler_alone_the_cluster_s(name: str) -> None:
+    assert "envFrom" not in cluster_spec(name)["autoscalerOptions"]
+    for pod in (template["spec"] for template in pods(name)):
+        (container,) = pod["containers"]
+        keys = [{"secretRef": {"name": "factory-object-store"}}]
+        assert container.get("envFrom") == (keys if container["name"].startswith("ray-") else None)
+        assert pod.get("automountServiceAccountToken") is (None if container["name"] == "ray-head" else False)
+
+
+@pytest.mark.parametrize("name", CLUSTERS)
+def test_only_who_needs_a_port_of_the_cluster_reaches_it(name: str) -> None:
+    policy = loaded("kuberay/network_policy.yaml")
+    kubernetes_validate.validate(policy, KUBERNETES, strict=True)
+    chosen = policy["spec"]["podSelector"]["matchLabels"].items()
+    within, *others = policy["spec"]["ingress"]
+    assert policy["spec"]["policyTypes"] == ["Ingress"]
+    assert within == {"from": [{"podSelector": policy["spec"]["podSelector"]}]}
+    (head,) = cluster_spec(name)["headGroupSpec"]["template"]["spec"]["containers"]
+    port = {entry["name"]: entry["containerPort"] for entry in head["ports"]}
+    opened = {
+        (peer["podSelector"]["matchLabels"]["app.kubernetes.io/name"], entry["port"])
+        for rule in others
+        for peer in rule["from"]
+        for entry in rule["ports"]
+    }
+    dashboard = {("kuberay-operator", port["dashboard"]), ("factory-submitter", port["dashboard"])}
+    assert opened == {*dashboard, ("prometheus", port["metrics"])}
+    for template in pods(name):
+        is_submitter = template["spec"]["containers"][0]["name"] == "submitter"
+        labels = {"app.kubernetes.io/name": "factory-submitter"}.items() if is_submitter else chosen
+        assert labels <= template["metadata"]["labels"].items()
+
+
+READ_ONLY_ROOT = """
+set -e
+mount --make-rprivate /
+for folder in $WRITABLE; do mount --bind $folder $folder; done
+for folder in / "$PWD" "$PREFIX"; do mount --bind "$folder" "$folder"; mount -o remount,bind,ro "$folder"; done
+cd "$PWD"
+for folder in /etc "$PWD" "$PREFIX"; do touch "$folder/probe" 2>&1 | grep -q "Read-only"; done
+exec setpriv --no-new-privs --inh-caps=-all --bounding-set=-all "$@"
+"""
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_a_run_needs_to_write_nowhere_but_where_pods_have_a_volume(tmp_path: Path) -> None:
+    """Without capabilities and new privileges, too, in a mount namespace of its own."""
+    if shutil.which("unshare") is None or subprocess.run(["unshare", "-m", "true"]).returncode:
+        pytest.skip("mounts need root and unshare")
+    cache = user_cache().parent
+    cache.mkdir(parents=True, exist_ok=True)
+    stands_for = {"/tmp": "/tmp", "/dev/shm": "/dev/shm", "/home/ubuntu": str(tmp_path), "/cache": str(cache)}
+    for group in (group for name in CLUSTERS for group in groups(cluster_spec(name))):
+        (container,) = group["template"]["spec"]["containers"]
+        assert {mount["mountPath"] for mount in container["volumeMounts"]} == set(stands_for)
+    env = os.environ | {"WRITABLE": " ".join(stands_for.values()), "PREFIX": sys.prefix}
+    env |= {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(cache)}
+    run = [sys.executable, "-m", "factory.run", *TINY.split(), f"out={tmp_path / 'out'}"]
+    command = ["unshare", "-m", "sh", "-c", READ_ONLY_ROOT, "sh", *run]
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=250)
+    assert done.returncode == 0, done.stderr
+    assert "│ human    │ 0     │ 1" in done.stdout
 
 
 def instructions() -> list[tuple[str, str]]:
@@ -156,18 +250,22 @@ def instructions() -> list[tuple[str, str]]:
 
 def test_the_image_is_built_of_what_is_there_pinned_and_without_root() -> None:
     found = instructions()
+    (pin,) = (rest.removeprefix("PIN=").strip('"') for _, rest in found if rest.startswith("PIN="))
     assert [rest for word, rest in found if word == "USER"][-1] != "root"
     for word, rest in found:
         if word == "COPY":
             for source in rest.split()[:-1]:
                 assert (ROOT / source).exists(), source
         if word == "FROM":
-            base = rest.split()[0]
-            assert base.startswith("base-") or re.search(r":.*\$\{(UBUNTU|CUDA)\}", base), f"{base} has no version"
+            assert re.fullmatch(r"base-\$\{VARIANT\}|\$\{(UBUNTU|CUDA)\} AS base-(cpu|cuda)", rest)
+        if word == "ARG" and not rest.startswith(("VARIANT=", "PIN=")):
+            assert re.fullmatch(r"(UBUNTU|CUDA)=[\w./-]+:[\w.-]*24\.04@sha256:[0-9a-f]{64}", rest), "tag and digest"
         if word == "RUN" and "apt-get install" in rest:
             assert "--no-install-recommends" in rest and "rm -rf /var/lib/apt/lists" in rest
-        if word == "RUN" and "pip install" in rest:
-            assert "--no-cache-dir" in rest and "-c constraints.txt" in rest
+        for command in rest.replace("$PIN", pin).split("&&") if word == "RUN" else ():
+            if "pip install" in command:
+                assert {"--no-cache-dir", "--no-deps", "--no-build-isolation"} <= set(command.split())
+                assert "--require-hashes" in command or command.split()[-1] == ".", "all but the project has a hash"
     assert {rest.split(" AS ")[1] for word, rest in found if word == "FROM" and " AS " in rest} == {
         "base-cpu",
         "base-cuda",

@@ -1,5 +1,6 @@
 """What an install of this project brings, worked out of pyproject.toml and the metadata of what is installed here."""
 
+import re
 import tomllib
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, distribution, packages_distributions
@@ -33,6 +34,27 @@ def closure(extra: str) -> set[str]:
                 found.add((name, wish))
                 waiting += _needed(name, wish)
     return {name for name, _ in found}
+
+
+def pins(lock: str) -> dict[str, tuple[Requirement, int]]:
+    """Distribution -> its pin in that file of locks/ for this platform, and how many hashes it has."""
+    found = {}
+    for entry in re.split(r"\n(?=\S)", (REPOSITORY / "locks" / f"{lock}.lock").read_text().strip()):
+        requirement = Requirement(re.split(r" \\$", entry, flags=re.M)[0])
+        if requirement.marker is None or requirement.marker.evaluate():
+            found[canonicalize_name(requirement.name)] = requirement, entry.count("--hash=sha256:")
+    return found
+
+
+def unpinned(extra: str, lock: str) -> list[str]:
+    """What an install with that extra asks for, in pyproject.toml, that the file of locks/ does not pin so."""
+    found = pins(lock)
+    return [
+        str(wanted)
+        for wanted in _requirements(extra)
+        if (name := canonicalize_name(wanted.name)) not in found
+        or not wanted.specifier.contains(str(found[name][0].specifier).removeprefix("=="), prereleases=True)
+    ]
 
 
 def absent_modules(extra: str) -> frozenset[str]:

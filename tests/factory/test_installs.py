@@ -6,7 +6,9 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
+from importlib.metadata import metadata, version
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,7 @@ import yaml
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from tests.factory.installs import PROJECT, REPOSITORY, SMALL, closure, declared
+from tests.factory.installs import PROJECT, REPOSITORY, SMALL, closure, declared, pins, unpinned
 
 OURS = {"tasks", "factory", "planners"}
 DISTRIBUTIONS = {  # of modules whose distribution has another name
@@ -96,9 +98,68 @@ def test_every_declared_package_is_imported() -> None:
     assert not unused
 
 
-def test_what_make_installs_is_pinned() -> None:
-    pinned = {line.partition("==")[0] for line in (REPOSITORY / "constraints.txt").read_text().splitlines()}
-    assert not (declared("planners") | declared("gpu")) - pinned - {"packaging"}
+LOCKS = {lock: pins(lock) for lock in ("run", "planners", "dev", "torch_cpu", "build", "tools")}
+
+
+def test_every_pin_is_one_version_with_its_hashes_and_the_same_in_every_lock_file() -> None:
+    files = [*(REPOSITORY / "locks").iterdir()]
+    assert {file.stem for file in files} == set(LOCKS)
+    assert not [line for file in files for line in re.findall(r"^\S.*[^\\]$", file.read_text(), re.M)], (
+        "no hash follows"
+    )
+    versions: dict[str, set[str]] = {}
+    for lock, found in LOCKS.items():
+        for name, (pin, n_hashes) in found.items():
+            assert re.fullmatch(r"==[\w.+]+", str(pin.specifier)) and n_hashes, f"{lock}: {pin}"
+            if lock != "tools":
+                versions.setdefault(name, set()).add(str(pin.specifier).removesuffix("+cpu"))
+    assert not {name: told for name, told in versions.items() if len(told) > 1}
+
+
+@pytest.mark.parametrize(
+    ("extra", "lock", "lacks"),
+    [("run", "run", ""), ("planners", "planners", ""), ("gpu", "planners", ""), ("dev", "dev", "torch>=2.6")],
+)
+def test_the_lock_files_pin_what_pyproject_asks_for(extra: str, lock: str, lacks: str) -> None:
+    assert unpinned(extra, lock) == lacks.split(), "make locks"
+
+
+@pytest.mark.parametrize("extra", ["run", "dev"])
+def test_nothing_is_installed_that_no_lock_file_pins(extra: str) -> None:
+    """What pip installs with --no-deps is what it would without."""
+    pinned = set(LOCKS[extra]) | (set(LOCKS["torch_cpu"]) if extra == "dev" else set())
+    assert closure(extra) - pinned == set()
+    installed = {name: f"=={version(name)}" for name in closure(extra) & set(LOCKS[extra])}
+    assert installed == {name: str(LOCKS[extra][name][0].specifier) for name in installed}, "make install"
+
+
+def test_what_builds_the_project_is_pinned() -> None:
+    groups = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+    assert groups["dependency-groups"]["build"] == ["pip", *groups["build-system"]["requires"]]
+    assert set(LOCKS["build"]) == {"pip", "setuptools"}
+    named = {canonicalize_name(word) for word in groups["dependency-groups"]["tools"] if isinstance(word, str)}
+    assert named < set(LOCKS["tools"])
+
+
+# Permissive ones, and MPL-2.0, whose condition ends at its own files. How packages call them differs.
+LICENCES = {
+    *("0BSD", "Apache", "Apache 2.0", "Apache License", "Apache Software License", "Apache-2.0"),
+    *("Apache-2.0 WITH LLVM-exception", "BSD", "BSD License", "3-Clause BSD License", "BSD-2-Clause", "BSD-3-Clause"),
+    *("BSL-1.0", "CC0-1.0", "CNRI-Python", "ISC", "MIT", "MIT License", "MIT-0", "MIT-CMU", "MPL-2.0"),
+    *("Mozilla Public License 2.0 (MPL 2.0)", "PSF-2.0", "Python Software Foundation License", "Zlib"),
+}
+
+
+def licences_of(name: str) -> set[str]:
+    told = metadata(name)
+    kept = [line.rpartition(" :: ")[2] for line in told.get_all("Classifier", []) if line.startswith("License :: OSI")]
+    words = told.get("License-Expression") or " AND ".join(kept) or told.get("License", "")
+    return set(re.split(r" AND | OR ", words))
+
+
+def test_all_that_is_installed_has_a_licence_that_lets_the_factory_be_handed_on() -> None:
+    refused = {name: unknown for name in sorted(closure("dev")) if (unknown := licences_of(name) - LICENCES)}
+    assert not refused
 
 
 def test_a_run_brings_neither_pytorch_nor_cuda() -> None:
@@ -132,8 +193,9 @@ def test_the_version_stands_in_one_place() -> None:
 def test_make_installs_pytorch_for_the_cpu() -> None:
     command = ["make", "-n", "-B", "install"]
     made = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout
-    (wanted,) = set(re.findall(r"torch==[\w.+]*\w", made))
-    assert wanted.endswith("+cpu") and re.search(r"--extra-index-url https://download\.pytorch\.org/whl/cpu ", made)
+    assert re.search(r"--extra-index-url https://download\.pytorch\.org/whl/cpu -r locks/torch_cpu.lock ", made)
+    (torch,) = LOCKS["torch_cpu"].values()
+    assert str(torch[0].specifier) == f"{LOCKS['planners']['torch'][0].specifier}+cpu", "the label of the CPU's build"
 
 
 OLD = "import sys; sys.version_info = (3, 9, 18, 'final', 0)\n"
@@ -154,8 +216,9 @@ def make(tmp_path: Path, python: str, *words: str) -> tuple[Path, "subprocess.Co
     """The Makefile in a folder with what its install reads, without a package index."""
     folder = tmp_path / "checkout"
     folder.mkdir(exist_ok=True)
-    for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+    for name in ("Makefile", "pyproject.toml"):
         shutil.copy(REPOSITORY / name, folder)
+    shutil.copytree(REPOSITORY / "locks", folder / "locks", dirs_exist_ok=True)
     outer = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}  # `make test`
     env = outer | {"PIP_NO_INDEX": "1", "PIP_CONFIG_FILE": os.devnull}
     words = ("make", *words, f"PYTHON={python}")
