@@ -60,13 +60,14 @@ def _matches(name: str, pattern: str) -> bool:
 
 
 def _data_in(folder: Path) -> list[os.DirEntry[str]]:
-    if broken := broken_link(folder):
-        _warn_skipped_once(folder, broken)
     try:
-        return [entry for entry in os.scandir(folder) if is_data(entry.name)] if folder.is_dir() else []
+        return [entry for entry in os.scandir(folder) if is_data(entry.name)]
+    except (FileNotFoundError, NotADirectoryError):
+        if broken := broken_link(folder):
+            _warn_skipped_once(folder, broken)
     except OSError as error:
         _warn_skipped_once(folder, error.strerror or str(error))
-        return []
+    return []
 
 
 def broken_link(path: str | os.PathLike[str]) -> str:

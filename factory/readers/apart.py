@@ -1,6 +1,6 @@
 """Files of others, looked at in another process: what brings that down, or never ends, costs one file and no run.
 
-One process for all that are looked at in this one, started with the first and again after a file that it did not
+One process for all that are looked at in a thread, started with the first and again after a file that it did not
 survive. It ends with this process, whose end of the pipe closes.
 """
 
@@ -12,13 +12,15 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection
-from threading import Lock
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from factory.exits import ignore_terminal_signals
-from factory.readers.base import BadClip
+from factory.readers.base import BadClip, failures_as_bad_clip
 
 LIMIT_S = 300.0  # for one file; the longest logs take seconds
 MEMORY_BYTES = 16 * 2**30  # beyond what a file of 1 GB may ask for
@@ -44,13 +46,17 @@ class ReaderProcess:
 
     def ask(self, function: bytes, argument: bytes, limit_s: float) -> Any:
         """The answer. Raises TimeoutError, and EOFError or OSError where the process died."""
-        if function != self._told:
+        if function is not self._told:
             self._pipe.send_bytes(FUNCTION + function)
             self._told = function
         self._pipe.send_bytes(ARGUMENT + argument)
         if not self._pipe.poll(limit_s):
             raise TimeoutError
         return self._pipe.recv()  # ours, where files are data as they are here: nothing of them was run
+
+    def kill(self) -> None:
+        """Whoever asks it meets its end."""
+        self._process.kill()
 
     def end(self) -> int:
         """Kill it, if it lives; how it ended."""
@@ -59,8 +65,8 @@ class ReaderProcess:
         return self._process.wait()
 
 
-_lock = Lock()
-_running: list[ReaderProcess] = []
+_idle: list[ReaderProcess] = []  # who asks takes one out, or starts another
+_busy: set[ReaderProcess] = set()
 
 
 class ProcessFunction(Generic[A, R]):
@@ -75,8 +81,7 @@ class ProcessFunction(Generic[A, R]):
         Raises BadClip with the file's name where it takes longer than `limit_s`, more memory than there is for it, or
         brings the process down.
         """
-        with _lock:
-            is_well, answer = self._asked(pickle.dumps(argument), file, limit_s)
+        is_well, answer = self._asked(pickle.dumps(argument), file, limit_s)
         if is_well:
             found: R = answer
             return found
@@ -85,22 +90,67 @@ class ProcessFunction(Generic[A, R]):
         raise answer
 
     def _asked(self, argument: bytes, file: str, limit_s: float) -> Any:
-        if not _running:
-            _running.append(ReaderProcess())
+        process = _idle.pop() if _idle else ReaderProcess()
+        _busy.add(process)
         try:
-            return _running[0].ask(self._function, argument, limit_s)
+            answer = process.ask(self._function, argument, limit_s)
         except TimeoutError:
-            _end()
+            process.end()
             raise BadClip(file, "file", f"reading it was given up after {limit_s:g} s") from None
         except (EOFError, OSError) as error:
-            raise BadClip(file, "file", f"its reader {_how(_end())} over it") from error
+            raise BadClip(file, "file", f"its reader {_how(process.end())} over it") from error
         except BaseException:  # a signal while it waits: the answer would be taken for the next question's
-            _end()
+            process.end()
             raise
+        finally:
+            _busy.discard(process)
+        _idle.append(process)
+        return answer
 
 
-def _end() -> int:
-    return _running.pop().end() if _running else 0
+LOGS_PER_PROCESS = 16  # at least, before another one is started: that takes a second
+
+
+def read_each(
+    read: Callable[[Path], R], paths: Collection[Path], apart: bool, limit_s: float = LIMIT_S
+) -> Iterator[R | BadClip]:
+    """What is read of each file or folder, in order; the BadClip of one that cannot be read.
+
+    apart: in other processes, one a core where there are many files. Else one after the other in this one.
+    """
+    elsewhere = ProcessFunction(read) if apart else None
+
+    def one(path: Path) -> R | BadClip:
+        try:
+            with failures_as_bad_clip(str(path)):
+                return read(path) if elsewhere is None else elsewhere(path, str(path), limit_s)
+        except BadClip as error:
+            return error
+
+    at_once = min(os.cpu_count() or 1, len(paths) // LOGS_PER_PROCESS)
+    if not apart or at_once < 2:
+        yield from map(one, paths)
+        return
+    pool, ahead = ThreadPoolExecutor(at_once), deque[Future[R | BadClip]]()
+    try:
+        for path in paths:
+            ahead.append(pool.submit(one, path))
+            if len(ahead) > 2 * at_once:
+                yield ahead.popleft().result()
+        yield from (answer.result() for answer in ahead)
+    except BaseException:  # a signal: their files may take minutes
+        for process in list(_busy):
+            process.kill()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+        while len(_idle) > 1:  # one is kept for what follows
+            _idle.pop().end()
+
+
+def _end() -> None:
+    while _idle:
+        _idle.pop().end()
 
 
 def _how(code: int) -> str:

@@ -1,6 +1,7 @@
 """What a reader is, and how a clip is named before anything of it is opened."""
 
 import hashlib
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -72,9 +73,10 @@ def _is_of(error: OSError, file: str) -> bool:
 def bytes_of(path: Path) -> bytes:
     """All of a file. Raises BadClip where it cannot be read or is larger than MAX_FILE_BYTES."""
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise BadClip(str(path), "size", f"more than {MAX_FILE_BYTES} bytes")
-        return path.read_bytes()
+        with path.open("rb") as file:
+            if os.fstat(file.fileno()).st_size > MAX_FILE_BYTES:
+                raise BadClip(str(path), "size", f"more than {MAX_FILE_BYTES} bytes")
+            return file.read()
     except OSError as error:
         raise BadClip(str(path), "file", f"cannot be read: {why_unread(path, error)}") from error
 
@@ -88,7 +90,7 @@ def read_feather(path: Path, columns: tuple[str, ...], whole: bool = True) -> di
     import pyarrow.feather
 
     try:
-        table = pyarrow.feather.read_table(path)
+        table = pyarrow.feather.read_table(pa.BufferReader(path.read_bytes()))  # Arrow itself would look at it 8 times
         table.validate(full=True)
     except FileNotFoundError as error:
         raise BadClip(str(path), "file", broken_link(path) or "missing") from error

@@ -37,7 +37,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from factory.readers.apart import ProcessFunction
+from factory.readers.apart import LOGS_PER_PROCESS, read_each
 from factory.readers.base import (
     SPLITS,
     BadClip,
@@ -311,7 +311,14 @@ class LogReader(ABC, Generic[Log]):
         self._logs: dict[str, Log] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_logs": {}}
+        held = {**self.__dict__, "_logs": {}}
+        held.pop("_listed", None)
+        return held
+
+    @cached_property
+    def _listed(self) -> Mapping[str, Path]:
+        """The logs, listed once a process."""
+        return self.logs()
 
     @abstractmethod
     def logs(self) -> Mapping[str, Path]:
@@ -357,14 +364,12 @@ class LogReader(ABC, Generic[Log]):
         chosen = self._chosen()
         if self.traversals:
             self._driven  # noqa: B018 - found once, before workers get the reader
-        importable = type(self).__module__ != "__main__"  # else no other process knows the class
-        elsewhere = ProcessFunction(self.windows_of) if self.untrusted and importable else None
-        for log_id, path in chosen.items():
-            try:
-                with failures_as_bad_clip(str(path)):
-                    found = self.windows_of(path) if elsewhere is None else elsewhere(path, str(path))
-            except BadClip as error:
-                broken[ClipRef(self.name, log_id, 0)] = str(error)
+        module = type(self).__module__  # no other process knows a class of __main__
+        apart = module.startswith("factory.") and len(chosen) >= 2 * LOGS_PER_PROCESS
+        apart |= module != "__main__" and self.untrusted
+        for log_id, found in zip(chosen, read_each(self.windows_of, chosen.values(), apart)):
+            if isinstance(found, BadClip):
+                broken[ClipRef(self.name, log_id, 0)] = str(found)
                 continue
             if found.skipped:
                 skipped[log_id] = found.skipped
@@ -435,7 +440,7 @@ class LogReader(ABC, Generic[Log]):
 
     def digest_with_others(self, ref: ClipRef, digest: str) -> str:
         """The content digest of a clip whose log's is `digest`: that of the drives its block is made of is in it."""
-        return digest_with(digest, self._others(ref), lambda log_id: self.log_digest(self.logs()[log_id]))
+        return digest_with(digest, self._others(ref), lambda log_id: self.log_digest(self._listed[log_id]))
 
     def _others(self, ref: ClipRef) -> tuple[Traversal, ...]:
         """The other drives that the block of a clip is made of as well."""
@@ -473,7 +478,7 @@ class LogReader(ABC, Generic[Log]):
         return found
 
     def _chosen(self) -> Mapping[str, Path]:
-        logs = self.logs()
+        logs = self._listed
         unknown = [log_id for log_id in self.only if log_id not in logs]
         if unknown:
             raise ValueError(f"clips.only: no log {', '.join(unknown)} under {self.root}; there are {', '.join(logs)}")
@@ -481,7 +486,7 @@ class LogReader(ABC, Generic[Log]):
 
     def path_of(self, ref: ClipRef) -> Path:
         """The file or folder of the clip's log. Raises BadClip where there is none."""
-        path = self.logs().get(ref.log_id)
+        path = self._listed.get(ref.log_id)
         if path is None or ref.dataset != self.name:
             raise BadClip(str(self.root), "log_id", f"no log {ref.log_id} of data set {ref.dataset} here")
         return path

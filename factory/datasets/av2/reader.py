@@ -569,9 +569,13 @@ class AV2Reader(LogReader[AV2Log]):
     data_set = "av2"
     block_stride_steps = 100
 
-    def logs(self) -> dict[str, Path]:
-        """Log id -> folder. Raises ValueError where the root holds no log."""
+    @cached_property
+    def _folders(self) -> dict[str, Path]:
         return log_folders(self.root)
+
+    def logs(self) -> dict[str, Path]:
+        """Log id -> folder, listed once. Raises ValueError where the root holds no log."""
+        return self._folders
 
     def drive(self, path: Path) -> LoggedDrive | str:
         """Ego and agents of the log in this folder. A log whose frames nobody annotated is skipped. Raises BadClip."""
@@ -602,11 +606,15 @@ class AV2Reader(LogReader[AV2Log]):
 
     def block(self, ref: ClipRef) -> str | None:
         """The block that the clip is rendered from; None where the log has no photos."""
-        return self.block_name(ref) if ref.log_id in self._photographed else None
+        if ref.log_id not in self._photographed and ref.log_id in self.logs():
+            cameras = self.logs()[ref.log_id] / "sensors" / "cameras"
+            self._photographed[ref.log_id] = cameras.is_dir()
+        return self.block_name(ref) if self._photographed.get(ref.log_id) else None
 
     @cached_property
-    def _photographed(self) -> frozenset[str]:
-        return frozenset(log_id for log_id, folder in self.logs().items() if (folder / "sensors" / "cameras").is_dir())
+    def _photographed(self) -> dict[str, bool]:
+        """Of the logs that were asked for: whether they have photos."""
+        return {}
 
     def recorded(self, log: AV2Log, start: int, stop: int) -> WindowSensors:
         """Poses, rig, photos and sweeps of a window, and the block that it is rendered from."""
