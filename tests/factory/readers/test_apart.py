@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from factory.datasets.scenarionet.reader import ScenarioNetReader
-from factory.readers.apart import ProcessFunction
+from factory.readers.apart import ProcessFunction, read_each
 from factory.readers.base import BadClip
 from tests.factory.datasets.scenarionet.scenarionet_scenarios import nuscenes, save
 
@@ -75,3 +75,28 @@ def test_a_fatal_log_of_a_folder_is_broken_and_the_others_are_clips(tmp_path: Pa
         f"{tmp_path / 'sd_fatal.pkl'}: file: its reader was killed by SIGSEGV over it"
     )
     assert ScenarioNetReader(tmp_path).index().refs[0] in index.refs
+
+
+def number_in(path: Path) -> tuple[int, int]:
+    """Who read it, and what is in it."""
+    if path.read_text() == "fatal":
+        os.kill(os.getpid(), signal.SIGSEGV)
+    return os.getpid(), int(path.read_text())
+
+
+@pytest.mark.slow
+def test_many_files_are_read_by_several_processes_and_come_in_their_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    paths = [tmp_path / f"{i:02}" for i in range(60)]
+    for i, path in enumerate(paths):
+        path.write_text({7: "fatal", 31: "no number"}.get(i, str(i)))
+    found = list(read_each(number_in, paths, apart=True))
+    bad = {i: str(one) for i, one in enumerate(found) if isinstance(one, BadClip)}
+    assert sorted(bad) == [7, 31] and "was killed by SIGSEGV" in bad[7] and str(paths[31]) in bad[31]
+    good = {i: one for i, one in enumerate(found) if not isinstance(one, BadClip)}
+    assert all(number == i for i, (_, number) in good.items())
+    assert len({pid for pid, _ in good.values()} - {os.getpid()}) > 1
+    alone = list(read_each(number_in, [paths[0], paths[31]], apart=False))
+    assert alone[0] == (os.getpid(), 0) and isinstance(alone[1], BadClip)

@@ -1,5 +1,6 @@
 """The base of log readers, through the smallest reader that there is: a street, its logs a few numbers each."""
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,23 @@ def test_a_clip_is_the_log_s_steps_from_its_start_on(reader: StreetReader) -> No
     assert np.abs(clip.world_from_ego[:, 0, 3] - expected).max() < 1e-9
     assert (clip.start_s, clip.dataset, clip.clip_id) == (1.0, "street", ClipRef("street", "a_whole", 1000).clip_id)
     assert StreetReader(reader.root, name="").name == "" and StreetReader(reader.root, name="mine").name == "mine"
+
+
+class CountingReader(StreetReader):
+    listed = 0
+
+    def logs(self) -> dict[str, Path]:
+        self.listed += 1
+        return super().logs()
+
+
+def test_logs_are_listed_once_a_process_however_many_clips_are_read(reader: StreetReader) -> None:
+    counting = CountingReader(reader.root)
+    refs = counting.index().refs
+    elsewhere = pickle.loads(pickle.dumps(counting))
+    for ref in refs:
+        assert counting.read(ref).clip_id == elsewhere.read(ref).clip_id == ref.clip_id
+    assert (counting.listed, elsewhere.listed) == (1, 2)  # the copy knows that it was
 
 
 def test_what_a_caller_does_to_a_clip_does_not_reach_the_next(reader: StreetReader) -> None:

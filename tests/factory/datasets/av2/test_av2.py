@@ -1,6 +1,8 @@
 """The Argoverse 2 reader on small logs written here: what it reads, what it drops, what it refuses and how."""
 
 import json
+import pickle
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -131,6 +133,16 @@ def test_a_root_may_be_the_data_set_a_split_or_one_log(log: Path, tmp_path: Path
             AV2Reader(tmp_path / root).index()
     else:
         assert [ref.log_id for ref in AV2Reader(tmp_path / root).index().refs] == ["log-a"] * 3
+
+
+def test_who_gets_the_reader_looks_at_no_log_but_the_clip_s(log: Path, tmp_path: Path) -> None:
+    reader = AV2Reader(tmp_path / "sensor")
+    ref = reader.index().refs[0]
+    worker = pickle.loads(pickle.dumps(reader))
+    shutil.copytree(log, tmp_path / "sensor" / "test" / log.name)  # who lists the logs again is refused
+    assert worker.read(ref).content_digest == worker.digest(ref) and worker.block(ref) == reader.block(ref)
+    with pytest.raises(ValueError, match="stands twice"):
+        AV2Reader(tmp_path / "sensor").index()
 
 
 def test_states_of_a_straight_drive_are_its_closed_form(log: Path) -> None:
