@@ -73,6 +73,8 @@ def _data_in(folder: Path) -> list[os.DirEntry[str]]:
 def broken_link(path: str | os.PathLike[str]) -> str:
     """Of a path that is not there: which link that it leads through leads nowhere; empty where none does."""
     path = Path(path)
+    if not path.is_symlink() and path.parent.exists():  # the usual case, and looks above may be dear
+        return ""
     link = next((place for place in (path, *path.parents) if place.is_symlink()), None)
     if link is None or os.path.exists(link):
         return ""

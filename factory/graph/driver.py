@@ -475,15 +475,17 @@ class RunDriver:
             self._episodes.on_commit([shard.path for shard in shards])
 
     def _show_state(self, last: bool = False) -> None:
-        in_flight = {
+        clips = len(self._plan.todo)
+        self._metrics.record_state(clips, clips - self._tally.clips, self._in_flight, last)
+
+    def _in_flight(self) -> dict[str, int]:
+        return {
             "walks": sum(self._walks_left.values()),
             "attempts": len(self._trying),
             "clips": len(self._preparing),
             "blocks": len(self._building),
             "batches": self._commits.n_writing,
         }
-        clips = len(self._plan.todo)
-        self._metrics.record_state(clips, clips - self._tally.clips, in_flight, last)
 
     def _start(self, what: ClipPlan | BlockBuild) -> None:
         if isinstance(what, BlockBuild):

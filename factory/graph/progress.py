@@ -346,14 +346,16 @@ class RunMetrics:
             self._add(SAMPLES, len(shard.keys), **where)
             self._add(BYTES, shard.size, **where)
 
-    def record_state(self, clips: int, left: int, in_flight: Mapping[str, int], last: bool = False) -> None:
+    def record_state(
+        self, clips: int, left: int, in_flight: Callable[[], Mapping[str, int]], last: bool = False
+    ) -> None:
         """How things stand; may be called as often as one likes, and at the end."""
         now = self._clock()
         if last or now - self._gauges_at >= GAUGES_EVERY_S:
             self._gauges_at = now
             self._add(CLIPS, clips)
             self._add(CLIPS_LEFT, left)
-            for what, n in in_flight.items():
+            for what, n in in_flight().items():
                 self._add(IN_FLIGHT, n, what=what)
         if self._out.is_local and now - self._disk_at >= DISK_EVERY_S:
             self._disk_at = now

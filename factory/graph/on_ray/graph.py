@@ -183,7 +183,8 @@ ILL = (  # what Ray says when it is the machine that failed
     *(exceptions.RuntimeEnvSetupError, exceptions.OutOfMemoryError, exceptions.ObjectLostError),
     *(exceptions.ObjectStoreFullError, exceptions.OutOfDiskError),
 )
-AHEAD_S = 1.0  # of attempts that one task makes: the driver bears some hundreds of tasks a second
+TASKS_A_SECOND = 300.0  # that one driver hands out and takes back
+AHEAD_S, MOST_AHEAD_S = 1.0, 8.0  # of attempts that one task makes; as much as so many workers need, less than DRAIN_S
 WARM_S = 90.0  # what kernels usually take on two cores
 SAY_EVERY_S = 10.0  # between two lines about them
 LOOK_S = 1.0  # between two looks at whether a cluster lives
@@ -201,6 +202,11 @@ def _recording(metric: Metric) -> Callable[[float, dict[str, str]], None]:
             return Gauge(metric.name, metric.about, labels).set
         case Type.HISTOGRAM:
             return Histogram(metric.name, metric.about, list(metric.buckets), labels).observe
+
+
+def seconds_ahead(workers: int) -> float:
+    """How long a task of several attempts is to take, so that the driver bears what so many workers hand in."""
+    return max(AHEAD_S, min(workers / TASKS_A_SECOND, MOST_AHEAD_S))
 
 
 class RayGraph(Graph):
@@ -289,10 +295,10 @@ class RayGraph(Graph):
         return ticket
 
     def attempts_per_task(self) -> int:
-        """As many as usually end in AHEAD_S, where one task makes a whole attempt."""
+        """As many as usually end in AHEAD_S, more on more workers; 1 where an attempt is several tasks."""
         if len(self.attempt_tasks) > 1:
             return 1
-        return self._costs.tasks_in("+".join(self.attempt_tasks[0]), AHEAD_S)
+        return self._costs.tasks_in("+".join(self.attempt_tasks[0]), seconds_ahead(self.parallelism))
 
     def _claims_gpu(self, ticket: Ticket) -> bool:
         return self._gpu_share > 0.0 and any(task.may_draw for task in TASKS if task.name in ticket.step.split("+"))

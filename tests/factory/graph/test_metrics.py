@@ -105,7 +105,7 @@ def test_gauges_are_set_once_a_second_however_often_they_are_offered(tmp_path: P
     recorded, now = Recorded(), [100.0]
     metrics = RunMetrics(recorded.record, Location.parse(tmp_path), clock=lambda: now[0])
     for _ in range(50):
-        metrics.record_state(10, 4, {"walks": 3})
+        metrics.record_state(10, 4, lambda: {"walks": 3})
         now[0] += 0.1
     assert recorded.total(CLIPS_LEFT) == 5
     assert recorded.last[CLIPS_LEFT.name] == 4
