@@ -1,7 +1,9 @@
 """A run whose bucket misbehaves, and the same command again: `python -m experiments.chaos.object_stores [NAME ...]`.
 
 Prints a line for each trouble: what the run ended with and said, what the next one, without the trouble, ended with,
-and how its rows compare with those of a run that nothing disturbed.
+and how its rows compare with those of a run that nothing disturbed. Before them `many`: the driver alone, with trivial
+work in very many commits, while one request in twenty fails in some way and all listings are behind; killed once, then
+the same command until it is complete.
 """
 
 import subprocess
@@ -48,6 +50,31 @@ TROUBLES: Mapping[str, Callable[[], Fault]] = {
 }
 
 
+LISTINGS_BEHIND_S = 0.3
+
+
+def everything() -> Fault:
+    """One request in twenty or so, in all ways at once."""
+    listed = Fault(What.UNLISTED, seconds=LISTINGS_BEHIND_S)
+    lost = Fault(What.UNANSWERED, "PUT|POST", share=0.02, other=listed)
+    late = Fault(What.LATE, seconds=0.5, share=0.01, other=lost)
+    return Fault(What.SLOW_DOWN, share=0.02, other=Fault(What.TORN, "GET", share=0.01, other=late))
+
+
+MANY, CLIPS, TIMES = "many", 8, 10
+TRIVIAL = """
+import sys
+from factory.graph.execute import Execution
+from factory.store.samples import Store
+from tests.factory.toy import ToyWork, executed, refs
+how = Execution("local", shard_seconds=0.0)
+work, store, clips = ToyWork(n_candidates=12), Store(sys.argv[1]), refs(int(sys.argv[2]))
+ended = executed(work, clips, ["pdm_closed", "recovery"], 4, store, how)
+print(ended.message, file=sys.stderr)
+sys.exit(ended.exit_code)
+"""
+
+
 WORDS = (
     *("executor=local", "render=none", "reward.labels=none", "vocabulary.k=64"),
     *("experts=[recovery,human]", "limit=2", "rounds=1", "shard_seconds=0.1"),
@@ -71,11 +98,11 @@ def command(out: str, words: Sequence[str] = WORDS) -> list[str]:
     return [sys.executable, "-m", "factory.run", f"out={out}", *words]
 
 
-def run(store: BadStore, out: str, fault: Fault | None) -> Ended:
+def run(store: BadStore, out: str, fault: Fault | None, words: Sequence[str] = ()) -> Ended:
     """One run, with what it meets."""
     store.fault = fault
     process = subprocess.Popen(
-        command(out),
+        words or command(out),
         cwd=REPOSITORY,
         env=environment_of(store),
         stdout=subprocess.DEVNULL,
@@ -106,6 +133,28 @@ def check(store: BadStore, golden: Path, out: str, fault: Fault) -> tuple[Ended,
     return first, again
 
 
+def check_many(store: BadStore, out: str) -> str:
+    """What many commits met. Raises AssertionError where they do not keep what is promised."""
+    words = [sys.executable, "-c", TRIVIAL]
+    kill = Fault(What.KILL, "PUT", COMMIT, first=30)
+    kill.other = everything()
+    assert run(store, out, kill, [*words, out, str(CLIPS)]).code == -9
+    faults, codes = kill.other.all, list[int]()
+    while 0 not in codes:
+        codes.append((ended := run(store, out, (again := everything()), [*words, out, str(CLIPS)])).code)
+        faults += again.all
+        assert ended.code in (0, 4) and "Traceback" not in ended.said and len(codes) < TIMES, ended.said
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run([*words, f"{folder}/golden", str(CLIPS)], cwd=REPOSITORY, check=True, capture_output=True)
+        there = Location.parse(out, credentials(store.straight))
+        assert_same_tables(there, Path(folder) / "golden")
+        assert verify(Store(there)).damage == ()
+    met = ", ".join(
+        f"{sum(f.met for f in faults if f.what is what)} {what.name}" for what in dict.fromkeys(f.what for f in faults)
+    )
+    return f"{len(store.log)} requests: {met}; codes {codes}"
+
+
 @contextmanager
 def undisturbed() -> Iterator[Path]:
     """A folder with the rows as they are to be."""
@@ -119,6 +168,11 @@ def undisturbed() -> Iterator[Path]:
 
 def main(names: Sequence[str]) -> int:
     failed = 0
+    if not names or MANY in names:
+        with bad_store() as store:
+            print(check_many(store, f"s3://{BUCKET}/many"), flush=True)
+    if list(names) == [MANY]:
+        return 0
     print("| the bucket | times | exit code | it said | again |\n|---|---|---|---|---|", flush=True)
     with undisturbed() as golden, bad_store() as store:
         for number, name in enumerate(TROUBLES):

@@ -11,7 +11,7 @@ import hashlib
 import re
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -278,6 +278,7 @@ def _damaged_episodes(out: Location, live: Collection[str]) -> list[DamagedPart]
 TEMPORARY = re.compile(r"(.*/)?(\..*\.tmp|\.trial-[0-9a-f]+|_commit_.*\.tmp|.*\.draft)")
 FULL_BYTES = 128 * 2**20  # of a shard, as a run closes it
 SMALL = 0.5  # of that: shards below are merged
+HELD_BYTES = 512 * 2**20  # of rows in memory, where they take much less in their files
 
 
 class RunInProgress(RuntimeError):
@@ -355,13 +356,27 @@ def compact(store: Store) -> Iterator[tuple[str, int, int]]:
         drop: list[str] = []
         add: list[tuple[Shard, int]] = []
         for group in _files_to_merge(table):
-            rows = pa.concat_tables([table.read_file(path, facts[path].partition) for path in group])
-            shard = write_shard(table.location, table.spec, rows)
-            add.append((shard, max(facts[path].written_ms for path in group)))
-            drop += group
+            for paths, rows in _held_together(table, facts, group):
+                shard = write_shard(table.location, table.spec, rows)
+                add.append((shard, max(facts[path].written_ms for path in paths)))
+                drop += paths
         if add:
             table.replace_files(drop, add)
         yield table.spec.name, len(facts), len(table.file_facts())
+
+
+def _held_together(
+    table: KeyedTable, facts: Mapping[str, LiveFile], group: Sequence[str]
+) -> Iterator[tuple[list[str], pa.Table]]:
+    """Files of a group, two or more each, and their rows, HELD_BYTES of memory at a time."""
+    paths, parts = list[str](), list[pa.Table]()
+    for path in group:
+        paths.append(path)
+        parts.append(table.read_file(path, facts[path].partition))
+        if path == group[-1] or sum(part.nbytes for part in parts) >= HELD_BYTES:
+            if len(paths) > 1:
+                yield paths, pa.concat_tables(parts)
+            paths, parts = [], []
 
 
 def _files_to_merge(table: KeyedTable) -> list[list[str]]:

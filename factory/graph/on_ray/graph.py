@@ -331,9 +331,9 @@ class RayGraph(Graph):
         self._check_alive()
         if not self._ready and self._tickets:
             pending = list(self._tickets)
-            some, _ = ray.wait(pending, num_returns=1, timeout=timeout_s, fetch_local=True)
-            if some:
-                some, _ = ray.wait(pending, num_returns=len(pending), timeout=0, fetch_local=True)
+            some, _ = ray.wait(pending, num_returns=len(pending), timeout=0, fetch_local=True)
+            if not some:
+                some, _ = ray.wait(pending, num_returns=1, timeout=timeout_s, fetch_local=True)
             self._ready.extend(some)
         if not self._ready:
             return None

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -49,6 +50,8 @@ class Fault:
     first: int = 1
     times: int = 10**9
     seconds: float = 0.0  # LATE: for so long; UNLISTED: new for so long
+    share: float = 1.0  # of them, by chance
+    other: "Fault | None" = None  # what the others may meet
     seen: int = 0
     met: int = 0
 
@@ -56,9 +59,14 @@ class Fault:
         if not (re.match(self.method, method) and re.search(self.target, target)):
             return False
         self.seen += 1
-        is_met = self.first <= self.seen < self.first + self.times
+        chance = zlib.crc32(f"{self.what}{self.seen}".encode()) / 2**32
+        is_met = self.first <= self.seen < self.first + self.times and chance < self.share
         self.met += is_met
         return is_met
+
+    @property
+    def all(self) -> "list[Fault]":
+        return [self, *(self.other.all if self.other is not None else ())]
 
 
 @dataclass
@@ -75,7 +83,8 @@ class BadStore:
 
     def met(self, method: str, target: str) -> Fault | None:
         with self.lock:
-            return self.fault if self.fault is not None and self.fault.meets(method, target) else None
+            faults = self.fault.all if self.fault is not None else []
+            return next((fault for fault in faults if fault.meets(method, target)), None)
 
     def environment(self, faults: bool = True) -> dict[str, str]:
         """Variables for a process that uses the bucket."""
