@@ -13,6 +13,7 @@ import pytest
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph import local
+from factory.graph.driver import DRAIN_S
 from factory.graph.execute import Execution
 from factory.graph.local import Claims
 from factory.graph.on_ray import graph
@@ -131,6 +132,12 @@ def long(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     monkeypatch.setattr(graph.RayGraph, "wait", wait)
     return lengths
+
+
+def test_one_driver_bears_what_workers_hand_in_and_tasks_end_while_a_run_is_stopped() -> None:
+    for workers in (1, 300, 1000, 2400, 100_000):
+        seconds = graph.seconds_ahead(workers)
+        assert 1.0 <= seconds < DRAIN_S and (workers / seconds <= graph.TASKS_A_SECOND or seconds == graph.MOST_AHEAD_S)
 
 
 def test_stretches_make_the_rows_of_attempts_one_by_one(tmp_path: Path, two_cpus: None, long: list[int]) -> None:

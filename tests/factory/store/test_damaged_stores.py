@@ -2,6 +2,7 @@
 
 import random
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import pyarrow as pa
@@ -323,6 +324,22 @@ def test_compacting_merges_files_and_changes_no_sample(tmp_path: Path, capsys: p
     assert found.damage == () and len([name for name in found.orphans if name.startswith("samples")]) == 9
     assert run(out, clips=5) == COMPLETE and COMMANDS["compact"].load()([f"out={out}"]) == 0
     assert capsys.readouterr().out.splitlines()[2].split() == ["samples", "3", "files,", "now", "3"]
+
+
+@pytest.mark.slow
+def test_files_whose_rows_are_large_are_merged_some_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out, whole = tmp_path / "out", tmp_path / "whole"
+    for n in (1, 3, 5, 7):
+        run(out, clips=n)
+    run(whole, clips=7)
+    table = Store(out).samples
+    largest = max(table.read_file(path, partition).nbytes for path, partition in table.live_files().items())
+    monkeypatch.setattr("factory.store.verify.HELD_BYTES", largest + 1)
+    for _ in range(2):  # the second finds nothing to merge that could be held
+        assert COMMANDS["compact"].load()([f"out={out}"]) == 0
+    counts = Counter(tuple(partition.items()) for partition in Store(out).samples.live_files().values())
+    assert set(counts.values()) <= {1, 2, 3} and max(counts.values()) > 1
+    assert_same_tables(out, whole)
 
 
 def test_a_damaged_log_is_named_by_whoever_opens_the_table(out: Path) -> None:
