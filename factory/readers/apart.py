@@ -109,6 +109,7 @@ class ProcessFunction(Generic[A, R]):
 
 
 LOGS_PER_PROCESS = 16  # at least, before another one is started: that takes a second
+MOST_PROCESSES = 32  # of some 300 MB each
 
 
 def read_each(
@@ -127,7 +128,7 @@ def read_each(
         except BadClip as error:
             return error
 
-    at_once = min(os.cpu_count() or 1, len(paths) // LOGS_PER_PROCESS)
+    at_once = min(os.cpu_count() or 1, len(paths) // LOGS_PER_PROCESS, MOST_PROCESSES)
     if not apart or at_once < 2:
         yield from map(one, paths)
         return

@@ -2,7 +2,7 @@
 
 To write a reader, subclass `LogReader` and give it four things; AV2Reader has all of them, ScenarioNetReader the least:
 
-* `logs()`: log id -> file or folder of every log under `self.root`;
+* `logs()`: log id -> file or folder of every log under `self.root`; asked once a process;
 * `drive(path)`: ego and agents every 0.1 s, all that the choice of windows needs. It runs over every log of the data
   set, so open no map and no sensor file;
 * `load(path)`: the same, and the map, the route (`route_of_drive`), the lights: a `WholeLog`, or a subclass that keeps
@@ -19,7 +19,7 @@ names the frame that a log's poses are in where other logs share it, `block_step
 block where that is longer than the window, and `log_digest(path)` the content digest of a log without loading it.
 
 A format that may bring its reader down or never end, as pickles may, is `untrusted`: the index reads each log in
-another process, and a log that kills it is broken as any other.
+another process, one a core where there are many logs, and a log that kills it is broken as any other.
 
 Wherever the input is broken, raise `BadClip(file, field, how to fix it)`. Units: metres, radians, seconds, one world
 frame per log; the columns of ego states are named in tasks.world.frames, absent agents hold NaN and valid = False.
