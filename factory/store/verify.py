@@ -369,14 +369,15 @@ def _held_together(
     table: KeyedTable, facts: Mapping[str, LiveFile], group: Sequence[str]
 ) -> Iterator[tuple[list[str], pa.Table]]:
     """Files of a group, two or more each, and their rows, HELD_BYTES of memory at a time."""
-    paths, parts = list[str](), list[pa.Table]()
+    paths, parts, held = list[str](), list[pa.Table](), 0
     for path in group:
         paths.append(path)
         parts.append(table.read_file(path, facts[path].partition))
-        if path == group[-1] or sum(part.nbytes for part in parts) >= HELD_BYTES:
+        held += parts[-1].nbytes
+        if path == group[-1] or held >= HELD_BYTES:
             if len(paths) > 1:
                 yield paths, pa.concat_tables(parts)
-            paths, parts = [], []
+            paths, parts, held = [], [], 0
 
 
 def _files_to_merge(table: KeyedTable) -> list[list[str]]:
