@@ -395,10 +395,7 @@ def ego_segments(track: LoggedTrack, source: Source, frames: FrameClock) -> tupl
 
     Columns 7..10 (steering and rates) are 0, as NAVSIM initialises an ego.
     """
-    position, heading, valid = resampled(track, frames)
-    xy = position[:, :2]
-    if source.can_bus and len(xy) > 1 and _keyframe_weights(xy).all():
-        xy, heading, valid = on_log_clock(xy, heading, valid)
+    xy, heading, valid = _ego_at_steps(track, source, frames)
     states, segment = np.full((len(xy), EGO_STATE_SIZE), np.nan), np.full(len(xy), -1, np.int64)
     broken = jumps(xy) | ~valid[1:] | ~valid[:-1]
     runs = pairwise([0, *(np.flatnonzero(broken) + 1).tolist(), len(xy)])
@@ -410,6 +407,19 @@ def ego_segments(track: LoggedTrack, source: Source, frames: FrameClock) -> tupl
         states[start:stop] = smooth_drive(axle, here, _keyframe_weights(axle), source.smoothing)
         segment[start:stop] = number
     return states, segment
+
+
+def _ego_at_steps(track: LoggedTrack, source: Source, frames: FrameClock) -> tuple[Array, Array, Bools]:
+    """(S, 2) positions, (S,) headings, (S,) valid, on the log's clock."""
+    position, heading, valid = resampled(track, frames)
+    if not source.can_bus or len(position) < 2 or not _keyframe_weights(position[:, :2]).all():
+        return position[:, :2], heading, valid
+    apart = np.diff(frames.times_s)
+    if ((apart < 0.5 * STEP_S) | (apart > 1.5 * STEP_S)).any():  # frames are missing
+        return on_log_clock(position[:, :2], heading, valid)
+    # As the messages come, before stamps that jitter by half a message pass for lost ones.
+    xy, heading, valid = on_log_clock(track.position[:, :2], track.heading, track.valid)
+    return resampled(replace(track, position=xy, heading=heading, valid=valid), frames)
 
 
 def smooth_drive(xy: Array, heading: Array, weight: Array, smoothing: float) -> Array:

@@ -1,4 +1,4 @@
-"""Real logs, damaged: `python -m tests.chaos.damaged_logs SHARED [seeds=200] [of=av2,nuscenes,navsim] [rows=0]`.
+"""Real logs, damaged: `python -m tests.chaos.damaged_logs SHARED [seeds=0-200] [of=av2,nuscenes,navsim] [rows=0]`.
 
 Of each data set a log a seed is copied with damages of the kinds in damages.py, at random, and read: two to four of
 any kind, at odd seeds a single one of one frame. Held against the log as it is
@@ -122,7 +122,8 @@ def main(argv: Sequence[str]) -> int:
     """The table; 1 where anything is not as it should be."""
     shared, *words = argv
     given = dict(word.split("=", 1) for word in words)
-    seeds, of = range(int(given.get("seeds", 200))), given.get("of", "av2,nuscenes,navsim").split(",")
+    first, _, stop = given.get("seeds", "0-200").rpartition("-")
+    seeds, of = range(int(first or 0), int(stop)), given.get("of", "av2,nuscenes,navsim").split(",")
     n_rows = int(given.get("rows", 0))
     fine = True
     lines, rows = [], []
