@@ -1,0 +1,872 @@
+"""Every command of both programs, in trouble made from outside: `python -m experiments.chaos.outside ...`.
+
+    python -m experiments.chaos.outside [rows=sighup,raylet] [commands=run,train] [trials=10] [seed=0] [keep=true]
+
+A row is a promise: how trouble is made for a command that runs as a process of its own, what it may end with, and the
+line that then has to say what happened and how to go on. No traceback, no process left behind; then the same command
+again, without trouble, must end with 0 and what it makes must be what undisturbed commands make. Prints
+
+    promise | trials | held | CPU s
+
+and ends with 1 where a promise did not hold in every trial. Rows that mount file systems or change rights need root and
+Linux, in name spaces of their own; without, they are left out and named. A trial in which the trouble came too late is
+made anew and not counted.
+"""
+
+import ctypes
+import hashlib
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import numpy as np
+
+from factory.exits import BAD_CONFIG, COMPLETE, INTERRUPTED
+from factory.store.samples import Store
+from factory.store.verify import verify
+from tasks.caches import user_cache
+from tests.pages import REPOSITORY
+
+OVER_S, LEFT_S = 240.0, 30.0  # until a command has ended, and then what it began
+ANYONE, NOBODY = 0, 4242  # users
+TRACE = re.compile(r"Traceback|Exception ignored|Fatal Python error|core dumped|Aborted|panicked")
+GOES_ON = r"again|free disk space|run it as a user|to=<another|out="  # how to go on
+SAID = re.compile(r"^error: |again|^interrupted")
+TOWN = "clips.n_clips=2 clips.settings.cameras=[] clips.settings.lidar_beams=0 render=none vocabulary.k=128"
+RUN = f"factory run {TOWN} rounds=2 shard_seconds=0.001 out={{out}}"
+BENCHMARK = "preset=hard_benchmark clips=synthetic clips.n_clips=3 clips.settings.cameras=[]"
+BENCHMARK += " clips.settings.lidar_beams=0 render=none vocabulary.k=512 executor=local"
+SUBMISSION = "team_name=ours authors=A email=a@b.org institution=ours country=ours"
+
+
+# Commands.
+
+
+@dataclass(frozen=True)
+class Command:
+    """One of a program's, as it is tried. {out} is what it works on or writes, {made} what was made for all."""
+
+    words: str
+    at: str = ""  # of {made}: what {out} is a copy of when it begins
+    goes_on: bool = False  # the same command resumes; of the others nothing is half there
+    ends: bool = True  # by itself
+
+    @property
+    def program(self) -> str:
+        return self.words.split()[0]
+
+
+COMMANDS: Mapping[str, Command] = {
+    "run": Command(f"{RUN} executor=local", goes_on=True),
+    "isolated": Command(f"{RUN} executor=local graph.isolated=always", goes_on=True),
+    "ray": Command(f"{RUN} executor=ray workers=1", goes_on=True),
+    "plan": Command(f"factory plan {TOWN} out={{out}}"),
+    "status": Command("factory status out={out}", "run"),
+    "failed": Command("factory failed out={out}", "run"),
+    "retry": Command("factory retry out={out} executor=local", "run", goes_on=True),
+    "lineage": Command("factory lineage 0 out={out}", "run"),
+    "show": Command("factory show sample=0 film=true out={made}/run to={out}"),
+    "dashboard": Command("factory dashboard out={out} port={port}", "run", ends=False),
+    "report": Command("factory report out={out}", "run"),
+    "export mcap": Command("factory export mcap out={made}/run sample=0 to={out}"),
+    "export mp4": Command("factory export mp4 out={made}/run sample=0 to={out}"),
+    "export navsim": Command(
+        "factory export navsim out={made}/run missing=none map_location=us-ma-boston to={out} workers=2", goes_on=True
+    ),
+    "import simscale": Command("factory import simscale root={made}/navsim out={out} pictures=false", goes_on=True),
+    "explain": Command(f"factory explain {TOWN} to={{out}}"),
+    "vocabulary": Command("factory vocabulary kinematic=true k=64 out={out}/v.npy"),
+    "scene": Command("factory scene export {made}/scene/block.safetensors to={out}"),
+    "verify": Command("factory verify out={out}", "run"),
+    "clean": Command("factory clean out={out} older_than=0h", "run"),
+    "compact": Command("factory compact out={out}", "run"),
+    "warm": Command("factory warm drive"),
+    "completion": Command("factory completion bash"),
+    "train": Command(
+        "planners train planner=ego_mlp_small data.real=[{made}/run] data.sim=[{made}/run] steps=60 out={out}",
+        goes_on=True,
+    ),
+    "import": Command(
+        "planners import {made}/public/ltf.ckpt planner=ltf_public planner.settings.image.width=256"
+        " planner.settings.image.height=64 out={out}"
+    ),
+    "evaluate": Command("planners evaluate benchmark={made}/benchmark planner={made}/train out={out}", goes_on=True),
+    "compare": Command("planners compare a={made}/scores/constant_velocity b={made}/scores/pdm_closed out={out}/a.csv"),
+    "serve": Command("planners serve planner={made}/train"),
+    "submit": Command(
+        "planners submit planner=constant_velocity split={made}/split/split.yaml logs={made}/split/navsim_logs/test"
+        f" root={{made}}/split/navhard_two_stage out={{out}}/submission.pkl {SUBMISSION}"
+    ),
+    "drive": Command(
+        "planners drive planner={made}/train clips.n_clips=1 clips.settings.cameras=[] clips.settings.lidar_beams=0"
+        " perturbed=1 films=none executor=local out={out}",
+        goes_on=True,
+    ),
+    "replay": Command("planners replay benchmark={made}/benchmark planner=constant_velocity out={out}/a.mp4"),
+}
+EVERY = tuple(name for name in COMMANDS if name != "ray")
+GO_ON = tuple(name for name in EVERY if COMMANDS[name].goes_on)
+WRITE = (*GO_ON, "report", "show", "export mcap", "export mp4", "explain", "vocabulary", "scene", "compact")
+WRITE += ("import", "compare", "submit", "replay")
+MADE: Mapping[str, str] = {  # folder -> the command that makes it, before all
+    "run": f"{RUN.format(out='{made}/run')} executor=local",
+    "navsim": "factory export navsim out={made}/run missing=none map_location=us-ma-boston to={made}/navsim",
+    "train": "planners train planner=ego_mlp_small data.real=[{made}/run] data.sim=[{made}/run] steps=20"
+    " out={made}/train",
+    "benchmark": f"factory run {BENCHMARK} out={{made}}/benchmark",
+    "scores": "planners evaluate benchmark={made}/benchmark planner=constant_velocity out={made}/scores",
+}
+
+
+def write_files(made: Path) -> None:
+    """What no command makes: a scene, a public checkpoint, a split of NAVSIM's."""
+    import torch
+
+    from factory.stages.scene_file import write_scene
+    from tests.factory.commands.test_scene_command import proper
+    from tests.factory.stages.test_scene_file import scene
+    from tests.planners.navsim.two_stage_files import log_frames, write_split
+    from tests.planners.published.formula import inputs
+    from tests.planners.published.ours import formula_weights
+    from tests.planners.published.test_parity import recorded
+
+    block, one = scene(), recorded("ltf")
+    (made / "scene").mkdir()
+    nodes = {name: proper(node) for name, node in block.nodes.items()}
+    write_scene(made / "scene" / "block.safetensors", replace(block, background=proper(block.background), nodes=nodes))
+    weights = formula_weights(one.names, inputs(*one.picture))
+    (made / "public").mkdir()
+    named = {f"agent._transfuser_model.{name}": value for name, value in weights.items()}
+    torch.save({"state_dict": named, "global_step": 1}, made / "public" / "ltf.ckpt")
+    write_split(made / "split", log_frames())
+
+
+# Processes.
+
+
+@cache
+def libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None, use_errno=True)
+
+
+def become_parent_of_orphans() -> None:
+    """So that what a command leaves behind is ours: seen, ended, and its CPU time counted (Linux)."""
+    libc().prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
+
+
+def use_own_mounts() -> bool:
+    """What is mounted from here on nobody else sees, and it goes with this process. False where we may not."""
+    if os.getuid() != 0 or libc().unshare(0x00020000):  # CLONE_NEWNS
+        return False
+    return subprocess.run(["mount", "--make-rprivate", "/"]).returncode == 0
+
+
+@contextmanager
+def mounted(folder: Path, n_bytes: int = 0, kind: str = "") -> Iterator[None]:
+    """A file system of its own with so many bytes free; kind=ro: the folder itself, to be read alone."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if kind == "ro":
+        subprocess.run(["mount", "--bind", str(folder), str(folder)], check=True)
+        subprocess.run(["mount", "-o", "remount,bind,ro", str(folder)], check=True)
+    else:
+        subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={max(n_bytes, 4096)}", "tmpfs", str(folder)], check=True)
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def below(pid: int) -> dict[int, str]:
+    """Pid -> command line of every process that descends from one, itself left out."""
+    parents: dict[int, list[int]] = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+        except OSError:  # gone meanwhile
+            continue
+        parents.setdefault(parent, []).append(int(folder.name))
+    found: dict[int, str] = {}
+    left = [pid]
+    while left:
+        children = parents.get(left.pop(), [])
+        left += children
+        found |= {child: command_line(child) for child in children}
+    return found
+
+
+def command_line(pid: int) -> str:
+    """Empty for one that is gone."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+    except OSError:
+        return ""
+
+
+def kill(pid: int, number: int = signal.SIGKILL) -> bool:
+    """False where it is gone."""
+    try:
+        os.kill(pid, number)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+PEERS = {  # part of the command line
+    "guard": r"graph/guard\.py",
+    "child": r"spawn_main|spawn_child|forkserver|compile_worker|-m factory|guard\.py",
+    "worker": r"^ray::(?!.*Agent$)",
+    "raylet": r"/raylet/raylet ",
+    "gcs": r"/gcs_server",
+    "agent": r"Agent$|dashboard/agent\.py|runtime_env/agent",
+}
+
+
+def peers(pid: int, kind: str) -> list[int]:
+    """Processes of a kind below one."""
+    return sorted(child for child, line in below(pid).items() if re.search(PEERS[kind], line))
+
+
+# Trouble.
+
+
+class TooLate(Exception):
+    """The command had ended before there was trouble."""
+
+
+@dataclass
+class Scene:
+    """Where a trial is made."""
+
+    folder: Path
+    port: int  # free
+    rng: random.Random
+    undisturbed: "Ended"
+    start: Callable[[str, str], "Ended"]  # another command, by its name, on the same folders; what its output is called
+
+    @property
+    def out(self) -> Path:
+        return self.folder / "out"
+
+
+@dataclass
+class Trouble:
+    """How a command is started, and what is done while it runs."""
+
+    prefix: Sequence[str] = ()
+    environment: Mapping[str, str | None] = field(default_factory=dict)
+    during: Callable[[subprocess.Popen[bytes]], None] | None = None
+    stdout: str = ""  # a file, or "nobody" who reads it
+
+
+Making = Callable[[Scene], AbstractContextManager[Trouble]]
+
+
+def making(trouble: Callable[[Scene], Trouble]) -> Making:
+    """Of trouble that leaves nothing."""
+
+    @contextmanager
+    def make(scene: Scene) -> Iterator[Trouble]:
+        yield trouble(scene)
+
+    return make
+
+
+def started_with(*prefix: str, stdout: str = "", **environment: str | None) -> Making:
+    return making(lambda scene: Trouble(prefix, environment, None, stdout))
+
+
+def a_moment(scene: Scene, process: subprocess.Popen[bytes], share: float = 1.0) -> None:
+    """Wait a part, drawn by chance, of what the command takes undisturbed, from when Python has begun."""
+    end = time.monotonic() + scene.rng.uniform(0.0, share * scene.undisturbed.seconds)
+    while process.poll() is None and _cpu_s(process.pid) < 0.1:
+        time.sleep(0.005)
+    while process.poll() is None and time.monotonic() < end:
+        time.sleep(0.005)
+    if process.poll() is not None:
+        raise TooLate
+
+
+def _cpu_s(pid: int) -> float:
+    with suppress(OSError):
+        user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+        return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+    return 0.0
+
+
+def signalled(number: signal.Signals, then: signal.Signals | None = None) -> Making:
+    """At any moment; then: another, 3 s later."""
+
+    def trouble(scene: Scene) -> Trouble:
+        def send(process: subprocess.Popen[bytes]) -> None:
+            a_moment(scene, process)
+            process.send_signal(number)
+            if then is not None:
+                time.sleep(3.0)
+                process.send_signal(then)
+
+        return Trouble(during=send)
+
+    return making(trouble)
+
+
+def losing(kind: str, share: float = 0.5) -> Making:
+    """A process of a kind that the command has begun is killed at any moment of its life."""
+
+    def trouble(scene: Scene) -> Trouble:
+        def strike(process: subprocess.Popen[bytes]) -> None:
+            while process.poll() is None and not peers(process.pid, kind):
+                time.sleep(0.01)
+            end = time.monotonic() + scene.rng.uniform(0.0, share * scene.undisturbed.seconds)
+            while process.poll() is None and time.monotonic() < end:
+                time.sleep(0.01)
+            found = peers(process.pid, kind)
+            if process.poll() is not None or not found or not kill(scene.rng.choice(found)):
+                raise TooLate
+
+        return Trouble(during=strike)
+
+    return making(trouble)
+
+
+def full(where: str, most: int, least: int = 4096, later: bool = False) -> Making:
+    """Little space, drawn by chance, in `out`, a folder of the environment, or /dev/shm; later: filled meanwhile."""
+
+    @contextmanager
+    def make(scene: Scene) -> Iterator[Trouble]:
+        place = {"out": scene.out, "shm": Path("/dev/shm")}.get(where, scene.folder / "place")
+        n_bytes = int(np.exp(scene.rng.uniform(np.log(least), np.log(most))))
+        kept = scene.folder / "kept"
+        if where == "out" and scene.out.exists():  # what it begins with takes its part
+            scene.out.rename(kept)
+            n_bytes += sum(2 * 4096 + path.stat().st_size for path in kept.rglob("*"))
+        with mounted(place, n_bytes):
+            if kept.exists():
+                shutil.copytree(kept, place, dirs_exist_ok=True)
+                shutil.rmtree(kept)
+            environment = {} if where in ("out", "shm") else {where: str(place)}
+            yield Trouble(environment=environment)
+            if where == "out":
+                shutil.copytree(place, kept)
+        if where == "out":
+            place.rmdir()
+            kept.rename(place)
+
+    return make
+
+
+@contextmanager
+def read_only_out(scene: Scene) -> Iterator[Trouble]:
+    with mounted(scene.out, kind="ro"):
+        yield Trouble()
+
+
+@contextmanager
+def no_shared_memory(scene: Scene) -> Iterator[Trouble]:
+    with mounted(Path("/dev/shm")):
+        subprocess.run(["mount", "-o", "remount,ro", "/dev/shm"], check=True)
+        yield Trouble()
+
+
+@contextmanager
+def of_another_user(scene: Scene) -> Iterator[Trouble]:
+    """Files and folders of `out` are another's, and this one's rights are no longer those of root."""
+    scene.out.mkdir(exist_ok=True)
+    places = [scene.out, *scene.out.rglob("*")]
+    for place in places:
+        os.chown(place, NOBODY, NOBODY)
+    yield Trouble(["setpriv", "--bounding-set", "-dac_override,-dac_read_search,-fowner,-chown"])
+    for place in [scene.out, *scene.out.rglob("*")]:
+        os.chown(place, 0, 0)
+
+
+def short_of_memory(scene: Scene) -> Trouble:
+    return Trouble(["prlimit", f"--as={(scene.undisturbed.peak_kb - 512 * 1024) * 1024}"])
+
+
+@contextmanager
+def jumping_clock(scene: Scene) -> Iterator[Trouble]:
+    library = scene.folder / "clock.so"
+    source = str(Path(__file__).with_name("clock.c"))
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", str(library), source, "-ldl"], check=True)
+    seconds = scene.rng.choice([-86400, -7200, 7200, 86400])
+    yield Trouble(environment={"LD_PRELOAD": str(library), "CLOCK_JUMP_S": str(seconds), "CLOCK_EVERY_MS": "700"})
+
+
+def clients_leave(scene: Scene) -> Trouble:
+    """Of the dashboard: in the middle of what they ask, and of what they are answered."""
+
+    def ask(process: subprocess.Popen[bytes]) -> None:
+        wait_for_page(scene.port, process)
+        for _ in range(30):
+            with socket.create_connection(("127.0.0.1", scene.port), timeout=10.0) as client:
+                client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, bytes([1, 0, 0, 0, 0, 0, 0, 0]))  # a reset
+                asked = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
+                client.sendall(asked[: scene.rng.randint(0, len(asked))])
+                if scene.rng.random() < 0.5:
+                    client.settimeout(0.2)
+                    with suppress(TimeoutError):
+                        client.recv(10)
+
+    return Trouble(during=ask)
+
+
+def server_of_half_questions(scene: Scene) -> Trouble:
+    """Who asks `planners serve` leaves after some bytes."""
+
+    def ask(process: subprocess.Popen[bytes]) -> None:
+        assert process.stdin is not None
+        process.stdin.write(scene.rng.randbytes(scene.rng.randint(0, 200)))
+        process.stdin.close()
+
+    return Trouble(during=ask)
+
+
+def another_driver(name: str) -> Making:
+    """Of the same `out`, begun at any moment: it goes on, and the first ends."""
+
+    def trouble(scene: Scene) -> Trouble:
+        def begin(process: subprocess.Popen[bytes]) -> None:
+            a_moment(scene, process)
+            ended = scene.start(name, "second")
+            assert ended.code == COMPLETE, f"the second driver ended with {ended.code}: {ended.err}"
+
+        return Trouble(during=begin)
+
+    return making(trouble)
+
+
+@contextmanager
+def standing_cluster(folder: Path, port: int) -> Iterator[list[int]]:
+    """Ray's processes of a node on this machine that nobody's run has begun."""
+    before = set(below(os.getpid()))
+    words = [str(Path(sys.executable).with_name("ray")), "start", "--head", f"--port={port}", "--num-cpus=2"]
+    words += [f"--temp-dir={folder}", "--include-dashboard=false", "--object-store-memory=200000000"]
+    words += ["--disable-usage-stats"]
+    subprocess.run(words, check=True, capture_output=True, cwd=REPOSITORY)
+    try:
+        yield sorted(set(below(os.getpid())) - before)
+    finally:
+        for pid in set(below(os.getpid())) - before:
+            kill(pid)
+        end_orphans(before, 10.0)
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+def losing_its_head(kind: str) -> Making:
+    """A standing cluster dies while a run is on it; kind: of its processes, or all of them."""
+
+    @contextmanager
+    def make(scene: Scene) -> Iterator[Trouble]:
+        port = free_port()
+        with standing_cluster(scene.folder / "ray", port) as pids:
+
+            def strike(process: subprocess.Popen[bytes]) -> None:
+                a_moment(scene, process)
+                chosen = [pid for pid in pids if not kind or re.search(PEERS[kind], command_line(pid))]
+                assert sum(map(kill, chosen)), "no such process"
+
+            yield Trouble(environment={"RAY_ADDRESS": f"127.0.0.1:{port}"}, during=strike)
+
+    return make
+
+
+# Promises.
+
+
+@dataclass(frozen=True)
+class Row:
+    """A promise, and how it is tried."""
+
+    promise: str
+    make: Making
+    commands: Sequence[str]
+    codes: Sequence[int] = (COMPLETE,)
+    says: str = GOES_ON  # in the line of a code that is neither 0 nor a signal's
+    needs_root: bool = False
+    each_once: bool = False  # the trouble is always the same: each command is tried once
+    may_leave: bool = False  # what Ray itself takes long to end
+
+
+SIGTERM, SIGHUP, SIGINT, SIGQUIT = signal.SIGTERM, signal.SIGHUP, signal.SIGINT, signal.SIGQUIT
+NO_HOME: dict[str, str | None] = {"HOME": None, "XDG_CACHE_HOME": None}
+NO_USER = ("unshare", "--user", f"--map-user={NOBODY}", f"--map-group={NOBODY}")
+ASCII = {"LC_ALL": "C", "LANG": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+BAD = (COMPLETE, BAD_CONFIG, INTERRUPTED)
+RAN = ("run", "isolated", "train", "evaluate", "drive", "export navsim", "import simscale")
+ROWS: Mapping[str, Row] = {
+    # What a command is started with.
+    "no-home": Row(
+        "without HOME, as a user whom the machine does not know",
+        started_with(*NO_USER, **NO_HOME),
+        EVERY,
+        needs_root=True,
+        each_once=True,
+    ),
+    "ascii": Row("with LANG=C and an output of ASCII alone", started_with(**ASCII), EVERY, each_once=True),
+    "files": Row("with 64 open files", started_with("prlimit", "--nofile=64"), EVERY, BAD, "files", each_once=True),
+    "memory": Row(
+        "with 512 MB less memory than it takes", making(short_of_memory), EVERY, BAD, "memory", each_once=True
+    ),
+    "no-shm": Row("without /dev/shm", no_shared_memory, (*EVERY, "ray"), BAD, needs_root=True, each_once=True),
+    "clock": Row("on a clock that jumps by hours and back", jumping_clock, EVERY, each_once=True),
+    "no-reader": Row("with nobody who reads its output", started_with(stdout="nobody"), EVERY, each_once=True),
+    "full-output": Row(
+        "with its output into a file on a full disk", started_with(stdout="/dev/full"), EVERY, each_once=True
+    ),
+    # Disks.
+    "read-only": Row("where out is read-only", read_only_out, EVERY, BAD, needs_root=True, each_once=True),
+    "another-user": Row("where out is another user's", of_another_user, EVERY, BAD, needs_root=True, each_once=True),
+    "full-out": Row("where out fills up", full("out", 2**21), WRITE, BAD, needs_root=True),
+    "full-cache": Row("where the cache fills up", full("XDG_CACHE_HOME", 2**22), RAN, BAD, needs_root=True),
+    "full-tmp": Row("where the temporary folder fills up", full("TMPDIR", 2**22), RAN, BAD, needs_root=True),
+    # Signals.
+    "sigint": Row(
+        "Ctrl-C ends any command with 4", signalled(SIGINT), EVERY, (COMPLETE, INTERRUPTED), "again|interrupted"
+    ),
+    "sigterm": Row("SIGTERM: what goes on ends with 4", signalled(SIGTERM), GO_ON, (COMPLETE, INTERRUPTED, -SIGTERM)),
+    "sighup": Row("a terminal that closes, alike", signalled(SIGHUP), GO_ON, (COMPLETE, INTERRUPTED, -SIGHUP)),
+    "sigquit": Row("Ctrl-\\ ends it at once", signalled(SIGQUIT), EVERY, (COMPLETE, -SIGQUIT)),
+    "sigkill": Row("SIGKILL, alike", signalled(signal.SIGKILL), EVERY, (COMPLETE, -signal.SIGKILL)),
+    "stop": Row("stopped for 3 s it goes on", signalled(signal.SIGSTOP, signal.SIGCONT), EVERY),
+    # Peers.
+    "guard": Row("its guard dies", losing("guard"), ("run", "isolated")),
+    "isolated": Row("the process for plug-ins dies", losing("child"), ("isolated",)),
+    "child": Row(
+        "a process that it has begun dies",
+        losing("child"),
+        ("drive", "evaluate", "export navsim", "import simscale"),
+        (COMPLETE, INTERRUPTED),
+    ),
+    "two-drivers": Row(
+        "another driver begins on its out, and wins", another_driver("run"), ("run",), (COMPLETE, INTERRUPTED), ""
+    ),
+    "dashboard-clients": Row("clients of the dashboard leave", making(clients_leave), ("dashboard",)),
+    "serve-clients": Row(
+        "who asks planners serve leaves", making(server_of_half_questions), ("serve",), (COMPLETE, BAD_CONFIG), "error"
+    ),
+    # Ray.
+    "ray-worker": Row("on Ray: a worker dies", losing("worker"), ("ray",)),
+    "ray-agent": Row("an agent of its node dies", losing("agent"), ("ray",)),
+    "ray-raylet": Row("its raylet dies: a new cluster", losing("raylet"), ("ray",)),
+    "ray-gcs": Row("its GCS dies: a new cluster", losing("gcs"), ("ray",)),
+    "ray-sigterm": Row("SIGTERM ends it with 4", signalled(SIGTERM), ("ray",), (COMPLETE, INTERRUPTED, -SIGTERM)),
+    "ray-sigkill": Row("SIGKILL ends all of it", signalled(signal.SIGKILL), ("ray",), (-signal.SIGKILL,)),
+    "ray-tmp": Row("Ray's temporary folder fills up", full("RAY_TMPDIR", 2**25, 2**16), ("ray",), BAD, needs_root=True),
+    "ray-store": Row("the object store's disk fills up", full("shm", 2**27, 2**20), ("ray",), BAD, needs_root=True),
+    "ray-and-local": Row(
+        "a local driver begins on the out of one on Ray", another_driver("run"), ("ray",), (COMPLETE, INTERRUPTED), ""
+    ),
+    "local-and-ray": Row(
+        "and one on Ray on that of a local one", another_driver("ray"), ("run",), (COMPLETE, INTERRUPTED), ""
+    ),
+    "head": Row("the head node of a standing cluster dies", losing_its_head(""), ("ray",), (INTERRUPTED,)),
+    "head-raylet": Row("its raylet alone", losing_its_head("raylet"), ("ray",), (INTERRUPTED,)),
+    "head-gcs": Row("its GCS alone", losing_its_head("gcs"), ("ray",), (COMPLETE, INTERRUPTED)),
+}
+
+
+# Trials.
+
+
+@dataclass
+class Ended:
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+    seconds: float
+    peak_kb: int = 0  # of address space
+
+
+@dataclass(frozen=True)
+class Undisturbed:
+    """What a command comes to without trouble."""
+
+    ended: Ended
+    stable: Mapping[str, str]  # name -> digest of what it makes, or empty where that differs from time to time
+
+
+def product(out: Path) -> dict[str, str]:
+    """Name -> digest: of files, and of the columns of tables, in the order of their keys."""
+    from deltalake import DeltaTable
+
+    tables = sorted(log.parent for log in out.rglob("_delta_log"))
+    paths = [path for path in sorted(out.rglob("*")) if path.is_file() and not {*path.parents} & {*tables}]
+    found = {str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+    for folder in tables:
+        rows = DeltaTable(str(folder)).to_pyarrow_table()
+        key = next((key for key in ("attempt_id", "drive_id", "clip_id", "plan_id") if key in rows.column_names), None)
+        rows = rows.sort_by(key) if key else rows
+        for name in set(rows.column_names) - {"tries"}:  # runs that a kill ended count
+            words = repr(rows[name].to_pylist())
+            found[f"{folder.relative_to(out)}:{name}"] = hashlib.sha256(words.encode()).hexdigest()
+    return found
+
+
+def settled(out: Path) -> int:
+    """Attempts that the tables of a run have done."""
+    store = Store(out)
+    kinds = store.outcomes.read(["kind"])["kind"].to_pylist() if len(store.outcomes) else []
+    return len(store.samples) + kinds.count("rejected")
+
+
+def wait_for_page(port: int, process: subprocess.Popen[bytes]) -> None:
+    """Until the dashboard answers."""
+    end = time.monotonic() + OVER_S
+    while process.poll() is None and time.monotonic() < end:
+        with suppress(OSError), urlopen(f"http://127.0.0.1:{port}/", timeout=10.0) as answer:
+            assert answer.status == 200 and b"</html>" in answer.read().lower(), "no page"
+            return
+        time.sleep(0.1)
+
+
+def end_orphans(before: set[int], seconds: float) -> list[str]:
+    """Waits for what a command has left behind; the command lines of what had to be ended."""
+    end, told = time.monotonic() + seconds, list[str]()
+    while left := {pid: line for pid, line in below(os.getpid()).items() if pid not in before}:
+        for pid in left:
+            with suppress(ChildProcessError):
+                os.waitpid(pid, os.WNOHANG)
+        if time.monotonic() > end:
+            told += [line for pid, line in left.items() if line and kill(pid)]
+        time.sleep(0.05)
+    return told
+
+
+@dataclass
+class Harness:
+    """All that trials share."""
+
+    folder: Path
+    may_mount: bool
+    rng: random.Random
+    keeps: bool = False
+    known: dict[str, Undisturbed] = field(default_factory=dict)
+
+    @property
+    def made(self) -> Path:
+        return self.folder / "made"
+
+    def make(self) -> None:
+        """What commands work on, where it is not there yet."""
+        for name, words in MADE.items():
+            if not (self.made / name).exists():
+                command = Command(words)
+                ended = self.run(command, self.made, Trouble(), "made")
+                assert ended.code == COMPLETE, ended
+        if not (self.made / "split").exists():
+            write_files(self.made)
+
+    def undisturbed(self, name: str) -> Undisturbed:
+        """Twice: what differs then is not looked at later."""
+        if name not in self.known:
+            found = []
+            for number in (1, 2):
+                folder = self.folder / f"{name.replace(' ', '-')}{number}"
+                self._begin(COMMANDS[name], folder)
+                ended = self.run(COMMANDS[name], folder, Trouble(), "first")
+                assert ended.code == COMPLETE, (name, ended)
+                assert not TRACE.search(ended.out + ended.err), (name, ended)
+                found.append((ended, product(folder / "out")))
+                shutil.rmtree(folder)
+            (_, one), (ended, other) = found
+            assert one.keys() == other.keys() or not COMMANDS[name].goes_on, one.keys() ^ other.keys()
+            stable = {key: one[key] if one[key] == other[key] else "" for key in one.keys() & other.keys()}
+            self.known[name] = Undisturbed(ended, stable)
+        return self.known[name]
+
+    def _begin(self, command: Command, folder: Path) -> None:
+        shutil.rmtree(folder, ignore_errors=True)
+        (folder / "tmp").mkdir(parents=True)
+        if command.at:
+            shutil.copytree(self.made / command.at, folder / "out")
+
+    def run(self, command: Command, folder: Path, trouble: Trouble, tag: str, port: int = 0) -> Ended:
+        """A command in a process of its own, until it has ended with all that it began. Raises AssertionError."""
+        port = port or free_port()
+        words = [word.format(out=folder / "out", made=self.made, port=port) for word in command.words.split()]
+        given: dict[str, str | None] = {
+            "TMPDIR": str(folder / "tmp" if (folder / "tmp").exists() else self.folder),
+            "XDG_CACHE_HOME": str(self.folder / "cache"),
+            "NUMBA_CACHE_DIR": os.environ.get("NUMBA_CACHE_DIR", str(user_cache())),
+            "RAY_ADDRESS": None,
+            **trouble.environment,
+        }
+        environment = {key: value for key, value in (os.environ | given).items() if value is not None}
+        before, began, peak_kb = set(below(os.getpid())), time.monotonic(), 0
+        said, warned = folder / f"{tag}.out", folder / f"{tag}.err"
+        with ExitStack() as stack:
+            to: Any = stack.enter_context(open(trouble.stdout if trouble.stdout.startswith("/") else said, "wb"))
+            if trouble.stdout == "nobody":
+                read, to = os.pipe()
+                os.close(read)
+                stack.callback(os.close, to)
+            process = subprocess.Popen(
+                [*trouble.prefix, sys.executable, "-m", *words],
+                cwd=REPOSITORY,
+                env=environment,
+                stdin=subprocess.PIPE,
+                stdout=to,
+                stderr=stack.enter_context(warned.open("wb")),
+                start_new_session=True,
+            )
+        try:
+            if trouble.during is not None:
+                trouble.during(process)
+            with suppress(OSError):
+                process.stdin.close()  # type: ignore[union-attr]
+            if not command.ends and process.poll() is None:
+                wait_for_page(port, process)
+                process.send_signal(signal.SIGINT)
+            while process.poll() is None and time.monotonic() - began < OVER_S:
+                time.sleep(0.01)
+                with suppress(OSError, StopIteration):
+                    lines = Path(f"/proc/{process.pid}/status").read_text().splitlines()
+                    peak_kb = next(int(line.split()[1]) for line in lines if line.startswith("VmPeak:"))
+            assert process.poll() is not None, f"no end in {OVER_S:.0f} s: {warned.read_text()[-500:]}"
+        finally:
+            process.kill()
+            process.wait()
+            left = end_orphans(before, LEFT_S)
+        assert not left, f"left behind after {LEFT_S:.0f} s: {left}"
+        told = said.read_text(errors="replace") if said.exists() else ""
+        code = process.returncode
+        return Ended(code, told, warned.read_text(errors="replace"), time.monotonic() - began, peak_kb)
+
+    def trial(self, name: str, row: Row, number: int) -> None:
+        """One command in trouble, and again without. Raises AssertionError with what is wrong, TooLate."""
+        command, known = COMMANDS[name], self.undisturbed(name)
+        folder = self.folder / f"t{number}"
+        self._begin(command, folder)
+        port = free_port()
+        scene = Scene(
+            folder,
+            port,
+            self.rng,
+            known.ended,
+            lambda other, tag: self.run(COMMANDS[other], folder, Trouble(), tag),
+        )
+        with row.make(scene) as trouble:
+            ended = self.run(command, folder, trouble, "first", port)
+        all_said = ended.out + ended.err
+        assert not (trace := TRACE.search(all_said)), f"{trace}: {all_said[-1500:]}"
+        assert ended.code in row.codes, f"exit code {ended.code}: {all_said[-1500:]}"
+        if ended.code > 0:
+            lines = [line for line in all_said.splitlines() if SAID.search(line)]
+            assert len(lines) == 1, f"not one line: {lines}; {all_said[-1500:]}"
+            assert re.search(row.says, lines[0]), f"exit code {ended.code} and the line does not say how: {lines[0]}"
+        if ended.code == COMPLETE:
+            self.compare(name, folder / "out", known)
+            return
+        done = settled(folder / "out") if (folder / "out" / "samples").exists() and name != "import simscale" else None
+        again = self.run(command, folder, Trouble(), "again")
+        assert again.code == COMPLETE, f"exit code {again.code} of the same command again: {again.err[-1500:]}"
+        if done is not None and (found := re.search(r"found (\d+) attempts done", again.out)):
+            assert int(found[1]) == done, f"{done} attempts were committed, {found[1]} are not made again"
+        self.compare(name, folder / "out", known)
+
+    def compare(self, name: str, out: Path, known: Undisturbed) -> None:
+        """What is there against what undisturbed commands make. Raises AssertionError."""
+        made = product(out)
+        missing = sorted(known.stable.keys() - made.keys())
+        assert not missing, f"missing: {missing[:5]}"
+        differ = sorted(key for key, digest in known.stable.items() if digest and made[key] != digest)
+        assert not differ, f"not as of an undisturbed command: {differ[:5]}"
+        if (out / "run.json").exists():
+            assert (found := verify(Store(out)).damage) == (), f"damage: {found}"
+
+    def row(self, name: str, row: Row, trials: int, only: Sequence[str]) -> tuple[int, int, float]:
+        """(trials, held, CPU seconds); findings are told at once."""
+        commands = [one for one in row.commands if not only or one in only]
+        wanted = len(commands) if row.each_once else trials if commands else 0
+        for one in commands[:wanted]:
+            self.undisturbed(one)
+        began, made, held, late = cpu_s(), 0, 0, 0
+        order = self.rng.sample(commands, len(commands)) if not row.each_once else commands
+        while made < wanted and late < 10 * wanted:
+            one = order[made % len(order)]
+            try:
+                self.trial(one, row, made)
+                held += 1
+            except TooLate:
+                late += 1
+                continue
+            except AssertionError as error:
+                print(f"{name}, {one}: {error}\n", file=sys.stderr, flush=True)
+                if self.keeps:
+                    (self.folder / f"t{made}").rename(self.folder / f"{name}-{one.replace(' ', '-')}-{made}")
+            made += 1
+            shutil.rmtree(self.folder / f"t{made - 1}", ignore_errors=True)
+        return made, held, cpu_s() - began
+
+
+def cpu_s() -> float:
+    """Of all processes below that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def main(
+    rows: Sequence[str] = (),
+    commands: Sequence[str] = (),
+    trials: int = 10,
+    seed: int = 0,
+    folder: str = "",
+    keep: bool = False,
+) -> int:
+    """Prints the table; how many rows did not hold. folder: where to work, and what is made once is kept."""
+    for unknown in {*rows} - {*ROWS} | {*commands} - {*COMMANDS}:
+        raise SystemExit(f"there is no {unknown}: rows are {', '.join(ROWS)}; commands {', '.join(COMMANDS)}")
+    become_parent_of_orphans()
+    wrong = 0
+    with tempfile.TemporaryDirectory(prefix="outside-", dir="/tmp") as own:
+        root = Path(folder or own)
+        (root / "made").mkdir(parents=True, exist_ok=True)
+        harness = Harness(root, use_own_mounts(), random.Random(seed), keep)
+        harness.make()
+        print("| promise | trials | held | CPU s |\n|---|---|---|---|", flush=True)
+        for name in rows or ROWS:
+            if ROWS[name].needs_root and not harness.may_mount:
+                print(f"{name} needs root and is left out", file=sys.stderr)
+                continue
+            made, held, used = harness.row(name, ROWS[name], trials, commands)
+            wrong += held < made or not made
+            share = f"{100 * held // made} %" if made else "never in time"
+            print(f"| {ROWS[name].promise} (`{name}`) | {made} | {share} | {used:.0f} |", flush=True)
+    return wrong
+
+
+def _typed(words: Sequence[str]) -> dict[str, Any]:
+    kinds: dict[str, Callable[[str], Any]] = {
+        "trials": int,
+        "seed": int,
+        "folder": str,
+        "keep": lambda text: text == "true",
+    }
+    split = partial(str.split, sep=",")
+    return {key: kinds.get(key, split)(value) for key, _, value in (word.partition("=") for word in words)}
+
+
+if __name__ == "__main__":
+    sys.exit(bool(main(**_typed(sys.argv[1:]))))
