@@ -15,6 +15,7 @@ made anew and not counted.
 
 import ctypes
 import hashlib
+import json
 import os
 import random
 import re
@@ -28,7 +29,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -679,7 +680,11 @@ class Harness:
             write_files(self.made)
 
     def undisturbed(self, name: str) -> Undisturbed:
-        """Twice: what differs then is not looked at later."""
+        """Twice: what differs then is not looked at later. Kept beside what is made once."""
+        kept = self.made / f"{name.replace(' ', '-')}.json"
+        if kept.exists() and name not in self.known:
+            ended, stable = json.loads(kept.read_text())
+            self.known[name] = Undisturbed(Ended(**ended), stable)
         if name not in self.known:
             found = []
             for number in (1, 2):
@@ -694,6 +699,7 @@ class Harness:
             assert one.keys() == other.keys() or not COMMANDS[name].goes_on, one.keys() ^ other.keys()
             stable = {key: one[key] if one[key] == other[key] else "" for key in one.keys() & other.keys()}
             self.known[name] = Undisturbed(ended, stable)
+            kept.write_text(json.dumps([asdict(ended), stable]))
         return self.known[name]
 
     def _begin(self, command: Command, folder: Path) -> None:
