@@ -156,6 +156,7 @@ class _Output(io.FileIO):
         except OSError as error:
             closed_terminal = error.errno == errno.EIO and stat.S_ISCHR(os.fstat(self.fileno()).st_mode)
             if not closed_terminal and not isinstance(error, ConnectionError):
+                error.filename = "the output"  # of a full disk, say: what ends the command has no other name
                 raise
             with open(os.devnull, "wb") as nowhere:
                 os.dup2(nowhere.fileno(), self.fileno())

@@ -7,9 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from factory.config.arguments import POSITIONAL, Refused
+from factory.config.arguments import POSITIONAL, Refused, run_command
 from factory.config.datasets import find_function
-from factory.exits import COMPLETE, INTERRUPTED
+from factory.exits import COMPLETE, INTERRUPTED, Stopped
 from factory.views.sample_text import find_sample_id, logged_drive, open_samples
 from factory.views.status import open_store
 from factory.wording import one_line
@@ -90,6 +90,12 @@ def export(request: ExportRequest) -> int:
         workers=<n>         at once; else 1, on Ray every core
     What is written: docs/navsim_format.md.
     """
+    if request.format == "navsim" and request.executor == "ray":
+        from factory.config.compose import need_run_extra
+        from factory.graph.own_process import run_command_in_own_process
+
+        need_run_extra("ray")
+        return run_command_in_own_process(_export_navsim_on_ray, request)
     if request.format == "navsim":
         return _export_navsim(request)
     for path in _export_sample_files(request):
@@ -121,14 +127,11 @@ def _export_sample_files(request: ExportRequest) -> Iterator[Path]:
 
 def _export_navsim(request: ExportRequest) -> int:
     """All samples in SimScale's layout; the exit code. Raises Refused."""
-    from factory.config.compose import need_run_extra
     from factory.graph.parallel import WorkerDied, parallel_map
     from factory.graph.steps import TaskStopped
     from factory.store.location import Location
     from factory.store.reader import sample_table
 
-    if request.executor == "ray":
-        need_run_extra("ray")
     store = open_store(request.out)
     try:
         target = Location.parse(request.to, setting="to")
@@ -136,8 +139,10 @@ def _export_navsim(request: ExportRequest) -> int:
         table = sample_table(store.location.uri, store.location.options)
         trajectories = _label_vocabulary(store, request.vocabulary)
         done = find_function("EXPORTS", request.format)(request, table, Path(target.uri), trajectories, dealt)
-    except (OSError, ValueError, WorkerDied) as error:  # no folder, a full disk, what cannot be written as asked
+    except (OSError, ValueError) as error:  # no folder, a full disk, what cannot be written as asked
         raise Refused(str(error)) from error
+    except WorkerDied as error:
+        raise Stopped(str(error)) from error
     except (TaskStopped, KeyboardInterrupt) as error:
         at_once = "" if isinstance(error, TaskStopped) else " at once"
         print(f"interrupted{at_once}; run the same command again to go on", file=sys.stderr)
@@ -146,6 +151,11 @@ def _export_navsim(request: ExportRequest) -> int:
         print(f"note: {note}")
     print(f"{done.written:,} logs written, {done.logs:,} in all, {done.n_bytes / 1e9:,.3f} GB: {target.uri}")
     return COMPLETE
+
+
+def _export_navsim_on_ray(request: ExportRequest) -> int:
+    """In the process that Ray may end."""
+    return run_command((), lambda _: _export_navsim(request), str, elsewhere=", or give to=<another place>")
 
 
 def _label_vocabulary(store: "Store", file: str | None) -> "Array | None":

@@ -9,6 +9,7 @@ import os
 import signal
 import socket
 import sys
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -16,6 +17,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import FrameType
+from typing import TypeVar
 
 from factory.exits import (
     INTERRUPTED,
@@ -28,9 +30,12 @@ from factory.exits import (
 AGAIN = "run the same command again to go on"
 ANSWER_S = 10.0  # for a cluster's port to be reached, and to say what it speaks
 GRPC_HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0"  # ends with a frame of kind 4, as answers begin
+LOOK_S = 2.0  # between two looks whether a head node answers
+LOST_S = 75.0  # without an answer, a head node is lost: Ray itself gives one up after 60 s, where it notices
 NEW_CLUSTERS = 3  # in one run, for those of its own that die
 BY_RAY = 1  # its exit code of a process whose raylet is gone
 
+T = TypeVar("T")
 Run = Callable[[int, Callable[[str], None]], int]  # clusters begun anew before, says that another is; its exit code
 
 
@@ -48,6 +53,7 @@ def run_in_own_process(run: Run, is_ours: bool, say: Callable[[str], None]) -> i
             with terminal_signals_blocked():
                 process.start()
             theirs.close()
+            lost = not is_ours and _ended_without_answer(process, os.environ.get("RAY_ADDRESS", ""))
             process.join()
         assert process.pid is not None
         _end_session(process.pid)
@@ -55,21 +61,54 @@ def run_in_own_process(run: Run, is_ours: bool, say: Callable[[str], None]) -> i
         if code is not None:
             return code
         ended = process.exitcode or 0
-        if ended < 0:
+        if ended < 0 and not lost:
             with suppress(OSError):  # SIGKILL
                 signal.signal(-ended, signal.SIG_DFL)
             os.kill(os.getpid(), -ended)
-        if ended != BY_RAY:
+        if ended != BY_RAY and not lost:
             return ended
         begun += len(lines)
         if not is_ours:
-            print(f"Ray ended the run, whose raylet has died; {AGAIN} once Ray is up", file=sys.stderr)
+            why = f"the head node has not answered for {LOST_S:.0f} s" if lost else "its raylet or head node has died"
+            print(f"the run's Ray cluster is lost: {why}; {AGAIN} once Ray is up", file=sys.stderr)
             return INTERRUPTED
         if begun == NEW_CLUSTERS:
             print(f"Ray's raylet died; {AGAIN}", file=sys.stderr)
             return INTERRUPTED
         begun += 1
         say(new_cluster_text("Ray's raylet died", begun))
+
+
+def run_command_in_own_process(command: Callable[[T], int], given: T) -> int:
+    """command(given), its exit code: as `run_in_own_process`, unless this process is on a cluster already.
+
+    command: a function of a module, which goes on where it was stopped. Raises ConnectionError where no cluster answers
+    at RAY_ADDRESS.
+    """
+    if "ray" in sys.modules and sys.modules["ray"].is_initialized():
+        return command(given)
+    address = os.environ.get("RAY_ADDRESS", "")
+    check_address_answers(address)
+    return run_in_own_process(partial(_call, command, given), not address, partial(print, flush=True))
+
+
+def _call(command: Callable[[T], int], given: T, begun: int, tell: Callable[[str], None]) -> int:
+    return command(given)
+
+
+def _ended_without_answer(process: BaseProcess, address: str) -> bool:
+    """Waits for a process that works on a cluster; True once the head node there has been silent for LOST_S: ended."""
+    answered = time.monotonic()
+    while process.is_alive():
+        process.join(LOOK_S)
+        try:
+            check_address_answers(address)
+            answered = time.monotonic()
+        except ConnectionError:
+            if process.is_alive() and time.monotonic() - answered > LOST_S:
+                process.kill()
+                return True
+    return False
 
 
 def no_cluster_text(address: str, why: object) -> str:

@@ -27,6 +27,7 @@ from factory.config.arguments import command
 from factory.config.compose import ConfigError, need_run_extra
 from factory.exits import Failed, Stopped
 from factory.files import why_unusable
+from factory.graph.own_process import run_command_in_own_process
 from factory.graph.parallel import WorkerDied, parallel_map
 from factory.graph.progress import RateBar
 from factory.graph.steps import TaskStopped
@@ -74,7 +75,7 @@ class RequestedDrives:
 def drive_all(settings: DriveSettings) -> tuple[list[Row], list[FailedDrive]]:
     """Drive what is not driven yet: the rows of all that were asked for, by planner and clip, and what could not be.
 
-    Raises ConfigError; Stopped where it was interrupted; Failed where a process died or another command drives here.
+    Raises ConfigError; Stopped where it was interrupted, a process died or another command drives here.
     """
     if unusable := why_unusable(settings.out):
         raise ConfigError(unusable)
@@ -87,7 +88,7 @@ def drive_all(settings: DriveSettings) -> tuple[list[Row], list[FailedDrive]]:
     except (TaskStopped, KeyboardInterrupt) as error:
         raise Stopped("interrupted; what is driven is kept, and the same command goes on") from error
     except (WorkerDied, AnotherWriter) as error:
-        raise Failed(str(error)) from error
+        raise Stopped(str(error)) from error
     return asked.rows(table), failed
 
 
@@ -162,12 +163,22 @@ def _drive(work: DriveWork, items: Sequence[DriveItem], table: KeyedTable) -> li
 
 
 @command("drive", DriveSettings)
-def main(argv: Sequence[str]) -> None:
+def main(argv: Sequence[str]) -> int | None:
     """Drive and print what a command line asks for. Raises ConfigError, Failed, Stopped."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     settings = settings_of(argv)
     if settings.executor == "ray":
         need_run_extra("ray")
+        return run_command_in_own_process(_main_on_ray, tuple(argv))
+    _drive_and_print(settings)
+    return None
+
+
+def _main_on_ray(argv: Sequence[str]) -> int:
+    return replace(main, does=lambda words: _drive_and_print(settings_of(words)))(argv)
+
+
+def _drive_and_print(settings: DriveSettings) -> None:
     rows, failed = drive_all(settings)
     if rows:
         lines, apart = summarise_drives(rows, settings.confidence), picture_source_effects(rows, settings.confidence)

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, compose, fill
 from factory.config.shapes import GIVE, deep_merge, to_plain
+from factory.graph.own_process import run_command_in_own_process
 from planners.data.index import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings, batches_in
@@ -143,25 +144,37 @@ class TrainConfig:
 
 
 @command("train", TrainConfig)
-def main(argv: Sequence[str]) -> None:
+def main(argv: Sequence[str]) -> int | None:
     """The command."""
-    config = fill(TrainConfig, compose("train", argv, TrainConfig, _with_planner_settings, _shapes_of), "train")
+    config = _config_of(argv)
     if config.executor == "ray":
+        return run_command_in_own_process(_main_on_ray, tuple(argv))
+    config.training  # noqa: B018 - raises ConfigError for a planner that does not learn
+    dataset, settings = open_data(config.data, mix=config.mix), settings_of(config.planner)
+    if isinstance(settings, GtrsDenseSettings) and config.init_from is None:  # before PyTorch takes its seconds
+        try:
+            settings.check_labels(dataset.label_vocabulary)
+        except ValueError as error:
+            raise ConfigError(f"planner {config.planner.name}: {error}") from error
+    from planners.training.processes import join_process_group
+
+    with join_process_group(config.device) as process:
+        train(config, process, dataset)
+    return None
+
+
+def _config_of(argv: Sequence[str]) -> TrainConfig:
+    return fill(TrainConfig, compose("train", argv, TrainConfig, _with_planner_settings, _shapes_of), "train")
+
+
+def _main_on_ray(argv: Sequence[str]) -> int:
+    def does(words: Sequence[str]) -> None:
         from planners.training.on_ray import train_on_ray
 
+        config = _config_of(words)
         train_on_ray(partial(train, config), config.out, **dataclasses.asdict(config.ray))
-    else:
-        config.training  # noqa: B018 - raises ConfigError for a planner that does not learn
-        dataset, settings = open_data(config.data, mix=config.mix), settings_of(config.planner)
-        if isinstance(settings, GtrsDenseSettings) and config.init_from is None:  # before PyTorch takes its seconds
-            try:
-                settings.check_labels(dataset.label_vocabulary)
-            except ValueError as error:
-                raise ConfigError(f"planner {config.planner.name}: {error}") from error
-        from planners.training.processes import join_process_group
 
-        with join_process_group(config.device) as process:
-            train(config, process, dataset)
+    return dataclasses.replace(main, does=does)(argv)
 
 
 def _with_planner_settings(values: dict[str, Any]) -> dict[str, Any]:
