@@ -1,6 +1,6 @@
 """Every command of both programs, in trouble made from outside: `python -m experiments.chaos.outside ...`.
 
-    python -m experiments.chaos.outside [rows=sighup,raylet] [commands=run,train] [trials=10] [seed=0] [keep=true]
+    python -m experiments.chaos.outside [rows=sighup,guard:run] [trials=10] [seed=0] [folder=/tmp/here] [keep=true]
 
 A row is a promise: how trouble is made for a command that runs as a process of its own, what it may end with, and the
 line that then has to say what happened and how to go on. No traceback, no process left behind; then the same command
@@ -696,15 +696,17 @@ class Harness:
     def made(self) -> Path:
         return self.folder / "made"
 
-    def make(self) -> None:
-        """What commands work on, where it is not there yet."""
-        for name, words in MADE.items():
-            if not (self.made / name).exists():
-                command = Command(words)
-                ended = self.run(command, self.made, Trouble(), "made")
+    def make(self, command: Command) -> None:
+        """What a command works on, where it is not there yet."""
+        for name in {*re.findall(r"\{made\}/(\w+)", command.words), command.at} - {""}:
+            if (self.made / name).exists():
+                continue
+            if name in MADE:
+                self.make(Command(MADE[name].replace(f"{{made}}/{name}", "")))
+                ended = self.run(Command(MADE[name]), self.made, Trouble(), "made")
                 assert ended.code == COMPLETE, ended
-        if not (self.made / "split").exists():
-            write_files(self.made)
+            else:
+                write_files(self.made)
 
     def undisturbed(self, name: str) -> Undisturbed:
         """Twice: what differs then is not looked at later. Kept beside what is made once."""
@@ -713,6 +715,7 @@ class Harness:
             ended, stable = json.loads(kept.read_text())
             self.known[name] = Undisturbed(Ended(**ended), stable)
         if name not in self.known:
+            self.make(COMMANDS[name])
             found = []
             for number in (1, 2):
                 folder = self.folder / f"{name.replace(' ', '-')}{number}"
@@ -828,10 +831,10 @@ class Harness:
         if (out / "run.json").exists():
             assert (found := verify(Store(out)).damage) == (), f"damage: {found}"
 
-    def row(self, name: str, row: Row, trials: int, only: Sequence[str]) -> tuple[int, int, float]:
-        """(trials, held, CPU seconds); findings are told at once."""
-        commands = [one for one in row.commands if not only or one in only]
-        wanted = min(trials, len(commands)) if row.each_once or not commands else trials
+    def row(self, name: str, row: Row, trials: int, only: str) -> tuple[int, int, float]:
+        """(trials, held, CPU seconds) of all its commands, or one; findings are told at once."""
+        commands = [only] if only else row.commands
+        wanted = min(trials, len(commands)) if row.each_once else trials
         order = self.rng.sample(commands, len(commands))
         for one in order[:wanted]:
             self.undisturbed(one)
@@ -863,14 +866,14 @@ def cpu_s() -> float:
 
 def main(
     rows: Sequence[str] = (),
-    commands: Sequence[str] = (),
     trials: int = 10,
     seed: int = 0,
     folder: str = "",
     keep: bool = False,
 ) -> int:
     """Prints the table; how many rows did not hold. folder: where to work, and what is made once is kept."""
-    for unknown in {*rows} - {*ROWS} | {*commands} - {*COMMANDS}:
+    asked = [row.partition(":")[::2] for row in rows or ROWS]
+    for unknown in {name for name, _ in asked} - {*ROWS} | {only for _, only in asked} - {"", *COMMANDS}:
         raise SystemExit(f"there is no {unknown}: rows are {', '.join(ROWS)}; commands {', '.join(COMMANDS)}")
     become_parent_of_orphans()
     for number in (SIGINT, SIGHUP, SIGQUIT):  # a shell's background ignores some, and commands would as well
@@ -880,13 +883,12 @@ def main(
         root = Path(folder or own)
         (root / "made").mkdir(parents=True, exist_ok=True)
         harness = Harness(root, use_own_mounts(), random.Random(seed), keep)
-        harness.make()
         print("| promise | trials | held | CPU s |\n|---|---|---|---|", flush=True)
-        for name in rows or ROWS:
+        for name, only in asked:
             if ROWS[name].needs_root and not harness.may_mount:
                 print(f"{name} needs root and is left out", file=sys.stderr)
                 continue
-            made, held, used = harness.row(name, ROWS[name], trials, commands)
+            made, held, used = harness.row(name, ROWS[name], trials, only)
             wrong += held < made or not made
             share = f"{100 * held // made} %" if made else "never in time"
             print(f"| {ROWS[name].promise} (`{name}`) | {made} | {share} | {used:.0f} |", flush=True)
