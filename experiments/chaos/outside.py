@@ -46,8 +46,8 @@ from tests.pages import REPOSITORY
 OVER_S, LEFT_S = 240.0, 30.0  # until a command has ended, and then what it began
 ANYONE, NOBODY = 0, 4242  # users
 TRACE = re.compile(r"Traceback|Exception ignored|Fatal Python error|core dumped|Aborted|panicked")
-GOES_ON = r"again|free disk space|run it as a user|to=<another|out="  # how to go on
-SAID = re.compile(r"^error: |again|^interrupted")
+GOES_ON = r"again|the same command goes on|free disk space|run it as a user|to=<another|out="  # how to go on
+SAID = re.compile(r"^error: |again|^interrupted|the same command goes on")
 TOWN = "clips.n_clips=2 clips.settings.cameras=[] clips.settings.lidar_beams=0 render=none vocabulary.k=128"
 RUN = f"factory run {TOWN} rounds=2 shard_seconds=0.001 out={{out}}"
 BENCHMARK = "preset=hard_benchmark clips=synthetic clips.n_clips=3 clips.settings.cameras=[]"
@@ -494,11 +494,15 @@ def free_port() -> int:
 
 
 def losing_a_node(kind: str) -> Making:
-    """Of a standing cluster, while a run is on it; kind: head, second of two, or one of the head's processes."""
+    """Of a standing cluster, while a run is on it; kind: head, second of two, or one of the head's processes.
+
+    token: it does not die, but the run was not given its token.
+    """
 
     @contextmanager
     def make(scene: Scene) -> Iterator[Trouble]:
         port = free_port()
+        there = {"RAY_ADDRESS": f"127.0.0.1:{port}"}
         with ExitStack() as stack:
             pids = stack.enter_context(standing_node(scene.folder / "ray", port, True))
             if kind == "second":
@@ -511,7 +515,10 @@ def losing_a_node(kind: str) -> Making:
                 chosen = [pid for pid in pids if kind not in PEERS or re.search(PEERS[kind], command_line(pid))]
                 assert sum(map(kill, chosen)), "no such process"
 
-            yield Trouble(environment=STANDING | {"RAY_ADDRESS": f"127.0.0.1:{port}"}, during=strike, leaves=True)
+            if kind == "token":
+                yield Trouble(environment={"RAY_AUTH_MODE": None, **there}, leaves=True)
+            else:
+                yield Trouble(environment=STANDING | there, during=strike, leaves=True)
 
     return make
 
@@ -607,6 +614,7 @@ ROWS: Mapping[str, Row] = {
         "and one on Ray on that of a local one", another_driver("ray"), ("run",), (COMPLETE, INTERRUPTED), ""
     ),
     "head": Row("the head node of a standing cluster dies", losing_a_node("head"), ON_RAY, ON_STANDING, NONE_ANSWERS),
+    "head-token": Row("no token for a standing cluster", losing_a_node("token"), ("ray",), (2,), "RAY_AUTH_MODE"),
     "node": Row("one node of two dies", losing_a_node("second"), ("ray",), ON_STANDING),
     "head-raylet": Row("its raylet alone", losing_a_node("raylet"), ON_RAY, ON_STANDING, NONE_ANSWERS),
     "head-gcs": Row("its GCS alone", losing_a_node("gcs"), ON_RAY, ON_STANDING, NONE_ANSWERS),

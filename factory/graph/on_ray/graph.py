@@ -109,7 +109,9 @@ def join_or_start_cluster(workers: int | None) -> bool:
             raise ClusterDied(f"{said}, where {free:,} bytes are free", True) from error
         if not isinstance(error, ConnectionError):
             raise
-        raise ConnectionError(no_cluster_text(named, one_line(error))) from error
+        asks = isinstance(error.__cause__, exceptions.AuthenticationError)
+        why = "it wants its token: export RAY_AUTH_MODE=token" if asks else one_line(error)
+        raise ConnectionError(no_cluster_text(named, why)) from error
     return where == "local"
 
 
