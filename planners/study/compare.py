@@ -94,6 +94,7 @@ def main(argv: Sequence[str]) -> None:
         first, second = ([read_record(Path(run)) for run in side] for side in (a, b))
         sentence += f"; {drives_sentence(settings.drives, first, second, settings)}"
     if settings.out is not None:
+        Path(settings.out).parent.mkdir(parents=True, exist_ok=True)
         write_csv(Path(settings.out), found)
     print(comparison_text(found, settings.confidence, of_tables))
     print(f"{_names(b)} against {_names(a)}: {sentence}")

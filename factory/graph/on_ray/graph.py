@@ -109,8 +109,10 @@ def join_or_start_cluster(workers: int | None) -> bool:
             raise ClusterDied(f"{said}, where {free:,} bytes are free", True) from error
         if not isinstance(error, ConnectionError):
             raise
-        asks = isinstance(error.__cause__, exceptions.AuthenticationError)
-        why = "it wants its token: export RAY_AUTH_MODE=token" if asks else one_line(error)
+        seen: BaseException | None = error
+        while seen is not None and not isinstance(seen, exceptions.AuthenticationError):
+            seen = seen.__cause__ or seen.__context__
+        why = one_line(error) if seen is None else "it wants its token: export RAY_AUTH_MODE=token"
         raise ConnectionError(no_cluster_text(named, why)) from error
     return where == "local"
 
