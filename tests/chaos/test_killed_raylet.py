@@ -3,6 +3,7 @@
 import os
 import secrets
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -16,6 +17,7 @@ from typing import Any
 import pytest
 
 from factory.exits import INTERRUPTED, calling_on_stop_signal
+from factory.graph import own_process
 from factory.graph.execute import Execution, execute
 from factory.graph.own_process import run_in_own_process
 from factory.store.samples import Store
@@ -102,6 +104,26 @@ def test_a_command_whose_clusters_all_die_ends_with_a_line(
     assert "raylet" in line and "run the same command again" in line
     monkeypatch.delenv("MARK")
     assert left_of(mark) == []
+
+
+def hangs(begun: int, tell: Callable[[str], None]) -> int:
+    """As Ray does where it connects to a head node that has just died."""
+    threading.Event().wait()
+    return 0
+
+
+@pytest.mark.slow
+def test_a_run_on_a_head_node_that_is_silent_ends_with_a_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # and nobody listens
+        monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{taken.getsockname()[1]}")
+        monkeypatch.setattr(own_process, "LOST_S", 0.5)
+        monkeypatch.setattr(own_process, "LOOK_S", 0.1)
+        assert run_in_own_process(hangs, False, print) == INTERRUPTED
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "has not answered for" in line and "run the same command again" in line
 
 
 def ends(how: str, begun: int, tell: Callable[[str], None]) -> int:
