@@ -395,32 +395,41 @@ class IsolatedGraph(Graph):
         return None
 
     def _begin(self) -> None:
-        self._pipe, theirs = self._context.Pipe()
-        given = (theirs, self._work, self._out, self._stop, self._notes)
-        self._process = self._context.Process(target=_serve_tasks, args=given, daemon=False)
-        try:
-            with terminal_signals_blocked():
-                self._process.start()
-            theirs.close()
-            said = self._pipe.recv()
-        except (pickle.PicklingError, AttributeError, TypeError) as error:
-            raise NotReady(f"no process of its own can be given this work ({error}): graph.isolated=never") from error
-        except EOFError:
-            self._process.join()
-            raise NotReady(f"the process for plug-ins ended with exit code {self._process.exitcode}") from None
-        except KeyboardInterrupt:  # which the process does not hear
-            if self._process.pid is not None:
+        """Another process, with its work. One that dies before it is ready is begun anew, MAX_RETRIES times."""
+        for deaths in count(1):
+            self._pipe, theirs = self._context.Pipe()
+            given = (theirs, self._out, self._stop, self._notes)
+            self._process = self._context.Process(target=_serve_tasks, args=given, daemon=False)
+            try:
+                with terminal_signals_blocked():
+                    self._process.start()
+                theirs.close()
+                self._pipe.send(self._work)  # no argument: Python would wait for ever until a dead process reads it
+                said = self._pipe.recv()
+            except (pickle.PicklingError, AttributeError, TypeError) as error:
                 self._process.kill()
-            raise
-        if isinstance(said, Failure):
-            raise not_ready_error(said)
+                advice = f"no process of its own can be given this work ({error}): graph.isolated=never"
+                raise NotReady(advice) from error
+            except (EOFError, BrokenPipeError, ConnectionResetError):
+                self._process.join()
+                if deaths > MAX_RETRIES:
+                    said = f"the process for plug-ins ended with exit code {self._process.exitcode}"
+                    raise NotReady(said) from None
+                continue
+            except KeyboardInterrupt:  # which the process does not hear
+                if self._process.pid is not None:
+                    self._process.kill()
+                raise
+            if isinstance(said, Failure):
+                raise not_ready_error(said)
+            return
 
 
-def _serve_tasks(pipe: Connection, work: Work, out: Location, stop: Any, notes: Path) -> None:
+def _serve_tasks(pipe: Connection, out: Location, stop: Any, notes: Path) -> None:
     """The other process: a task at a time, until there is none or the run is gone."""
     ignore_terminal_signals()
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the run decides
-    supplied = {"work": work, "out": out, "stopped": stop.is_set}
+    supplied = {"out": out, "stopped": stop.is_set}
     kept: OrderedDict[int, Any] = OrderedDict()
 
     def value_of(arg: Any) -> Any:
@@ -433,6 +442,7 @@ def _serve_tasks(pipe: Connection, work: Work, out: Location, stop: Any, notes: 
         return kept[arg.number]
 
     try:
+        supplied["work"] = work = pipe.recv()
         said, _ = warm(work, draws=True)
         pipe.send(said)
         if isinstance(said, Failure):

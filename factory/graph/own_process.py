@@ -93,7 +93,12 @@ def run_command_in_own_process(command: Callable[[T], int], given: T) -> int:
 
 
 def _call(command: Callable[[T], int], given: T, begun: int, tell: Callable[[str], None]) -> int:
-    return command(given)
+    from factory.graph.local import ClusterDied
+
+    try:
+        return command(given)
+    except ClusterDied:
+        os._exit(BY_RAY)  # as Ray does it, where it is quicker to notice
 
 
 def _ended_without_answer(process: BaseProcess, address: str) -> bool:

@@ -66,6 +66,7 @@ VITAL = ("raylet", "gcs_server")
 PROBE_SECONDS = 120.0
 OWN_BYTES = 2**20  # of files of a cluster of our own, before it does anything: less, and another will not begin either
 GPU_WAIT_S = 900.0  # for the first node with one to come
+RAYLET_DIED = "Ray's raylet on this machine died; run the same command again once Ray is up"
 WORKER_ENV = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 FORWARDED_ENV = ("NUMBA_CACHE_DIR",)
 
@@ -348,8 +349,7 @@ class RayGraph(Graph):
         try:
             report, worked_s = ray.get(reference)
         except exceptions.LocalRayletDiedError as error:
-            said = "Ray's raylet on this machine died; run the same command again once Ray is up"
-            raise ClusterDied(said, self._is_ours) from error
+            raise ClusterDied(RAYLET_DIED, self._is_ours) from error
         except RayError as error:
             report, worked_s = Failure(_error_kind(error), f"{type(error).__name__}: {error}"[:2000]), 0.0
         if isinstance(report, BatchReport):
@@ -463,10 +463,10 @@ class RayPool(Executor):
         """
         self._connected = not ray.is_initialized()
         try:
-            is_ours = self._connected and join_or_start_cluster(workers)
+            self._is_ours = self._connected and join_or_start_cluster(workers)
         except ClusterDied as error:
             raise ConnectionError(str(error)) from error
-        self.parallelism = tasks_at_once(workers, is_ours)
+        self.parallelism = tasks_at_once(workers, self._is_ours)
         self._references: dict[Future[Any], Any] = {}
         try:
             if to is not None:
@@ -476,7 +476,7 @@ class RayPool(Executor):
             raise
 
     def submit(self, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        """BrokenExecutor is raised by a future whose worker died, with all of its retries."""
+        """A future raises BrokenExecutor where its worker died, with all retries, and ClusterDied with the raylet."""
         reference = _call_function.remote(function, args, kwargs)
         future: Future[R] = Future()
         future.set_running_or_notify_cancel()
@@ -491,6 +491,8 @@ class RayPool(Executor):
             future.set_result(done.result())
         elif isinstance(error, RayTaskError):  # Ray wraps what a task raised with its traceback
             future.set_exception(error.cause)
+        elif isinstance(error, exceptions.LocalRayletDiedError):
+            future.set_exception(ClusterDied(RAYLET_DIED, self._is_ours))
         else:
             future.set_exception(BrokenExecutor(f"{type(error).__name__}: {one_line(error)}"))
 
