@@ -26,6 +26,21 @@ from tests.pages import REPOSITORY
 ONE = "log0:0:recovery:0"
 
 
+def arrived(journal: str, large: bytes) -> "DyingAtFirst":
+    """In the process that is given the work: which is killed there the first time."""
+    if not Path(journal).exists():
+        Path(journal).write_text("")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return DyingAtFirst(journal=journal)
+
+
+class DyingAtFirst(WildWork):
+    """Larger than what a pipe holds."""
+
+    def __reduce__(self) -> tuple[object, tuple[str, bytes]]:
+        return arrived, (self.journal, bytes(2**20))
+
+
 def failed_in(out: Path) -> list[tuple[str, str]]:
     """Kind and error of every failed row."""
     return [(o["error_kind"], o["error"]) for o in tables_of(out)[1] if o["kind"] == "failed"]  # type: ignore[index]
@@ -34,6 +49,12 @@ def failed_in(out: Path) -> list[tuple[str, str]]:
 @pytest.mark.slow
 def test_a_process_of_its_own_makes_the_same_rows(tmp_path: Path, plain: Callable[..., Path]) -> None:
     assert run(tmp_path / "out", isolated=True).exit_code == COMPLETE
+    assert_same_tables(tmp_path / "out", plain())
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_before_it_is_ready_is_begun_anew(tmp_path: Path, plain: Callable[..., Path]) -> None:
+    assert run(tmp_path / "out", DyingAtFirst(journal=str(tmp_path / "journal")), isolated=True).exit_code == COMPLETE
     assert_same_tables(tmp_path / "out", plain())
 
 
