@@ -494,10 +494,7 @@ def free_port() -> int:
 
 
 def losing_a_node(kind: str) -> Making:
-    """Of a standing cluster, while a run is on it; kind: head, second of two, or one of the head's processes.
-
-    token: it does not die, but the run was not given its token.
-    """
+    """Of a standing cluster, while a run is on it; kind: head, second of two, or one of the head's processes."""
 
     @contextmanager
     def make(scene: Scene) -> Iterator[Trouble]:
@@ -515,10 +512,7 @@ def losing_a_node(kind: str) -> Making:
                 chosen = [pid for pid in pids if kind not in PEERS or re.search(PEERS[kind], command_line(pid))]
                 assert sum(map(kill, chosen)), "no such process"
 
-            if kind == "token":
-                yield Trouble(environment={"RAY_AUTH_MODE": None, **there}, leaves=True)
-            else:
-                yield Trouble(environment=STANDING | there, during=strike, leaves=True)
+            yield Trouble(environment=STANDING | there, during=strike, leaves=True)
 
     return make
 
@@ -619,7 +613,6 @@ ROWS: Mapping[str, Row] = {
         "and one on Ray on that of a local one", another_driver("ray"), ("run",), (COMPLETE, INTERRUPTED), ""
     ),
     "head": Row("the head node of a standing cluster dies", losing_a_node("head"), ON_RAY, ON_STANDING, NONE_ANSWERS),
-    "head-token": Row("no token for a standing cluster", losing_a_node("token"), ("ray",), (2,), "RAY_AUTH_MODE"),
     "node": Row("one node of two dies", losing_a_node("second"), ("ray",), ON_STANDING),
     "head-raylet": Row("its raylet alone", losing_a_node("raylet"), ON_RAY, ON_STANDING, NONE_ANSWERS),
     "head-gcs": Row("its GCS alone", losing_a_node("gcs"), ON_RAY, ON_STANDING, NONE_ANSWERS),

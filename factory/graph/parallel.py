@@ -34,7 +34,8 @@ def parallel_map(
     workers: at once; None: 1 here, every core on Ray, which is the cluster of RAY_ADDRESS or one of this machine's own.
     to: the folder that the function writes to, called `to=` where a node of a cluster does not see it. At the first
     SIGINT or SIGTERM nothing new is begun; what is in hand still comes. Close the iterator to have the signals back.
-    Raises TaskStopped where items are left then, WorkerDied, BadLocation, ConnectionError where no cluster answers.
+    Raises TaskStopped where items are left then, WorkerDied, BadLocation, ConnectionError where no cluster answers, and
+    ClusterDied where Ray dies on this machine.
     """
     stopped: list[bool] = []
     waiting = iter(items)

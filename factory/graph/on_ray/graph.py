@@ -110,11 +110,7 @@ def join_or_start_cluster(workers: int | None) -> bool:
             raise ClusterDied(f"{said}, where {free:,} bytes are free", True) from error
         if not isinstance(error, ConnectionError):
             raise
-        seen: BaseException | None = error
-        while seen is not None and not isinstance(seen, exceptions.AuthenticationError):
-            seen = seen.__cause__ or seen.__context__
-        why = one_line(error) if seen is None else "it wants its token: export RAY_AUTH_MODE=token"
-        raise ConnectionError(no_cluster_text(named, why)) from error
+        raise ConnectionError(no_cluster_text(named, one_line(error))) from error
     return where == "local"
 
 
@@ -458,14 +454,11 @@ class RayPool(Executor):
     def __init__(self, workers: int | None, to: Location | None) -> None:
         """Workers as of RayGraph; to: the folder that tasks write to.
 
-        Raises BadLocation where some node does not see it, ConnectionError where no cluster answers, or none
-        begins here.
+        Raises BadLocation where some node does not see it, ConnectionError where no cluster answers,
+        ClusterDied where none begins here.
         """
         self._connected = not ray.is_initialized()
-        try:
-            self._is_ours = self._connected and join_or_start_cluster(workers)
-        except ClusterDied as error:
-            raise ConnectionError(str(error)) from error
+        self._is_ours = self._connected and join_or_start_cluster(workers)
         self.parallelism = tasks_at_once(workers, self._is_ours)
         self._references: dict[Future[Any], Any] = {}
         try:
