@@ -36,7 +36,14 @@ def one_line(error: BaseException) -> str:
     except ValueError:  # of an integer that Python does not write out, such as a missing key
         said = ", ".join(map(shown, error.args))
     plain = re.sub(r"\x1b\[[0-9;]*m", "", said).replace("\u21b3", ":")
-    return " ".join(plain.split())[:300] or type(error).__name__
+    return printable(" ".join(plain.split())[:300]) or type(error).__name__
+
+
+def printable(text: str) -> str:
+    """On one line and without what a terminal would obey: what a file says may be quoted in it."""
+    if text.isprintable():
+        return text
+    return "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in text)
 
 
 def shown(value: object, inside: int = 2) -> str:

@@ -122,7 +122,9 @@ def run_command(
         code, line = _exit_of_error(error, refused, resumes, elsewhere)
         if code == COMPLETE:
             raise
-        print(line, file=sys.stderr)
+        from factory.wording import printable
+
+        print("\n".join(map(printable, line.split("\n"))), file=sys.stderr)
         return code
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.files import broken_link, why_unread
-from factory.wording import one_line, shown
+from factory.wording import one_line, printable, shown
 from tasks.world.arrays import Array, Bytes, Ints
 from tasks.world.clip import CLIP_STEPS, STEP_S, AgentKind, AgentTracks, Camera, Clip
 from tasks.world.frames import EGO_STATE_SIZE, HEADING, LARGEST, PACIFICA, X, Y, wrap_angle
@@ -44,7 +44,7 @@ class Unreadable(BadClip):
 
 
 def _cut(text: str) -> str:
-    return text if len(text) <= MOST_SAID else f"{text[:MOST_SAID]}..."
+    return printable(text if len(text) <= MOST_SAID else f"{text[:MOST_SAID]}...")
 
 
 @contextmanager

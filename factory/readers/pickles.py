@@ -3,7 +3,8 @@
 A pickle is a program. Four walls stand before and around it:
 1. the opcodes are read first, without running any: only those that build plain values may occur, every length is
    checked against the file, no memo index may exceed the number of opcodes (else 5 bytes could ask for 64 GB), nothing
-   is nested deeper than `pickle_shape.MAX_DEPTH`, and no key of a dict or set is a tuple that takes long to hash;
+   is nested deeper than MAX_DEPTH, and no key of a dict or set is a tuple that takes long to hash, or an integer that
+   can be made to share its hash with all others;
 2. every global is answered with a function made for this one load; the named object is never imported or called;
 3. arrays and copied containers are paid for from a budget of `BUDGET_PER_BYTE` x file size (+ 16 MB), so that one big
    value cannot be copied without end. Opcodes themselves cost at most some 100 bytes of memory per byte read;
@@ -36,6 +37,8 @@ MAX_HASHED = 1000  # values that a key of a dict or a member of a set may hold; 
 
 Shape = list[int]  # [values in it, those of its members counted wherever they are referred to; depth]
 _LEAF: Shape = [1, 0]
+_LONG: Shape = [MAX_HASHED + 1, 0]  # no key: Python hashes integers modulo 2^61 - 1, so that any number share one hash
+KEY_BITS = 64
 _CONSTANTS = """
     NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT STRING BINSTRING SHORT_BINSTRING
     UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8 GLOBAL
@@ -60,7 +63,7 @@ class _Stack:
         """One opcode. Raises IndexError and KeyError where it takes what is not there."""
         items = self.items
         if name in _LEAVES:
-            items.append(_LEAF)
+            items.append(_LONG if isinstance(argument, int) and argument.bit_length() > KEY_BITS else _LEAF)
         elif name == "MARK":
             self._marks.append(len(items))
         elif name in _MEMO:
@@ -128,7 +131,7 @@ class _Stack:
         self._add(self.items[-1], inside)
 
     def _add(self, shape: Shape, inside: list[Shape]) -> None:
-        if inside and shape is not _LEAF:  # which holds nothing
+        if inside and shape[1]:  # a leaf holds nothing
             shape[0] = min(shape[0] + sum(size for size, _ in inside), MAX_HASHED + 1)
             shape[1] = max(shape[1], 1 + max(depth for _, depth in inside))
             if shape[1] > MAX_DEPTH:
@@ -137,7 +140,7 @@ class _Stack:
     def _check_keys(self, keys: list[Shape]) -> None:
         for size, _ in keys:
             if size > MAX_HASHED:
-                raise self._refuse(f"a key of more than {MAX_HASHED} values")
+                raise self._refuse(f"a key of more than {MAX_HASHED} values or {KEY_BITS} bits")
 
 
 def check_opcodes(data: bytes | BinaryIO, file: str, allowed: Collection[str]) -> None:
@@ -366,8 +369,9 @@ class _Array(np.ndarray):
 
 
 def _left_after_hashing(value: object, left: int) -> int:
-    """What is left of `left` values once those that hashing a tuple goes through are taken; below 0: too many."""
-    left -= 1
+    """What is left of `left` values once those that hashing a tuple goes through are taken; below 0: too many, or an
+    integer that is no key."""
+    left -= MAX_HASHED + 1 if isinstance(value, int) and value.bit_length() > KEY_BITS else 1
     for item in value if isinstance(value, tuple) and left >= 0 else ():
         left = _left_after_hashing(item, left)
         if left < 0:
@@ -426,7 +430,7 @@ def _stand_ins(file: str, budget: int, classes: frozenset[str]) -> dict[tuple[st
         def build(items: list[object] | tuple[object, ...] | str = ()) -> Any:
             spend(64 * len(items))
             if kind in (set, frozenset) and any(_left_after_hashing(item, MAX_HASHED) < 0 for item in items):
-                raise BadClip(file, "pickle", "a member of a set is a tuple of too many")
+                raise BadClip(file, "pickle", "a member of a set is a tuple of too many, or an integer too large")
             return kind(items)
 
         return build

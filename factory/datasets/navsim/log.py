@@ -197,7 +197,7 @@ def parse_frames(value: Any, path: Path, whole: bool = True) -> LogFrames:
     for i, problem in _out_of_place(frames, path):
         wrong[i] = problem
         frames.pop(i, None)
-    for i in _away(frames) if not whole else ():
+    for i in _away(frames) if frames and not whole else ():
         wrong[i] = BadClip(file, f"frames[{i}].ego2global_translation", "the ego lies away from the frames around it")
         frames.pop(i)
     if wrong and (whole or len(wrong) > MOST * len(value)):

@@ -60,7 +60,7 @@ from factory.readers.logs import (
     with_other_drives,
 )
 from factory.readers.pickles import check_values, load_plain
-from factory.wording import shown, time_text
+from factory.wording import listed, shown, time_text
 from tasks.caches import user_cache, with_checksum, without_checksum
 from tasks.kernels.compiled import write_whole
 from tasks.world.arrays import Array, Bools, Ints
@@ -212,9 +212,18 @@ def _read(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: no text in UTF-8: {error}") from error
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same rules, ten times as fast
+    base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same rules, ten times as fast
+
+    class Loader(base):  # type: ignore[misc]
+        """Keys are texts: integers can share one hash, and merges (<<) of merges grow without end."""
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            if any(key.tag != "tag:yaml.org,2002:str" for key, _ in node.value):
+                raise yaml.constructor.ConstructorError(None, None, "a key that is no text", node.start_mark)
+            return super().construct_mapping(node, deep)
+
     try:
-        content = yaml.load(text, loader)  # noqa: S506 - both loaders are safe
+        content = yaml.load(text, Loader)  # noqa: S506 - a safe loader
     except (yaml.YAMLError, RecursionError, ValueError) as error:  # a date or a number that is none
         raise ValueError(f"{path}: no YAML of plain values: {' '.join(str(error).split())}") from error
     check_values(content, len(text), str(path), "YAML")
@@ -225,7 +234,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _refuse_unknown(content: Mapping[str, Any], known: frozenset[str], file: str) -> None:
     if unknown := sorted(content.keys() - known):
-        raise ValueError(f"{file}: unknown key {', '.join(unknown)}; known: {', '.join(sorted(known))}")
+        raise ValueError(f"{file}: unknown key {listed(unknown)}; known: {', '.join(sorted(known))}")
 
 
 # Which windows of a folder of logs are clips, found without opening the logs again.

@@ -1,0 +1,66 @@
+"""Crafted files against the commands that read them: `python -m tests.chaos.hostile_files [cases=250] [minutes=150]
+[to=build/hostile_files] [doors=word,word]`.
+
+Of each door (doors.py) so many cases; what is judged already, by the lines of verdicts.jsonl, is not tried again. Logs
+lie by 25 beside an innocent one and are read by one run; a run that is not well is tried again in halves, down to the
+files that did it. A single file is read by a command in a process forked from one that has imported it, one in 20 by
+the command as it is typed. Findings end it with 1.
+"""
+
+import json
+import shutil
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from pathlib import Path
+
+from tests.chaos.hostile_files.doors import DOORS, LOGS, write_innocents
+from tests.chaos.hostile_files.trials import BATCH, Verdict, in_fork, judge_logs, judge_single, load_what_is_read_with
+
+
+def main(cases: int = 250, minutes: float = 150.0, to: str = "build/hostile_files", doors: str = "") -> int:
+    end, kept = time.monotonic() + 60.0 * minutes, Path(to) / "verdicts.jsonl"
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    told = [Verdict(**json.loads(line)) for line in kept.read_text().splitlines()] if kept.exists() else []
+    if not (innocents := kept.parent.absolute() / "innocents").exists():
+        innocents.mkdir()
+        if (made := in_fork(lambda: write_innocents(innocents) or 0, kept.parent / "made")).code:
+            raise RuntimeError(made.said[-2000:])
+    load_what_is_read_with()
+    chosen = [door for door in DOORS if not doors or any(word in door for word in doors.split(","))]
+    left = {door: sorted({*range(cases)} - {verdict.number for verdict in told if verdict.door == door}) for door in chosen}
+    with kept.open("a") as file:
+        for at in range(0, cases, BATCH):  # round by round, so that a part that ends early has some of every kind
+            for door in chosen:
+                numbers = left[door][at : at + BATCH]
+                if not numbers or time.monotonic() > end:
+                    continue
+                folder = Path(tempfile.mkdtemp())  # what forks remove when they end, a TemporaryDirectory, is not this
+                if door in LOGS:
+                    new = judge_logs(innocents, folder, door, numbers)
+                else:
+                    new = [judge_single(innocents, folder / str(n), door, n) for n in numbers]
+                shutil.rmtree(folder)
+                for verdict in new:
+                    print(verdict.text, file=sys.stderr) if verdict.finding else None
+                    file.write(json.dumps(verdict.__dict__) + "\n")
+                file.flush()
+                told += new
+    print("| door | cases | attacks | read | refused by name | findings | CPU, most s | memory, most GB |\n|---|---|---|---|---|---|---|---|")
+    of = defaultdict(list)
+    for verdict in told:
+        of[verdict.door].append(verdict)
+    for door, verdicts in of.items():
+        counts = [sum(v.how == how for v in verdicts) for how in ("read", "refused")]
+        n, found = len(verdicts), sum(bool(v.finding) for v in verdicts)
+        most = max(v.cpu_s for v in verdicts), max(v.gb for v in verdicts)
+        print(f"| {door} | {n:,} | {len({v.attack for v in verdicts})} | {counts[0]:,} | {counts[1]:,} | {found} | {most[0]:.1f} | {most[1]:.2f} |")
+    print(f"{len(told):,} cases")
+    return sum(bool(verdict.finding) for verdict in told)
+
+
+if __name__ == "__main__":
+    words = dict(word.split("=", 1) for word in sys.argv[1:])
+    kinds = {"cases": int, "minutes": float}
+    sys.exit(bool(main(**{name: kinds.get(name, str)(word) for name, word in words.items()})))  # type: ignore[arg-type]
