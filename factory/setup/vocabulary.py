@@ -6,6 +6,8 @@ them a run later reads, so that a run's `limit` never changes what the experts k
 
 import hashlib
 import json
+import os
+import zipfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,6 +35,7 @@ from tasks.world.vocabulary import (
 STEP_MS = round(STEP_S * 1000)
 TABLE_KEYS = ("trajectories", "digest")
 START_COLUMNS = ("clip_id", "trajectory")
+MOST_EXPANDED = 16  # of an archive that is packed
 
 
 @dataclass(frozen=True)
@@ -168,6 +171,7 @@ def load_recovery_table(path: str | Path) -> RecoveryTable:
 
 def _load(path: str | Path) -> np.ndarray | dict[str, np.ndarray]:
     try:
+        _refuse_bombs(path)
         loaded = np.load(path, allow_pickle=False)
         return loaded if isinstance(loaded, np.ndarray) else {key: loaded[key] for key in loaded.files}
     except OSError as error:
@@ -175,6 +179,15 @@ def _load(path: str | Path) -> np.ndarray | dict[str, np.ndarray]:
     except Exception as error:  # numpy takes what it does not know for a pickle, zipfile and zlib have errors of theirs
         why = "it holds no plain numbers" if "pickled (object)" in str(error) else str(error)
         raise ValueError(f"{path}: not readable as a numpy file: {why}") from error
+
+
+def _refuse_bombs(path: str | Path) -> None:
+    with open(path, "rb") as file:
+        if not zipfile.is_zipfile(file):
+            return
+        with zipfile.ZipFile(file) as packed:
+            if sum(member.file_size for member in packed.infolist()) > MOST_EXPANDED * (os.stat(path).st_size + 2**16):
+                raise ValueError(f"its members are packed to less than 1/{MOST_EXPANDED} of their size")
 
 
 def save_vocabulary(path: str | Path, vocabulary: Vocabulary, origin: dict[str, object]) -> None:

@@ -1,9 +1,9 @@
 """Crafted files against the commands that read them: `python -m tests.chaos.hostile_files [cases=250] [minutes=150]
-[to=build/hostile_files] [doors=word,word]`.
+[to=build/hostile_files] [doors=word,word] [only=door:number,door:number]`.
 
 Of each door (doors.py) so many cases; what is judged already, by the lines of verdicts.jsonl, is not tried again. Logs
 lie by 25 beside an innocent one and are read by one run; a run that is not well is tried again in halves, down to the
-files that did it. A single file is read by a command in a process forked from one that has imported it, one in 20 by
+files that did it. A single file is read by a command in a process forked from one that has imported it, one in 50 by
 the command as it is typed. Findings end it with 1.
 """
 
@@ -19,20 +19,28 @@ from tests.chaos.hostile_files.doors import DOORS, LOGS, write_innocents
 from tests.chaos.hostile_files.trials import BATCH, Verdict, in_fork, judge_logs, judge_single, load_what_is_read_with
 
 
-def main(cases: int = 250, minutes: float = 150.0, to: str = "build/hostile_files", doors: str = "") -> int:
+def main(
+    cases: int = 250, minutes: float = 150.0, to: str = "build/hostile_files", doors: str = "", only: str = ""
+) -> int:
     end, kept = time.monotonic() + 60.0 * minutes, Path(to) / "verdicts.jsonl"
     kept.parent.mkdir(parents=True, exist_ok=True)
     told = [Verdict(**json.loads(line)) for line in kept.read_text().splitlines()] if kept.exists() else []
-    if not (innocents := kept.parent.absolute() / "innocents").exists():
-        innocents.mkdir()
-        if (made := in_fork(lambda: write_innocents(innocents) or 0, kept.parent / "made")).code:
-            raise RuntimeError(made.said[-2000:])
+    if only:
+        asked = [case.split(":") for case in only.split(",")]
+        wanted = {door: [int(n) for d, n in asked if d == door] for door in dict.fromkeys(door for door, _ in asked)}
+    else:
+        wanted = {
+            door: [*range(cases)] for door in DOORS if not doors or any(word in door for word in doors.split(","))
+        }
+    known = {(verdict.door, verdict.number) for verdict in told}
+    left = {door: [n for n in numbers if (door, n) not in known] for door, numbers in wanted.items()}
+    (innocents := kept.parent.absolute() / "innocents").mkdir(exist_ok=True)
     load_what_is_read_with()
-    chosen = [door for door in DOORS if not doors or any(word in door for word in doors.split(","))]
-    left = {door: sorted({*range(cases)} - {verdict.number for verdict in told if verdict.door == door}) for door in chosen}
+    if (made := in_fork(lambda: write_innocents(innocents, left) or 0, kept.parent / "made")).code:
+        raise RuntimeError(made.said[-2000:])
     with kept.open("a") as file:
-        for at in range(0, cases, BATCH):  # round by round, so that a part that ends early has some of every kind
-            for door in chosen:
+        for at in range(0, max(map(len, left.values())), BATCH):  # a part that ends early has some of every kind
+            for door in left:
                 numbers = left[door][at : at + BATCH]
                 if not numbers or time.monotonic() > end:
                     continue
@@ -47,7 +55,9 @@ def main(cases: int = 250, minutes: float = 150.0, to: str = "build/hostile_file
                     file.write(json.dumps(verdict.__dict__) + "\n")
                 file.flush()
                 told += new
-    print("| door | cases | attacks | read | refused by name | findings | CPU, most s | memory, most GB |\n|---|---|---|---|---|---|---|---|")
+    print(
+        "| door | cases | attacks | read | refused by name | findings | CPU, most s | memory, most GB |\n|---|---|---|---|---|---|---|---|"
+    )
     of = defaultdict(list)
     for verdict in told:
         of[verdict.door].append(verdict)
@@ -55,7 +65,9 @@ def main(cases: int = 250, minutes: float = 150.0, to: str = "build/hostile_file
         counts = [sum(v.how == how for v in verdicts) for how in ("read", "refused")]
         n, found = len(verdicts), sum(bool(v.finding) for v in verdicts)
         most = max(v.cpu_s for v in verdicts), max(v.gb for v in verdicts)
-        print(f"| {door} | {n:,} | {len({v.attack for v in verdicts})} | {counts[0]:,} | {counts[1]:,} | {found} | {most[0]:.1f} | {most[1]:.2f} |")
+        print(
+            f"| {door} | {n:,} | {len({v.attack for v in verdicts})} | {counts[0]:,} | {counts[1]:,} | {found} | {most[0]:.1f} | {most[1]:.2f} |"
+        )
     print(f"{len(told):,} cases")
     return sum(bool(verdict.finding) for verdict in told)
 

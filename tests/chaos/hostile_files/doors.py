@@ -3,7 +3,7 @@
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -28,20 +28,23 @@ CITY = next(iter(CITIES))
 PLAIN = ("experts=[human]", "rounds=1", "render=none", "reward.labels=none", "executor=local", "vocabulary.k=16")
 
 
-def write_innocents(folder: Path) -> None:
-    """What stands beside the hostile files, or is what they are made like: a log of each format, a run, a town."""
+def write_innocents(folder: Path, doors: Collection[str]) -> None:
+    """What stands beside the hostile files of these doors, or is what they are made like; what is there is kept."""
     from factory.datasets.town.reader import SyntheticReader
     from factory.datasets.town.settings import TownSettings
     from factory.run import main as run
 
-    SyntheticReader(folder / "towns", 1, 0, TownSettings(("ring_front_center",), 64, 36, lidar_beams=0)).index()
-    (town,) = (path for path in folder.glob("towns/*/*") if path.is_dir())
-    shutil.copytree(town, folder / "av2" / "innocent")
-    convert(town, folder / "py123d")
-    write_town(folder / "navsim", "mini", town, CITY)
-    save(nuscenes(), folder / "scenarionet", "sd_innocent.pkl")
-    if run(["clips=scenarionet", f"clips.root={folder / 'scenarionet'}", *PLAIN, f"out={folder / 'run'}"]):
-        raise RuntimeError("the innocent run did not end well")
+    if not (folder / "scenarionet").exists():
+        save(nuscenes(), folder / "scenarionet", "sd_innocent.pkl")
+    if not (folder / "towns").exists() and any(door.startswith(("av2", "navsim", "py123d")) for door in doors):
+        SyntheticReader(folder / "towns", 1, 0, TownSettings(("ring_front_center",), 64, 36, lidar_beams=0)).index()
+        (town,) = (path for path in folder.glob("towns/*/*") if path.is_dir())
+        shutil.copytree(town, folder / "av2" / "innocent")
+        convert(town, folder / "py123d")
+        write_town(folder / "navsim", "mini", town, CITY)
+    if not (folder / "run").exists() and any(door.startswith(("table", "shard")) for door in doors):
+        if run(["clips=scenarionet", f"clips.root={folder / 'scenarionet'}", *PLAIN, f"out={folder / 'run'}"]):
+            raise RuntimeError("the innocent run did not end well")
 
 
 # Data folders
@@ -69,7 +72,11 @@ def _frames(innocents: Path, rng: Rng) -> Crafted:
         return grammars.program(rng)
     good = _good_frames(innocents)
     if rng.random() < 0.1:
-        stamps = [frame | {"log_name": "hostile", "timestamp": frame["timestamp"] + k} for k in range(int(grammars.pick(rng, (400, 2000)))) for frame in good[:10]]
+        stamps = [
+            frame | {"log_name": "hostile", "timestamp": frame["timestamp"] + k}
+            for k in range(int(grammars.pick(rng, (400, 2000))))
+            for frame in good[:10]
+        ]
         return "frames: many", grammars.dumped(stamps, rng)
     name, what = grammars.value(rng)
     frames = [frame | {"log_name": "hostile"} for frame in good]
@@ -108,7 +115,12 @@ def _packed(path: Path, rng: Rng) -> Crafted:
     good = pyarrow.feather.read_table(path, memory_map=False)
     size, n = int(grammars.pick(rng, grammars.SIZES)), int(grammars.pick(rng, grammars.MANY))
     values: dict[str, Any] = {
-        "array": {b"__ndarray__": True, b"dtype": grammars.pick(rng, ("f8", "O", "V99", "(9999,)f8")), b"shape": [size], b"data": b"x" * 8},
+        "array": {
+            b"__ndarray__": True,
+            b"dtype": grammars.pick(rng, ("f8", "O", "V99", "(9999,)f8")),
+            b"shape": [size],
+            b"data": b"x" * 8,
+        },
         "deep": grammars.nested(400),
         "texts": {f"{k}{grammars.FORGED}": "x" for k in range(min(n, 9999))},
     }
@@ -121,7 +133,11 @@ def _packed(path: Path, rng: Rng) -> Crafted:
 
 def _log(folder: Path) -> Path:
     """The one log below it: the folder with files in it."""
-    return next(Path(here) for here, _, names in sorted(os.walk(folder)) if any(n.endswith((".feather", ".arrow")) for n in names))
+    return next(
+        Path(here)
+        for here, _, names in sorted(os.walk(folder))
+        if any(n.endswith((".feather", ".arrow")) for n in names)
+    )
 
 
 def _as_folder(folder: str, innocents: Path, data: Path, name: str, crafted: bytes) -> str:
@@ -201,7 +217,11 @@ class Single:
 
 
 def _import(suffix: str, craft: Callable[[Rng], Crafted]) -> Single:
-    return Single(lambda _, rng: craft(rng), f"hostile{suffix}", ("factory", "scene", "import", f"hostile{suffix}", "to=scene.safetensors"))
+    return Single(
+        lambda _, rng: craft(rng),
+        f"hostile{suffix}",
+        ("factory", "scene", "import", f"hostile{suffix}", "to=scene.safetensors"),
+    )
 
 
 def _function(craft: Callable[[Rng], Crafted], name: str, read: Callable[[Path], Any]) -> Single:
@@ -210,7 +230,11 @@ def _function(craft: Callable[[Rng], Crafted], name: str, read: Callable[[Path],
 
 def _good_commit(innocents: Path, table: str) -> list[dict[str, Any]]:
     """All of a good log in one commit."""
-    lines = [line for path in sorted((innocents / "run" / table / "_delta_log").glob("*.json")) for line in path.read_text().splitlines()]
+    lines = [
+        line
+        for path in sorted((innocents / "run" / table / "_delta_log").glob("*.json"))
+        for line in path.read_text().splitlines()
+    ]
     return [action for action in map(json.loads, lines) if "commitInfo" not in action]
 
 
@@ -227,7 +251,9 @@ SHARD, COMMIT = "run/samples/round=0/expert=human/hostile.parquet", f"run/sample
 RUN_OF = ("factory", "run", "clips=scenarionet", "clips.root=scenarionet", *PLAIN, "out=out")
 
 
-def _of_run(name: str, craft: Callable[[Path, Rng], Crafted], *argv: str, read: Callable[[Path], Any] | None = None) -> Single:
+def _of_run(
+    name: str, craft: Callable[[Path, Rng], Crafted], *argv: str, read: Callable[[Path], Any] | None = None
+) -> Single:
     return Single(craft, name, argv, read, (Exception,), "run", "run")
 
 
@@ -283,23 +309,50 @@ def _read_samples(path: Path) -> Any:
 
 
 SIDECAR = {
-    "cameras": {"front": {"K": [[50.0, 0, 32], [0, 50, 18], [0, 0, 1]], "width": 64, "height": 36, "ego_from_camera": np.eye(4).tolist()}},
+    "cameras": {
+        "front": {
+            "K": [[50.0, 0, 32], [0, 50, 18], [0, 0, 1]],
+            "width": 64,
+            "height": 36,
+            "ego_from_camera": np.eye(4).tolist(),
+        }
+    },
     "frames": [{"camera": "front", "file": "a.jpg", "time_s": 0.1}],
 }
 SINGLES: Mapping[str, Single] = {
     "yaml filter": Single(
         lambda _, rng: grammars.yaml_text(rng),
         "hostile.yaml",
-        ("factory", "run", "clips=navsim", "clips.root=.", "clips.maps=.", "clips.scene_filter=hostile.yaml", *PLAIN, "out=out"),
+        (
+            "factory",
+            "run",
+            "clips=navsim",
+            "clips.root=.",
+            "clips.maps=.",
+            "clips.scene_filter=hostile.yaml",
+            *PLAIN,
+            "out=out",
+        ),
     ),
-    "vocabulary": Single(lambda _, rng: grammars.array_file(rng), "hostile.npy", (*RUN_OF, "vocabulary.file=hostile.npy"), like="scenarionet"),
+    "vocabulary": Single(
+        lambda _, rng: grammars.array_file(rng),
+        "hostile.npy",
+        (*RUN_OF, "vocabulary.file=hostile.npy"),
+        like="scenarionet",
+    ),
     "recovery table": _function(grammars.npz, "hostile.npz", _read_table),
     "scene ply": _import(".ply", grammars.ply),
     "scene spz": _import(".spz", grammars.spz),
     "scene checkpoint": _import(".ckpt", grammars.checkpoint),
-    "scene file": Single(lambda _, rng: grammars.safetensors(rng), "hostile.safetensors", ("factory", "scene", "info", "hostile.safetensors")),
+    "scene file": Single(
+        lambda _, rng: grammars.safetensors(rng),
+        "hostile.safetensors",
+        ("factory", "scene", "info", "hostile.safetensors"),
+    ),
     "planner checkpoint": Single(
-        lambda _, rng: grammars.checkpoint(rng), "hostile.ckpt", ("planners", "import", "hostile.ckpt", "planner=ltf_public", "out=planner")
+        lambda _, rng: grammars.checkpoint(rng),
+        "hostile.ckpt",
+        ("planners", "import", "hostile.ckpt", "planner=ltf_public", "out=planner"),
     ),
     "picture": _function(grammars.picture, "hostile.jpg", _read_image),
     "picture of a batch": _function(grammars.jpeg, "hostile.jpg", _read_batch),
@@ -331,7 +384,11 @@ def put_single(single: Single, innocents: Path, folder: Path, crafted: bytes) ->
 
 def _naming(innocents: Path, size: int) -> Iterator[dict[str, Any]]:
     for action in _good_commit(innocents, "samples"):
-        yield action | {"add": action["add"] | {"path": SHARD.partition("samples/")[2], "size": size}} if "add" in action else action
+        yield (
+            action | {"add": action["add"] | {"path": SHARD.partition("samples/")[2], "size": size}}
+            if "add" in action
+            else action
+        )
 
 
 DOORS = (*LOGS, *SINGLES)

@@ -129,7 +129,9 @@ def array(shape: Sequence[int], kind: bytes, raw: bytes = b"") -> bytes:
     """numpy's own program for an array."""
     start = b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\x00tC\x01btR(K\x01("
     sizes = b"".join(map(long4, shape))
-    spec = b"tcnumpy\ndtype\n(X" + len(kind).to_bytes(4, "little") + kind + b"I00\nI01\ntR(K\x03U\x01<NNNJ\xff\xff\xff\xff"
+    spec = (
+        b"tcnumpy\ndtype\n(X" + len(kind).to_bytes(4, "little") + kind + b"I00\nI01\ntR(K\x03U\x01<NNNJ\xff\xff\xff\xff"
+    )
     return start + sizes + spec + b"J\xff\xff\xff\xffK\x00tbI00\nB" + len(raw).to_bytes(4, "little") + raw + b"tb"
 
 
@@ -181,13 +183,25 @@ def scenario(rng: Rng) -> Crafted:
 
 
 def npy_header(text: str, version: int = 1, length: int | None = None) -> bytes:
-    packed = struct.pack("<H" if version == 1 else "<I", (len(text) if length is None else length) & (0xFFFF if version == 1 else 0xFFFFFFFF))
+    packed = struct.pack(
+        "<H" if version == 1 else "<I",
+        (len(text) if length is None else length) & (0xFFFF if version == 1 else 0xFFFFFFFF),
+    )
     return b"\x93NUMPY" + bytes([version, 0]) + packed + text.encode("latin1" if version < 3 else "utf-8")
 
 
 def npy(rng: Rng) -> Crafted:
     size, n = int(pick(rng, SIZES)), int(pick(rng, (100, 9_000)))
-    kinds = ("'<f8'", "'|O'", "'<U99999999'", f"'V{size}'", "[('a','<f8',(99999,))]", repr(FORGED), "'<M8[as]'", "'|S1'")
+    kinds = (
+        "'<f8'",
+        "'|O'",
+        "'<U99999999'",
+        f"'V{size}'",
+        "[('a','<f8',(99999,))]",
+        repr(FORGED),
+        "'<M8[as]'",
+        "'|S1'",
+    )
     shapes = (f"({size},)", f"({size},0,{size})", "(-1,)", "(9,40,3)", f"(9,40,{'9' * n})", f"({'1,' * n})", "(1e308,)")
     texts = {
         "shape": f"{{'descr': '<f8', 'fortran_order': False, 'shape': {pick(rng, shapes)}, }}\n",
@@ -202,21 +216,31 @@ def npy(rng: Rng) -> Crafted:
     return f"npy: {name}", npy_header(texts[name], int(rng.integers(1, 4)), length) + bytes(int(pick(rng, (0, 8640))))
 
 
+def deflated(head: bytes, n_bytes: int, wbits: int) -> bytes:
+    """The head and zeros, which are packed once and repeated; a checksum at its end is wrong."""
+    packer = zlib.compressobj(9, zlib.DEFLATED, wbits)
+    start = packer.compress(head) + packer.flush(zlib.Z_FULL_FLUSH)
+    million = packer.compress(bytes(10**6)) + packer.flush(zlib.Z_FULL_FLUSH)
+    return start + million * (n_bytes // 10**6) + packer.flush()
+
+
 def npz(rng: Rng, names: Sequence[str] = ("trajectories", "digest", "tree")) -> Crafted:
     sink, what = io.BytesIO(), pick(rng, ("bomb", "members", "doubled", "paths", "headers"))
-    zeros = int(pick(rng, (10**8, 15 * 10**8)))
+    if what == "bomb":
+        n = 960 * int(pick(rng, (10**5, 2 * 10**6)))
+        head = npy_header(f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({n // 960},40,3), }}\n")
+        body = deflated(head, n, -15)
+        name = b"trajectories.npy"
+        told = struct.pack("<HHHHHIII", 20, 0, 8, 0, 0, 0, len(body), n + len(head)) + struct.pack("<HH", len(name), 0)
+        entry = b"PK\1\2\x14\0" + told + struct.pack("<HHHII", 0, 0, 0, 0, 0) + name
+        end = struct.pack("<HHHHIIH", 0, 0, 1, 1, len(entry), 30 + len(name) + len(body), 0)
+        return "npz: bomb", b"PK\3\4" + told + name + body + entry + b"PK\5\6" + end
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED) as packed:
-        for name in names if what != "members" else [f"{FORGED}{k}" for k in range(20_000)]:
-            inside = npy(rng)[1] if what == "headers" else npy_header("{'descr': '|u1', 'fortran_order': False, 'shape': (8,), }\n") + bytes(8)
-            path = f"../../{name}.npy" if what == "paths" else f"{name}.npy"
-            if what != "bomb":
-                packed.writestr(path, inside)
-                continue
-            with packed.open(path, "w", force_zip64=True) as member:
-                member.write(npy_header(f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({zeros // 960},40,3), }}\n"))
-                for _ in range(zeros // 10**7):
-                    member.write(bytes(10**7))
-            break
+        for name in names if what != "members" else [f"{FORGED}{k}" for k in range(5_000)]:
+            good = npy_header("{'descr': '|u1', 'fortran_order': False, 'shape': (8,), }\n") + bytes(8)
+            packed.writestr(
+                f"../../{name}.npy" if what == "paths" else f"{name}.npy", npy(rng)[1] if what == "headers" else good
+            )
         if what == "doubled":
             packed.writestr(f"{names[0]}.npy", npy(rng)[1])
     return f"npz: {what}", sink.getvalue()
@@ -264,7 +288,9 @@ def columns_of(good: pa.Table, rng: Rng) -> tuple[str, pa.Table]:
 def arrow(good: pa.Table, rng: Rng) -> Crafted:
     if rng.random() < 0.2:
         size = int(pick(rng, SIZES))
-        return "arrow: length of its footer", b"ARROW1\0\0" + bytes(64) + struct.pack("<I", size & 0x7FFFFFFF) + b"ARROW1"
+        return "arrow: length of its footer", b"ARROW1\0\0" + bytes(64) + struct.pack(
+            "<I", size & 0x7FFFFFFF
+        ) + b"ARROW1"
     what, table = columns_of(good, rng)
     sink = io.BytesIO()
     options = pa.ipc.IpcWriteOptions(compression=pick(rng, ("zstd", "lz4")))
@@ -279,7 +305,17 @@ def arrow(good: pa.Table, rng: Rng) -> Crafted:
 def json_text(good: Any, rng: Rng) -> Crafted:
     """A text with a value in it that JSON can say, or a text of signs."""
     n = int(pick(rng, MANY))
-    words = ("1e308", "-1e999", "NaN", "9" * n, "[" * n, "[" * n + "]" * n, '{"a":' * n, json.dumps(FORGED), '"' + "x" * n + '"')
+    words = (
+        "1e308",
+        "-1e999",
+        "NaN",
+        "9" * n,
+        "[" * n,
+        "[" * n + "]" * n,
+        '{"a":' * n,
+        json.dumps(FORGED),
+        '"' + "x" * n + '"',
+    )
     what = int(rng.integers(len(words)))
     mark = "@@here@@"
     text = json.dumps(planted(good, rng, mark, 0.9)) if rng.random() < 0.8 else f'"{mark}"'
@@ -287,7 +323,16 @@ def json_text(good: Any, rng: Rng) -> Crafted:
     return f"json: {names[what]}", text.replace(f'"{mark}"', words[what], 1).encode()
 
 
-YAML_KEYS = ("tokens", "log_names", "max_scenes", "num_history_frames", "all_mapping", "_target_", FORGED[1:], "scene_filter")
+YAML_KEYS = (
+    "tokens",
+    "log_names",
+    "max_scenes",
+    "num_history_frames",
+    "all_mapping",
+    "_target_",
+    FORGED[1:],
+    "scene_filter",
+)
 
 
 def yaml_text(rng: Rng) -> Crafted:
@@ -299,7 +344,8 @@ def yaml_text(rng: Rng) -> Crafted:
         "itself": " &a [*a, *a]",
         "itself as a key": " &a {? *a : 1}",
         "merges": " &a {<<: [*a, *a]}",
-        "merges of merges": "\n  - &a0 {x: 1}\n" + "".join(f"  - &a{k} {{<<: [*a{k - 1}, *a{k - 1}, *a{k - 1}]}}\n" for k in range(1, 40)),
+        "merges of merges": "\n  - &a0 {x: 1}\n"
+        + "".join(f"  - &a{k} {{<<: [*a{k - 1}, *a{k - 1}, *a{k - 1}]}}\n" for k in range(1, 40)),
         "digits": " " + pick(rng, ("", "-", "0x", "0b", "0")) + "1" * n,
         "sixties": " " + ":".join(["59"] * n),
         "deep": " " + "[" * n,
@@ -337,20 +383,27 @@ def ply(rng: Rng) -> Crafted:
     }
     name = pick(rng, [*heads, "values"])
     if name == "values":
-        return "ply: values", head + b"end_header\n" + struct.pack("<f", pick(rng, (3e38, np.nan, np.inf, 0.0))) * (len(body) // 4)
+        return "ply: values", head + b"end_header\n" + struct.pack("<f", pick(rng, (3e38, np.nan, np.inf, 0.0))) * (
+            len(body) // 4
+        )
     return f"ply: {name}", "\n".join([*heads[name], "end_header", ""]).encode() + body
 
 
 def spz(rng: Rng) -> Crafted:
-    count, version, degree = int(pick(rng, (0, 1, 10**6, 10**7, 2**32 - 1))), int(rng.integers(0, 6)), int(pick(rng, (0, 3, 4, 255)))
-    head = struct.pack("<IIIBBBB", 0x5053474E, version, count, degree, int(pick(rng, (0, 12, 255))), int(pick(rng, (0, 1, 255))), 0)
+    count, version, degree = (
+        int(pick(rng, (0, 1, 10**6, 10**7, 2**32 - 1))),
+        int(rng.integers(0, 6)),
+        int(pick(rng, (0, 3, 4, 255))),
+    )
+    head = struct.pack(
+        "<IIIBBBB", 0x5053474E, version, count, degree, int(pick(rng, (0, 12, 255))), int(pick(rng, (0, 1, 255))), 0
+    )
     if rng.random() < 0.5:
         size = int(pick(rng, (10**6, 2 * 10**8, 6 * 10**8)))
-        packer = zlib.compressobj(9, zlib.DEFLATED, 31)
-        return "spz: gzip", b"".join([packer.compress(head), *(packer.compress(bytes(10**6)) for _ in range(size // 10**6)), packer.flush()])
+        return "spz: gzip", deflated(head, size, 31)
     streams = int(pick(rng, (0, 5, 6, 255)))
     sizes = [count * each for each in (9, 1, 3, 3, 4, 45)]
-    frames = [pa.compress(bytes(min(size, 10**8)), codec="zstd", asbytes=True) for size in sizes[:streams]]
+    frames = [pa.compress(bytes(min(size, 10**7)), codec="zstd", asbytes=True) for size in sizes[:streams]]
     lies = pick(rng, (None, 2**62, 2**64 - 1))
     table = b"".join(struct.pack("<QQ", lies or len(frame), size) for frame, size in zip(frames, sizes))
     head = head[:8] + head[8:15] + bytes([streams]) + struct.pack("<I", int(pick(rng, (32, 0, 2**32 - 1)))) + bytes(12)
@@ -381,10 +434,17 @@ def safetensors(rng: Rng) -> Crafted:
         return f"safetensors: {name}", struct.pack("<Q", len(text)) + text + bytes(4)
     if name == "tensors":
         key = pick(rng, list(tensors))
-        kinds = (np.zeros((0, 3)), np.full(tensors[key].shape, np.nan, np.float32), np.zeros(n), tensors[key].astype("i8"))
+        kinds = (
+            np.zeros((0, 3)),
+            np.full(tensors[key].shape, np.nan, np.float32),
+            np.zeros(n),
+            tensors[key].astype("i8"),
+        )
         tensors[key] = np.ascontiguousarray(pick(rng, kinds))
     else:
-        what = pick(rng, ("x" * n, FORGED, 1e308, 10**400, None, -1, [[]] * n, list(range(n)), {FORGED: 1}, nested(90), True))
+        what = pick(
+            rng, ("x" * n, FORGED, 1e308, 10**400, None, -1, [[]] * n, list(range(n)), {FORGED: 1}, nested(90), True)
+        )
         described = planted(described, rng, what, 0.9)
         if not isinstance(described, dict):
             described = {"version": described}
@@ -409,7 +469,9 @@ def checkpoint(rng: Rng) -> Crafted:
             packed.writestr("archive/data.pkl", body)
             packed.writestr("archive/version", "3\n")
             packed.writestr("archive/byteorder", pick(rng, ("little", "big", FORGED)))
-            packed.writestr(pick(rng, ("archive/data/0", "../../data/0", "archive/data.pkl")), bytes(int(pick(rng, MANY))))
+            packed.writestr(
+                pick(rng, ("archive/data/0", "../../data/0", "archive/data.pkl")), bytes(int(pick(rng, MANY)))
+            )
         return f"checkpoint: {name}", sink.getvalue()
     size, n = int(pick(rng, (10**5, 2**40, 2**62))), int(pick(rng, MANY))
     one = torch.zeros(1)
@@ -425,12 +487,16 @@ def checkpoint(rng: Rng) -> Crafted:
         "empty": lambda: torch.empty((0, size)),
         "a parameter": lambda: torch.nn.Parameter(one.expand(10**9)),
         "nested": lambda: torch.nested.nested_tensor([one, torch.zeros(2)]),
-        "value": lambda: VALUES[(chosen := pick(rng, ["shared", "holds itself", "huge integer", "huge text", "odd keys"]))](rng),
+        "value": lambda: VALUES[
+            (chosen := pick(rng, ["shared", "holds itself", "huge integer", "huge text", "odd keys"]))
+        ](rng),
     }
     name = pick(rng, list(tensors))
     keys = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
     gauss = {f"_model.gauss_params.{k}": torch.zeros(2, w) for k, w in zip(keys, (3, 4, 3, 1, 3, 0))}
-    public = {f"agent._transfuser_model.{k}": torch.zeros(2) for k in ("_status_encoding.weight", "_keyval_embedding.weight")}
+    public = {
+        f"agent._transfuser_model.{k}": torch.zeros(2) for k in ("_status_encoding.weight", "_keyval_embedding.weight")
+    }
     inside: dict[str, Any] = pick(rng, (gauss, public, {}))
     key = pick(rng, [*inside, FORGED, "_model.gauss_params.means"])
     inside = {**inside, key: tensors[name]()}
@@ -449,9 +515,13 @@ def chunk(kind: bytes, body: bytes) -> bytes:
 
 def png(rng: Rng) -> Crafted:
     width, height = (int(pick(rng, (0, 1, 64, 8192, 65_535, 2**31 - 1, 2**32 - 1))) for _ in range(2))
-    depth, colour, interlaced = int(pick(rng, (1, 8, 16, 3))), int(pick(rng, (0, 2, 3, 6, 7))), int(pick(rng, (0, 1, 9)))
+    depth, colour, interlaced = (
+        int(pick(rng, (1, 8, 16, 3))),
+        int(pick(rng, (0, 2, 3, 6, 7))),
+        int(pick(rng, (0, 1, 9))),
+    )
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, interlaced))
-    bomb = zlib.compress(bytes(int(pick(rng, (100, 10**6, 2 * 10**8)))), 9)
+    bomb = deflated(b"", int(pick(rng, (0, 10**6, 10**9))), 15)
     extra = {
         "plain": b"",
         "second header": chunk(b"IHDR", struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)),
@@ -490,7 +560,10 @@ def jpeg(rng: Rng) -> Crafted:
         "lossless": segment(0xC3, frame(width, height)) + tables + scan,
         "arithmetic": segment(0xC9, frame(width, height)) + tables + scan,
         "lines told later": segment(0xC0, frame(width, 0)) + tables + scan + segment(0xDC, b"\xff\xff"),
-        "exif": segment(0xE1, b"Exif\0\0II*\0" + struct.pack("<I", 2**32 - 1)) + segment(0xC0, frame(width, height)) + tables + scan,
+        "exif": segment(0xE1, b"Exif\0\0II*\0" + struct.pack("<I", 2**32 - 1))
+        + segment(0xC0, frame(width, height))
+        + tables
+        + scan,
         "thumbnail": segment(0xE1, segment(0xC0, frame(64, 36))) + segment(0xC0, frame(width, height)) + tables + scan,
         "many segments": segment(0xFE, b"x") * 100_000 + segment(0xC0, frame(width, height)) + tables + scan,
         "filler": b"\xff" * 10**6 + segment(0xC0, frame(width, height)) + tables + scan,
@@ -528,13 +601,24 @@ def record(opcode: int, body: bytes, length: int | None = None) -> bytes:
     return bytes([opcode]) + struct.pack("<Q", len(body) if length is None else length) + body
 
 
+def zstd_zeros(n_bytes: int) -> bytes:
+    """One frame of blocks that each repeat a byte (RFC 8878); of no told size."""
+    block = lambda last: struct.pack("<I", last | 1 << 1 | 128 * 1024 << 3)[:3] + b"\0"  # noqa: E731
+    return b"\x28\xb5\x2f\xfd\x00\x58" + block(0) * (n_bytes // 2**17) + block(1)
+
+
 def mcap(rng: Rng) -> Crafted:
     size, kind = int(pick(rng, SIZES)), pick(rng, ("zstd", "lz4", "", FORGED))
     zeros = int(pick(rng, (10**6, 15 * 10**8)))
-    squeezed = pa.compress(bytes(min(zeros, 2**31 - 1)), codec="zstd" if kind != "lz4" else "lz4", asbytes=True)
+    squeezed = zstd_zeros(zeros) if kind != "lz4" else pa.compress(bytes(10**7), codec="lz4", asbytes=True)
     text = lambda word: struct.pack("<I", len(word)) + word.encode()  # noqa: E731
     head = record(1, text("") + text("x"))
-    a_chunk = struct.pack("<QQQI", 0, 1, pick(rng, (zeros, size)), 0) + text(kind) + struct.pack("<Q", len(squeezed)) + squeezed
+    a_chunk = (
+        struct.pack("<QQQI", 0, 1, pick(rng, (zeros, size)), 0)
+        + text(kind)
+        + struct.pack("<Q", len(squeezed))
+        + squeezed
+    )
     bodies = {
         "chunk bomb": record(6, a_chunk) * int(pick(rng, (1, 4))),
         "length": record(6, b"", size),
@@ -552,7 +636,15 @@ def mcap(rng: Rng) -> Crafted:
 
 
 def with_stats(add: dict[str, Any], rng: Rng, n: int) -> dict[str, Any]:
-    stats = pick(rng, ("x" * n, "[" * n, '{"numRecords": 1e308}', f'{{"numRecords": {2**63 - 1}, "minValues": {{"attempt_id": "{"z" * n}"}}}}'))
+    stats = pick(
+        rng,
+        (
+            "x" * n,
+            "[" * n,
+            '{"numRecords": 1e308}',
+            f'{{"numRecords": {2**63 - 1}, "minValues": {{"attempt_id": "{"z" * n}"}}}}',
+        ),
+    )
     return add | {"stats": stats}
 
 
@@ -560,11 +652,40 @@ def commit(good: Sequence[dict[str, Any]], rng: Rng) -> Crafted:
     """A log's first commit: actions like a good one's with lies among them."""
     n, size = int(pick(rng, MANY)), int(pick(rng, SIZES))
     lies: dict[str, Callable[[dict[str, Any]], Any]] = {
-        "path": lambda add: add | {"path": pick(rng, ("../../../../etc/passwd", "/etc/passwd", "file:///etc/passwd", "s3://x/y", "%2e%2e/x", FORGED, "", "x" * n))},
+        "path": lambda add: (
+            add
+            | {
+                "path": pick(
+                    rng,
+                    (
+                        "../../../../etc/passwd",
+                        "/etc/passwd",
+                        "file:///etc/passwd",
+                        "s3://x/y",
+                        "%2e%2e/x",
+                        FORGED,
+                        "",
+                        "x" * n,
+                    ),
+                )
+            }
+        ),
         "statistics": lambda add: with_stats(add, rng, n),
         "size": lambda add: add | {"size": pick(rng, (size, -1, 0))},
-        "partition": lambda add: add | {"partitionValues": {FORGED: FORGED, **{f"{k}": "x" for k in range(min(n, 9999))}}},
-        "vector": lambda add: add | {"deletionVector": {"storageType": "p", "pathOrInlineDv": "/etc/passwd", "sizeInBytes": size & 0x7FFFFFFF, "cardinality": size}},
+        "partition": lambda add: (
+            add | {"partitionValues": {FORGED: FORGED, **{f"{k}": "x" for k in range(min(n, 9999))}}}
+        ),
+        "vector": lambda add: (
+            add
+            | {
+                "deletionVector": {
+                    "storageType": "p",
+                    "pathOrInlineDv": "/etc/passwd",
+                    "sizeInBytes": size & 0x7FFFFFFF,
+                    "cardinality": size,
+                }
+            }
+        ),
         "value": lambda add: planted(add, rng, pick(rng, (1e308, None, [], FORGED, -1, True)), 0.95),
     }
     what = pick(rng, [*lies, "schema", "protocol", "many", "text", "properties"])
@@ -573,12 +694,26 @@ def commit(good: Sequence[dict[str, Any]], rng: Rng) -> Crafted:
         if "add" in action and what in lies:
             action["add"] = lies[what](action["add"])
         if "protocol" in action and what == "protocol":
-            action["protocol"] = {"minReaderVersion": size & 0x7FFFFFFF, "minWriterVersion": 2, "readerFeatures": [FORGED]}
+            action["protocol"] = {
+                "minReaderVersion": size & 0x7FFFFFFF,
+                "minWriterVersion": 2,
+                "readerFeatures": [FORGED],
+            }
         if "metaData" in action and what == "schema":
-            schema = pick(rng, ("[" * n, "", '{"type":"struct","fields":' * min(n, 9999), json.dumps({"type": "struct", "fields": []})))
+            schema = pick(
+                rng,
+                (
+                    "[" * n,
+                    "",
+                    '{"type":"struct","fields":' * min(n, 9999),
+                    json.dumps({"type": "struct", "fields": []}),
+                ),
+            )
             action["metaData"] = action["metaData"] | {"schemaString": schema}
         if "metaData" in action and what == "properties":
-            action["metaData"] = action["metaData"] | {"configuration": {FORGED: "x" * n, "delta.dataSkippingNumIndexedCols": str(size)}}
+            action["metaData"] = action["metaData"] | {
+                "configuration": {FORGED: "x" * n, "delta.dataSkippingNumIndexedCols": str(size)}
+            }
     if what == "many":
         adds = [action for action in actions if "add" in action]
         actions += [{"add": adds[0]["add"] | {"path": f"x{k}.parquet"}} for k in range(20_000)] if adds else []

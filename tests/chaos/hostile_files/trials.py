@@ -27,7 +27,7 @@ BATCH = 25  # logs beside an innocent one
 CPU_S, GB = 8.0, 1.0  # beyond what it takes without the file
 LIMIT_S, LIMIT_BYTES = 120.0, 6 << 30  # of what would take all of the machine
 MOST_SAID = 20_000  # characters that a file makes a command say
-EVERY = 20  # single files, of which one is read by the command as it is typed
+EVERY = 50  # single files, of which one is read by the command as it is typed
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def as_typed(argv: Sequence[str], folder: Path, said: Path) -> Told:
             stdin=subprocess.DEVNULL,
             stdout=file,
             stderr=file,
-            preexec_fn=_limit,  # noqa: PLW1509
+            preexec_fn=_limit,
             start_new_session=True,
         )
     told = _waited(process.pid, said, 0)
@@ -128,7 +128,9 @@ def _waited(pid: int, said: Path, less_kb: int) -> Told:
             os.killpg(pid, signal.SIGKILL)
         time.sleep(0.005)
     text = said.read_bytes().decode(errors="replace")
-    return Told(os.waitstatus_to_exitcode(status), text, used.ru_utime + used.ru_stime, max(0, used.ru_maxrss - less_kb) / 2**20)
+    return Told(
+        os.waitstatus_to_exitcode(status), text, used.ru_utime + used.ru_stime, max(0, used.ru_maxrss - less_kb) / 2**20
+    )
 
 
 def what_is_wrong(told: Told, codes: Sequence[int]) -> str:
@@ -203,7 +205,14 @@ def _judged(innocents: Path, folder: Path, door: str, crafted: dict[int, tuple[s
         if found.get(name) != rows:
             wrong = f"the innocent log has {len(found.get(name, []))} rows of {len(rows)}, or others"
         for n in crafted:
-            log_id = next((i for i in (f"h{n:06}", f"sd_h{n:06}") if re.search(rf"\b{i}\b", told.said) or i in found or i in failed), "")
+            log_id = next(
+                (
+                    i
+                    for i in (f"h{n:06}", f"sd_h{n:06}")
+                    if re.search(rf"\b{i}\b", told.said) or i in found or i in failed
+                ),
+                "",
+            )
             how[n] = "read" if log_id in found else "refused"
             wrong = wrong or ("" if log_id else f"log h{n:06} is not named")
     shutil.rmtree(here)
@@ -279,7 +288,4 @@ def load_what_is_read_with() -> None:
     import deltalake  # noqa: F401
     import torch  # noqa: F401
 
-    import factory.commands.exchange
-    import factory.run
     import planners.published.import_planner  # noqa: F401
-
