@@ -68,7 +68,7 @@ def check_episode(data: bytes) -> None:
     Raises ValueError, with the reason, where it is not whole.
     """
     try:
-        last = deque(StreamReader(io.BytesIO(data)).records, maxlen=1)[0]
+        last = deque(StreamReader(io.BytesIO(data), emit_chunks=True).records, maxlen=1)[0]  # none is unpacked
     except Exception as error:  # whatever damaged records, or a broken zstd frame, raise
         raise ValueError(str(error) or type(error).__name__) from error
     if not isinstance(last, Footer) or not DATA_END_BYTES < last.summary_start < len(data):

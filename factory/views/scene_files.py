@@ -255,11 +255,12 @@ def _load_checkpoint(path: Path) -> object:
     older = [(rebuilt, "numpy.core.multiarray._reconstruct"), (scalar, "numpy.core.multiarray.scalar")]  # numpy 1
     arrays = [np.ndarray, np.dtype, *kinds, rebuilt, scalar, *older]
     try:
-        return _as_arrays(load_tensors(path, arrays))
+        content = load_tensors(path, arrays)
     except ImportError as error:
         raise BadScene(f"{path}: {NO_TORCH}") from error
     except ValueError as error:
         raise BadScene(str(error)) from error
+    return _as_arrays(content)
 
 
 def _as_arrays(value: Any) -> Any:

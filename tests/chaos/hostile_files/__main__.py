@@ -55,19 +55,18 @@ def main(
                     file.write(json.dumps(verdict.__dict__) + "\n")
                 file.flush()
                 told += new
-    print(
-        "| door | cases | attacks | read | refused by name | findings | CPU, most s | memory, most GB |\n|---|---|---|---|---|---|---|---|"
-    )
-    of = defaultdict(list)
+    print("| door | cases | attacks | read | refused | findings | CPU s | GB |\n|---|---|---|---|---|---|---|---|")
+    of = defaultdict[str, list[Verdict]](list)
     for verdict in told:
         of[verdict.door].append(verdict)
-    for door, verdicts in of.items():
-        counts = [sum(v.how == how for v in verdicts) for how in ("read", "refused")]
-        n, found = len(verdicts), sum(bool(v.finding) for v in verdicts)
-        most = max(v.cpu_s for v in verdicts), max(v.gb for v in verdicts)
-        print(
-            f"| {door} | {n:,} | {len({v.attack for v in verdicts})} | {counts[0]:,} | {counts[1]:,} | {found} | {most[0]:.1f} | {most[1]:.2f} |"
-        )
+    for door, some in of.items():
+        counts = [
+            len(some),
+            len({v.attack for v in some}),
+            *(sum(v.how == how for v in some) for how in ("read", "refused")),
+        ]
+        most = [f"{max(v.cpu_s for v in some):.1f}", f"{max(v.gb for v in some):.2f}"]
+        print("|", " | ".join(map(str, [door, *counts, sum(bool(v.finding) for v in some), *most])), "|")
     print(f"{len(told):,} cases")
     return sum(bool(verdict.finding) for verdict in told)
 

@@ -168,11 +168,10 @@ def rows_of(out: Path, table: str = "samples") -> dict[str, list[str]]:
 
 @cache
 def innocent_alone(innocents: Path, door: str) -> tuple[Told, list[str]]:
-    """How a run without a hostile log ends, and its rows; run twice, as the first compiles kernels."""
-    for _ in range(2):
-        folder = innocents.parent / f"alone {door}"
-        shutil.rmtree(folder, ignore_errors=True)
-        told, name = _run(innocents, folder, door, {})
+    """How a run without a hostile log ends, and its rows."""
+    folder = innocents.parent / f"alone {door}"
+    shutil.rmtree(folder, ignore_errors=True)
+    told, name = _run(innocents, folder, door, {})
     if told.code or not (rows := rows_of(folder / "out").get(name)):
         raise RuntimeError(f"{door}: the innocent log alone ended with {told.code}: {told.said[-2000:]}")
     return told, rows
@@ -190,21 +189,21 @@ def _run(innocents: Path, folder: Path, door: str, hostile: dict[str, bytes]) ->
 
 def judge_logs(innocents: Path, folder: Path, door: str, numbers: Sequence[int]) -> list[Verdict]:
     """All beside one innocent log; where that is not well, in halves."""
-    crafted = {n: crafted_in_fork(door, innocents, folder, n) for n in numbers}
-    return _judged(innocents, folder, door, crafted)
+    files = {n: crafted(door, innocents, n) for n in numbers}
+    return _judged(innocents, folder, door, files)
 
 
-def _judged(innocents: Path, folder: Path, door: str, crafted: dict[int, tuple[str, bytes]]) -> list[Verdict]:
+def _judged(innocents: Path, folder: Path, door: str, files: dict[int, tuple[str, bytes]]) -> list[Verdict]:
     before, rows = innocent_alone(innocents, door)
-    here = folder / "-".join(map(str, (min(crafted), max(crafted), len(crafted))))
-    told, name = _run(innocents, here, door, {f"h{n:06}": content for n, (_, content) in crafted.items()})
+    here = folder / "-".join(map(str, (min(files), max(files), len(files))))
+    told, name = _run(innocents, here, door, {f"h{n:06}": content for n, (_, content) in files.items()})
     wrong = what_is_wrong(told, (0, 3)) or over(told, before)
     how: dict[int, str] = {}
     if not wrong:
         found, failed = rows_of(here / "out"), rows_of(here / "out", "outcomes")
         if found.get(name) != rows:
             wrong = f"the innocent log has {len(found.get(name, []))} rows of {len(rows)}, or others"
-        for n in crafted:
+        for n in files:
             log_id = next(
                 (
                     i
@@ -216,28 +215,16 @@ def _judged(innocents: Path, folder: Path, door: str, crafted: dict[int, tuple[s
             how[n] = "read" if log_id in found else "refused"
             wrong = wrong or ("" if log_id else f"log h{n:06} is not named")
     shutil.rmtree(here)
-    if wrong and len(crafted) > 1:
-        items, half = list(crafted.items()), len(crafted) // 2
+    if wrong and len(files) > 1:
+        items, half = list(files.items()), len(files) // 2
         return [v for part in (items[:half], items[half:]) for v in _judged(innocents, folder, door, dict(part))]
     more_s, more_gb = told.cpu_s - before.cpu_s, told.gb - before.gb
-    return [Verdict(door, n, attack, how.get(n, ""), wrong, more_s, more_gb) for n, (attack, _) in crafted.items()]
+    return [Verdict(door, n, attack, how.get(n, ""), wrong, more_s, more_gb) for n, (attack, _) in files.items()]
 
 
-def crafted_in_fork(door: str, innocents: Path, folder: Path, number: int) -> tuple[str, bytes]:
-    """Attack and file; nothing of what is made for it stays here."""
-    folder.mkdir(parents=True, exist_ok=True)
-    to = folder / "crafted"
-
-    def craft() -> int:
-        attack, content = (LOGS.get(door) or SINGLES[door]).craft(innocents, rng_of(door, number))
-        to.write_bytes(attack.encode() + b"\0" + content)
-        return 0
-
-    if (told := in_fork(craft, folder / "crafting")).code:
-        raise RuntimeError(f"{door} {number}: {told.said[-2000:]}")
-    attack, _, content = to.read_bytes().partition(b"\0")
-    to.unlink()
-    return attack.decode(), content
+def crafted(door: str, innocents: Path, number: int) -> tuple[str, bytes]:
+    """Attack and file of a case."""
+    return (LOGS.get(door) or SINGLES[door]).craft(innocents, rng_of(door, number))
 
 
 # Single files
@@ -262,7 +249,8 @@ def _answer(single: Single, folder: Path, path: Path) -> int:
 def judge_single(innocents: Path, folder: Path, door: str, number: int) -> Verdict:
     """One case in a folder of its own, which is removed."""
     single = SINGLES[door]
-    attack, content = crafted_in_fork(door, innocents, folder, number)
+    attack, content = crafted(door, innocents, number)
+    folder.mkdir()
     path = put_single(single, innocents, folder, content)
     if single.argv and number % EVERY == 0:
         before = Told(0, "", _typed(single.argv[:2], innocents).cpu_s, _typed(single.argv[:2], innocents).gb)
