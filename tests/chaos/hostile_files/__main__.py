@@ -44,17 +44,17 @@ def main(
                 numbers = left[door][at : at + BATCH]
                 if not numbers or time.monotonic() > end:
                     continue
-                folder = Path(tempfile.mkdtemp())  # what forks remove when they end, a TemporaryDirectory, is not this
-                if door in LOGS:
-                    new = judge_logs(innocents, folder, door, numbers)
-                else:
-                    new = [judge_single(innocents, folder / str(n), door, n) for n in numbers]
+                folder = Path(tempfile.mkdtemp())  # a TemporaryDirectory would be removed by forks that end
+                singly = ([judge_single(innocents, folder / str(n), door, n)] for n in numbers)
+                for new in [judge_logs(innocents, folder, door, numbers)] if door in LOGS else singly:
+                    for verdict in new:
+                        if verdict.finding:
+                            print(verdict.text, file=sys.stderr)
+                        print(json.dumps(verdict.__dict__), file=file, flush=True)
+                    told += new
+                    if time.monotonic() > end:
+                        break
                 shutil.rmtree(folder)
-                for verdict in new:
-                    print(verdict.text, file=sys.stderr) if verdict.finding else None
-                    file.write(json.dumps(verdict.__dict__) + "\n")
-                file.flush()
-                told += new
     print("| door | cases | attacks | read | refused | findings | CPU s | GB |\n|---|---|---|---|---|---|---|---|")
     of = defaultdict[str, list[Verdict]](list)
     for verdict in told:
