@@ -1,9 +1,9 @@
 """Where hostile files get in: data folders with an innocent log, and commands and functions that read one file."""
 
 import json
-import os
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+import struct
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -15,8 +15,13 @@ import pyarrow as pa
 import pyarrow.feather
 import pyarrow.parquet as pq
 
+from factory.datasets.scenarionet.photos import cameras_in, load_sidecar, read_photographs
 from factory.exits import COMPLETE
 from factory.readers.base import BadClip
+from factory.setup.vocabulary import load_recovery_table
+from factory.stages.sensors import decode_image
+from factory.store.episodes import check_episode
+from tasks.world.frames import EGO_STATE_SIZE
 from tests.chaos.hostile_files import grammars
 from tests.chaos.hostile_files.grammars import Crafted, Rng
 from tests.factory.datasets.navsim.geopackage_writer import CITIES
@@ -72,15 +77,10 @@ def _frames(innocents: Path, rng: Rng) -> Crafted:
     if rng.random() < 0.25:
         return grammars.program(rng)
     good = _good_frames(innocents)
-    if rng.random() < 0.1:
-        stamps = [
-            frame | {"log_name": "hostile", "timestamp": frame["timestamp"] + k}
-            for k in range(int(grammars.pick(rng, (400, 2000))))
-            for frame in good[:10]
-        ]
-        return "frames: many", grammars.dumped(stamps, rng)
-    name, what = grammars.value(rng)
     frames = [frame | {"log_name": "hostile"} for frame in good]
+    if rng.random() < 0.1:
+        return "frames: many", grammars.dumped(frames * grammars.pick(rng, (100, 400)), rng)
+    name, what = grammars.value(rng)
     return f"frames: {name}", grammars.dumped(grammars.planted(frames, rng, what, 0.9), rng)
 
 
@@ -114,31 +114,23 @@ def _of_log(folder: str, patterns: Sequence[str], innocents: Path, rng: Rng) -> 
 def _packed(path: Path, rng: Rng) -> Crafted:
     """msgpack within Arrow's metadata."""
     good = pyarrow.feather.read_table(path, memory_map=False, use_threads=False)
-    size, n = int(grammars.pick(rng, grammars.SIZES)), int(grammars.pick(rng, grammars.MANY))
+    size, n = grammars.pick(rng, grammars.SIZES), min(grammars.pick(rng, grammars.MANY), 9999)
+    kind = grammars.pick(rng, ("f8", "O", "V99", "(9999,)f8"))
     values: dict[str, Any] = {
-        "array": {
-            b"__ndarray__": True,
-            b"dtype": grammars.pick(rng, ("f8", "O", "V99", "(9999,)f8")),
-            b"shape": [size],
-            b"data": b"x" * 8,
-        },
+        "array": {b"__ndarray__": True, b"dtype": kind, b"shape": [size], b"data": b"x" * 8},
         "deep": grammars.nested(400),
-        "texts": {f"{k}{grammars.FORGED}": "x" for k in range(min(n, 9999))},
+        "texts": {f"{k}{grammars.FORGED}": "x" for k in range(n)},
     }
-    what = grammars.pick(rng, [*values, "length"])
-    packed = b"\xdd" + (size & 0xFFFFFFFF).to_bytes(4, "big") if what == "length" else msgpack.packb(values[what])
-    sink = pa.BufferOutputStream()
+    what, sink = grammars.pick(rng, [*values, "length"]), pa.BufferOutputStream()
+    packed = msgpack.packb(values[what]) if what in values else b"\xdd" + struct.pack(">I", size & 0xFFFFFFFF)
     pyarrow.feather.write_feather(good.replace_schema_metadata({b"metadata": packed}), sink)
     return f"msgpack: {what}", sink.getvalue().to_pybytes()
 
 
 def _log(folder: Path) -> Path:
     """The one log below it: the folder with files in it."""
-    return next(
-        Path(here)
-        for here, _, names in sorted(os.walk(folder))
-        if any(n.endswith((".feather", ".arrow")) for n in names)
-    )
+    found = (path for path in sorted(folder.rglob("*")) if path.suffix in (".feather", ".arrow"))
+    return next(found).parent
 
 
 def _as_folder(folder: str, innocents: Path, data: Path, name: str, crafted: bytes) -> str:
@@ -210,37 +202,22 @@ class Single:
 
     craft: Callable[[Path, Rng], Crafted]
     name: str  # of the file
-    argv: tuple[str, ...] = ()  # factory or planners, and its words
+    command: str = ""  # factory or planners, and its words
     read: Callable[[Path], Any] | None = None  # the file
     refusals: tuple[type[Exception], ...] = (BadClip, ValueError)
     like: str = ""  # what of the innocents the file lies in a copy of
-    named: str = ""  # what a refusal must name; the file
+    named: str = ""  # what a refusal must name; the file where it is empty
 
 
-def _import(suffix: str, craft: Callable[[Rng], Crafted]) -> Single:
-    return Single(
-        lambda _, rng: craft(rng),
-        f"hostile{suffix}",
-        ("factory", "scene", "import", f"hostile{suffix}", "to=scene.safetensors"),
-    )
+def _alone(craft: Callable[[Rng], Crafted], name: str, command: str = "", **more: Any) -> Single:
+    return Single(lambda _, rng: craft(rng), name, command.format(name), **more)
 
 
-def _function(craft: Callable[[Rng], Crafted], name: str, read: Callable[[Path], Any]) -> Single:
-    return Single(lambda _, rng: craft(rng), name, read=read)
-
-
-def _good_commit(innocents: Path, table: str) -> list[dict[str, Any]]:
+def _good_commit(innocents: Path) -> list[dict[str, Any]]:
     """All of a good log in one commit."""
-    lines = [
-        line
-        for path in sorted((innocents / "run" / table / "_delta_log").glob("*.json"))
-        for line in path.read_text().splitlines()
-    ]
-    return [action for action in map(json.loads, lines) if "commitInfo" not in action]
-
-
-def _commit(innocents: Path, rng: Rng) -> Crafted:
-    return grammars.commit(_good_commit(innocents, "samples"), rng)
+    files = sorted((innocents / "run/samples/_delta_log").glob("*.json"))
+    actions = [json.loads(line) for path in files for line in path.read_text().splitlines()]
+    return [action for action in actions if "commitInfo" not in action]
 
 
 def _shard(innocents: Path, rng: Rng) -> Crafted:
@@ -249,53 +226,30 @@ def _shard(innocents: Path, rng: Rng) -> Crafted:
 
 
 SHARD, COMMIT = "run/samples/round=0/expert=human/hostile.parquet", f"run/samples/_delta_log/{0:020}.json"
-RUN_OF = ("factory", "run", "clips=scenarionet", "clips.root=scenarionet", *PLAIN, "out=out")
 
 
-def _of_run(
-    name: str, craft: Callable[[Path, Rng], Crafted], *argv: str, read: Callable[[Path], Any] | None = None
-) -> Single:
-    return Single(craft, name, argv, read, (Exception,), "run", "run")
+def _of_run(name: str, command: str = "", read: Callable[[Path], Any] | None = None) -> Single:
+    craft = _shard if name == SHARD else lambda innocents, rng: grammars.commit(_good_commit(innocents), rng)
+    return Single(craft, name, command, read, (Exception,), "run", "run")
 
 
-def _read_image(path: Path) -> Any:
-    from factory.stages.sensors import decode_image
-
-    return decode_image(path.read_bytes(), str(path)).shape
-
-
-def _read_batch(path: Path) -> Any:
-    """By the decoder of a planner's batches."""
-    from factory.readers.pictures import BadPicture, jpeg_size
-    from planners.data.images import _decode_jpeg
-
-    data = np.frombuffer(path.read_bytes(), np.uint8)
+def _named(read: Callable[[bytes], Any], path: Path) -> Any:
+    """Of a function that does not know the file's name."""
     try:
-        width, height = jpeg_size(data)
-        return _decode_jpeg(data, (height, width)).shape
-    except (BadPicture, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-def _read_episode(path: Path) -> Any:
-    from factory.store.episodes import check_episode
-
-    try:
-        check_episode(path.read_bytes())
+        return read(path.read_bytes())
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
 
-def _read_table(path: Path) -> Any:
-    from factory.setup.vocabulary import load_recovery_table
+def _read_batch(data: bytes) -> Any:
+    """By the decoder of a planner's batches."""
+    from factory.readers.pictures import jpeg_size
+    from planners.data.images import _decode_jpeg
 
-    return load_recovery_table(path)
+    return _decode_jpeg(np.frombuffer(data, np.uint8), jpeg_size(data)[::-1])
 
 
 def _read_sidecar(path: Path) -> Any:
-    from factory.datasets.scenarionet.photos import cameras_in, load_sidecar, read_photographs
-    from tasks.world.frames import EGO_STATE_SIZE
-
     cameras_in(load_sidecar(path)[0], str(path))
     return read_photographs(path, path.parent, np.zeros((121, EGO_STATE_SIZE)))
 
@@ -304,92 +258,54 @@ def _read_samples(path: Path) -> Any:
     """The run that the file lies in."""
     from factory.store.reader import SampleTable
 
-    run = next(parent for parent in path.parents if parent.name == "run")
-    table = SampleTable(run)
+    table = SampleTable(next(parent for parent in path.parents if parent.name == "run"))
     return [len(table[k]) for k in range(len(table))]
 
 
+PLACED = {"width": 64, "height": 36, "ego_from_camera": np.eye(4).tolist()}
 SIDECAR = {
-    "cameras": {
-        "front": {
-            "K": [[50.0, 0, 32], [0, 50, 18], [0, 0, 1]],
-            "width": 64,
-            "height": 36,
-            "ego_from_camera": np.eye(4).tolist(),
-        }
-    },
+    "cameras": {"front": PLACED | {"K": [[50.0, 0, 32], [0, 50, 18], [0, 0, 1]]}},
     "frames": [{"camera": "front", "file": "a.jpg", "time_s": 0.1}],
 }
+RUN, IMPORT = f"factory run {' '.join(PLAIN)} out=out ", "factory scene import {} to=scene.safetensors"
+FILTERED = RUN + "clips=navsim clips.root=. clips.maps=. clips.scene_filter={}"
+WITH_VOCABULARY = RUN + "clips=scenarionet clips.root=scenarionet vocabulary.file={}"
 SINGLES: Mapping[str, Single] = {
-    "yaml filter": Single(
-        lambda _, rng: grammars.yaml_text(rng),
-        "hostile.yaml",
-        (
-            "factory",
-            "run",
-            "clips=navsim",
-            "clips.root=.",
-            "clips.maps=.",
-            "clips.scene_filter=hostile.yaml",
-            *PLAIN,
-            "out=out",
-        ),
-    ),
-    "vocabulary": Single(
-        lambda _, rng: grammars.array_file(rng),
-        "hostile.npy",
-        (*RUN_OF, "vocabulary.file=hostile.npy"),
-        like="scenarionet",
-    ),
-    "recovery table": _function(grammars.npz, "hostile.npz", _read_table),
-    "scene ply": _import(".ply", grammars.ply),
-    "scene spz": _import(".spz", grammars.spz),
-    "scene checkpoint": _import(".ckpt", grammars.checkpoint),
-    "scene file": Single(
-        lambda _, rng: grammars.safetensors(rng),
-        "hostile.safetensors",
-        ("factory", "scene", "info", "hostile.safetensors"),
-    ),
-    "planner checkpoint": Single(
-        lambda _, rng: grammars.checkpoint(rng),
-        "hostile.ckpt",
-        ("planners", "import", "hostile.ckpt", "planner=ltf_public", "out=planner"),
-    ),
-    "picture": _function(grammars.picture, "hostile.jpg", _read_image),
-    "picture of a batch": _function(grammars.jpeg, "hostile.jpg", _read_batch),
-    "episode": _function(grammars.mcap, "hostile.mcap", _read_episode),
-    "sidecar": _function(lambda rng: grammars.json_text(SIDECAR, rng), "hostile.json", _read_sidecar),
-    "table, status": _of_run(COMMIT, _commit, "factory", "status", "out=run"),
-    "table, verify": _of_run(COMMIT, _commit, "factory", "verify", "run"),
-    "table, read": _of_run(COMMIT, _commit, read=_read_samples),
-    "shard, verify": _of_run(SHARD, _shard, "factory", "verify", "run"),
-    "shard, read": _of_run(SHARD, _shard, read=_read_samples),
+    "yaml filter": _alone(grammars.yaml_text, "hostile.yaml", FILTERED),
+    "vocabulary": _alone(grammars.array_file, "hostile.npy", WITH_VOCABULARY, like="scenarionet"),
+    "recovery table": _alone(grammars.npz, "hostile.npz", read=load_recovery_table),
+    "scene ply": _alone(grammars.ply, "hostile.ply", IMPORT),
+    "scene spz": _alone(grammars.spz, "hostile.spz", IMPORT),
+    "scene checkpoint": _alone(grammars.checkpoint, "hostile.ckpt", IMPORT),
+    "scene file": _alone(grammars.safetensors, "hostile.safetensors", "factory scene info {}"),
+    "planner checkpoint": _alone(grammars.checkpoint, "h.ckpt", "planners import {} planner=ltf_public out=planner"),
+    "picture": _alone(grammars.picture, "h.jpg", read=lambda path: decode_image(path.read_bytes(), str(path))),
+    "picture of a batch": _alone(grammars.jpeg, "hostile.jpg", read=partial(_named, _read_batch)),
+    "episode": _alone(grammars.mcap, "hostile.mcap", read=partial(_named, check_episode)),
+    "sidecar": _alone(partial(grammars.json_text, SIDECAR), "hostile.json", read=_read_sidecar),
+    "table, status": _of_run(COMMIT, "factory status out=run"),
+    "table, verify": _of_run(COMMIT, "factory verify run"),
+    "table, read": _of_run(COMMIT, read=_read_samples),
+    "shard, verify": _of_run(SHARD, "factory verify run"),
+    "shard, read": _of_run(SHARD, read=_read_samples),
 }
 
 
 def put_single(single: Single, innocents: Path, folder: Path, crafted: bytes) -> Path:
-    """The file in a folder of its own; a run's log is remade to be one commit that names a hostile shard."""
+    """The file in a folder of its own; a run's log is remade to be one commit, which names a hostile shard."""
+    folder.mkdir()
     if single.like:
         shutil.copytree(innocents / single.like, folder / single.like)
     path = folder / single.name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if single.name in (COMMIT, SHARD):
+    if single.like == "run":
         shutil.rmtree(folder / "run/samples/_commits")  # a stranger's run has none, or made to match
         for old in (folder / "run/samples/_delta_log").iterdir():
             old.unlink()
-    if single.name == SHARD:
-        (folder / COMMIT).write_text("\n".join(map(json.dumps, _naming(innocents, len(crafted)))))
+        told = {"path": SHARD.partition("samples/")[2], "size": len(crafted)}
+        adds = [a | {"add": a["add"] | told} if "add" in a else a for a in _good_commit(innocents)]
+        (folder / COMMIT).write_text("\n".join(map(json.dumps, adds)))
     path.write_bytes(crafted)
     return path
-
-
-def _naming(innocents: Path, size: int) -> Iterator[dict[str, Any]]:
-    for action in _good_commit(innocents, "samples"):
-        yield (
-            action | {"add": action["add"] | {"path": SHARD.partition("samples/")[2], "size": size}}
-            if "add" in action
-            else action
-        )
 
 
 DOORS = (*LOGS, *SINGLES)

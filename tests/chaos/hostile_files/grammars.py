@@ -141,6 +141,7 @@ def program(rng: Rng) -> Crafted:
         "copies of a text": b"]X" + struct.pack("<I", n) + b"x" * n + b"q\1(" + b"h\1" * 5000 + b"e",
         "copies of an array": b"]" + array((n,), b"u1", b"\0" * n) + b"q\1a(" + b"h\1" * 5000 + b"e",
         "tuples of a tuple": b"(" + b"K\1" * n + b"tq\1" + b"cbuiltins\nlist\n(h\1tR" * 1000,
+        "a shared kind": b"cnumpy.core.multiarray\n_reconstruct\n()" + b"q\1h\1h\1\x87" * 60 + b"K\0U\1btR",
         "colliding keys": colliding_keys(pick(rng, (1000, 30_000)), rng),
         "nothing": pick(rng, (b"", b"0", b"(((", b"\xff", b"u", b"}Nb")),
     }

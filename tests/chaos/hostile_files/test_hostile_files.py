@@ -12,7 +12,7 @@ from tests.chaos.hostile_files.trials import REPOSITORY, rng_of
 
 pytestmark = pytest.mark.slow
 
-SHORT = ["cases=20", "doors=scenarionet,recovery table,episode,sidecar,picture of"]
+SHORT = ["cases=17", "doors=scenarionet,recovery table,episode,sidecar,picture"]
 KEPT = [  # door, number, the attack that the number stands for
     ("scenarionet", 0, ""),
 ]
@@ -27,7 +27,7 @@ def told(to: Path, *words: str) -> list[dict[str, object]]:
 
 def test_a_hundred_crafted_files_hurt_nobody(tmp_path: Path) -> None:
     verdicts = told(tmp_path, *SHORT)
-    assert len(verdicts) == 100 and len({verdict["attack"] for verdict in verdicts}) > 30
+    assert len(verdicts) == 102 and len({verdict["attack"] for verdict in verdicts}) > 30
 
 
 def test_what_did_harm_does_none(tmp_path: Path) -> None:

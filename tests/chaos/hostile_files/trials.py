@@ -25,7 +25,7 @@ from tests.chaos.hostile_files.grammars import ESCAPE, Rng
 REPOSITORY = Path(__file__).resolve().parents[3]
 BATCH = 25  # logs beside an innocent one
 CPU_S, GB = 8.0, 1.0  # beyond what it takes without the file
-LIMIT_S, LIMIT_BYTES = 120.0, 6 << 30  # of what would take all of the machine
+LIMIT_S, LIMIT_CPU_S, LIMIT_BYTES = 600.0, 100, 6 << 30  # of what would take all of the machine
 MOST_SAID = 20_000  # characters that a file makes a command say
 EVERY = 50  # single files, of which one is read by the command as it is typed
 
@@ -110,6 +110,7 @@ def as_typed(argv: Sequence[str], folder: Path, said: Path) -> Told:
 
 def _limit() -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (LIMIT_BYTES, LIMIT_BYTES))
+    resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_CPU_S, LIMIT_CPU_S))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
@@ -233,11 +234,11 @@ def crafted(door: str, innocents: Path, number: int) -> tuple[str, bytes]:
 def _answer(single: Single, folder: Path, path: Path) -> int:
     """Of a command, or of the function that reads the file: 0, or 2 with the line of its refusal."""
     os.chdir(folder)
-    if single.argv:
+    if argv := single.command.split():
         from factory.__main__ import main as factory
         from planners.__main__ import main as planners
 
-        return {"factory": factory, "planners": planners}[single.argv[0]](list(single.argv[1:]))
+        return {"factory": factory, "planners": planners}[argv[0]](argv[1:])
     try:
         single.read(path)  # type: ignore[misc]
     except single.refusals as error:
@@ -250,11 +251,11 @@ def judge_single(innocents: Path, folder: Path, door: str, number: int) -> Verdi
     """One case in a folder of its own, which is removed."""
     single = SINGLES[door]
     attack, content = crafted(door, innocents, number)
-    folder.mkdir()
     path = put_single(single, innocents, folder, content)
-    if single.argv and number % EVERY == 0:
-        before = Told(0, "", _typed(single.argv[:2], innocents).cpu_s, _typed(single.argv[:2], innocents).gb)
-        told = as_typed(single.argv, folder, folder / "said")
+    argv = tuple(single.command.split())
+    if argv and number % EVERY == 0:
+        before = Told(0, "", _typed(argv[:2], innocents).cpu_s, _typed(argv[:2], innocents).gb)
+        told = as_typed(argv, folder, folder / "said")
     else:
         before, told = Told(0, "", 0.0, 0.0), in_fork(lambda: _answer(single, folder, path), folder / "said")
     wrong = what_is_wrong(told, [code for code in EXIT_CODE_TEXT if code != 4]) or over(told, before)
