@@ -88,13 +88,14 @@ format: install
 	$(PY) -m ruff format .
 	$(PY) -m ruff check --fix .
 
-# Every kind of file with 5,000 mutants each (half an hour), one flipped bit at a time in what a run keeps, every command
-# in trouble made from outside (root for some; hours), kills at every step of a commit (Linux, a C compiler), 200 real
+# Every kind of file with 5,000 mutants each (half an hour), files crafted to do harm (150 minutes at most; goes on where
+# it stopped), one flipped bit at a time in what a run keeps, every command in trouble made from outside (root for some; hours), kills at every step of a commit (Linux, a C compiler), 200 real
 # logs of each format with damaged frames and boxes (10 minutes; SHARED=<folder of the real logs>), buckets that break
 # requests, clips that do harm, a run under kills for HOURS (2).
 # N=<mutants of each kind>, KINDS="ply spz".
 chaos: install
 	$(PY) -m tests.chaos.damaged_files.fuzz $(or $(N),5000) $(KINDS)
+	$(PY) -m tests.chaos.hostile_files
 	$(PY) -m experiments.chaos.flips
 	$(PY) -m experiments.chaos.outside trials=30
 	$(PY) -m tests.chaos.commit_steps

@@ -15,7 +15,7 @@ import pytest
 from factory.datasets.navsim.pickles import RewardFile
 from factory.readers.base import BadClip
 from factory.readers.pickles import load_plain
-from factory.wording import shown
+from factory.wording import printable, shown
 from tests.factory.datasets.scenarionet.scenarionet_scenarios import nuscenes, save
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -156,6 +156,12 @@ def aliases(last: str) -> str:
     return "all_mapping:\n" + "".join(f"  - {line}\n" for line in lines) + last
 
 
+def merges() -> str:
+    """Mappings that take over three times the one before."""
+    lines = ["&a0 {x: 1}", *(f"&a{k} {{<<: [*a{k - 1}, *a{k - 1}, *a{k - 1}]}}" for k in range(1, LEVELS))]
+    return "all_mapping:\n" + "".join(f"  - {line}\n" for line in lines)
+
+
 def checkpoint(path: Path, stream: bytes) -> None:
     with zipfile.ZipFile(path, "w") as packed:
         packed.writestr("archive/data.pkl", stream)
@@ -187,6 +193,12 @@ DRIVER_READS: dict[str, tuple[Callable[[Path], None], tuple[str, ...], str]] = {
         "dataset_summary.pkl",
     ),
     "filter with aliases": (lambda at: scene_filter(at, aliases("tokens: [*a59]\n")), FILTER, "small.yaml"),
+    "filter with keys that share a hash": (
+        lambda at: scene_filter(at, "tokens:\n" + "".join(f"  {k * (2**61 - 1)}: 0\n" for k in range(50_000))),
+        FILTER,
+        "small.yaml",
+    ),
+    "filter of merges": (lambda at: scene_filter(at, merges()), FILTER, "small.yaml"),
     "filter with digits": (lambda at: scene_filter(at, "max_scenes: -0x" + "f" * 5000), FILTER, "small.yaml"),
     "scene of shared dictionaries": (
         nested_dicts,
@@ -253,3 +265,23 @@ def test_values_that_logs_share_and_values_that_are_large_load() -> None:
     for value in ([row] * 400, list(range(300_000)), {"ids": [2**255, -1]}, ["x" * 10_000] * 500):
         assert load_plain(pickle.dumps(value), "a.pkl") == value
     assert shown({"a": ["b", 1.5, None, True]}) == repr({"a": ["b", 1.5, None, True]})
+
+
+@pytest.mark.parametrize("how", ["of a dict", "in a tuple", "of a set"])
+def test_keys_that_share_a_hash_are_refused(how: str) -> None:
+    """Python hashes integers modulo 2^61 - 1; building a dict of n that are equal there takes n^2 / 2 comparisons."""
+    keys = [k * (2**61 - 1) for k in range(50_000)]
+    longs = [pickle.dumps(key, 2)[2:-1] for key in keys]
+    stream = {
+        "of a dict": b"}(" + b"".join(key + b"N" for key in longs) + b"u.",
+        "in a tuple": b"}(" + b"".join(key + b"\x85N" for key in longs) + b"u.",
+        "of a set": b"cbuiltins\nset\n(](" + b"".join(longs) + b"etR.",
+    }[how]
+    with pytest.raises(BadClip, match=r"key of more than|integer too large"):
+        load_plain(stream, "a.pkl")
+    assert load_plain(pickle.dumps({2**63: {-(2**63)}}), "a.pkl") == {2**63: {-(2**63)}}
+
+
+def test_what_a_file_says_is_shown_without_what_a_terminal_obeys() -> None:
+    assert str(BadClip("a.pkl", "x\x1b[2J", "is no\nlane")) == "a.pkl: x\\x1b[2J: is no\\nlane"
+    assert printable("Straße 5 €, 街") == "Straße 5 €, 街"
