@@ -235,7 +235,7 @@ def _parts(value: object) -> Iterable[object] | None:
         return chain(value.keys(), value.values())
     if isinstance(value, list | tuple | set | frozenset):
         return value
-    if hasattr(value, "nbytes"):  # an array, a tensor
+    if hasattr(type(value), "nbytes"):  # an array, a tensor; a sparse one's raises
         return None
     if isinstance(value, Mapping):
         return chain(value.keys(), value.values())
@@ -247,7 +247,10 @@ def _size(value: object, refuse: Callable[[str], BadClip]) -> int:
         if value.bit_length() > MAX_INT_BITS:
             raise refuse(f"an integer of {value.bit_length():,} bits")
         return 1
-    n_bytes = len(value) if isinstance(value, str | bytes | bytearray) else int(getattr(value, "nbytes", 0))
+    try:
+        n_bytes = len(value) if isinstance(value, str | bytes | bytearray) else int(getattr(value, "nbytes", 0))
+    except RuntimeError as error:
+        raise refuse("a sparse tensor") from error
     return 1 + n_bytes // BYTES_A_VALUE
 
 

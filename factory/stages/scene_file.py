@@ -176,6 +176,8 @@ def scene_from_parts(tensors: Tensors, described: Mapping[str, Any], digest: str
     def part(name: str) -> Gaussians:
         return _in_float32({field.name: tensors[f"{name}.{field.name}"] for field in fields(Gaussians)})
 
+    if tensors["origin"].shape != (3,):
+        raise ValueError(f"origin of shape {tensors['origin'].shape}, expected (3,)")
     block = described["block"]
     if block is not None:
         block = BlockRange(**block | {side: np.array(block[side], np.float64) for side in ("low", "high")})

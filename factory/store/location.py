@@ -254,6 +254,10 @@ def read_parquet(location: Location, path: str, schema: pa.Schema, without: Coll
     names = [name for name in schema.names if name not in without]
     with raising_damaged_file(f"{location.uri}/{path}"):
         file = open_parquet(location, path)
+        groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
+        n_bytes = sum(group.column(i).total_compressed_size for group in groups for i in range(group.num_columns))
+        if file.metadata.num_rows > n_bytes:  # keys that are all different take more
+            raise OSError(f"{file.metadata.num_rows:,} rows in {n_bytes:,} bytes")
         return file.read(columns=names, use_threads=not location.is_local)  # threads cost more than small columns do
 
 

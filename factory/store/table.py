@@ -33,7 +33,7 @@ from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundErr
 from deltalake.transaction import AddAction, RemoveAction
 from numpy.typing import NDArray
 
-from factory.files import DamagedFile, naming_disk_errors
+from factory.files import DamagedFile, machine_fault_of, naming_disk_errors
 from factory.store.commit_copies import COPIES, CommitCopies
 from factory.store.location import Location, Shard, read_parquet, with_partition_columns, write_shard
 from factory.store.schema import TableSpec
@@ -335,7 +335,7 @@ class KeyedTable:
             if not panic and not isinstance(error, Exception):
                 raise
             found = [f"{damage.name} {damage.problem}" for damage in self.copies.damage()]
-            if panic or found:
+            if panic or found or (isinstance(error, DeltaError) and not machine_fault_of(error)):
                 said = "; ".join(found) or f"its log cannot be read: {one_line(error)}"
                 raise DamagedLog(f"{self.location.uri}: {said}") from error
             raise

@@ -35,7 +35,7 @@ def main(
     known = {(verdict.door, verdict.number) for verdict in told}
     left = {door: [n for n in numbers if (door, n) not in known] for door, numbers in wanted.items()}
     (innocents := kept.parent.absolute() / "innocents").mkdir(exist_ok=True)
-    load_what_is_read_with()
+    load_what_is_read_with(left)
     if (made := in_fork(lambda: write_innocents(innocents, left) or 0, kept.parent / "made")).code:
         raise RuntimeError(made.said[-2000:])
     with kept.open("a") as file:

@@ -428,6 +428,11 @@ def chunk(kind: bytes, body: bytes) -> bytes:
 
 
 def png(rng: Rng) -> Crafted:
+    if rng.random() < 0.2:  # a whole one
+        side = pick(rng, (10_000, 20_000, 30_000))
+        head = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0))
+        zeros = deflated(b"", side * (side + 1) + 10**6, 15)
+        return f"png: {side} a side", b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zeros) + chunk(b"IEND", b"")
     width, height = (pick(rng, (0, 1, 64, 8192, 65_535, 2**31 - 1, 2**32 - 1)) for _ in range(2))
     form = struct.pack("BBBBB", pick(rng, (1, 8, 16, 3)), pick(rng, (0, 2, 3, 6, 7)), 0, 0, pick(rng, (0, 1, 9)))
     bomb = deflated(b"", pick(rng, (0, 10**6, 10**9)), 15)

@@ -12,9 +12,15 @@ from tests.chaos.hostile_files.trials import REPOSITORY, rng_of
 
 pytestmark = pytest.mark.slow
 
-SHORT = ["cases=17", "doors=scenarionet,recovery table,episode,sidecar,picture"]
-KEPT = [  # door, number, the attack that the number stands for
-    ("scenarionet", 0, ""),
+SHORT = ["cases=19", "doors=scenarionet,recovery table,episode,sidecar,picture"]
+KEPT = [  # door, number, the attack that the number stands for: what did harm once, or would where a guard is gone
+    ("scenarionet", 18, "program: a shared kind"),
+    ("recovery table", 9, "npz: bomb"),
+    ("episode", 0, "mcap: chunk bomb"),
+    ("picture", 10, "png: 30000 a side"),
+    ("scene checkpoint", 4, "checkpoint: empty"),
+    ("scene checkpoint", 9, "checkpoint: sparse"),
+    ("scene file", 1, "safetensors: tensors"),
 ]
 
 
@@ -25,15 +31,13 @@ def told(to: Path, *words: str) -> list[dict[str, object]]:
     return [json.loads(line) for line in (to / "verdicts.jsonl").read_text().splitlines()]
 
 
-def test_a_hundred_crafted_files_hurt_nobody(tmp_path: Path) -> None:
-    verdicts = told(tmp_path, *SHORT)
-    assert len(verdicts) == 102 and len({verdict["attack"] for verdict in verdicts}) > 30
-
-
-def test_what_did_harm_does_none(tmp_path: Path) -> None:
-    only = ",".join(f"{door}:{number}" for door, number, _ in KEPT)
-    attacks = {(verdict["door"], verdict["number"]): verdict["attack"] for verdict in told(tmp_path, f"only={only}")}
-    assert attacks == {(door, number): attack for door, number, attack in KEPT}, "a grammar changed: find others"
+def test_a_hundred_crafted_files_and_what_did_harm_hurt_nobody(tmp_path: Path) -> None:
+    told(tmp_path, *SHORT)
+    more = [f"{door}:{number}" for door, number, _ in KEPT if door.startswith("scene ")]
+    verdicts = told(tmp_path, f"only={','.join(more)}")
+    attacks = {(verdict["door"], verdict["number"]): verdict["attack"] for verdict in verdicts}
+    assert len(attacks) == 6 * 19 + len(more) and len(set(attacks.values())) > 30
+    assert all(attacks[door, number] == attack for door, number, attack in KEPT), "a grammar changed: find others"
 
 
 def test_a_case_is_the_same_again(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -272,9 +272,12 @@ def _typed(argv: tuple[str, ...], innocents: Path) -> Told:
     return as_typed([*argv, "--help"], innocents, innocents.parent / "help")
 
 
-def load_what_is_read_with() -> None:
+def load_what_is_read_with(doors: Collection[str]) -> None:
     """Once, before the first fork; nothing of it may start threads."""
-    import deltalake  # noqa: F401
-    import torch  # noqa: F401
+    import factory.commands.exchange
+    import factory.run  # noqa: F401
 
-    import planners.published.import_planner  # noqa: F401
+    if any("checkpoint" in door for door in doors):
+        import planners.published.import_planner
+    if any("batch" in door for door in doors):
+        import planners.data.images  # noqa: F401
