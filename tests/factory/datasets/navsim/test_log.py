@@ -148,6 +148,12 @@ def test_a_wrong_value_is_refused_by_file_frame_and_key(
     assert (refused.value.file, refused.value.field) == (str(path), f"frames[1].{field}")
 
 
+def test_a_log_under_another_name_is_told_so_where_wrong_frames_are_left_out(tmp_path: Path) -> None:
+    path = _write(tmp_path, [frame(k, log_name="other") for k in range(3)])
+    with pytest.raises(BadClip, match="rename the file"):
+        read_frames(path, whole=False)
+
+
 @pytest.mark.parametrize("key", [key for key in frame(0) if key not in ("can_bus", "anns", "driving_command")])
 def test_a_missing_key_is_named(key: str) -> None:
     item = frame(0)
