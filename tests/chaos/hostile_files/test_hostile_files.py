@@ -12,7 +12,7 @@ from tests.chaos.hostile_files.trials import REPOSITORY, rng_of
 
 pytestmark = pytest.mark.slow
 
-SHORT = ["cases=19", "doors=scenarionet,recovery table,episode,sidecar,picture"]
+SHORT = ["cases=19", "doors=scenarionet,recovery table,episode,sidecar,picture of"]
 KEPT = [  # door, number, the attack that the number stands for: what did harm once, or would where a guard is gone
     ("scenarionet", 18, "program: a shared kind"),
     ("recovery table", 9, "npz: bomb"),
@@ -33,10 +33,10 @@ def told(to: Path, *words: str) -> list[dict[str, object]]:
 
 def test_a_hundred_crafted_files_and_what_did_harm_hurt_nobody(tmp_path: Path) -> None:
     told(tmp_path, *SHORT)
-    more = [f"{door}:{number}" for door, number, _ in KEPT if door.startswith("scene ")]
+    more = [f"{door}:{number}" for door, number, _ in KEPT if door == "picture" or door.startswith("scene ")]
     verdicts = told(tmp_path, f"only={','.join(more)}")
     attacks = {(verdict["door"], verdict["number"]): verdict["attack"] for verdict in verdicts}
-    assert len(attacks) == 6 * 19 + len(more) and len(set(attacks.values())) > 30
+    assert len(attacks) == 5 * 19 + len(more) and len(set(attacks.values())) > 30
     assert all(attacks[door, number] == attack for door, number, attack in KEPT), "a grammar changed: find others"
 
 
