@@ -214,7 +214,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: no text in UTF-8: {error}") from error
     base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same rules, ten times as fast
 
-    class Loader(base):  # type: ignore[misc]
+    class Loader(base):
         """Keys are texts: integers can share one hash, and merges (<<) of merges grow without end."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
