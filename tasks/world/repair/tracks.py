@@ -88,7 +88,7 @@ def observed(
     """n boxes in any order as tracks ordered by id, each of the first kind that its boxes name.
 
     times_s: (n,) of the frames frame_times_s (F,); boxes: (n, 9). What no id names is left out, things of no known kind
-    (None) and what has the id of another box of its frame.
+    (None), what has the id of another box of its frame, and a frame of which most things stand elsewhere too.
     """
     done: list[Repair] = []
     in_time = np.argsort(times_s, kind="stable")
@@ -109,13 +109,21 @@ def observed(
     column = np.array([-1 if name is None else column_of.get(name, -1) for _, name, _ in rows_ids_kinds], int)
     known, column = in_time[column >= 0], column[column >= 0]
     placed, at = np.unique(frame_of[known] * len(names) + column, return_index=True)
-    for k in np.setdiff1d(np.arange(len(known)), at).tolist():
-        time_s = float(times_s[known[k]])
-        done.append(Repair("twice", names[column[k]], time_s, "two boxes of one frame", "the first of them"))
-        unnamed.add(int(frame_of[known[k]]))
     rows = np.full((len(frame_times_s), len(names)), UNSEEN)
     of_things = np.zeros((*rows.shape, 9))
     rows.ravel()[placed], of_things.reshape(-1, 9)[placed] = known[at], boxes[known[at]]
+    again = np.setdiff1d(np.arange(len(known)), at)
+    frames, things = frame_of[known[again]], column[again]
+    other = (boxes[known[again]] != of_things[frames, things]).any(axis=1)
+    n_other = np.bincount(frames[other], minlength=len(rows))
+    torn = (n_other > 1) & (n_other > MOST * (rows != UNSEEN).sum(axis=1))
+    for frame in np.flatnonzero(torn).tolist():  # nothing tells which box is of its own time
+        rows[frame] = TAKEN_OUT
+        done.append(Repair("twice", "", float(frame_times_s[frame]), "several frames of one stamp", LEFT_OUT))
+    for frame, thing in zip(frames[~torn[frames]].tolist(), things[~torn[frames]].tolist()):
+        time_s = float(frame_times_s[frame])
+        done.append(Repair("twice", names[thing], time_s, "two boxes of one frame", "the first of them"))
+        unnamed.add(frame)
     for frame in unnamed:  # what is missing there may be what lost its name, and is put between its neighbours
         rows[frame, rows[frame] == UNSEEN] = TAKEN_OUT
     of_kinds = tuple(kind_of[name] for name in names)

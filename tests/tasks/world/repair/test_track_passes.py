@@ -641,6 +641,17 @@ def test_boxes_in_any_order_are_tracks_by_id_without_those_that_name_nothing() -
     ]
 
 
+def test_a_frame_that_holds_another_one_too_is_left_out_and_one_that_is_listed_twice_is_not() -> None:
+    ids, kinds, times_s = ["a", "b", "c"] * 3, [CAR] * 9, np.repeat([0.0, 0.1, 0.1], 3)
+    boxes = np.repeat(np.arange(9.0)[:, None], 9, axis=1)
+    tracks, did = observed(np.array([0.0, 0.1]), times_s, ids, kinds, boxes)
+    assert tracks.rows.tolist() == [[0, 1, 2], [TAKEN_OUT] * 3]
+    assert [(r.what, r.thing, r.time_s, r.now) for r in did] == [("twice", "", 0.1, LEFT_OUT)]
+    boxes[6:] = boxes[3:6]
+    tracks, did = observed(np.array([0.0, 0.1]), times_s, ids, kinds, boxes)
+    assert tracks.rows.tolist() == [[0, 1, 2], [3, 4, 5]] and [r.thing for r in did] == ["a", "b", "c"]
+
+
 def test_nothing_is_repaired_where_nothing_is_seen() -> None:
     tracks, did = observed(TIMES_S, np.zeros(0), [], [], np.zeros((0, 9)))
     found, done = repaired(tracks, far_ego(40))
