@@ -39,8 +39,10 @@ from tests.writable import load_writable
 CITY = "us-ma-boston"
 
 
-def data_sets(shared: Path, folder: Path, of: Sequence[str]) -> Iterator[tuple[str, DataSet]]:
-    """The shared logs, and such as an export writes below a folder."""
+def data_sets(
+    shared: Path, folder: Path, of: Sequence[str], to_export: int | None = None
+) -> Iterator[tuple[str, DataSet]]:
+    """The shared logs, and such as an export writes below a folder; to_export: the first of nuScenes alone."""
     av2 = tuple(sorted((shared / "data/av2/sensor/val").iterdir()))
     files = sorted((shared / "data/scenarionet/nuscenes").glob("*.pkl"))
     moving = tuple(path for path in files if "0553" not in path.name)  # whose ego stands
@@ -57,10 +59,9 @@ def data_sets(shared: Path, folder: Path, of: Sequence[str]) -> Iterator[tuple[s
             ),
         )
     if "navsim" in of:
-        rows = {
-            **exported_logs("scenarionet", moving, read_scenario, folder / "nuscenes"),
-            **exported_logs("av2", av2, read_av2, folder / "av2"),
-        }
+        rows = exported_logs("scenarionet", moving[:to_export], read_scenario, folder / "nuscenes")
+        if to_export is None:
+            rows |= exported_logs("av2", av2, read_av2, folder / "av2")
 
         def maps(root: Path, log: Path) -> Path:
             return root / "maps" if (root / "maps").is_dir() else log.parent / "maps"
@@ -89,7 +90,14 @@ def exported_logs(
     from factory.__main__ import main as factory
 
     out, to = folder / "run", folder / "export"
-    words = [*of_run(clips, logs[0].parent), "experts=[human]", "rounds=1", "render=none", "reward.labels=none"]
+    words = [
+        *of_run(clips, logs[0].parent),
+        f"clips.only=[{','.join(log.stem for log in logs)}]",
+        "experts=[human]",
+        "rounds=1",
+        "render=none",
+        "reward.labels=none",
+    ]
     if code := run([*words, "executor=local", f"out={out}"]):
         raise RuntimeError(f"the run to export ended with {code}")
     if code := factory(["export", "navsim", f"out={out}", f"to={to}", f"map_location={CITY}", "missing=none"]):

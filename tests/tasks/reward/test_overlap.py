@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 from tasks.reward.collisions import Box, apart, centroid, touching
-from tasks.world import geometry
+from tasks.world import frames
 from tasks.world.frames import box_corners
 
 
@@ -29,7 +29,7 @@ def test_boxes_touch_exactly_where_the_numpy_version_says_so() -> None:
     first, second = random_boxes(rng, 4000), random_boxes(rng, 4000)
     verdict = np.array([touching(box(*a), box(*b)) for a, b in zip(first, second)])
     assert 0.1 < verdict.mean() < 0.9
-    assert np.array_equal(verdict, geometry.touching(first, second))
+    assert np.array_equal(verdict, frames.touching(first, second))
 
 
 def test_boxes_that_are_apart_never_touch_and_the_others_nearly_always_do() -> None:
