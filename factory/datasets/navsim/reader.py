@@ -214,7 +214,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: no text in UTF-8: {error}") from error
     base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same rules, ten times as fast
 
-    class Loader(base):
+    class _TextKeysLoader(base):
         """Keys are texts: integers can share one hash, and merges (<<) of merges grow without end."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
@@ -223,7 +223,7 @@ def _read(path: Path) -> dict[str, Any]:
             return super().construct_mapping(node, deep)
 
     try:
-        content = yaml.load(text, Loader)  # noqa: S506 - a safe loader
+        content = yaml.load(text, _TextKeysLoader)  # noqa: S506 - a safe loader
     except (yaml.YAMLError, RecursionError, ValueError) as error:  # a date or a number that is none
         raise ValueError(f"{path}: no YAML of plain values: {' '.join(str(error).split())}") from error
     check_values(content, len(text), str(path), "YAML")

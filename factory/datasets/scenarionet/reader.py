@@ -415,7 +415,8 @@ def _ego_at_steps(track: LoggedTrack, source: Source, frames: FrameClock) -> tup
     if not source.can_bus or len(position) < 2 or not _keyframe_weights(position[:, :2]).all():
         return position[:, :2], heading, valid
     apart = np.diff(frames.times_s)
-    if ((apart < 0.5 * STEP_S) | (apart > 1.5 * STEP_S)).any():  # frames are missing
+    is_whole = ((apart > 0.5 * STEP_S) & (apart < 1.5 * STEP_S)).all()
+    if (frames.at == np.floor(frames.at)).all() or not is_whole:
         return on_log_clock(position[:, :2], heading, valid)
     # As the messages come, before stamps that jitter by half a message pass for lost ones.
     xy, heading, valid = on_log_clock(track.position[:, :2], track.heading, track.valid)

@@ -496,9 +496,9 @@ def write_towns(towns: Sequence[TownFolder], settings: TownSettings) -> None:
                 paths = {"root": str(town.root), "unfinished": str(begun[-1])}
                 told = {"seed": town.seed, "indices": town.indices, "settings": asdict(settings)} | paths
                 command = [sys.executable, "-m", __name__, json.dumps(told)]
-                with terminal_signals_blocked():
+                with terminal_signals_blocked():  # until it is known, and can be ended
                     child = subprocess.Popen(command, stdin=lifeline, stdout=subprocess.PIPE)  # noqa: S603 - our own
-                painting[child] = town
+                    painting[child] = town
             for child in [child for child in painting if child.poll() is not None]:
                 town = painting.pop(child)
                 if refused := child.communicate()[0]:
