@@ -202,7 +202,7 @@ def default_runs_folder() -> str:
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
-AS_ANOTHER = "run it as a user who may write there, or on a copy"
+AS_ANOTHER = "run it as a user who may, or on a copy"
 DELTA_ERRNO = re.compile(r"\(os error (\d+)\)")  # how delta-rs says it, in an OSError without a number
 
 
@@ -267,16 +267,16 @@ def why_disk_full(error: BaseException) -> str:
     return ""
 
 
-def why_not_written(error: BaseException) -> str:
+def why_not_written(error: BaseException) -> tuple[str, str]:
     """What a disk said that is full or not to be written, and what helps, where that is behind the error."""
     seen: BaseException | None = error
     while seen is not None:
         number = _number_of(seen)
         if isinstance(seen, NotWritable) or number in REFUSED:
-            return f"{one_line(seen)}; {AS_ANOTHER}"
+            return one_line(seen), AS_ANOTHER
         seen = seen.__cause__ or seen.__context__
     full = why_disk_full(error)
-    return full and f"{full}; free disk space"
+    return full, full and "free disk space"
 
 
 def nearest_existing(path: Path) -> Path:

@@ -205,7 +205,6 @@ def clean(request: CleanRequest) -> None:
     replaced. A reader that was opened before rows were replaced or shards merged still reads what they stood in:
     leave it its time. While a run writes here the command is refused.
     """
-    from factory.files import why_not_written
     from factory.store.location import BadLocation
     from factory.store.table import AnotherWriter
     from factory.store.verify import RunInProgress, claim_for_upkeep, old_leftovers, refuse_while_running
@@ -215,7 +214,7 @@ def clean(request: CleanRequest) -> None:
         (refuse_while_running if request.say else claim_for_upkeep)(store)
         found = old_leftovers(store, request.older_s, time.time())
     except (RunInProgress, AnotherWriter, BadLocation, OSError) as error:
-        raise Refused(why_not_written(error) or str(error)) from error
+        raise Refused(str(error)) from error
     for name in found:
         if not request.say:
             store.location.remove(name)

@@ -141,14 +141,16 @@ def _exit_of_error(
         return BAD_CONFIG, f"error: {str(error).rstrip('.')}; {VERIFY}"
     if isinstance(error, Failed):
         return COMPLETE_WITH_FAILURES, f"error: {error}"
+    why, helps = why_not_written(error)
+    helps = f"; {helps}{elsewhere}" if helps and helps not in str(error) else ""
     if isinstance(error, (Refused, ConfigError, MemoryError, *refused)):
-        return BAD_CONFIG, f"error: {error}"
+        return BAD_CONFIG, f"error: {error}{helps}"
     if resumes and isinstance(error, DiskFull):
         return INTERRUPTED, f"error: {error}; free disk space and run the same command again"
     if resumes and machine_fault_of(error):
         return INTERRUPTED, f"error: {one_line(error)}; run the same command again to go on"
-    if not resumes and (why := why_not_written(error)):
-        return BAD_CONFIG, f"error: {why}{elsewhere}"
+    if why and not resumes:
+        return BAD_CONFIG, f"error: {why}{helps}"
     return COMPLETE, ""
 
 

@@ -569,7 +569,8 @@ class KeyedTable:
         )
 
     def _another_writer_error(self) -> AnotherWriter:
-        return AnotherWriter(f"{self.spec.name}: another run has taken over {self.location.uri}")
+        taken = f"{self.spec.name}: another run has taken over {self.location.uri}"
+        return AnotherWriter(f"{taken}; once that has ended, run the same command again")
 
     def _properties(self, *transactions: Transaction) -> CommitProperties:
         return CommitProperties({"writer": self._token}, max_commit_retries=0, app_transactions=list(transactions))

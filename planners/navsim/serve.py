@@ -175,8 +175,17 @@ class Request:
     undistort: bool = False  # for a planner that was trained on pinhole pictures
 
 
+def _next_question() -> dict[str, Any] | None:
+    """None where nobody asks any more. Raises Refused for what is none."""
+    try:
+        return receive(sys.stdin.buffer)
+    except ValueError as error:
+        raise Refused(f"standard input: {error}; start planners serve again") from error
+
+
 def main(request: Request) -> None:
-    """Answer until nobody asks any more. Raises Refused for a planner that cannot plan there."""
+    """Answer until nobody asks any more. Raises Refused for a planner that cannot plan there, and for half a question.
+    """
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever prints must not come between the answers
     with suppress(BrokenPipeError):  # who asked has gone
@@ -186,7 +195,7 @@ def main(request: Request) -> None:
             send(answers, {"error": str(error)})
             raise Refused(str(error)) from error
         send(answers, {"cameras": np.array(pilot.cameras, dtype=str)})
-        while (question := receive(sys.stdin.buffer)) is not None:
+        while (question := _next_question()) is not None:
             try:
                 poses = pilot.plan(observation_of(question, pilot.cameras), int(question["n_poses"]))
             except ValueError as error:

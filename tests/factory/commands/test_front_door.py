@@ -199,7 +199,7 @@ def test_lineage_of_what_is_no_sample_says_what_became_of_it(out: Path, capsys: 
 # Of root alone: it may write whatever its capabilities, which are dropped here, let it.
 DROPPED = ["setpriv", "--bounding-set=-all", "--inh-caps=-all"] if os.getuid() == 0 else []
 DENIED = "cannot be written: Permission denied"
-INSTEAD = "run it as a user who may write there, or on a copy"
+INSTEAD = "run it as a user who may, or on a copy"
 
 
 @pytest.fixture(scope="module")
