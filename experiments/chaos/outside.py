@@ -889,6 +889,10 @@ def main(
     with tempfile.TemporaryDirectory(prefix="outside-", dir="/tmp") as own:
         root = Path(folder or own)
         (root / "made").mkdir(parents=True, exist_ok=True)
+        place = root / "made" / "place"  # what is made names files by it
+        if place.exists() and place.read_text() != str(root):
+            raise SystemExit(f"{root} was made as {place.read_text()} and cannot be moved: remove it")
+        place.write_text(str(root))
         harness = Harness(root, use_own_mounts(), random.Random(seed), keep)
         print("| promise | trials | held | CPU s |\n|---|---|---|---|", flush=True)
         for name, only in asked:

@@ -9,8 +9,9 @@ from pathlib import Path
 import pyarrow.compute as pc
 import pytest
 
-from factory.exits import COMPLETE, INTERRUPTED
-from factory.files import DiskFull, naming_disk_errors, why_disk_full, why_unusable
+from factory.config.arguments import INPUT_ERRORS, run_command
+from factory.exits import BAD_CONFIG, COMPLETE, INTERRUPTED
+from factory.files import AS_ANOTHER, DiskFull, naming_disk_errors, why_disk_full, why_unusable
 from factory.graph.execute import Execution, RunSummary, execute, rerun_on_new_clusters
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
 from factory.graph.steps import failure_from_error
@@ -131,6 +132,18 @@ def test_what_a_full_disk_said_is_found_behind_other_errors_and_in_delta_s_words
     except RuntimeError as error:
         assert failure_from_error(error).disk_full == why_disk_full(error) == "/a/file: the disk is full"
     assert failure_from_error(ValueError("else")).disk_full == ""
+
+
+@pytest.mark.parametrize("refused", [(), INPUT_ERRORS])
+@pytest.mark.parametrize("number, helps", [(28, "free disk space"), (30, AS_ANOTHER), (13, AS_ANOTHER)])
+def test_every_command_says_how_to_go_on_where_a_disk_refuses_once(
+    number: int, helps: str, refused: tuple[type[Exception], ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def does(argv: object) -> int:
+        raise OSError(number, "refused", "/a/file")
+
+    assert run_command([], does, str, refused, elsewhere=", or so") == BAD_CONFIG
+    assert re.fullmatch(f"error: .*/a/file.*; {helps}, or so\n", capsys.readouterr().err)
 
 
 def test_a_full_disk_under_the_user_s_cache_is_told_with_its_path_and_is_no_wrong_setting(
