@@ -476,7 +476,7 @@ def standing_node(folder: Path, port: int, is_head: bool, with_env: Mapping[str,
     """Ray's processes of a node on this machine that nobody's run has begun; not the head: of the cluster there."""
     before = set(below(os.getpid()))
     words = [str(Path(sys.executable).with_name("ray")), "start", "--num-cpus=1", "--object-store-memory=200000000"]
-    words += ["--disable-usage-stats", "--node-ip-address=127.0.0.1"]
+    words += ["--disable-usage-stats", f"--node-ip-address=127.0.0.{1 if is_head else 2}"]
     words += ["--head", f"--port={port}", "--include-dashboard=false"] if is_head else [f"--address=127.0.0.1:{port}"]
     words += [f"--temp-dir={folder}"] if is_head else []
     subprocess.run(words, check=True, capture_output=True, cwd=REPOSITORY, env=os.environ | with_env)

@@ -184,7 +184,7 @@ def _next_question() -> dict[str, Any] | None:
 
 
 def main(request: Request) -> None:
-    """Answer until nobody asks any more. Raises Refused for a planner that cannot plan there, and for half a question."""
+    """Answer until nobody asks any more. Raises Refused for a planner that cannot plan there, and half a question."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever prints must not come between the answers
     with suppress(BrokenPipeError):  # who asked has gone
