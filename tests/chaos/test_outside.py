@@ -8,7 +8,7 @@ import pytest
 
 from tests.pages import REPOSITORY
 
-ROWS = ("no-reader:status", "full-output:status", "ascii:status", "dashboard-clients", "sigterm:run", "guard:run")
+ROWS = ("no-reader:status", "full-output:status", "ascii:status", "dashboard-clients", "sigint:vocabulary")
 
 
 @pytest.mark.slow
