@@ -782,7 +782,7 @@ class Harness:
                 wait_for_page(port, process)
                 process.send_signal(signal.SIGINT)
             while process.poll() is None and time.monotonic() - began < OVER_S:
-                time.sleep(0.01)
+                time.sleep(0.03)
                 with suppress(OSError, StopIteration):
                     lines = Path(f"/proc/{process.pid}/status").read_text().splitlines()
                     peak_kb = next(int(line.split()[1]) for line in lines if line.startswith("VmPeak:"))

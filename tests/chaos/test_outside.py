@@ -8,7 +8,7 @@ import pytest
 
 from tests.pages import REPOSITORY
 
-ROWS = ("no-reader:status", "full-output:status", "ascii:status", "dashboard-clients", "sigint:vocabulary")
+ROWS = ("no-reader:status", "ascii:status", "full-output:vocabulary", "sigint:vocabulary", "dashboard-clients")
 
 
 @pytest.mark.slow
