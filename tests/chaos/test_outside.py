@@ -8,7 +8,7 @@ import pytest
 
 from tests.pages import REPOSITORY
 
-ROWS = ("no-reader:status", "ascii:status", "full-output:vocabulary", "sigint:vocabulary", "dashboard-clients")
+ROWS = ("no-reader:status", "ascii:vocabulary", "full-output:vocabulary", "sigquit:vocabulary", "dashboard-clients")
 
 
 @pytest.mark.slow
