@@ -46,7 +46,7 @@ def read_header(data: bytes | Bytes) -> tuple[str, Size]:
     """JPEG or PNG, and the size that the header declares, whatever it is. Raises BadPicture."""
     view = data.data if isinstance(data, np.ndarray) else memoryview(data)
     if view[:8] == PNG:
-        name, size = "PNG", (_number(view[16:20]), _number(view[20:24])) if view[12:16] == b"IHDR" else (0, 0)
+        name, size = "PNG", _png_size(view)
     elif view[:2] == JPEG:
         name, size = (
             "JPEG",
@@ -144,6 +144,17 @@ def _segments(jpeg: memoryview) -> Iterator[tuple[int, int, int]]:
                 return
             yield marker, at, end
             at = end
+
+
+def _png_size(png: memoryview) -> Size:
+    """0, 0 where a chunk is longer than the file: OpenCV takes as much memory as a chunk claims, up to 2 GB."""
+    at, kind = len(PNG), b""
+    while kind != b"IEND":
+        kind = bytes(png[at + 4 : at + 8])
+        at += 12 + _number(png[at : at + 4])
+        if at > len(png):
+            return 0, 0
+    return (_number(png[16:20]), _number(png[20:24])) if png[12:16] == b"IHDR" else (0, 0)
 
 
 def _size(segment: memoryview) -> Size:

@@ -99,7 +99,7 @@ AV2_FILES = ("annotations.feather", "city_SE3_egovehicle.feather", "calibration/
 def _of_log(folder: str, patterns: Sequence[str], innocents: Path, rng: Rng) -> Crafted:
     """One file of a log in several; its name stands before the bytes."""
     log = _log(innocents / folder)
-    path = next(log.glob(grammars.pick(rng, patterns)))
+    path = grammars.pick(rng, sorted(log.glob(grammars.pick(rng, patterns))))
     if path.suffix == ".json":
         what, crafted = grammars.json_text(json.loads(path.read_bytes()), rng)
     elif path.suffix in (".jpg", ".png"):

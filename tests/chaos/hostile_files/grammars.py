@@ -235,9 +235,10 @@ def columns_of(good: pa.Table, rng: Rng) -> tuple[str, pa.Table]:
     }
     what = pick(rng, [*columns, "rows", "rows of nothing", "many columns", "names"])
     if what == "rows":
+        n = min(n, 10**9 // sum(pa.nulls(1000, field.type).nbytes // 1000 + 1 for field in good.schema))
         return what, pa.table([pa.nulls(n, field.type) for field in good.schema], schema=good.schema)
     if what == "rows of nothing":
-        return what, pa.table({name: pa.nulls(pick(rng, SIZES))})
+        return what, pa.table({name: pa.nulls(pick(rng, (10**6, 2**31 - 1)))})
     if what == "many columns":
         return what, pa.table({f"{k}": pa.nulls(rows) for k in range(20_000)})
     if what == "names":

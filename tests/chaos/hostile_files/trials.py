@@ -273,9 +273,11 @@ def _typed(argv: tuple[str, ...], innocents: Path) -> Told:
 
 
 def load_what_is_read_with(doors: Collection[str]) -> None:
-    """Once, before the first fork; nothing of it may start threads."""
+    """Once, before the first fork; nothing of it may start threads, as importing deltalake does."""
     import factory.commands.exchange
-    import factory.run  # noqa: F401
+    import factory.run
+    import tasks.experts.pdm_closed
+    import tasks.render.fit.reconstruct  # noqa: F401
 
     if any("checkpoint" in door for door in doors):
         import planners.published.import_planner
