@@ -13,11 +13,16 @@ from typing import TYPE_CHECKING
 from factory.commands.look import FolderRequest
 from factory.config.arguments import GIVEN_ALONE, POSITIONAL, RUN_SETTINGS, Refused
 from factory.exits import COMPLETE, DAMAGED
+from factory.readers.base import MOST_SAID
 from factory.views.status import IMPORT_AGAIN, failed_lines, location_of_out, open_store
+from factory.wording import printable
 
 if TYPE_CHECKING:
     from factory.store.samples import Store
     from factory.store.verify import Verdict
+
+
+MOST_LINES = 100  # that verify prints of a kind
 
 
 @dataclass(frozen=True)
@@ -116,13 +121,11 @@ def verify(request: VerifyRequest) -> int:
     try:
         refuse_other_schema(out)
         if request.repair:
-            for name in restore_logs(out):
-                print(f"put back {name}")
+            _print_some("put back", restore_logs(out))
         if found := damaged_logs(out):
             told = [str(part) for part in (*found, *damaged_beside_logs(out))]
             told += [f"{name}: {problem}" for name, problem in damaged_blocks(out).items()]
-            for line in told:
-                print(f"DAMAGED {line}")
+            _print_some("DAMAGED", told)
             how = "repair=true puts the tables' logs back first"
             if request.repair:
                 how = (
@@ -135,20 +138,16 @@ def verify(request: VerifyRequest) -> int:
         if request.repair and verdict.files:
             claim_for_upkeep(store)
             drop_damaged(store, verdict)
-            for name in verdict.files:
-                print(f"taken out {name}")
+            _print_some("taken out", verdict.files)
             verdict = _verify_again(request.out)
     except DamagedLog as error:
         print(f"DAMAGED {error}")
         return DAMAGED
     except (RunInProgress, AnotherWriter, BadLocation, OtherSchema) as error:
         raise Refused(str(error)) from error
-    for line in verdict.damage:
-        print(f"DAMAGED {line}")
-    for line in verdict.orphans:
-        print(f"orphan  {line}")
-    for line in verdict.missing:
-        print(f"missing {line}: the run's command makes the others again")
+    _print_some("DAMAGED", verdict.damage)
+    _print_some("orphan ", verdict.orphans)
+    _print_some("missing", [f"{line}: the run's command makes the others again" for line in verdict.missing])
     print(f"{verdict.n_samples} samples, {len(verdict.damage)} damages, {len(verdict.orphans)} orphans")
     if verdict.files:
         print(
@@ -156,6 +155,14 @@ def verify(request: VerifyRequest) -> int:
             file=sys.stderr,
         )
     return DAMAGED if verdict.damage else COMPLETE
+
+
+def _print_some(kind: str, lines: Sequence[str]) -> None:
+    """A line each, which may quote files, as many as a person reads."""
+    for line in lines[:MOST_LINES]:
+        print(f"{kind} {printable(line[:MOST_SAID])}")
+    if len(lines) > MOST_LINES:
+        print(f"{kind} and {len(lines) - MOST_LINES:,} more")
 
 
 def _verify_again(out: str) -> "Verdict":

@@ -37,7 +37,7 @@ from factory.files import DamagedFile, machine_fault_of, naming_disk_errors
 from factory.store.commit_copies import COPIES, CommitCopies
 from factory.store.location import Location, Shard, read_parquet, with_partition_columns, write_shard
 from factory.store.schema import TableSpec
-from factory.wording import one_line
+from factory.wording import one_line, shown
 
 # Texts of millions of rows as integers: a number for each different text.
 
@@ -385,6 +385,9 @@ class KeyedTable:
         facts = ["path", "size_bytes", "num_records", "modification_time"]
         with self._log_naming():
             actions = pa.table(delta.get_add_actions(flatten=True)).select([*facts, *parts.values()])
+        for path in actions["path"].to_pylist():
+            if not {"", ".", ".."}.isdisjoint(path.split("/")):  # verify removes files by these names
+                raise DamagedLog(f"{self.location.uri}: names a file that is not in its folder: {shown(path)}")
         return {
             a["path"]: LiveFile(
                 {name: str(a[part]) for name, part in parts.items()},

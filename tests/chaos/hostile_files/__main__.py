@@ -8,6 +8,7 @@ the command as it is typed. Findings end it with 1.
 """
 
 import json
+import re
 import shutil
 import sys
 import tempfile
@@ -26,7 +27,7 @@ def main(
     kept.parent.mkdir(parents=True, exist_ok=True)
     told = [Verdict(**json.loads(line)) for line in kept.read_text().splitlines()] if kept.exists() else []
     if only:
-        asked = [case.split(":") for case in only.split(",")]
+        asked = [case.split(":") for case in re.split(r"(?<=\d),", only)]
         wanted = {door: [int(n) for d, n in asked if d == door] for door in dict.fromkeys(door for door, _ in asked)}
     else:
         wanted = {

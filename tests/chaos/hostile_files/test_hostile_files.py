@@ -12,7 +12,7 @@ from tests.chaos.hostile_files.trials import REPOSITORY, rng_of
 
 pytestmark = pytest.mark.slow
 
-SHORT = ["cases=19", "doors=scenarionet,recovery table,episode,sidecar,picture"]
+SHORT = ("scenarionet", "recovery table", "episode", "sidecar", "picture", "picture of a batch")  # 16 cases of each
 KEPT = [  # door, number, the attack that the number stands for: what did harm once, or would where a guard is gone
     ("scenarionet", 18, "program: a shared kind"),
     ("recovery table", 9, "npz: bomb"),
@@ -25,19 +25,15 @@ KEPT = [  # door, number, the attack that the number stands for: what did harm o
 ]
 
 
-def told(to: Path, *words: str) -> list[dict[str, object]]:
-    command = [sys.executable, "-m", "tests.chaos.hostile_files", f"to={to}", *words]
+def test_a_hundred_crafted_files_and_what_did_harm_hurt_nobody(tmp_path: Path) -> None:
+    cases = dict.fromkeys([*((door, n) for door in SHORT for n in range(16)), *(kept[:2] for kept in KEPT)])
+    only = ",".join(f"{door}:{n}" for door, n in cases)
+    command = [sys.executable, "-m", "tests.chaos.hostile_files", f"to={tmp_path}", f"only={only}"]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr[-3000:]
-    return [json.loads(line) for line in (to / "verdicts.jsonl").read_text().splitlines()]
-
-
-def test_a_hundred_crafted_files_and_what_did_harm_hurt_nobody(tmp_path: Path) -> None:
-    told(tmp_path, *SHORT)
-    more = [f"{door}:{number}" for door, number, _ in KEPT if door == "picture" or door.startswith("scene ")]
-    verdicts = told(tmp_path, f"only={','.join(more)}")
+    verdicts = [json.loads(line) for line in (tmp_path / "verdicts.jsonl").read_text().splitlines()]
     attacks = {(verdict["door"], verdict["number"]): verdict["attack"] for verdict in verdicts}
-    assert len(attacks) == 5 * 19 + len(more) and len(set(attacks.values())) > 30
+    assert attacks.keys() == cases.keys() and len(set(attacks.values())) > 30
     assert all(attacks[door, number] == attack for door, number, attack in KEPT), "a grammar changed: find others"
 
 

@@ -275,7 +275,7 @@ def _typed(argv: tuple[str, ...], innocents: Path) -> Told:
 def load_what_is_read_with(doors: Collection[str]) -> None:
     """Once, before the first fork; nothing of it may start threads, as importing deltalake does."""
     import factory.commands.exchange
-    import factory.run
+    import factory.run  # noqa: F401
     import tasks.experts.pdm_closed
     import tasks.render.fit.reconstruct  # noqa: F401
 

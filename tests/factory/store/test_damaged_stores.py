@@ -1,6 +1,8 @@
 """verify survives every damage and names the file; a repair takes out what was damaged, and the run makes it again."""
 
+import json
 import random
+import re
 import shutil
 from collections import Counter
 from pathlib import Path
@@ -110,6 +112,27 @@ def test_the_command_says_so_and_repairs_a_log(out: Path, golden: Path, capsys: 
         code, said = told(capsys, str(out), "repair=true")
         assert code == COMPLETE and f"put back samples/_delta_log/{path.name}" in said
     assert_same_tables(out, golden)
+
+
+@pytest.mark.parametrize("path", ["../../kept", "", "{}/kept", "file://{}/kept", "round=0/../../../kept"])
+def test_no_file_outside_a_table_is_of_it_and_none_is_taken_out(
+    out: Path, path: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (kept := out.parent / "kept").write_bytes(b"of somebody else")
+    shutil.rmtree(out / "samples" / "_commits")  # a stranger may make them match the log as well
+    log = files(out, "samples/_delta_log/*.json")[-1]
+    log.write_text(re.sub(r'(?<="path":)"[^"]*"', json.dumps(path.format(out.parent)), log.read_text()))
+    code, said = told(capsys, str(out), "repair=true")
+    assert kept.exists(), said
+    assert code == DAMAGED and "names a file that is not in its folder" in said
+
+
+def test_verify_prints_what_a_terminal_shows_and_a_person_reads(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for n in range(300):
+        (out / "samples" / f"\n\x1b[2J{n:0200}").touch()
+    code, said = told(capsys, str(out))
+    assert code == COMPLETE and "\x1b" not in said and "orphan  samples/\\n\\x1b[2J000" in said
+    assert said.count("\n") == 102 and "and 200 more" in said and "0 damages, 300 orphans" in said
 
 
 def test_a_lost_last_commit_is_noticed_by_the_run_too(out: Path, golden: Path) -> None:
