@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 
 from factory.files import atomic_file
 from factory.readers.base import BadClip, ClipReader, read_clip
+from factory.wording import one_line
 from tasks.caches import append_checksum
 from tasks.experts.recovery import RecoveryTable
 from tasks.world.arrays import Array
@@ -177,7 +178,7 @@ def _load(path: str | Path) -> np.ndarray | dict[str, np.ndarray]:
     except OSError as error:
         raise ValueError(f"{path}: not readable as a numpy file: {error.strerror or error}") from error
     except Exception as error:  # numpy takes what it does not know for a pickle, zipfile and zlib have errors of theirs
-        why = "it holds no plain numbers" if "pickled (object)" in str(error) else str(error)
+        why = "it holds no plain numbers" if "pickled (object)" in str(error) else one_line(error)
         raise ValueError(f"{path}: not readable as a numpy file: {why}") from error
 
 

@@ -223,7 +223,7 @@ def _duplicate_keys(table: KeyedTable, kept: list[pa.Table] | None) -> list[str]
     file = np.repeat(np.arange(len(paths)), [len(keys) for keys in parts[1:]])
     order = np.argsort(keys, kind="stable")
     again = np.sort(order[1:][keys[order[1:]] == keys[order[:-1]]]).tolist()
-    return [f"{table.spec.name}: {keys[at].decode()} stands twice, again in {paths[file[at]]}" for at in again]
+    return [f"{table.spec.name}/{paths[file[at]]}: key {keys[at].decode()} stands twice" for at in again]
 
 
 def _broken_rows(parts: Sequence[pa.Table], store: Store) -> tuple[list[str], list[str]]:

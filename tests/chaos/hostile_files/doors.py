@@ -19,8 +19,9 @@ from factory.datasets.scenarionet.photos import cameras_in, load_sidecar, read_p
 from factory.exits import COMPLETE
 from factory.readers.base import BadClip
 from factory.setup.vocabulary import load_recovery_table
-from factory.stages.sensors import decode_image
+from factory.stages.sensors import decode_image, opened_photos
 from factory.store.episodes import check_episode
+from tasks.world.clip import Camera, SensorFile
 from tasks.world.frames import EGO_STATE_SIZE
 from tests.chaos.hostile_files import grammars
 from tests.chaos.hostile_files.grammars import Crafted, Rng
@@ -102,8 +103,6 @@ def _of_log(folder: str, patterns: Sequence[str], innocents: Path, rng: Rng) -> 
     path = grammars.pick(rng, sorted(log.glob(grammars.pick(rng, patterns))))
     if path.suffix == ".json":
         what, crafted = grammars.json_text(json.loads(path.read_bytes()), rng)
-    elif path.suffix in (".jpg", ".png"):
-        what, crafted = grammars.picture(rng)
     elif rng.random() < 0.1 and folder == "py123d":
         what, crafted = _packed(path, rng)
     else:
@@ -152,11 +151,8 @@ def _maps(innocents: Path, data: Path) -> Sequence[str]:
     return ("clips=navsim", f"clips.root={data / 'navsim_logs/mini'}", f"clips.maps={innocents / 'navsim/maps'}", kept)
 
 
-PHOTOS = ("render=map", "render.cameras=[ring_front_center]", "render.width=64", "render.height=36")
-
-
-def _words(clips: str, more: Sequence[str], innocents: Path, data: Path) -> Sequence[str]:
-    return (f"clips={clips}", f"clips.root={data}", *more)
+def _words(clips: str, innocents: Path, data: Path) -> Sequence[str]:
+    return (f"clips={clips}", f"clips.root={data}")
 
 
 def _copied(path: Path, to: Path) -> str:
@@ -165,11 +161,11 @@ def _copied(path: Path, to: Path) -> str:
     return path.stem
 
 
-def _folders(clips: str, patterns: Sequence[str], *more: str) -> Logs:
+def _folders(clips: str, patterns: Sequence[str]) -> Logs:
     return Logs(
         partial(_of_log, clips, patterns),
         partial(_as_folder, clips),
-        partial(_words, clips, more),
+        partial(_words, clips),
         lambda innocents, data: _as_folder(clips, innocents, data, "innocent", b""),
     )
 
@@ -178,7 +174,7 @@ LOGS: Mapping[str, Logs] = {
     "scenarionet": Logs(
         lambda _, rng: grammars.scenario(rng),
         partial(_as_pickle, "sd_{}.pkl"),
-        partial(_words, "scenarionet", ()),
+        partial(_words, "scenarionet"),
         lambda innocents, data: _copied(innocents / "scenarionet/sd_innocent.pkl", data),
     ),
     "navsim": Logs(
@@ -188,7 +184,6 @@ LOGS: Mapping[str, Logs] = {
         lambda innocents, data: _copied(_good_navsim(innocents), data / "navsim_logs/mini"),
     ),
     "av2": _folders("av2", AV2_FILES),
-    "av2 photos": _folders("av2", ("sensors/cameras/*/*",), *PHOTOS),
     "py123d": _folders("py123d", ("*.arrow",)),
 }
 
@@ -230,7 +225,8 @@ SHARD, COMMIT = "run/samples/round=0/expert=human/hostile.parquet", f"run/sample
 
 def _of_run(name: str, command: str = "", read: Callable[[Path], Any] | None = None) -> Single:
     craft = _shard if name == SHARD else lambda innocents, rng: grammars.commit(_good_commit(innocents), rng)
-    return Single(craft, name, command, read, (Exception,), "run", "run")
+    named = Path(SHARD).name if name == SHARD and command else "run"
+    return Single(craft, name, command, read, (Exception,), "run", named)
 
 
 def _named(read: Callable[[bytes], Any], path: Path) -> Any:
@@ -252,6 +248,12 @@ def _read_batch(data: bytes) -> Any:
 def _read_sidecar(path: Path) -> Any:
     cameras_in(load_sidecar(path)[0], str(path))
     return read_photographs(path, path.parent, np.zeros((121, EGO_STATE_SIZE)))
+
+
+def _read_photo(path: Path) -> Any:
+    """As a log's photos are read, which a camera of 64 x 36 took."""
+    camera = Camera("front", 64, 36, np.eye(3), np.zeros(5), np.eye(4))
+    return list(opened_photos([SensorFile("front", str(path), 0.0, np.eye(4))], [camera]))
 
 
 def _read_samples(path: Path) -> Any:
@@ -280,6 +282,7 @@ SINGLES: Mapping[str, Single] = {
     "scene file": _alone(grammars.safetensors, "hostile.safetensors", "factory scene info {}"),
     "planner checkpoint": _alone(grammars.checkpoint, "h.ckpt", "planners import {} planner=ltf_public out=planner"),
     "picture": _alone(grammars.picture, "h.jpg", read=lambda path: decode_image(path.read_bytes(), str(path))),
+    "photo": _alone(grammars.picture, "hostile.jpg", read=_read_photo),
     "picture of a batch": _alone(grammars.jpeg, "hostile.jpg", read=partial(_named, _read_batch)),
     "episode": _alone(grammars.mcap, "hostile.mcap", read=partial(_named, check_episode)),
     "sidecar": _alone(partial(grammars.json_text, SIDECAR), "hostile.json", read=_read_sidecar),
