@@ -10,7 +10,7 @@ import pytest
 from tests.chaos.hostile_files.doors import LOGS, SINGLES
 from tests.chaos.hostile_files.trials import REPOSITORY, rng_of
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # 30 s of CPU time, which a busy machine spreads
 
 SHORT = ("scenarionet", "recovery table", "episode", "sidecar", "picture", "picture of a batch")  # 16 cases of each
 KEPT = [  # door, number, the attack that the number stands for: what did harm once, or would where a guard is gone
