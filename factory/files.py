@@ -255,26 +255,30 @@ def atomic_file(path: Path, n_bytes: int) -> Iterator[Path]:
             raise
 
 
+def _errors_behind(error: BaseException | None) -> Iterator[BaseException]:
+    """The error and what it was raised of. An error that was kept and is raised again may stand behind itself."""
+    seen = set[int]()
+    while error is not None and id(error) not in seen:
+        yield error
+        seen.add(id(error))
+        error = error.__cause__ or error.__context__
+
+
 def why_disk_full(error: BaseException) -> str:
     """What a full disk said, where that is behind the error; else nothing."""
-    seen: BaseException | None = error
-    while seen is not None:
+    for seen in _errors_behind(error):
         if isinstance(seen, DiskFull):
             return str(seen)
         if isinstance(seen, OSError) and seen.errno in FULL:
             return f"{seen.filename or 'a temporary file'}: the disk is full"
-        seen = seen.__cause__ or seen.__context__
     return ""
 
 
 def why_not_written(error: BaseException) -> tuple[str, str]:
     """What a disk said that is full or not to be written, and what helps, where that is behind the error."""
-    seen: BaseException | None = error
-    while seen is not None:
-        number = _number_of(seen)
-        if isinstance(seen, NotWritable) or number in REFUSED:
+    for seen in _errors_behind(error):
+        if isinstance(seen, NotWritable) or _number_of(seen) in REFUSED:
             return one_line(seen), AS_ANOTHER
-        seen = seen.__cause__ or seen.__context__
     full = why_disk_full(error)
     return full, full and "free disk space"
 
@@ -320,15 +324,13 @@ def raising_place_refused(where: str | os.PathLike[str]) -> Iterator[None]:
 
 def machine_fault_of(error: BaseException) -> str:
     """What the machine said, where its illness is behind the error; else nothing."""
-    seen: BaseException | None = error
-    while seen is not None:
+    for seen in _errors_behind(error):
         if isinstance(seen, MemoryError) and _free_memory_share() < SHORT_OF_MEMORY:
             return f"out of memory: {seen}"
         if isinstance(seen, PlaceRefused | DiskFull | NotWritable | ConnectionError | TimeoutError) or _is_of_machine(
             seen
         ):
             return str(seen)
-        seen = seen.__cause__ or seen.__context__
     return ""
 
 

@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterator, Sequence
 from itertools import islice
 
 MOST_SHOWN, ITEMS_SHOWN = 80, 4  # characters of a text, items of a container
+MOST_SAID = 1000  # characters of what is wrong: it may quote a file
 BITS_SHOWN = 256  # of an integer; Python writes out some 14,000
 
 

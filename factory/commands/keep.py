@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 from factory.commands.look import FolderRequest
 from factory.config.arguments import GIVEN_ALONE, POSITIONAL, RUN_SETTINGS, Refused
 from factory.exits import COMPLETE, DAMAGED
-from factory.readers.base import MOST_SAID
 from factory.views.status import IMPORT_AGAIN, failed_lines, location_of_out, open_store
-from factory.wording import printable
+from factory.wording import MOST_SAID, printable
 
 if TYPE_CHECKING:
     from factory.store.samples import Store

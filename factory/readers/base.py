@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.files import broken_link, why_unread
-from factory.wording import one_line, printable, shown
+from factory.wording import MOST_SAID, one_line, printable, shown
 from tasks.world.arrays import Array, Bytes, Ints
 from tasks.world.clip import CLIP_STEPS, STEP_S, AgentKind, AgentTracks, Camera, Clip
 from tasks.world.frames import EGO_STATE_SIZE, HEADING, LARGEST, PACIFICA, X, Y, wrap_angle
@@ -24,7 +24,6 @@ from tasks.world.road_map import Lane, LightState, MapLayer, RoadMap, Route, Tra
 
 SPLITS = ("train", "val", "test")
 MAX_FILE_BYTES = 1 << 30  # of a file that is read whole
-MOST_SAID = 1000  # characters of what is wrong: it may quote the file
 
 
 class BadClip(Exception):

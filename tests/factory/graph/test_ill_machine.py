@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
-from factory.files import PlaceRefused, machine_fault_of, raising_place_refused
+from factory.files import PlaceRefused, machine_fault_of, raising_place_refused, why_not_written
 from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt, failure_from_error
 from factory.store.samples import ErrorKind
 from tests.factory.graph.runs import run
@@ -124,3 +124,12 @@ def test_memory_is_the_machine_s_only_where_little_is_left(monkeypatch: pytest.M
     assert failure_from_error(MemoryError("Unable to allocate 7.28 TiB")).kind is ErrorKind.SYSTEM
     monkeypatch.setattr("factory.files._free_memory_share", lambda: 0.02)
     assert failure_from_error(MemoryError("Unable to allocate 1.00 MiB")).kind is ErrorKind.MACHINE
+
+
+def test_errors_that_stand_behind_one_another_in_a_ring_are_looked_at_once() -> None:
+    """As where an error that was kept is raised again while the one that it caused is handled."""
+    kept, caused = ValueError("no such folder"), ValueError("no table")
+    kept.__context__, caused.__context__ = caused, kept
+    assert machine_fault_of(kept) == "" and why_not_written(kept) == ("", "")
+    caused.__context__ = PermissionError(errno.EACCES, "Permission denied", "/out")
+    assert why_not_written(kept)[1]
