@@ -11,8 +11,8 @@ import sys
 import termios
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +34,15 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> str:
     return f"clips.cache_dir={tmp_path_factory.mktemp('towns')}"
 
 
-def started(*words: str, package: str = "factory", **how: Any) -> "subprocess.Popen[str]":
+@contextmanager
+def started(*words: str, package: str = "factory", **how: Any) -> Iterator["subprocess.Popen[str]"]:
     how = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "start_new_session": True} | how
-    return subprocess.Popen([sys.executable, "-m", package, *words], cwd=REPOSITORY, **how)
+    with subprocess.Popen([sys.executable, "-m", package, *words], cwd=REPOSITORY, **how) as command:
+        try:
+            yield command
+        except BaseException:  # a failure is told now, not when the command ends
+            command.kill()
+            raise
 
 
 def until(is_so: Callable[[], Any], command: "subprocess.Popen[str]") -> Any:
@@ -162,7 +168,7 @@ def test_a_terminal_that_closes_ends_a_run_as_sigterm_does(tmp_path: Path, town:
             os.read(ours, 65536)  # a terminal shows what it is given
         return shards(out)
 
-    words = ("run", "clips.n_clips=3", "rounds=300", *BLIND, *QUICK, town, f"out={out}")
+    words = ("run", "clips.n_clips=45", *BLIND, *QUICK, town, f"out={out}")
     how: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), theirs)
     with started(*words, **how, preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0)) as command:
         os.close(theirs)
@@ -177,7 +183,7 @@ def test_a_terminal_that_closes_ends_a_run_as_sigterm_does(tmp_path: Path, town:
 @pytest.mark.slow
 def test_a_run_outlives_its_guard_and_ends_by_a_signal_as_ever(tmp_path: Path, town: str) -> None:
     out = tmp_path / "out"
-    with started("run", "clips.n_clips=3", "rounds=300", *BLIND, *QUICK, town, f"out={out}") as command:
+    with started("run", "clips.n_clips=45", *BLIND, *QUICK, town, f"out={out}") as command:
         os.kill(until(lambda: child_of(command, "guard.py"), command), signal.SIGKILL)
         before = shards(out)
         until(lambda: shards(out) > before + 2, command)
