@@ -12,7 +12,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -30,6 +30,7 @@ from factory.datasets.navsim.window import (
     cameras_with_pictures,
     ego_states,
     repaired_frames,
+    repairs_from,
     road_around,
     sensor_files,
     stretch_agents,
@@ -424,7 +425,7 @@ def usable_windows(table: FrameTable, windows: list[int], choice: WindowChoice) 
 
 LICENCE = "CC BY-NC-SA 4.0 (nuPlan via OpenScene)"
 BLOCK_FRAMES, BLOCK_STRIDE_FRAMES = 40, 20  # of the stretches that are reconstructed
-FRAMES_AROUND = 4  # of a window: as many tell a thing's usual speed, and what lies elsewhere for a frame or two
+FRAMES_AROUND = 4  # of a block: as many tell a thing's usual speed, and what lies elsewhere for a frame or two
 SPLIT_OF = {  # by how the name of the filter, or of the logs' folder, begins; others: by the hash of the log's id
     "navtrain": "train",
     "synthetic_reaction": "train",  # SimScale's, made of navtrain
@@ -445,6 +446,21 @@ class OpenLog:
     log: LogFrames
     table: FrameTable
     content_digest: str
+    blocks: dict[int, tuple[tuple[Frame, ...], Repairs]] = field(default_factory=dict)  # repaired, by their first frame
+
+    def repaired(self, first: int, stop: int) -> tuple[tuple[Frame, ...], Repairs]:
+        """The frames first..stop-1 as of `repaired_frames`, seen with those around them."""
+        (stretch,) = np.nonzero(self.table.stretch == self.table.stretch[first])
+        begin = max(first - FRAMES_AROUND, int(stretch[0]))
+        end = min(stop + FRAMES_AROUND, int(stretch[-1]) + 1)
+        return repaired_frames(self.log.frames[begin:end], first - begin, stop - begin)
+
+    def repaired_block(self, start: int) -> tuple[int, tuple[Frame, ...], Repairs]:
+        """First frame, frames and repairs of the block of the window that begins at frame `start`, repaired once."""
+        first, stop = _block_frames(self.table, start)
+        if first not in self.blocks:
+            self.blocks[first] = self.repaired(first, stop)
+        return first, *self.blocks[first]
 
 
 class NavsimReader:
@@ -543,7 +559,9 @@ class NavsimReader:
         window, now = frames[start : start + WINDOW_FRAMES], start + FRAMES_BEFORE
         if any(frame.boxes is None for frame in window):
             raise BadClip(opened.log.file, f"frames[{start}].anns", "missing: nobody annotated the window")
-        window, repairs = _repaired(opened, start, start + WINDOW_FRAMES)
+        first, block_frames, block_repairs = opened.repaired_block(start)
+        window = block_frames[start - first :][:WINDOW_FRAMES]
+        repairs = repairs_from(block_repairs, FRAME_S * (start - first), FRAME_S * (start - first + WINDOW_FRAMES - 1))
         states = ego_states(window)
         road = road_around(self.maps, frames[now], states[:, :2], states[NOW, :3], opened.log.file, now)
         lights, light_repairs = lights_on_map(traffic_lights(window), road.road_map.lanes, road.city_lanes)
@@ -719,18 +737,16 @@ class NavsimReader:
             images, sweeps = sensor_files(frames, self.sensors)
             if images or sweeps:
                 cameras = cameras_with_pictures(frames[len(frames) // 2], images, opened.log.file)
-                agents = stretch_agents(_repaired(opened, int(inside[0]), int(inside[-1]) + 1)[0])
+                agents = stretch_agents(opened.repaired(int(inside[0]), int(inside[-1]) + 1)[0])
                 others.append(OtherDrive(other.log_id, agents, cameras, images, sweeps))
         return with_other_drives(block, others) if others else block
 
     def _block(self, opened: OpenLog, start: int) -> Block:
         """Up to 20 s that begin at a multiple of 10 s of the stretch and hold the window."""
         assert self.sensors is not None
-        first, stop = _block_frames(opened.table, start)
-        frames = opened.log.frames[first:stop]
+        first, frames, _ = opened.repaired_block(start)
         images, sweeps = sensor_files(frames, self.sensors)
-        start_s = float(opened.table.start_ms[first]) / 1000
-        return Block(start_s, stretch_agents(_repaired(opened, first, stop)[0]), images, sweeps)
+        return Block(float(opened.table.start_ms[first]) / 1000, stretch_agents(frames), images, sweeps)
 
 
 def log_files(root: Path) -> dict[str, Path]:
@@ -760,14 +776,6 @@ def _frame_at(ref: ClipRef, table: FrameTable, file: str) -> int:
     if start < 0 or start + WINDOW_FRAMES > len(table) or stretch[start] != stretch[start + WINDOW_FRAMES - 1]:
         raise BadClip(file, "start_ms", f"no window of {ref.window} starts at {ref.start_ms} ms")
     return start
-
-
-def _repaired(opened: OpenLog, first: int, stop: int) -> tuple[tuple[Frame, ...], Repairs]:
-    """The frames first..stop-1 of a log as of `repaired_frames`, seen with those around them."""
-    stretch = np.flatnonzero(opened.table.stretch == opened.table.stretch[first])
-    begin = max(first - FRAMES_AROUND, int(stretch[0]))
-    end = min(stop + FRAMES_AROUND, int(stretch[-1]) + 1)
-    return repaired_frames(opened.log.frames[begin:end], first - begin, stop - begin)
 
 
 def _block_frames(table: FrameTable, start: int) -> tuple[int, int]:

@@ -101,10 +101,10 @@ def repaired_frames(frames: Sequence[Frame], first: int, stop: int) -> tuple[tup
         tokens = tuple(seen.track_ids[n] for n in here)
         kept = FrameBoxes(own, tuple(seen.kinds[n] for n in here), frame.boxes.velocities[at], tokens)
         out.append(replace(frame, boxes=kept))
-    return tuple(out), _within((*at_parse, *repairs), times_s[first], times_s[stop - 1])
+    return tuple(out), repairs_from((*at_parse, *repairs), times_s[first], times_s[stop - 1])
 
 
-def _within(repairs: Repairs, first_s: float, last_s: float) -> Repairs:
+def repairs_from(repairs: Repairs, first_s: float, last_s: float) -> Repairs:
     """Those that show from first_s to last_s, on a clock that begins at first_s."""
     return tuple(
         replace(one, time_s=max(one.time_s, first_s) - first_s, until_s=min(one.until_s, last_s) - first_s)

@@ -92,21 +92,22 @@ def observed(
     """
     done: list[Repair] = []
     in_time = np.argsort(times_s, kind="stable")
-    rows_ids_kinds = [(row, ids[row], kinds[row]) for row in in_time.tolist()]
-    kind_of = {name: kind for _, name, kind in reversed(rows_ids_kinds) if name is not None and kind is not None}
+    ordered: list[int] = in_time.tolist()
+    latest_first = ((ids[row], kinds[row]) for row in reversed(ordered))
+    kind_of = {name: kind for name, kind in latest_first if name is not None and kind is not None}
     frame_of = np.searchsorted(frame_times_s, times_s)
     unnamed = set[int]()
-    for row, name, _ in rows_ids_kinds:
-        if name is None:
+    for row in ordered:
+        if ids[row] is None:
             done.append(Repair("token", f"box {row}", float(times_s[row]), "no id", LEFT_OUT))
             unnamed.add(int(frame_of[row]))
-    for row, name, kind in rows_ids_kinds:
-        if kind is None and name is not None:
+    for row in ordered:
+        if kinds[row] is None and (name := ids[row]) is not None:
             now = kind_of[name].lower() if name in kind_of else LEFT_OUT
             done.append(Repair("class", name, float(times_s[row]), "of no known class", now))
     names = sorted(kind_of)
     column_of = {name: column for column, name in enumerate(names)}
-    column = np.array([-1 if name is None else column_of.get(name, -1) for _, name, _ in rows_ids_kinds], int)
+    column = np.array([-1 if (name := ids[row]) is None else column_of.get(name, -1) for row in ordered], int)
     known, column = in_time[column >= 0], column[column >= 0]
     placed, at = np.unique(frame_of[known] * len(names) + column, return_index=True)
     rows = np.full((len(frame_times_s), len(names)), UNSEEN)
