@@ -15,11 +15,13 @@ from factory.graph.steps import SampleColumns, run_attempt
 from factory.readers.base import ClipRef
 from factory.setup.settings import Run
 from factory.store.schema import BOOKKEEPING, sample_rows_to_table
+from tasks.experts.recovery import RecoveryExpert
 from tasks.render.settings import RenderMode
 from tasks.stages import TASKS, Rejected
 from tasks.world.vocabulary import Vocabulary
 
 CALIBRATION_CLIPS = 3
+NAVTRAIN_DRIVES = 103_288  # the paper's table of the recovery expert: of each scene the human one
 KINEMATIC_LABELS = (
     "labels: of kinematic trajectories, few of which end where a driver would, so that a planner learns little from "
     "them: give vocabulary.file=<.npy> of human ones (python -m factory vocabulary makes it), or reward.labels=none"
@@ -35,6 +37,7 @@ WATCHED = (
     "reward.after",
     "expert.recovery.smooth",
     "render.mode",
+    "render.frames",
     "render.width",
     "render.height",
     "render.psnr_min",
@@ -61,7 +64,8 @@ def plan_text(run: Run, refs: Sequence[ClipRef]) -> str:
         n_clips = sum(ref.clip_id in starts for ref in refs)
         lines.append(f"starts: {sum(map(len, starts.values()))}; {n_clips} of the {len(refs)} clips have some")
     lines.append(f"experts: {', '.join(config.experts)}; rounds: {config.rounds}; out: {config.out}")
-    lines.append(paper_deviations_line(config, vocabulary))
+    tables = {name: len(one.table) for name, one in run.work.experts.items() if isinstance(one, RecoveryExpert)}
+    lines.append(paper_deviations_line(config, vocabulary, tables))
     return "\n".join(lines)
 
 
@@ -140,9 +144,17 @@ def estimate_run_size(run: Run, refs: Sequence[ClipRef]) -> str:
     return "\n".join(lines)
 
 
-def paper_deviations_line(config: RunConfig, vocabulary: Vocabulary) -> str:
-    """One line: settings that are not preset=paper's, with those in brackets, and what no preset makes the paper's."""
+def paper_deviations_line(config: RunConfig, vocabulary: Vocabulary, tables: Mapping[str, int]) -> str:
+    """One line: settings that are not preset=paper's, with those in brackets, and what no preset makes the paper's.
+
+    tables: trajectories of each recovery expert's table.
+    """
     found = [*differences_from_paper(config, vocabulary), *differences_in_every_preset(config)]
+    found += [
+        f"expert.{name}: {size:,} trajectories to retrieve ({NAVTRAIN_DRIVES:,}, all of navtrain's)"
+        for name, size in tables.items()
+        if size < NAVTRAIN_DRIVES
+    ]
     return f"set-up: not the paper's (in brackets; preset=paper comes nearest): {', '.join(found)}"
 
 
@@ -152,7 +164,7 @@ def differences_in_every_preset(config: RunConfig) -> list[str]:
     if config.traffic.mode == "idm":
         found.append("IDM along the lane graph (the public code's brakes for each lane's end: traffic=navsim)")
     if config.render.mode is not RenderMode.NONE:
-        found.append(f"render.frames={config.render.frames} (all of T .. T+2H)")
+        found.append("pictures from T+2.5 s on, as the release (from T)")
         gate = "the project's own picture gate" if config.render.gate.enabled else "no picture gate"
         found.append(f"{gate} (unstable renderings are left out, by a rule that is not published)")
     return found

@@ -204,7 +204,7 @@ class RenderSettings:
 
     mode: RenderMode = RenderMode.AUTO  # auto: clips with cameras or lidar; map: lanes, boxes; painter: the town
     backend: Backend = Backend.CPU  # gsplat: CUDA, needs the extra [gpu]
-    frames: Frames = Frames.HISTORY  # at 2 Hz; all: T-1.5 s .. the end, history: a planner's input
+    frames: Frames = Frames.HISTORY  # at 2 Hz; all: from 1.5 s before now to the label's end; history: to now
     cameras: tuple[str, ...] = ()  # by name; empty: every camera of the rig
     width: int = 320  # pixels
     height: int = 180  # pixels

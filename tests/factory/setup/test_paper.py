@@ -57,12 +57,15 @@ def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:
         "traffic.yields=True (False)",
         "reward.off_route=True (False)",
         "reward.after=True (False)",
+        "render.frames=history (all)",
         "render.width=320 (1920)",
         "render.height=180 (1080)",
         "render.camera_psnr_min=20.0 (0.0)",
         "render.gate.enabled=True (False)",
     ]
-    assert "\n" not in paper_deviations_line(config, choose_vocabulary(config.vocabulary))
+    said = paper_deviations_line(config, choose_vocabulary(config.vocabulary), {"recovery": 8192, "mine": 103_288})
+    assert "\n" not in said and "expert.mine" not in said
+    assert said.endswith("expert.recovery: 8,192 trajectories to retrieve (103,288, all of navtrain's)")
 
 
 def test_every_setting_of_the_paper_s_table_is_watched(vocabulary: Vocabulary) -> None:
@@ -73,6 +76,7 @@ def test_every_setting_of_the_paper_s_table_is_watched(vocabulary: Vocabulary) -
         "reward.progress_above=-1": "reward.progress_above=-1.0 (0.5)",
         "traffic=replay": "traffic.mode=replay (idm)",
         "render.psnr_gate=mark": "render.psnr_gate=mark (reject)",
+        "render.frames=now": "render.frames=now (all)",
         "pdm=corrected": "pdm.speed_below_zero=False (True)",
     }
     assert set(others.values()) <= set(differences_from_paper(paper(*others), vocabulary))
