@@ -1,5 +1,6 @@
 """What a program ends with, how signals end it, and what becomes of its output: the one place for these."""
 
+import atexit
 import errno
 import io
 import os
@@ -48,32 +49,39 @@ def exit_on_early_interrupt() -> None:
 
 def run_program(main: Callable[[Sequence[str]], int]) -> None:
     """Run the command line of this process and end with its exit code."""
+    # Of all that is done at exit the last: what then comes is Python's own teardown, which makes SIGINT deadly again.
+    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     sys.exit(run_for_exit_code(lambda: main(sys.argv[1:])))
 
 
 def run_for_exit_code(work: Callable[[], int]) -> int:
     """What the work of this process returns; INTERRUPTED, after a line, at a KeyboardInterrupt.
 
+    A first SIGINT that comes once the exit code is known changes nothing; a second one ends the process by that code.
     What it prints decides nothing: see `ignore_broken_output`. TERMINAL_SIGNALS are heeded from here on, where the
     process was begun in `terminal_signals_blocked`.
     """
     ignore_broken_output()
-    noted = list[int]()
+    noted, known = list[int](), list[int]()
 
     def interrupt(number: int, frame: FrameType | None) -> None:
+        if known and noted:  # what is waited for at exit, threads and processes, can hang: on a share, say
+            os._exit(known[0])
         noted.append(number)
-        raise _Interrupt
+        if not known:
+            raise _Interrupt
 
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         signal.signal(signal.SIGINT, interrupt)
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, TERMINAL_SIGNALS)
-        return work()
+        known.append(work())
     except (KeyboardInterrupt, Exception) as error:
         if not (noted or isinstance(error, KeyboardInterrupt)):
             raise  # after a signal it is what an import of compiled modules has made of it
+        known.append(INTERRUPTED)
         print("interrupted", file=sys.stderr)
-        return INTERRUPTED
+    return known[0]
 
 
 class _Interrupt(KeyboardInterrupt):

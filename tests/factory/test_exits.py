@@ -126,6 +126,30 @@ def test_an_interrupt_is_one_line_within_code_that_is_made_up_and_where_it_surfa
     assert (done.returncode, done.stderr) == (INTERRUPTED, "interrupted\n")
 
 
+LATE = {  # what is left when the exit code is known: a callback, a library's own once Python is gone, a thread for ever
+    "callback": "atexit.register(signal.raise_signal, 2)",
+    "library": "libc.__cxa_atexit(libc['raise'], ctypes.c_void_p(2), None)",
+    "hanging": "threading.Thread(target=press).start()",
+}
+
+
+@pytest.mark.parametrize("moment", LATE)
+def test_ctrl_c_once_the_work_is_done_changes_nothing_and_ends_what_hangs(moment: str) -> None:
+    code = f"""
+import atexit, ctypes, os, signal, threading, time
+from factory.exits import run_program
+libc = ctypes.CDLL(None)
+def press():
+    threading.main_thread().join()
+    while True:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.01)
+{LATE[moment]}
+run_program(lambda _: 3)"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (3, "")
+
+
 @pytest.mark.parametrize(
     ("package", "words"),
     [
