@@ -149,6 +149,9 @@ def _child_main(pipe: Connection, run: Run, begun: int) -> None:
     code = 1
     try:
         code = run_for_exit_code(lambda: run(begun, pipe.send))
+    except SystemExit:  # Ray's own answer to SIGTERM, from when it begins to where the run heeds signals itself
+        print(f"interrupted; {AGAIN}", file=sys.stderr)
+        code = INTERRUPTED
     finally:
         pipe.send(code)
     sys.exit(code)

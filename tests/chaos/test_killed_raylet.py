@@ -132,6 +132,8 @@ def ends(how: str, begun: int, tell: Callable[[str], None]) -> int:
             return 3
         case "bug":
             raise RuntimeError("a bug of ours")
+        case "asked":
+            sys.exit(signal.SIGTERM)  # as Ray's handler of that does
         case _:
             os.kill(os.getpid(), signal.SIGKILL)
             return 0
@@ -163,12 +165,13 @@ def test_a_command_ends_as_its_run_did(tmp_path: Path) -> None:
     script.write_text(APART)
     how: dict[str, Any] = {"env": os.environ | {"PYTHONPATH": str(REPOSITORY)}, "text": True}
     how |= dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
-    codes = {"code": 3, "bug": 1, "killed": -signal.SIGKILL}
+    codes = {"code": 3, "bug": 1, "asked": INTERRUPTED, "killed": -signal.SIGKILL}
     running = {word: subprocess.Popen([sys.executable, str(script), "ends", word], **how) for word in codes}
     for word, process in running.items():
         told, said = process.communicate(timeout=100)
         assert process.returncode == codes[word] and "new cluster" not in told
         assert said.count("RuntimeError: a bug of ours") == (word == "bug"), said
+        assert said.count("run the same command again") == (word == "asked"), said
 
 
 @pytest.mark.slow
