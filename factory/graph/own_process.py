@@ -26,6 +26,7 @@ from factory.exits import (
     run_for_exit_code,
     terminal_signals_blocked,
 )
+from factory.wording import one_line
 
 AGAIN = "run the same command again to go on"
 ANSWER_S = 10.0  # for a cluster's port to be reached, and to say what it speaks
@@ -116,9 +117,15 @@ def _ended_without_answer(process: BaseProcess, address: str) -> bool:
     return False
 
 
-def no_cluster_text(address: str, why: object) -> str:
-    """The line about an address at which there is none."""
-    return f"no Ray cluster answers at RAY_ADDRESS={address} ({why}); unset it to run on this machine alone"
+def no_cluster_text(address: str, error: Exception) -> str:
+    """The line about an address whose cluster could not be joined, by what an attempt raised: the cause comes first."""
+    alone = "unset it to run on this machine alone"
+    if "authentication token" in f"{error} {error.__cause__}".lower():  # as Ray has it, of various kinds
+        return (
+            f"this command lacks the token of the Ray cluster at RAY_ADDRESS={address}: export RAY_AUTH_MODE=token and "
+            f"have the token in ~/.ray/auth_token, or {alone}"
+        )
+    return f"no Ray cluster answers at RAY_ADDRESS={address} ({one_line(error)}); {alone}"
 
 
 def check_address_answers(address: str) -> None:

@@ -14,10 +14,12 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # keeps every listener on 127.0.0.1
 
 import ray
+from ray.exceptions import AuthenticationError
 from ray.train import RunConfig, ScalingConfig, WorkerGroupError
 from ray.train.torch import TorchConfig, TorchTrainer, get_device
 
 from factory.exits import terminal_signals_blocked
+from factory.graph.own_process import no_cluster_text
 from planners.training.processes import TrainingProcess, join_process_group
 
 
@@ -65,6 +67,11 @@ def _connected() -> Iterator[None]:
                 include_dashboard=None if there else False,
                 logging_level=logging.WARNING,
             )
+    except (ConnectionError, AuthenticationError) as error:
+        if not there:
+            raise
+        raise ConnectionError(no_cluster_text(os.environ["RAY_ADDRESS"], error)) from error
+    try:
         yield
     finally:
         ray.shutdown()

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+from factory.exits import BAD_CONFIG
 from factory.stages.warm import compile_kernels, part_marker
 from factory.store.reader import SampleTable
 from tasks.caches import without_checksum
@@ -200,3 +201,20 @@ def test_a_run_finds_the_cluster_as_the_page_says(head: Head, tmp_path: Path, sh
     )
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert len(SampleTable(tmp_path / "out")) == 1
+
+
+@pytest.mark.parametrize(
+    ("mode", "words"),  # train reads its data only once it is on the cluster
+    [
+        ("disabled", ("factory", "run", *SMALL, "executor=ray")),
+        ("token", ("planners", "train", "planner=ego_mlp_small", "data.real=[a]", "data.sim=[b]", "executor=ray")),
+    ],
+)
+def test_a_cluster_that_wants_its_token_says_so_first(
+    head: Head, tmp_path: Path, mode: str, words: tuple[str, ...]
+) -> None:
+    environment = head.environment | {"RAY_ADDRESS": head.gcs, "HOME": str(tmp_path), "RAY_AUTH_MODE": mode}
+    command = [sys.executable, "-m", *words, f"out={tmp_path / 'out'}"]
+    ran = subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=200)
+    (line,) = (line for line in ran.stderr.splitlines() if line.startswith("error: "))
+    assert ran.returncode == BAD_CONFIG and line.startswith("error: this command lacks the token of the Ray cluster")

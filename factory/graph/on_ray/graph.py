@@ -69,7 +69,6 @@ GPU_WAIT_S = 900.0  # for the first node with one to come
 RAYLET_DIED = "Ray's raylet on this machine died; run the same command again once Ray is up"
 WORKER_ENV = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 FORWARDED_ENV = ("NUMBA_CACHE_DIR",)
-OR_AUTHENTICATE = "where it wants a token export RAY_AUTH_MODE=token and have the token in ~/.ray/auth_token"
 
 
 @ray.remote(num_cpus=0)
@@ -111,7 +110,7 @@ def join_or_start_cluster(workers: int | None) -> bool:
             raise ClusterDied(f"{said}, where {free:,} bytes are free", True) from error
         if not isinstance(error, ConnectionError | ray.exceptions.AuthenticationError):
             raise
-        raise ConnectionError(f"{no_cluster_text(named, one_line(error))}, or {OR_AUTHENTICATE}") from error
+        raise ConnectionError(no_cluster_text(named, error)) from error
     return where == "local"
 
 
