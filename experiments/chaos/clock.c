@@ -1,5 +1,5 @@
 /* The time of day jumps: every CLOCK_EVERY_MS another CLOCK_JUMP_S is added to it, or taken away again. Loaded before
- * libc (LD_PRELOAD) in a command and in what it begins. See experiments/chaos/outside.py. */
+ * libc (LD_PRELOAD) in a command and in what it begins. See experiments/chaos/trouble.py. */
 
 #define _GNU_SOURCE
 #include <dlfcn.h>

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import IO
 
 from experiments.chaos.memory import Flatness, Held, draw, flatness, read, rss_mb, write
-from experiments.chaos.outside import below, command_line, kill, peers
+from experiments.chaos.trouble import below, command_line, kill, peers
 from factory.exits import COMPLETE
 from factory.store.samples import Store
 from tests.chaos.trials import assert_same_stores
