@@ -118,8 +118,11 @@ def terminal_signals_blocked(*signals: signal.Signals) -> Iterator[None]:
             signal.raise_signal(number)
 
 
-def end_with_parent(code: int) -> None:
-    """From now on this process, one of multiprocessing's, ends by an exit code once the one that began it has ended."""
+def end_with_parent(code: int, last: Callable[[], object] = lambda: None) -> None:
+    """From now on this process, one of multiprocessing's, ends by an exit code once the one that began it has ended.
+
+    last: what it does then.
+    """
     import multiprocessing  # here alone: most programs begin no process
 
     parent = multiprocessing.parent_process()
@@ -127,6 +130,7 @@ def end_with_parent(code: int) -> None:
 
     def watch() -> None:
         parent.join()
+        last()
         os._exit(code)
 
     threading.Thread(target=watch, daemon=True).start()

@@ -152,7 +152,7 @@ def new_cluster_text(said: str, number: int) -> str:
 def _child_main(pipe: Connection, run: Run, begun: int) -> None:
     """The other process: a session of its own, so that a terminal's signals come by way of the command's alone."""
     os.setsid()
-    end_with_parent(BY_RAY)
+    end_with_parent(BY_RAY, partial(_end_session, os.getpid()))  # Ray's agents would look for their GCS for a minute
     code = 1
     try:
         code = run_for_exit_code(lambda: run(begun, pipe.send))
@@ -182,8 +182,9 @@ def _pass_on(process: BaseProcess, number: int, frame: FrameType | None) -> None
 
 
 def _end_session(session: int) -> None:
-    """End what a process that is gone had begun: Ray's processes of a cluster of its own."""
+    """End what a process that is gone, or this one, had begun: Ray's processes of a cluster of its own."""
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):
-            if int(stat.read_text().rpartition(")")[2].split()[3]) == session:
-                os.kill(int(stat.parent.name), signal.SIGKILL)
+            pid = int(stat.parent.name)
+            if int(stat.read_text().rpartition(")")[2].split()[3]) == session and pid != os.getpid():
+                os.kill(pid, signal.SIGKILL)

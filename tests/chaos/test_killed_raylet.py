@@ -140,8 +140,9 @@ def ends(how: str, begun: int, tell: Callable[[str], None]) -> int:
 
 
 def waits(journal: str, begun: int, tell: Callable[[str], None]) -> int:
-    """Until it is asked to stop."""
+    """Until it is asked to stop, with a process of its cluster beside it."""
     asked = threading.Event()
+    subprocess.Popen(["sleep", "1000"])
     with calling_on_stop_signal(asked.set):
         Path(journal).write_text(str(os.getpid()))
         assert asked.wait(100.0)
