@@ -283,6 +283,14 @@ def why_not_written(error: BaseException) -> tuple[str, str]:
     return full, full and "free disk space"
 
 
+def why_no_memory(error: BaseException) -> str:
+    """What was said where memory was refused, also to who loads a library, where that is behind the error."""
+    for seen in _errors_behind(error):
+        if isinstance(seen, MemoryError) or (isinstance(seen, ImportError) and NO_ROOM.search(str(seen))):
+            return f"out of memory: {one_line(seen)}"
+    return ""
+
+
 def nearest_existing(path: Path) -> Path:
     """The path itself, or the nearest folder above it that is there."""
     return next(place for place in (path, *path.parents) if place.exists())
@@ -304,6 +312,7 @@ MACHINE_ERRNOS = frozenset(
 STORE_FAULT = re.compile(
     r"AWS Error (?!NO_SUCH|RESOURCE_NOT_FOUND)|Generic (?:S3|GCS|MicrosoftAzure) error|lacked the necessary privileges"
 )
+NO_ROOM = re.compile(r"failed to map segment from shared object(: Cannot allocate memory)?$", re.M)  # ld.so
 SHORT_OF_MEMORY = 0.1  # of it is left: then a MemoryError is the machine's, else of what was asked for
 
 

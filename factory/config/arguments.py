@@ -132,7 +132,7 @@ def _exit_of_error(
     error: Exception, refused: tuple[type[Exception], ...], resumes: bool, elsewhere: str
 ) -> tuple[int, str]:
     """The exit code and the line that an exception ends a command with; COMPLETE for a fault of the program."""
-    from factory.files import DamagedFile, DiskFull, machine_fault_of, why_not_written
+    from factory.files import DamagedFile, DiskFull, machine_fault_of, why_no_memory, why_not_written
     from factory.wording import one_line
 
     if isinstance(error, Stopped):
@@ -143,8 +143,10 @@ def _exit_of_error(
         return COMPLETE_WITH_FAILURES, f"error: {error}"
     why, helps = why_not_written(error)
     helps = f"; {helps}{elsewhere}" if helps and helps not in str(error) else ""
-    if isinstance(error, (Refused, ConfigError, MemoryError, *refused)):
+    if isinstance(error, (Refused, ConfigError, *refused)):
         return BAD_CONFIG, f"error: {error}{helps}"
+    if refused_memory := why_no_memory(error):
+        return BAD_CONFIG, f"error: {refused_memory}"
     if resumes and isinstance(error, DiskFull):
         return INTERRUPTED, f"error: {error}; free disk space and run the same command again"
     if resumes and machine_fault_of(error):

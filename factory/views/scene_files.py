@@ -256,7 +256,7 @@ def _load_checkpoint(path: Path) -> object:
     arrays = [np.ndarray, np.dtype, *kinds, rebuilt, scalar, *older]
     try:
         content = load_tensors(path, arrays)
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise BadScene(f"{path}: {NO_TORCH}") from error
     except ValueError as error:
         raise BadScene(str(error)) from error
@@ -278,7 +278,7 @@ def _checkpoint_bytes(content: Mapping[str, Any]) -> bytes:
 
     try:
         import torch
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise ValueError(NO_TORCH) from error
 
     def tensors(value: Any) -> Any:

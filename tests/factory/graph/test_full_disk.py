@@ -146,6 +146,20 @@ def test_every_command_says_how_to_go_on_where_a_disk_refuses_once(
     assert re.fullmatch(f"error: .*/a/file.*; {helps}, or so\n", capsys.readouterr().err)
 
 
+UNMAPPED = "libtorch_cpu.so: failed to map segment from shared object"
+
+
+@pytest.mark.parametrize("error", [MemoryError(), MemoryError("Unable to allocate 7 TiB"), ImportError(UNMAPPED)])
+def test_every_command_names_memory_where_that_is_refused(error: Exception, capsys: pytest.CaptureFixture[str]) -> None:
+    def does(argv: object, raised: Exception = error) -> int:
+        raise raised
+
+    assert run_command([], does, str) == BAD_CONFIG
+    assert re.fullmatch("error: out of memory: .+\n", capsys.readouterr().err)
+    with pytest.raises(ImportError):  # a folder that nothing may be run from
+        run_command([], lambda argv: does(argv, ImportError(f"{UNMAPPED}: Operation not permitted")), str)
+
+
 def test_a_full_disk_under_the_user_s_cache_is_told_with_its_path_and_is_no_wrong_setting(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
