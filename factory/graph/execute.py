@@ -267,11 +267,12 @@ class _Run:
             self._end_broken(ended.message or f"{one_line(error)}; {AGAIN}")
         driver = self._driver
         ended.executed, ended.seconds, ended.notes = driver.executed, driver.seconds, driver.notes
-        if ended.began_ms or ended.exit_code:
-            try:
+        try:
+            killed = self._store.newest_run().goes_on  # behind its last commit
+            if ended.began_ms or ended.exit_code or killed:
                 write_last_run(self._store, ended)
-            except OSError as error:  # the same disk or share
-                self._end_broken(ended.message or _advice_after(error))
+        except OSError as error:  # the same disk or share
+            self._end_broken(ended.message or _advice_after(error))
         return ended
 
 

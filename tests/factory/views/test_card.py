@@ -82,6 +82,8 @@ def test_a_card_says_that_a_run_was_interrupted_and_the_next_that_it_is_complete
     assert "The run is complete." in (tmp_path / FILE).read_text()
     (tmp_path / "last_run.json").unlink()  # as after a kill
     assert "The run is not finished" in card(store)
+    assert executed(ToyWork(), refs(3), ["human"], 1, store).exit_code == COMPLETE
+    assert "The run is complete." in card(store), "though nothing was left to do"
 
 
 @pytest.mark.parametrize("name", ["current_run.json", "last_run.json"])
