@@ -48,7 +48,7 @@ from factory.graph.local import (
     task_name,
     task_note,
 )
-from factory.graph.own_process import check_address_answers, no_cluster_text
+from factory.graph.own_process import AGAIN, check_address_answers, no_cluster_text
 from factory.graph.plan import AttemptBatch
 from factory.graph.progress import METRICS, Metric, Type
 from factory.graph.steps import BatchReport, Failure, NotReady, PreparedClip, Work, attempt, never_stop
@@ -161,22 +161,34 @@ def on_node(node: str) -> NodeAffinitySchedulingStrategy:
 
 
 def check_shared(out: Location, setting: str, wanted: str) -> None:
-    """Every node reads what the driver wrote under `out`. Raises BadLocation with what is `wanted` of the setting."""
+    """Every node reads what the driver wrote under `out`; one that dies meanwhile need not.
+
+    Raises BadLocation with what is `wanted` of the setting, ConnectionError where a node does not answer.
+    """
     nodes = nodes_of_cluster()
     if len(nodes) < 2:
         return
     name, token = f"probe-{secrets.token_hex(8)}", secrets.token_bytes(16)
     out.write(name, token)
     try:
-        answers = ray.get(
-            [_can_read.options(scheduling_strategy=on_node(node)).remote(out, name, token) for node in nodes],
-            timeout=PROBE_SECONDS,
-        )
+        asked = [_can_read.options(scheduling_strategy=on_node(node)).remote(out, name, token) for node in nodes]
+        ray.wait(asked, num_returns=len(asked), timeout=PROBE_SECONDS)
+        blind = [node for node, answer in zip(nodes, asked) if not _answer_of(node, answer)]
     finally:
         out.remove(name)
-    blind = [node for node, sees in zip(nodes, answers) if not sees]
     if blind:
         raise BadLocation(f"{setting}={out.uri} is not the same folder on nodes {blind}: name {wanted}")
+
+
+def _answer_of(node: str, answer: Any) -> bool:
+    try:
+        return bool(ray.get(answer, timeout=0.0))
+    except RayTaskError:
+        raise
+    except RayError as error:
+        if node in nodes_of_cluster():
+            raise ConnectionError(f"node {node} does not answer ({one_line(error)}); {AGAIN}") from error
+        return True
 
 
 ILL = (  # what Ray says when it is the machine that failed

@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
@@ -18,6 +19,7 @@ from factory.graph.execute import Execution
 from factory.graph.local import Claims
 from factory.graph.on_ray import graph
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
+from factory.store.location import Location
 from factory.store.samples import Store
 from factory.store.verify import verify
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
@@ -72,6 +74,18 @@ def test_a_head_node_is_told_from_what_else_listens(two_cpus: None) -> None:
             with pytest.raises(ConnectionError, match=f"at RAY_ADDRESS={address} .*; unset it"):
                 graph.check_address_answers(address)
         server.shutdown()
+
+
+def test_a_node_that_dies_before_it_is_asked_for_out_is_left_out(
+    tmp_path: Path, two_cpus: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, nodes = Location.parse(str(tmp_path)), graph.nodes_of_cluster()
+    for alive in (nodes, [*nodes, "ab" * 28]):
+        seen = iter([[*nodes, "ab" * 28], alive])
+        monkeypatch.setattr(graph, "nodes_of_cluster", lambda having="", seen=seen: next(seen))
+        with nullcontext() if alive == nodes else pytest.raises(ConnectionError, match="does not answer"):
+            graph.check_shared(out, "out", "a shared folder")
+    assert not list(tmp_path.iterdir())
 
 
 def test_local_and_ray_with_one_and_two_workers_make_identical_rows(tmp_path: Path, two_cpus: None) -> None:
