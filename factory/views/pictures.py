@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -139,9 +140,13 @@ def write_text(image: Bytes, text: str, at: tuple[int, int], size: float = 0.4, 
 
 
 def write_mp4(path: "os.PathLike[str]", frames: Iterable[Bytes], frames_per_s: int = 10) -> None:
-    """RGB frames (height, width, 3), even sizes, as H.264 that browsers play. Raises ValueError without frames."""
+    """RGB frames (height, width, 3), even sizes, as H.264 that browsers play; makes the folder.
+
+    Raises ValueError without frames.
+    """
     import av
 
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = None
         for frame in frames:

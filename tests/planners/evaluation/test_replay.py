@@ -1,10 +1,13 @@
 """A film of a street: every instant of both stages, with or without a camera."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
 from factory.config.compose import ConfigError
+from factory.views.pictures import write_mp4
 from planners.evaluation.planner_names import find_planner
 from planners.evaluation.replay import HOLD, ReplaySettings, find_clip, replay, settings_of
 from planners.evaluation.scoring import Rules
@@ -24,6 +27,11 @@ def test_both_stages_are_shown_from_history_to_the_end(benchmark: StreetBenchmar
     assert len(pictures) == 2 * (INSTANTS + HOLD)
     assert {picture.shape for picture in pictures} == {(560, 1280, 3)}
     assert (pictures[0] != pictures[30]).any()
+
+
+def test_a_film_makes_its_folder(tmp_path: Path) -> None:
+    write_mp4(path := tmp_path / "a" / "b.mp4", [np.zeros((16, 16, 3), np.uint8)])
+    assert path.stat().st_size > 0
 
 
 def test_nobody_drives_like_the_human_after_stage_one(benchmark: StreetBenchmark) -> None:
