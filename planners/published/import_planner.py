@@ -352,8 +352,8 @@ def import_to(config: ImportConfig) -> Path:
         "backbones": {"all": source},
         "parameters": sum(parameter.numel() for parameter in found.planner.parameters()),
     }
+    print(describe_import(found, public), flush=True)  # before it is there: a full disk may hold what is printed
     folder = save_checkpoint(out, 0, found.planner, record, {})
-    print(describe_import(found, public))
     print(f"imported: {folder}")
     return folder
 

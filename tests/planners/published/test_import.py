@@ -1,5 +1,8 @@
 """`python -m planners import`: from a Lightning checkpoint to a folder that everything else takes."""
 
+import errno
+import io
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,13 @@ from tests.planners.published.ours import batch_of, formula_weights
 from tests.planners.published.test_parity import TOLERANCE, recorded
 
 
+class FullDisk(io.StringIO):
+    """Standard output into a file on one."""
+
+    def flush(self) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
 @pytest.mark.slow
 def test_a_checkpoint_becomes_a_folder_that_plans_as_the_public_model(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -23,6 +33,9 @@ def test_a_checkpoint_becomes_a_folder_that_plans_as_the_public_model(
     named = {f"agent._transfuser_model.{name}": value for name, value in weights.items()}
     torch.save({"state_dict": named, "global_step": 123}, path)
     size = ["planner.settings.image.width=256", "planner.settings.image.height=64"]
+    with redirect_stdout(FullDisk()):
+        assert main([str(path), "planner=ltf_public", f"out={out}", *size]) == 2 and not out.exists()
+    assert "space" in capsys.readouterr().err
     assert main([str(path), "planner=ltf_public", f"out={out}", *size]) == 0
     said = capsys.readouterr().out
     assert f"in {len(one.names)} arrays are the planner's weights" in said
