@@ -284,10 +284,10 @@ def why_not_written(error: BaseException) -> tuple[str, str]:
 
 
 def why_no_memory(error: BaseException) -> str:
-    """What was said where memory was refused, also to who loads a library, where that is behind the error."""
+    """What was said where memory was refused, also to a library or a thread, where that is behind the error."""
     for seen in _errors_behind(error):
-        if isinstance(seen, MemoryError) or (isinstance(seen, ImportError) and NO_ROOM.search(str(seen))):
-            return f"out of memory: {one_line(seen)}"
+        if isinstance(seen, MemoryError) or NO_ROOM.search(str(seen)):
+            return f"out of memory or threads: {one_line(seen)}"
     return ""
 
 
@@ -312,7 +312,11 @@ MACHINE_ERRNOS = frozenset(
 STORE_FAULT = re.compile(
     r"AWS Error (?!NO_SUCH|RESOURCE_NOT_FOUND)|Generic (?:S3|GCS|MicrosoftAzure) error|lacked the necessary privileges"
 )
-NO_ROOM = re.compile(r"failed to map segment from shared object(: Cannot allocate memory)?$", re.M)  # ld.so
+NO_ROOM = re.compile(  # ld.so's words, Python's, PyTorch's
+    r"failed to map segment from shared object(: Cannot allocate memory)?$|^can't start new thread$"
+    r"|can't allocate memory",
+    re.M,
+)
 SHORT_OF_MEMORY = 0.1  # of it is left: then a MemoryError is the machine's, else of what was asked for
 
 

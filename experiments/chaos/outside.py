@@ -160,13 +160,14 @@ ROWS: Mapping[str, Row] = {
     ),
     "ascii": Same("with LANG=C and an output of ASCII alone", trouble.started_with(**ASCII), EVERY),
     "files": Same("with 64 open files", trouble.started_with("prlimit", "--nofile=64"), EVERY, BAD, "files"),
-    # delta-rs ends by SIGABRT where Rust is refused memory, OpenBLAS by exit code 1 and a line of its own
+    # Where it is refused, Rust ends by SIGABRT, other native code by SIGSEGV, OpenBLAS by exit code 1 and a line of its
+    # own, or without threads by raise(SIGINT).
     "memory": Same(
         "with 512 MB less memory than it takes",
         trouble.short_of_memory,
         EVERY,
-        (*BAD, -signal.SIGABRT, DAMAGED),
-        "(?i)memory|again",
+        (*BAD, -signal.SIGABRT, -signal.SIGSEGV, DAMAGED),
+        "(?i)memory|again|interrupted",
     ),
     "no-shm": Same("without /dev/shm", trouble.no_shared_memory, (*EVERY, "ray"), BAD, needs_root=True),
     "clock": Same("on a clock that jumps by hours and back", trouble.jumping_clock, EVERY),

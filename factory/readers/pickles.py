@@ -24,6 +24,7 @@ from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
+from factory.files import why_no_memory
 from factory.readers.base import MAX_FILE_BYTES, BadClip
 from factory.wording import one_line, shown
 
@@ -485,7 +486,7 @@ def load_tensors(path: Path, safe: Sequence[Any] = ()) -> Any:
     except OSError:
         raise
     except Exception as error:  # whatever a damaged file, or an object that is refused, raises
-        said = one_line(error).partition(". ")[0]
+        said = why_no_memory(error) or one_line(error).partition(". ")[0]
         raise ValueError(f"{path}: cannot be read as a checkpoint of tensors and plain values: {said}") from error
     try:
         check_values(content, path.stat().st_size, str(path), "checkpoint")

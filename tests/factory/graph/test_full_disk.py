@@ -155,7 +155,7 @@ def test_every_command_names_memory_where_that_is_refused(error: Exception, caps
         raise raised
 
     assert run_command([], does, str) == BAD_CONFIG
-    assert re.fullmatch("error: out of memory: .+\n", capsys.readouterr().err)
+    assert re.fullmatch("error: out of memory or threads: .+\n", capsys.readouterr().err)
     with pytest.raises(ImportError):  # a folder that nothing may be run from
         run_command([], lambda argv: does(argv, ImportError(f"{UNMAPPED}: Operation not permitted")), str)
 
