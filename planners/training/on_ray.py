@@ -14,17 +14,22 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # keeps every listener on 127.0.0.1
 
 import ray
-from ray.exceptions import AuthenticationError
+from ray.exceptions import ActorDiedError, AuthenticationError
 from ray.train import RunConfig, ScalingConfig, WorkerGroupError
 from ray.train.torch import TorchConfig, TorchTrainer, get_device
 
 from factory.exits import terminal_signals_blocked
+from factory.graph.local import ClusterDied
 from factory.graph.own_process import no_cluster_text
+from factory.wording import one_line
 from planners.training.processes import TrainingProcess, join_process_group
 
 
 def train_on_ray(train: Callable[[TrainingProcess], None], out: str, processes: int, gpus: int, cpus: int) -> None:
-    """Call `train` in each of `processes`, with so many GPUs and CPUs each. What one of them raises is raised here."""
+    """Call `train` in each of `processes`, with so many GPUs and CPUs each. What one of them raises is raised here.
+
+    Raises ClusterDied where Ray's own trainer dies.
+    """
     gpu = gpus > 0
     with _connected():
         trainer = TorchTrainer(
@@ -41,6 +46,8 @@ def train_on_ray(train: Callable[[TrainingProcess], None], out: str, processes: 
         except WorkerGroupError as error:
             cause = next(iter(error.worker_failures.values()))
             raise getattr(cause, "_base_exc", cause) from error  # Ray wraps what a process raised with its traceback
+        except ActorDiedError as error:  # the trainer's own, with the node of this process
+            raise ClusterDied(f"Ray's trainer died: {one_line(error)}", "RAY_ADDRESS" not in os.environ) from error
 
 
 def _part(settings: dict[str, Any]) -> None:
