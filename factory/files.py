@@ -231,10 +231,11 @@ def naming_disk_errors(path: str | os.PathLike[str], n_bytes: int) -> Iterator[N
     """For the writing of about `n_bytes` at a local path. Raises DiskFull where they find none, and NotWritable."""
     try:
         yield
-    except OSError as error:
-        number = _number_of(error)
-        if isinstance(error, DiskFull | NotWritable) or number not in (*FULL, *REFUSED):
+    except Exception as error:  # also a library's own, such as of safetensors
+        numbers = {_number_of(seen) for seen in _errors_behind(error)} & {*FULL, *REFUSED}
+        if isinstance(error, DiskFull | NotWritable) or not numbers:
             raise
+        number = numbers.pop()
         if number in REFUSED:
             raise NotWritable(f"{path}: cannot be written: {os.strerror(number)}") from error
         free = shutil.disk_usage(nearest_existing(Path(path))).free

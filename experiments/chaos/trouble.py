@@ -309,10 +309,11 @@ def half_questions(scene: Scene, process: subprocess.Popen[bytes]) -> None:
 
 
 def another_driver(name: str) -> Making:
-    """Of the same `out`, begun at any moment: it goes on, and the first ends."""
+    """Of the same `out`, at any moment from when the first has begun there: it goes on, and the first ends."""
 
     def begin(scene: Scene, process: subprocess.Popen[bytes]) -> None:
-        a_moment(scene, process)
+        wait_for(process, (scene.out / "current_run.json").exists)
+        a_moment(scene, process, 0.5)
         ended = scene.start(name, "second")
         assert ended.code == COMPLETE, f"the second driver ended with {ended.code}: {ended.err}"
 
@@ -351,8 +352,7 @@ def losing_a_node(kind: str) -> Making:
 
     @contextmanager
     def make(scene: Scene) -> Iterator[Trouble]:
-        port = free_port()
-        ray = OF_NODES if kind == "second" else STANDING
+        port, ray = free_port(), OF_NODES if kind == "second" else STANDING
         with ExitStack() as stack:
             pids = stack.enter_context(standing_node(scene.folder / "ray", port, True, ray))
             if kind == "second":

@@ -26,6 +26,7 @@ import numpy as np
 
 from factory.config.compose import ConfigError
 from factory.config.shapes import to_plain
+from factory.files import naming_disk_errors
 from factory.readers.pickles import load_tensors
 from factory.wording import one_line
 from planners.models.settings import PlannerChoice
@@ -56,7 +57,8 @@ def save_checkpoint(
 ) -> Path:
     """Write checkpoint `step` under `out` and remove those that do not stay; returns its folder.
 
-    record: what is to be known of the training, plain values; the planner's name and settings are added.
+    record: what is to be known of the training, plain values; the planner's name and settings are added. Raises
+    DiskFull, NotWritable.
     """
     import torch
     from safetensors.torch import save_file
@@ -64,15 +66,18 @@ def save_checkpoint(
     folder = out / FOLDER / f"{step:08d}"
     unfinished = folder.with_name(f".{folder.name}.{os.getpid()}")
     shutil.rmtree(unfinished, ignore_errors=True)
-    unfinished.mkdir(parents=True)
     who = {"planner": {"name": planner.chosen_as, "settings": settings_record(planner.settings)}, "step": step}
-    save_file({k: v.contiguous() for k, v in planner.state_dict().items()}, unfinished / WEIGHTS)
-    np.savez(unfinished / ARRAYS, **planner.arrays)  # type: ignore[arg-type]
-    torch.save(dict(training), unfinished / TRAINING)
-    files = {FILES: {name: _sha256(unfinished / name) for name in (WEIGHTS, ARRAYS, TRAINING)}}
-    (unfinished / RECORD).write_text(json_with_checksum({**who, **record, **files}))
-    shutil.rmtree(folder, ignore_errors=True)
-    os.replace(unfinished, folder)
+    weights = {k: v.contiguous() for k, v in planner.state_dict().items()}
+    with naming_disk_errors(folder, sum(v.nbytes for v in weights.values())):
+        unfinished.mkdir(parents=True)
+        save_file(weights, unfinished / WEIGHTS)
+        np.savez(unfinished / ARRAYS, **planner.arrays)  # type: ignore[arg-type]
+        with (unfinished / TRAINING).open("wb") as file:  # by its path PyTorch writes itself, and says not what failed
+            torch.save(dict(training), file)
+        files = {FILES: {name: _sha256(unfinished / name) for name in (WEIGHTS, ARRAYS, TRAINING)}}
+        (unfinished / RECORD).write_text(json_with_checksum({**who, **record, **files}))
+        shutil.rmtree(folder, ignore_errors=True)
+        os.replace(unfinished, folder)
     stays = None if keep.best is None else best_checkpoint(out, keep.best)
     for old in checkpoints(out)[:-KEPT]:
         if old != stays and not (keep.every and int(old.name) % keep.every == 0):

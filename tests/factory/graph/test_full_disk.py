@@ -134,6 +134,16 @@ def test_what_a_full_disk_said_is_found_behind_other_errors_and_in_delta_s_words
     assert failure_from_error(ValueError("else")).disk_full == ""
 
 
+def test_a_library_s_own_error_of_a_full_disk_is_named_by_the_path() -> None:
+    """As safetensors has it, and PyTorch, which raises of what the file raised."""
+    for first in (Exception("I/O error: No space left on device (os error 28)"), OSError(errno.ENOSPC, "No space")):
+        with pytest.raises(DiskFull, match="/a/file: the disk is full: 7"), naming_disk_errors("/a/file", 7):
+            try:
+                raise first
+            except OSError as error:
+                raise RuntimeError("unexpected pos 704 vs 598") from error
+
+
 @pytest.mark.parametrize("refused", [(), INPUT_ERRORS])
 @pytest.mark.parametrize("number, helps", [(28, "free disk space"), (30, AS_ANOTHER), (13, AS_ANOTHER)])
 def test_every_command_says_how_to_go_on_where_a_disk_refuses_once(
