@@ -25,7 +25,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from scipy.spatial.transform import Rotation
 
 from factory.store.episodes import Message, episode_bytes
-from factory.store.schema import FIELDS, NOW_INDEX
+from factory.store.schema import AGENT_STEPS, FIELDS, NOW_INDEX
 from factory.views.pictures import AGENT_COLOURS, EXPERT, LOGGED, OBJECT, PERTURBED, Colour, ego_poses
 from tasks.world.arrays import Array
 from tasks.world.frames import PACIFICA, to_local
@@ -186,7 +186,7 @@ def _agents(row: Row) -> Iterator[Message]:
         update = SceneUpdate(
             deletions=[SceneEntityDeletion(timestamp=_stamp(time_ns), type=SceneEntityDeletion.Type.ALL)]
         )
-        for i in np.flatnonzero(np.asarray(row["agent_valid"], bool).reshape(len(boxes), -1)[:, step]):
+        for i in np.flatnonzero(np.asarray(row["agent_valid"], bool).reshape(-1, AGENT_STEPS)[:, step]):
             x, y, heading, length, width = boxes[i, step]
             kind, height = row["agent_kinds"][i], float(row["agent_heights"][i])
             z = centre_z[i, step] - ground

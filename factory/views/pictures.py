@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from factory.store.reader import decode_stored_image, labels_of
-from factory.store.schema import NOW_INDEX
+from factory.store.schema import AGENT_STEPS, NOW_INDEX
 from tasks.attempt import Judged
 from tasks.perturb import Candidate, ConsideredTrajectories
 from tasks.world.arrays import Array, Bytes, Image, ShortInts
@@ -308,7 +308,7 @@ def sample_bev(
         lanes=list(lanes.values()),
         red=[lanes[i] for i in sorted(red) if i in lanes],
     )
-    boxes = np.asarray(row["agent_boxes"], dtype=float).reshape(len(row["agent_kinds"]), -1, 5)
+    boxes = np.asarray(row["agent_boxes"], dtype=float).reshape(-1, AGENT_STEPS, 5)
     here = ego_poses(row)[step]
     paths = [*(_scored_paths(row, vocabulary) if vocabulary is not None else ()), *_paths_of_sample(row, logged)]
     if not legend:

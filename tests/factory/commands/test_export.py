@@ -16,6 +16,7 @@ from factory.store.episodes import episode_bytes
 from factory.store.samples import Store
 from factory.store.schema import COLUMNS
 from factory.views.episode_messages import episode_messages, metadata_of, world_from_now
+from factory.views.pictures import sample_bev
 from tests.planners.samples import FRONT_YAWS, jpeg, pictures, plain, sample, write_table
 
 main = COMMANDS["export"].load()
@@ -125,6 +126,14 @@ def test_agents_are_where_and_when_they_are_and_gone_when_they_are_not(
             q = cube.pose.orientation
             turned = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_euler("zyx")[0]
             assert np.cos(turned - box[2]) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_a_street_without_anybody_is_drawn_and_exported(row: dict[str, Any]) -> None:
+    alone = row | {name: row[name][:0] for name in row if name.startswith("agent_")}
+    for kept in (alone, alone | {name: [] for name in alone if name.startswith("agent_")}):  # of a run, of a table
+        agents = read(episode_bytes(episode_messages(kept), metadata_of(kept)))["/agents"]
+        assert len(agents) == 56 and not any(message.entities for _, message in agents)
+        assert (sample_bev(kept) != sample_bev(row)).any()
 
 
 def test_the_three_drives_meet(row: dict[str, Any], topics: dict[str, list[Message]]) -> None:
