@@ -487,6 +487,10 @@ class NavsimReader:
         self.cache_dir = Path(given.cache_dir or user_cache() / "navsim").expanduser().absolute()
         self._logs: dict[str, OpenLog] = {}
 
+    @property
+    def _filter(self) -> str:
+        return f"the scene filter {self.selection.name}" if self.selection else "no scene filter"
+
     def __getstate__(self) -> dict[str, Any]:
         held = {**self.__dict__, "_logs": {}}
         held.pop("_paths", None)
@@ -543,7 +547,7 @@ class NavsimReader:
             raise ValueError(" ".join(map(str, cities.values())))
         if tokens is not None and (absent := len(tokens - found_tokens)):
             if not found and not broken:
-                raise ValueError(f"{self.root}: none of the scene filter's {len(tokens)} tokens is in the logs here")
+                raise ValueError(f"{self.root}: none of the {len(tokens)} tokens of {self._filter} is in the logs here")
             dropped[ABSENT] += absent
         return ClipIndex(tuple(refs), dict(dropped), skipped, broken)
 
@@ -645,7 +649,7 @@ class NavsimReader:
         wanted = frozenset(named)
         chosen = {log_id: path for log_id, path in chosen.items() if log_id in wanted}
         if not chosen:
-            raise ValueError(f"{self.root}: none of the {len(wanted)} logs that the scene filter names is here")
+            raise ValueError(f"{self.root}: none of the {len(wanted)} logs that {self._filter} names is here")
         return chosen
 
     def _tables(self, logs: Mapping[str, Path]) -> Iterable[tuple[str, FrameTable | BadClip]]:

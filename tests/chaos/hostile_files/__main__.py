@@ -14,65 +14,71 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from tests.chaos.hostile_files.doors import DOORS, LOGS, write_innocents
-from tests.chaos.hostile_files.trials import BATCH, Verdict, in_fork, judge_logs, judge_single, load_what_is_read_with
+from tests.chaos.hostile_files.trials import (
+    LIMIT_S,
+    Verdict,
+    crafted,
+    in_fork,
+    judge_logs,
+    judge_single,
+    load_what_is_read_with,
+)
+
+BATCH = 25  # logs beside an innocent one
 
 
 def main(
-    cases: int = 250, minutes: float = 150.0, to: str = "build/hostile_files", doors: str = "", only: str = ""
+    cases: str = "250", minutes: str = "150", to: str = "build/hostile_files", doors: str = "", only: str = ""
 ) -> int:
-    end, kept = time.monotonic() + 60.0 * minutes, Path(to) / "verdicts.jsonl"
-    kept.parent.mkdir(parents=True, exist_ok=True)
+    end, kept = time.monotonic() + 60.0 * float(minutes), Path(to).absolute() / "verdicts.jsonl"
+    (innocents := kept.with_name("innocents")).mkdir(parents=True, exist_ok=True)
     told = [Verdict(**json.loads(line)) for line in kept.read_text().splitlines()] if kept.exists() else []
-    if only:
-        asked = [case.split(":") for case in re.split(r"(?<=\d),", only)]
-        wanted = {door: [int(n) for d, n in asked if d == door] for door in dict.fromkeys(door for door, _ in asked)}
-    else:
-        wanted = {
-            door: [*range(cases)] for door in DOORS if not doors or any(word in door for word in doors.split(","))
-        }
+    wanted = defaultdict[str, list[int]](list)
+    for case in re.split(r"(?<=\d),", only) if only else ():
+        wanted[case.partition(":")[0]].append(int(case.partition(":")[2]))
+    if not only:
+        wanted |= {door: [*range(int(cases))] for door in DOORS if any(word in door for word in doors.split(","))}
     known = {(verdict.door, verdict.number) for verdict in told}
     left = {door: [n for n in numbers if (door, n) not in known] for door, numbers in wanted.items()}
-    (innocents := kept.parent.absolute() / "innocents").mkdir(exist_ok=True)
     load_what_is_read_with(left)
-    if (made := in_fork(lambda: write_innocents(innocents, left) or 0, kept.parent / "made")).code:
+    if (made := in_fork(lambda: write_innocents(innocents, left), kept.with_name("made"), LIMIT_S)).code:
         raise RuntimeError(made.said[-2000:])
     with kept.open("a") as file:
         for at in range(0, max(map(len, left.values())), BATCH):  # a part that ends early has some of every kind
             for door in left:
-                numbers = left[door][at : at + BATCH]
-                if not numbers or time.monotonic() > end:
-                    continue
-                folder = Path(tempfile.mkdtemp())  # a TemporaryDirectory would be removed by forks that end
-                singly = ([judge_single(innocents, folder / str(n), door, n)] for n in numbers)
-                for new in [judge_logs(innocents, folder, door, numbers)] if door in LOGS else singly:
-                    for verdict in new:
-                        if verdict.finding:
-                            print(verdict.text, file=sys.stderr)
-                        print(json.dumps(verdict.__dict__), file=file, flush=True)
-                    told += new
-                    if time.monotonic() > end:
-                        break
-                shutil.rmtree(folder)
-    print("| door | cases | attacks | read | refused | findings | CPU s | GB |\n|---|---|---|---|---|---|---|---|")
-    of = defaultdict[str, list[Verdict]](list)
-    for verdict in told:
-        of[verdict.door].append(verdict)
-    for door, some in of.items():
-        counts = [
-            len(some),
-            len({v.attack for v in some}),
-            *(sum(v.how == how for v in some) for how in ("read", "refused")),
-        ]
-        most = [f"{max(v.cpu_s for v in some):.1f}", f"{max(v.gb for v in some):.2f}"]
-        print("|", " | ".join(map(str, [door, *counts, sum(bool(v.finding) for v in some), *most])), "|")
-    print(f"{len(told):,} cases")
+                for new in tried(innocents, door, left[door][at : at + BATCH], end):
+                    if new.finding:
+                        print(new.text, file=sys.stderr, flush=True)
+                    print(json.dumps(new.__dict__), file=file, flush=True)
+                    told.append(new)
+    print(table_of(told))
     return sum(bool(verdict.finding) for verdict in told)
 
 
+def tried(innocents: Path, door: str, numbers: Sequence[int], end: float) -> Iterator[Verdict]:
+    folder = Path(tempfile.mkdtemp())  # a TemporaryDirectory would be removed by forks that end
+    if door in LOGS and numbers and time.monotonic() < end:
+        yield from judge_logs(innocents, folder, door, {n: crafted(door, innocents, n) for n in numbers})
+    for n in numbers if door not in LOGS else ():
+        if time.monotonic() < end:
+            yield judge_single(innocents, folder / str(n), door, n)
+    shutil.rmtree(folder)
+
+
+def table_of(told: Sequence[Verdict]) -> str:
+    lines = ["| door | cases | attacks | read | refused | findings | CPU s | GB |", "|---|---|---|---|---|---|---|---|"]
+    for door in dict.fromkeys(verdict.door for verdict in told):
+        some = [verdict for verdict in told if verdict.door == door]
+        hows, found = [verdict.how for verdict in some], sum(bool(verdict.finding) for verdict in some)
+        counts = len(some), len({verdict.attack for verdict in some}), hows.count("read"), hows.count("refused"), found
+        most = f"{max(verdict.cpu_s for verdict in some):.1f} | {max(verdict.gb for verdict in some):.2f}"
+        lines.append(f"| {door} | {' | '.join(map(str, counts))} | {most} |")
+    return "\n".join([*lines, f"{len(told):,} cases"])
+
+
 if __name__ == "__main__":
-    words = dict(word.split("=", 1) for word in sys.argv[1:])
-    kinds = {"cases": int, "minutes": float}
-    sys.exit(bool(main(**{name: kinds.get(name, str)(word) for name, word in words.items()})))  # type: ignore[arg-type]
+    sys.exit(bool(main(**dict(word.split("=", 1) for word in sys.argv[1:]))))

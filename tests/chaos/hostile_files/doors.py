@@ -5,7 +5,7 @@ import shutil
 import struct
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +31,10 @@ from tests.factory.datasets.py123d.py123d_logs import convert
 from tests.factory.datasets.scenarionet.scenarionet_scenarios import nuscenes, save
 from tests.writable import load_writable
 
-CITY = next(iter(CITIES))
 PLAIN = ("experts=[human]", "rounds=1", "render=none", "reward.labels=none", "executor=local", "vocabulary.k=16")
 
 
-def write_innocents(folder: Path, doors: Collection[str]) -> None:
+def write_innocents(folder: Path, doors: Collection[str]) -> int:
     """What stands beside the hostile files of these doors, or is what they are made like; what is there is kept."""
     from factory.datasets.town.reader import SyntheticReader
     from factory.datasets.town.settings import TownSettings
@@ -43,15 +42,15 @@ def write_innocents(folder: Path, doors: Collection[str]) -> None:
 
     if not (folder / "scenarionet").exists():
         save(nuscenes(), folder / "scenarionet", "sd_innocent.pkl")
-    if not (folder / "towns").exists() and any(door.startswith(("av2", "navsim", "py123d")) for door in doors):
+    if not (folder / "towns").exists() and any(door.startswith(("av2", "navsim", "py123d", "yaml")) for door in doors):
         SyntheticReader(folder / "towns", 1, 0, TownSettings(("ring_front_center",), 64, 36, lidar_beams=0)).index()
         (town,) = (path for path in folder.glob("towns/*/*") if path.is_dir())
         shutil.copytree(town, folder / "av2" / "innocent")
         convert(town, folder / "py123d")
-        write_town(folder / "navsim", "mini", town, CITY)
+        write_town(folder / "navsim", "mini", town, next(iter(CITIES)))
     if not (folder / "run").exists() and any(door.startswith(("table", "shard")) for door in doors):
-        code = run(["clips=scenarionet", f"clips.root={folder / 'scenarionet'}", *PLAIN, f"out={folder / 'run'}"])
-        assert code == COMPLETE, f"the innocent run ended with {code}"
+        return run(["clips=scenarionet", f"clips.root={folder / 'scenarionet'}", *PLAIN, f"out={folder / 'run'}"])
+    return COMPLETE
 
 
 # Data folders
@@ -62,39 +61,34 @@ class Logs:
     """A folder of logs that a run reads, where many hostile ones lie beside an innocent one."""
 
     craft: Callable[[Path, Rng], Crafted]  # of write_innocents' folder
-    put: Callable[[Path, Path, str, bytes], str]  # innocents, data folder, name, crafted: the log's id
-    words: Callable[[Path, Path], Sequence[str]]  # innocents, data folder: of the run
-    innocent: Callable[[Path, Path], str]  # puts it there: its id
+    put: Callable[[Path, Path, str, bytes | None], str]  # innocents, data, name, crafted or None, the innocent: its id
+    words: str  # of the run
 
 
-def _as_pickle(place: str, innocents: Path, data: Path, name: str, crafted: bytes) -> str:
-    path = data / place.format(name)
+def _pickled(good: str, place: str, innocents: Path, data: Path, name: str, crafted: bytes | None) -> str:
+    source, path = next(innocents.glob(good)), data / place.format(name)
+    path = path if crafted is not None else path.with_name(source.name)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(crafted.replace(b"hostile", name.encode()))  # as a log's frames name it
+    path.write_bytes(source.read_bytes() if crafted is None else crafted.replace(b"hostile", name.encode()))
     return path.stem
+
+
+SCENARIO, FRAMES = "scenarionet/*.pkl", "navsim/navsim_logs/mini/*.pkl"
 
 
 def _frames(innocents: Path, rng: Rng) -> Crafted:
     if rng.random() < 0.25:
         return grammars.program(rng)
-    good = _good_frames(innocents)
-    frames = [frame | {"log_name": "hostile"} for frame in good]
+    frames = [frame | {"log_name": "hostile"} for frame in load_writable(next(innocents.glob(FRAMES)))]
     if rng.random() < 0.1:
         return "frames: many", grammars.dumped(frames * grammars.pick(rng, (100, 400)), rng)
     name, what = grammars.value(rng)
     return f"frames: {name}", grammars.dumped(grammars.planted(frames, rng, what, 0.9), rng)
 
 
-@cache
-def _good_frames(innocents: Path) -> list[dict[str, Any]]:
-    return list(load_writable(_good_navsim(innocents)))
-
-
-def _good_navsim(innocents: Path) -> Path:
-    return next((innocents / "navsim/navsim_logs/mini").glob("*.pkl"))
-
-
-AV2_FILES = ("annotations.feather", "city_SE3_egovehicle.feather", "calibration/intrinsics.feather", "map/*.json")
+def _log(folder: Path) -> Path:
+    """The one log below it: the folder with files in it."""
+    return next(path for path in sorted(folder.rglob("*")) if path.suffix in (".feather", ".arrow")).parent
 
 
 def _of_log(folder: str, patterns: Sequence[str], innocents: Path, rng: Rng) -> Crafted:
@@ -103,88 +97,58 @@ def _of_log(folder: str, patterns: Sequence[str], innocents: Path, rng: Rng) -> 
     path = grammars.pick(rng, sorted(log.glob(grammars.pick(rng, patterns))))
     if path.suffix == ".json":
         what, crafted = grammars.json_text(json.loads(path.read_bytes()), rng)
-    elif rng.random() < 0.1 and folder == "py123d":
-        what, crafted = _packed(path, rng)
     else:
-        what, crafted = grammars.arrow(pyarrow.feather.read_table(path, memory_map=False, use_threads=False), rng)
+        packed = rng.random() < 0.1 and folder == "py123d"
+        good = pyarrow.feather.read_table(path, memory_map=False, use_threads=False)
+        what, crafted = (_packed if packed else grammars.arrow)(good, rng)
     return f"{path.name} {what}", str(path.relative_to(log)).encode() + b"\n" + crafted
 
 
-def _packed(path: Path, rng: Rng) -> Crafted:
+def _packed(good: pa.Table, rng: Rng) -> Crafted:
     """msgpack within Arrow's metadata."""
-    good = pyarrow.feather.read_table(path, memory_map=False, use_threads=False)
     size, n = grammars.pick(rng, grammars.SIZES), min(grammars.pick(rng, grammars.MANY), 9999)
     kind = grammars.pick(rng, ("f8", "O", "V99", "(9999,)f8"))
-    values: dict[str, Any] = {
-        "array": {b"__ndarray__": True, b"dtype": kind, b"shape": [size], b"data": b"x" * 8},
-        "deep": grammars.nested(400),
-        "texts": {f"{k}{grammars.FORGED}": "x" for k in range(n)},
+    texts = {f"{k}{grammars.FORGED}": "x" for k in range(n)}
+    values: dict[str, bytes] = {
+        "array": msgpack.packb({b"__ndarray__": True, b"dtype": kind, b"shape": [size], b"data": b"x" * 8}),
+        "deep": msgpack.packb(grammars.nested(400)),
+        "texts": msgpack.packb(texts),
+        "length": b"\xdd" + struct.pack(">I", size & 0xFFFFFFFF),
     }
-    what, sink = grammars.pick(rng, [*values, "length"]), pa.BufferOutputStream()
-    packed = msgpack.packb(values[what]) if what in values else b"\xdd" + struct.pack(">I", size & 0xFFFFFFFF)
-    pyarrow.feather.write_feather(good.replace_schema_metadata({b"metadata": packed}), sink)
-    return f"msgpack: {what}", sink.getvalue().to_pybytes()
+    name, packed = grammars.one_of("msgpack", values, rng)
+    pyarrow.feather.write_feather(good.replace_schema_metadata({b"metadata": packed}), sink := pa.BufferOutputStream())
+    return name, sink.getvalue().to_pybytes()
 
 
-def _log(folder: Path) -> Path:
-    """The one log below it: the folder with files in it."""
-    found = (path for path in sorted(folder.rglob("*")) if path.suffix in (".feather", ".arrow"))
-    return next(found).parent
-
-
-def _as_folder(folder: str, innocents: Path, data: Path, name: str, crafted: bytes) -> str:
+def _linked(folder: str, innocents: Path, data: Path, name: str, crafted: bytes | None) -> str:
     """A log like the innocent one, by links, but for one file."""
     log = _log(innocents / folder)
     here = data / log.relative_to(innocents / folder).with_name(name)
-    part, _, content = crafted.partition(b"\n")
+    part, _, content = (crafted or b"").partition(b"\n")
     for path in (path for path in log.rglob("*") if path.is_file()):
         (to := here / path.relative_to(log)).parent.mkdir(parents=True, exist_ok=True)
-        to.symlink_to(path.resolve())
-    if part:
-        (to := here / part.decode()).unlink()
-        to.write_bytes(content)
+        if to == here / part.decode():
+            to.write_bytes(content)
+        else:
+            to.symlink_to(path.resolve())
     return name
 
 
-def _maps(innocents: Path, data: Path) -> Sequence[str]:
-    kept = f"clips.cache_dir={data.parent / 'kept'}"
-    return ("clips=navsim", f"clips.root={data / 'navsim_logs/mini'}", f"clips.maps={innocents / 'navsim/maps'}", kept)
-
-
-def _words(clips: str, innocents: Path, data: Path) -> Sequence[str]:
-    return (f"clips={clips}", f"clips.root={data}")
-
-
-def _copied(path: Path, to: Path) -> str:
-    to.mkdir(parents=True, exist_ok=True)
-    shutil.copy(path, to)
-    return path.stem
-
-
-def _folders(clips: str, patterns: Sequence[str]) -> Logs:
-    return Logs(
-        partial(_of_log, clips, patterns),
-        partial(_as_folder, clips),
-        partial(_words, clips),
-        lambda innocents, data: _as_folder(clips, innocents, data, "innocent", b""),
-    )
-
-
+AV2_FILES = ("annotations.feather", "city_SE3_egovehicle.feather", "calibration/intrinsics.feather", "map/*.json")
+MAPPED = (
+    "clips=navsim clips.root={data}/navsim_logs/mini clips.maps={innocents}/navsim/maps clips.cache_dir={data}/kept"
+)
 LOGS: Mapping[str, Logs] = {
     "scenarionet": Logs(
         lambda _, rng: grammars.scenario(rng),
-        partial(_as_pickle, "sd_{}.pkl"),
-        partial(_words, "scenarionet"),
-        lambda innocents, data: _copied(innocents / "scenarionet/sd_innocent.pkl", data),
+        partial(_pickled, SCENARIO, "sd_{}.pkl"),
+        "clips=scenarionet clips.root={data}",
     ),
-    "navsim": Logs(
-        _frames,
-        partial(_as_pickle, "navsim_logs/mini/{}.pkl"),
-        _maps,
-        lambda innocents, data: _copied(_good_navsim(innocents), data / "navsim_logs/mini"),
+    "navsim": Logs(_frames, partial(_pickled, FRAMES, "navsim_logs/mini/{}.pkl"), MAPPED),
+    "av2": Logs(partial(_of_log, "av2", AV2_FILES), partial(_linked, "av2"), "clips=av2 clips.root={data}"),
+    "py123d": Logs(
+        partial(_of_log, "py123d", ("*.arrow",)), partial(_linked, "py123d"), "clips=py123d clips.root={data}"
     ),
-    "av2": _folders("av2", AV2_FILES),
-    "py123d": _folders("py123d", ("*.arrow",)),
 }
 
 
@@ -197,15 +161,14 @@ class Single:
 
     craft: Callable[[Path, Rng], Crafted]
     name: str  # of the file
-    command: str = ""  # factory or planners, and its words
-    read: Callable[[Path], Any] | None = None  # the file
-    refusals: tuple[type[Exception], ...] = (BadClip, ValueError)
+    reads: str | Callable[[Path], Any]  # a command, factory or planners, and its words; a function of the file
+    refusals: tuple[type[Exception], ...] = (BadClip, ValueError)  # of the function
     like: str = ""  # what of the innocents the file lies in a copy of
     named: str = ""  # what a refusal must name; the file where it is empty
 
 
-def _alone(craft: Callable[[Rng], Crafted], name: str, command: str = "", **more: Any) -> Single:
-    return Single(lambda _, rng: craft(rng), name, command.format(name), **more)
+def _alone(craft: Callable[[Rng], Crafted], name: str, reads: str | Callable[[Path], Any], like: str = "") -> Single:
+    return Single(lambda _, rng: craft(rng), name, reads.format(name) if isinstance(reads, str) else reads, like=like)
 
 
 def _good_commit(innocents: Path) -> list[dict[str, Any]]:
@@ -223,10 +186,10 @@ def _shard(innocents: Path, rng: Rng) -> Crafted:
 SHARD, COMMIT = "run/samples/round=0/expert=human/hostile.parquet", f"run/samples/_delta_log/{0:020}.json"
 
 
-def _of_run(name: str, command: str = "", read: Callable[[Path], Any] | None = None) -> Single:
+def _of_run(name: str, reads: str | Callable[[Path], Any]) -> Single:
     craft = _shard if name == SHARD else lambda innocents, rng: grammars.commit(_good_commit(innocents), rng)
-    named = Path(SHARD).name if name == SHARD and command else "run"
-    return Single(craft, name, command, read, (Exception,), "run", named)
+    named = Path(SHARD).name if name == SHARD and isinstance(reads, str) else "run"
+    return Single(craft, name, reads, (Exception,), "run", named)
 
 
 def _named(read: Callable[[bytes], Any], path: Path) -> Any:
@@ -264,33 +227,35 @@ def _read_samples(path: Path) -> Any:
     return [len(table[k]) for k in range(len(table))]
 
 
-PLACED = {"width": 64, "height": 36, "ego_from_camera": np.eye(4).tolist()}
-SIDECAR = {
-    "cameras": {"front": PLACED | {"K": [[50.0, 0, 32], [0, 50, 18], [0, 0, 1]]}},
-    "frames": [{"camera": "front", "file": "a.jpg", "time_s": 0.1}],
+CAMERA = {
+    "width": 64,
+    "height": 36,
+    "ego_from_camera": np.eye(4).tolist(),
+    "K": [[50.0, 0, 32], [0, 50, 18], [0, 0, 1]],
 }
+SIDECAR = {"cameras": {"front": CAMERA}, "frames": [{"camera": "front", "file": "a.jpg", "time_s": 0.1}]}
 RUN, IMPORT = f"factory run {' '.join(PLAIN)} out=out ", "factory scene import {} to=scene.safetensors"
-FILTERED = RUN + "clips=navsim clips.root=. clips.maps=. clips.scene_filter={}"
+FILTERED = RUN + "clips=navsim clips.root=navsim/navsim_logs/mini clips.maps=navsim/maps clips.scene_filter={}"
 WITH_VOCABULARY = RUN + "clips=scenarionet clips.root=scenarionet vocabulary.file={}"
 SINGLES: Mapping[str, Single] = {
-    "yaml filter": _alone(grammars.yaml_text, "hostile.yaml", FILTERED),
-    "vocabulary": _alone(grammars.array_file, "hostile.npy", WITH_VOCABULARY, like="scenarionet"),
-    "recovery table": _alone(grammars.npz, "hostile.npz", read=load_recovery_table),
+    "yaml filter": _alone(grammars.yaml_text, "hostile.yaml", FILTERED, "navsim"),
+    "vocabulary": _alone(grammars.array_file, "hostile.npy", WITH_VOCABULARY, "scenarionet"),
+    "recovery table": _alone(grammars.npz, "hostile.npz", load_recovery_table),
     "scene ply": _alone(grammars.ply, "hostile.ply", IMPORT),
     "scene spz": _alone(grammars.spz, "hostile.spz", IMPORT),
     "scene checkpoint": _alone(grammars.checkpoint, "hostile.ckpt", IMPORT),
     "scene file": _alone(grammars.safetensors, "hostile.safetensors", "factory scene info {}"),
     "planner checkpoint": _alone(grammars.checkpoint, "h.ckpt", "planners import {} planner=ltf_public out=planner"),
-    "picture": _alone(grammars.picture, "h.jpg", read=lambda path: decode_image(path.read_bytes(), str(path))),
-    "photo": _alone(grammars.picture, "hostile.jpg", read=_read_photo),
-    "picture of a batch": _alone(grammars.jpeg, "hostile.jpg", read=partial(_named, _read_batch)),
-    "episode": _alone(grammars.mcap, "hostile.mcap", read=partial(_named, check_episode)),
-    "sidecar": _alone(partial(grammars.json_text, SIDECAR), "hostile.json", read=_read_sidecar),
+    "picture": _alone(grammars.picture, "h.jpg", lambda path: decode_image(path.read_bytes(), str(path))),
+    "photo": _alone(grammars.picture, "hostile.jpg", _read_photo),
+    "picture of a batch": _alone(grammars.jpeg, "hostile.jpg", partial(_named, _read_batch)),
+    "episode": _alone(grammars.mcap, "hostile.mcap", partial(_named, check_episode)),
+    "sidecar": _alone(partial(grammars.json_text, SIDECAR), "hostile.json", _read_sidecar),
     "table, status": _of_run(COMMIT, "factory status out=run"),
     "table, verify": _of_run(COMMIT, "factory verify run"),
-    "table, read": _of_run(COMMIT, read=_read_samples),
+    "table, read": _of_run(COMMIT, _read_samples),
     "shard, verify": _of_run(SHARD, "factory verify run"),
-    "shard, read": _of_run(SHARD, read=_read_samples),
+    "shard, read": _of_run(SHARD, _read_samples),
 }
 
 
@@ -299,7 +264,6 @@ def put_single(single: Single, innocents: Path, folder: Path, crafted: bytes) ->
     folder.mkdir()
     if single.like:
         shutil.copytree(innocents / single.like, folder / single.like)
-    path = folder / single.name
     if single.like == "run":
         shutil.rmtree(folder / "run/samples/_commits")  # a stranger's run has none, or made to match
         for old in (folder / "run/samples/_delta_log").iterdir():
@@ -307,7 +271,7 @@ def put_single(single: Single, innocents: Path, folder: Path, crafted: bytes) ->
         told = {"path": SHARD.partition("samples/")[2], "size": len(crafted)}
         adds = [a | {"add": a["add"] | told} if "add" in a else a for a in _good_commit(innocents)]
         (folder / COMMIT).write_text("\n".join(map(json.dumps, adds)))
-    path.write_bytes(crafted)
+    (path := folder / single.name).write_bytes(crafted)
     return path
 
 

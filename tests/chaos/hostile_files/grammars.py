@@ -10,7 +10,7 @@ import pickle
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -34,6 +34,11 @@ MANY = (100, 10_000, 200_000)
 
 def pick(rng: Rng, options: Sequence[Any]) -> Any:
     return options[int(rng.integers(len(options)))]
+
+
+def one_of(kind: str, options: Mapping[str, Any], rng: Rng) -> tuple[str, Any]:
+    name = pick(rng, list(options))
+    return f"{kind}: {name}", options[name]
 
 
 # Values
@@ -96,9 +101,13 @@ def planted(tree: Any, rng: Rng, what: Any, chance: float = 0.8) -> Any:
 # Pickles: whole logs with a value in them, and programs
 
 
+def told(raw: bytes) -> bytes:
+    """Behind its length."""
+    return struct.pack("<I", len(raw)) + raw
+
+
 def long4(n: int) -> bytes:
-    raw = n.to_bytes(n.bit_length() // 8 + 1, "little", signed=True)
-    return b"\x8b" + len(raw).to_bytes(4, "little") + raw
+    return b"\x8b" + told(n.to_bytes(n.bit_length() // 8 + 1, "little", signed=True))
 
 
 def colliding_keys(n: int, rng: Rng) -> bytes:
@@ -111,10 +120,8 @@ def colliding_keys(n: int, rng: Rng) -> bytes:
 def array(shape: Sequence[int], kind: bytes, raw: bytes = b"") -> bytes:
     """numpy's own program for an array."""
     start = b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\x00tC\x01btR(K\x01("
-    sizes = b"".join(map(long4, shape))
-    named = b"tcnumpy\ndtype\n(X" + len(kind).to_bytes(4, "little") + kind
-    spec = named + b"I00\nI01\ntR(K\x03U\x01<NNNJ\xff\xff\xff\xff"
-    return start + sizes + spec + b"J\xff\xff\xff\xffK\x00tbI00\nB" + len(raw).to_bytes(4, "little") + raw + b"tb"
+    spec = b"tcnumpy\ndtype\n(X" + told(kind) + b"I00\nI01\ntR(K\x03U\x01<NNNJ\xff\xff\xff\xff"
+    return start + b"".join(map(long4, shape)) + spec + b"J\xff\xff\xff\xffK\x00tbI00\nB" + told(raw) + b"tb"
 
 
 def program(rng: Rng) -> Crafted:
@@ -138,15 +145,15 @@ def program(rng: Rng) -> Crafted:
         "a shape": array((size,), pick(rng, (b"f8", b"S9", b"?", b"u1"))),
         "shapes that multiply to 0": array((size, 0, size), b"f8"),
         "a kind": array((1,), pick(rng, (b"O", b"V1000000000", b"(1000000,)f8", b"f8,O", b"U99999", FORGED.encode()))),
-        "copies of a text": b"]X" + struct.pack("<I", n) + b"x" * n + b"q\1(" + b"h\1" * 5000 + b"e",
+        "copies of a text": b"]X" + told(b"x" * n) + b"q\1(" + b"h\1" * 5000 + b"e",
         "copies of an array": b"]" + array((n,), b"u1", b"\0" * n) + b"q\1a(" + b"h\1" * 5000 + b"e",
         "tuples of a tuple": b"(" + b"K\1" * n + b"tq\1" + b"cbuiltins\nlist\n(h\1tR" * 1000,
         "a shared kind": b"cnumpy.core.multiarray\n_reconstruct\n()" + b"q\1h\1h\1\x87" * 60 + b"K\0U\1btR",
         "colliding keys": colliding_keys(pick(rng, (1000, 30_000)), rng),
         "nothing": pick(rng, (b"", b"0", b"(((", b"\xff", b"u", b"}Nb")),
     }
-    name = pick(rng, list(bodies))
-    return f"program: {name}", pick(rng, (b"\x80\x02", b"\x80\x04", b"")) + bodies[name] + pick(rng, (b".", b".", b""))
+    name, body = one_of("program", bodies, rng)
+    return name, pick(rng, (b"\x80\x02", b"\x80\x04", b"")) + body + pick(rng, (b".", b".", b""))
 
 
 def dumped(tree: Any, rng: Rng) -> bytes:
@@ -182,9 +189,8 @@ def npy(rng: Rng) -> Crafted:
         "keys": "{" + ", ".join(f"'{k}': {k}" for k in range(n // 20)) + "}",
         "an expression": "__import__('os').system('true')",
     }
-    name = pick(rng, list(texts))
-    length = pick(rng, (None, None, None, size))
-    return f"npy: {name}", npy_header(texts[name], int(rng.integers(1, 4)), length) + bytes(pick(rng, (0, 8640)))
+    (name, text), length = one_of("npy", texts, rng), pick(rng, (None, None, None, size))
+    return name, npy_header(text, int(rng.integers(1, 4)), length) + bytes(pick(rng, (0, 8640)))
 
 
 def deflated(head: bytes, n_bytes: int, wbits: int) -> bytes:
@@ -196,7 +202,7 @@ def deflated(head: bytes, n_bytes: int, wbits: int) -> bytes:
 
 
 def npz(rng: Rng) -> Crafted:
-    sink, what, name = io.BytesIO(), pick(rng, ("bomb", "members", "headers")), "trajectories.npy"
+    what, name = pick(rng, ("bomb", "members", "headers")), "trajectories.npy"
     if what == "bomb":
         n = 960 * pick(rng, (10**5, 2 * 10**6))
         head = npy_header(f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({n // 960},40,3), }}\n")
@@ -206,10 +212,14 @@ def npz(rng: Rng) -> Crafted:
         end = struct.pack("<HHHHIIH", 0, 0, 1, 1, len(entry), 30 + len(name) + len(body), 0)
         return "npz: bomb", b"PK\3\4" + told + name.encode() + body + entry + b"PK\5\6" + end
     names = [name, "digest.npy"] if what == "headers" else [f"../{FORGED}{k}.npy" for k in range(2_000)]
-    with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED) as packed:
-        for each in names:
-            packed.writestr(each, npy(rng)[1])
-    return f"npz: {what}", sink.getvalue()
+    return f"npz: {what}", zipped(((each, npy(rng)[1]) for each in names), zipfile.ZIP_DEFLATED)
+
+
+def zipped(members: Iterable[tuple[str, str | bytes]], method: int) -> bytes:
+    with zipfile.ZipFile(sink := io.BytesIO(), "w", method) as packed:
+        for name, content in members:
+            packed.writestr(zipfile.ZipInfo(name), content, method)  # of 1980, whenever it is made
+    return sink.getvalue()
 
 
 def array_file(rng: Rng) -> Crafted:
@@ -264,15 +274,10 @@ def json_text(good: Any, rng: Rng) -> Crafted:
     """A text with a value in it that JSON can say, or one that is cut."""
     n, mark = pick(rng, MANY), "@@here@@"
     words = {"1e308": "1e308", "1e999": "-1e999", "NaN": "NaN", "digits": "9" * n, "open": "[" * n}
-    words |= {
-        "deep": "[" * n + "]" * n,
-        "objects": '{"a":' * n,
-        "forged": json.dumps(FORGED),
-        "long": json.dumps("x" * n),
-    }
-    name = pick(rng, list(words))
+    words |= {"deep": "[" * n + "]" * n, "objects": '{"a":' * n}
+    name, word = one_of("json", words | {"forged": json.dumps(FORGED), "long": json.dumps("x" * n)}, rng)
     text = json.dumps(planted(good, rng, mark, 0.9)) if rng.random() < 0.8 else f'"{mark}"'
-    return f"json: {name}", text.replace(f'"{mark}"', words[name], 1).encode()
+    return name, text.replace(f'"{mark}"', word, 1).encode()
 
 
 YAML_KEYS = ("tokens", "log_names", "max_scenes", "num_history_frames", "all_mapping", "_target_", FORGED[1:])
@@ -302,8 +307,8 @@ def yaml_text(rng: Rng) -> Crafted:
         "many keys": "\n" + "".join(f"k{k}: 1\n" for k in range(n)),
         "1e308": " [1.0e+308, .inf, .nan]",
     }
-    name = pick(rng, list(bodies))
-    return f"yaml: {name}", f"{json.dumps(pick(rng, YAML_KEYS))}:{bodies[name]}\n".encode()
+    name, body = one_of("yaml", bodies, rng)
+    return name, f"{json.dumps(pick(rng, YAML_KEYS))}:{body}\n".encode()
 
 
 # Scenes: ply, spz, safetensors
@@ -325,10 +330,10 @@ def ply(rng: Rng) -> Crafted:
         "a format": [line.replace("binary_little_endian", FORGED[1:]) for line in lines],
         "a comment": [lines[0], "comment " + "x" * n * 100, *lines[1:]],
     }
-    name = pick(rng, list(heads))
-    if name == "values":
+    name, lines = one_of("ply", heads, rng)
+    if name == "ply: values":
         body = struct.pack("<f", pick(rng, (3e38, np.nan, np.inf, 0.0))) * (len(body) // 4)
-    return f"ply: {name}", "\n".join([*heads[name], "end_header", ""]).encode() + body
+    return name, "\n".join([*lines, "end_header", ""]).encode() + body
 
 
 def spz(rng: Rng) -> Crafted:
@@ -354,12 +359,8 @@ def safetensors(rng: Rng) -> Crafted:
     size, n, name = pick(rng, SIZES), pick(rng, MANY), pick(rng, ("header", "described", "tensors"))
     tensors, described = dict(scene_tensors(scene())), scene_header(scene())
     if name == "header":
-        shapes = ([size, size], [0, size], [4], [])
-        one = {
-            "dtype": pick(rng, ("F32", "U8", FORGED)),
-            "shape": pick(rng, shapes),
-            "data_offsets": [0, pick(rng, (4, 0, size))],
-        }
+        kind, shape = pick(rng, ("F32", "U8", FORGED)), pick(rng, ([size, size], [0, size], [4], []))
+        one = {"dtype": kind, "shape": shape, "data_offsets": [0, pick(rng, (4, 0, size))]}
         metadata = {KEY: pick(rng, ("[" * n, "9" * n, "NaN", json.dumps(FORGED), "{}" + " " * n))}
         many = {f"{FORGED}{k}": one for k in range(10_000)}
         text = json.dumps(pick(rng, ({"a": one}, {"a": one, "b": one}, many, {"__metadata__": metadata}))).encode()
@@ -367,9 +368,7 @@ def safetensors(rng: Rng) -> Crafted:
     if name == "tensors":
         key = pick(rng, list(tensors))
         wrong = np.full(tensors[key].shape, pick(rng, (np.nan, 3e38)), np.float32)
-        tensors[key] = np.ascontiguousarray(
-            pick(rng, (np.zeros((0, 3)), wrong, np.zeros(n), tensors[key].astype("i8")))
-        )
+        tensors[key] = pick(rng, (np.zeros((0, 3)), wrong, np.zeros(n), np.ascontiguousarray(tensors[key], "i8")))
     else:
         what = pick(rng, ("x" * n, FORGED, 1e308, 10**400, None, -1, [[]] * n, {FORGED: 1}, nested(90), True))
         described = {"version": 1, **described, pick(rng, list(described)): planted(described, rng, what, 0.9)}
@@ -389,22 +388,14 @@ def checkpoint(rng: Rng) -> Crafted:
 
     size, n, one, sink = pick(rng, (10**5, 2**40, 2**62)), pick(rng, MANY), torch.zeros(1), io.BytesIO()
     if rng.random() < 0.3:
-        name, body = program(rng)
-        with zipfile.ZipFile(sink, "w", pick(rng, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as packed:
-            members = {
-                "data.pkl": body,
-                "version": "3\n",
-                "byteorder": pick(rng, ("little", FORGED)),
-                "data/0": bytes(n),
-            }
-            for member, content in members.items():
-                packed.writestr(f"archive/{member}", content)
-        return f"checkpoint: {name}", sink.getvalue()
+        (name, body), method = program(rng), pick(rng, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))
+        members = {"data.pkl": body, "version": "3\n", "byteorder": pick(rng, ("little", FORGED)), "data/0": bytes(n)}
+        return f"checkpoint: {name}", zipped(((f"archive/{k}", content) for k, content in members.items()), method)
     tensors: dict[str, Callable[[], Any]] = {
         "strides of 0": lambda: one.expand(pick(rng, (10**6, 10**9, 10**11))),
         "sparse": lambda: torch.sparse_coo_tensor(torch.zeros((1, 1), dtype=torch.int64), one, (size,)),
         "sparse rows": lambda: torch.sparse_csr_tensor(torch.tensor([0, 1]), torch.tensor([0]), one, (1, size)),
-        "meta": lambda: torch.empty(size, device="meta"),
+        "meta": lambda: torch.empty(min(size, 2**60), device="meta"),
         "quantised": lambda: torch.quantize_per_tensor(one, 1e-30, 0, torch.qint8),
         "of few bits": lambda: torch.zeros(n, dtype=pick(rng, (torch.bfloat16, torch.float8_e4m3fn, torch.complex64))),
         "nan": lambda: torch.full((n, 3), pick(rng, (torch.nan, torch.inf, 3e38))),
@@ -412,13 +403,14 @@ def checkpoint(rng: Rng) -> Crafted:
         "a parameter": lambda: torch.nn.Parameter(one.expand(10**9)),
         "a value": lambda: VALUES[pick(rng, ("shared", "holds itself", "huge integer", "huge text", "odd keys"))](rng),
     }
-    name, keys = pick(rng, list(tensors)), ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
-    gauss = {f"_model.gauss_params.{k}": torch.zeros(2, w) for k, w in zip(keys, (3, 4, 3, 1, 3, 0))}
+    name, tensor = one_of("checkpoint", tensors, rng)
+    widths = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "features_dc": 3, "features_rest": 0}
+    gauss = {f"_model.gauss_params.{key}": torch.zeros(2, width) for key, width in widths.items()}
     public = {"agent._transfuser_model._status_encoding.weight": torch.zeros(2)}
     inside = dict(pick(rng, (gauss, public)))
-    inside[pick(rng, [*inside, FORGED])] = tensors[name]()
+    inside[pick(rng, [*inside, FORGED])] = tensor()
     torch.save(pick(rng, (inside, {"state_dict": inside}, {"pipeline": inside, "step": 10**4000})), sink)
-    return f"checkpoint: {name}", sink.getvalue()
+    return name, sink.getvalue()
 
 
 # Pictures
@@ -428,12 +420,16 @@ def chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
+def png_of(head: bytes, between: bytes, pixels: bytes) -> bytes:
+    chunks = (chunk(b"IHDR", head), between, chunk(b"IDAT", pixels), chunk(b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
 def png(rng: Rng) -> Crafted:
     if rng.random() < 0.2:  # a whole one
         side = pick(rng, (10_000, 20_000, 30_000))
-        head = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0))
-        zeros = deflated(b"", side * (side + 1) + 10**6, 15)
-        return f"png: {side} a side", b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zeros) + chunk(b"IEND", b"")
+        head, zeros = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0), deflated(b"", side * (side + 1) + 10**6, 15)
+        return f"png: {side} a side", png_of(head, b"", zeros)
     width, height = (pick(rng, (0, 1, 64, 8192, 65_535, 2**31 - 1, 2**32 - 1)) for _ in range(2))
     form = struct.pack("BBBBB", pick(rng, (1, 8, 16, 3)), pick(rng, (0, 2, 3, 6, 7)), 0, 0, pick(rng, (0, 1, 9)))
     bomb = deflated(b"", pick(rng, (0, 10**6, 10**9)), 15)
@@ -446,8 +442,8 @@ def png(rng: Rng) -> Crafted:
         "length": struct.pack(">I", 2**31 - 1) + b"tEXt",
         "many": chunk(b"tEXt", b"a\0b") * 100_000,
     }
-    name, head = pick(rng, list(extra)), chunk(b"IHDR", struct.pack(">II", width, height) + form)
-    return f"png: {name}", b"\x89PNG\r\n\x1a\n" + head + extra[name] + chunk(b"IDAT", bomb) + chunk(b"IEND", b"")
+    name, between = one_of("png", extra, rng)
+    return name, png_of(struct.pack(">II", width, height) + form, between, bomb)
 
 
 def segment(marker: int, body: bytes) -> bytes:
@@ -481,8 +477,8 @@ def jpeg(rng: Rng) -> Crafted:
         "many segments": segment(0xFE, b"x") * 100_000 + plain,
         "filler": b"\xff" * 10**6 + plain,
     }
-    name = pick(rng, list(shapes))
-    return f"jpeg: {name}", b"\xff\xd8" + shapes[name] + b"\xff\xd9"
+    name, body = one_of("jpeg", shapes, rng)
+    return name, b"\xff\xd8" + body + b"\xff\xd9"
 
 
 def other_picture(rng: Rng) -> Crafted:
@@ -496,8 +492,7 @@ def other_picture(rng: Rng) -> Crafted:
         "pnm": b"P6 %d %d 255\n" % (side, side),
         "avif": b"\0\0\0\x1cftypavif" + b"\xff" * 60,
     }
-    name = pick(rng, list(heads))
-    return f"picture: {name}", heads[name]
+    return one_of("picture", heads, rng)
 
 
 def picture(rng: Rng) -> Crafted:
@@ -522,9 +517,9 @@ def mcap(rng: Rng) -> Crafted:
         "many": record(15, struct.pack("<I", 0)) * 100_000,
         "opcodes": record(int(rng.integers(16, 256)), b"x" * 100),
     }
-    name = pick(rng, list(bodies))
+    name, body = one_of("mcap", bodies, rng)
     footer = record(2, struct.pack("<QQI", pick(rng, (0, 30, size)), pick(rng, (0, size)), 0))
-    return f"mcap: {name}", b"\x89MCAP0\r\n" + record(1, bytes(8)) + bodies[name] + footer + b"\x89MCAP0\r\n"
+    return name, b"\x89MCAP0\r\n" + record(1, bytes(8)) + body + footer + b"\x89MCAP0\r\n"
 
 
 # Delta tables: a commit, a shard
@@ -534,12 +529,8 @@ def commit(good: Sequence[dict[str, Any]], rng: Rng) -> Crafted:
     """A log's first commit: actions like a good one's with lies among them."""
     n, size = pick(rng, MANY), pick(rng, SIZES)
     paths = ("../../../../etc/passwd", "/etc/passwd", "file:///etc/passwd", "s3://x/y", "%2e%2e/x", FORGED, "", "x" * n)
-    stats = (
-        "x" * n,
-        "[" * n,
-        '{"numRecords": 1e308}',
-        f'{{"numRecords": {size}, "minValues": {{"clip_id": "{"z" * n}"}}}}',
-    )
+    least = f'{{"numRecords": {size}, "minValues": {{"clip_id": "{"z" * n}"}}}}'
+    stats = ("x" * n, "[" * n, '{"numRecords": 1e308}', least)
     schemas = ("[" * n, "", '{"type":"struct","fields":' * min(n, 9999), '{"type": "struct", "fields": []}')
     lies: dict[str, tuple[str, dict[str, Any]]] = {
         "path": ("add", {"path": pick(rng, paths)}),
@@ -563,18 +554,14 @@ def commit(good: Sequence[dict[str, Any]], rng: Rng) -> Crafted:
 
 
 def parquet(good: pa.Table, rng: Rng) -> Crafted:
-    sink, n, what = (
-        io.BytesIO(),
-        pick(rng, (10**6, 3 * 10**7)),
-        pick(rng, ("rows", "texts", "metadata", "footer", "nested")),
-    )
+    n, what = pick(rng, (10**6, 3 * 10**7)), pick(rng, ("rows", "texts", "metadata", "footer", "nested"))
     tables = {
         "rows": lambda: pa.table({"attempt_id": pa.DictionaryArray.from_arrays(np.zeros(n, np.int32), ["0" * 32])}),
         "texts": lambda: good.set_column(0, good.column_names[0], pa.array(["x" * n] * good.num_rows)),
         "nested": lambda: good.append_column(FORGED, pa.array([nested(40)] * good.num_rows)),
     }
     table = tables.get(what, lambda: good.replace_schema_metadata({b"x": b"y" * n}))()
-    pq.write_table(table, sink, compression="zstd")
+    pq.write_table(table, sink := io.BytesIO(), compression="zstd")
     data = sink.getvalue()
     if what == "footer":
         data = data[:-8] + struct.pack("<I", pick(rng, SIZES) & 0xFFFFFFFF) + b"PAR1"

@@ -1,4 +1,4 @@
-"""A hundred crafted files, and those that did harm; the long form: `make chaos`."""
+"""Eighty crafted files, and those that did harm; the long form: `make chaos`."""
 
 import json
 import subprocess
@@ -7,13 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.chaos.hostile_files.doors import LOGS, SINGLES
-from tests.chaos.hostile_files.trials import REPOSITORY, rng_of
+from tests.chaos.hostile_files.trials import REPOSITORY, crafted
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # 30 s of CPU time, which a busy machine spreads
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # 25 s of CPU time, which a busy machine spreads
 
-SHORT = ("scenarionet", "recovery table", "episode", "sidecar", "picture", "picture of a batch")  # 16 cases of each
+SHORT = ("recovery table", "episode", "sidecar", "picture", "picture of a batch")  # 16 cases of each
 KEPT = [  # door, number, the attack that the number stands for: what did harm once, or would where a guard is gone
+    ("scenarionet", 6, "program: colliding keys"),
+    ("scenarionet", 12, "scenario: holds itself"),
+    ("scenarionet", 15, "scenario: huge integer"),
     ("scenarionet", 18, "program: a shared kind"),
     ("recovery table", 9, "npz: bomb"),
     ("episode", 0, "mcap: chunk bomb"),
@@ -25,19 +27,22 @@ KEPT = [  # door, number, the attack that the number stands for: what did harm o
 ]
 
 
-def test_a_hundred_crafted_files_and_what_did_harm_hurt_nobody(tmp_path: Path) -> None:
-    cases = dict.fromkeys([*((door, n) for door in SHORT for n in range(16)), *(kept[:2] for kept in KEPT)])
+CASES = {"some": [(door, n) for door in SHORT for n in range(16)], "kept": [(door, n) for door, n, _ in KEPT]}
+
+
+@pytest.mark.parametrize("cases", CASES.values(), ids=CASES)
+def test_crafted_files_hurt_nobody(cases: list[tuple[str, int]], tmp_path: Path) -> None:
     only = ",".join(f"{door}:{n}" for door, n in cases)
     command = [sys.executable, "-m", "tests.chaos.hostile_files", f"to={tmp_path}", f"only={only}"]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr[-3000:]
     verdicts = [json.loads(line) for line in (tmp_path / "verdicts.jsonl").read_text().splitlines()]
     attacks = {(verdict["door"], verdict["number"]): verdict["attack"] for verdict in verdicts}
-    assert attacks.keys() == cases.keys() and len(set(attacks.values())) > 30
-    assert all(attacks[door, number] == attack for door, number, attack in KEPT), "a grammar changed: find others"
+    assert attacks.keys() == set(cases)
+    stood_for = {(door, n): attack for door, n, attack in KEPT}
+    assert all(attacks[case] == stood_for.get(case, attacks[case]) for case in cases), "a grammar changed: find others"
 
 
 def test_a_case_is_the_same_again(tmp_path: Path) -> None:
     for door in ("scenarionet", "picture", "scene spz", "vocabulary"):
-        craft = (LOGS.get(door) or SINGLES[door]).craft
-        assert craft(tmp_path, rng_of(door, 3)) == craft(tmp_path, rng_of(door, 3))
+        assert crafted(door, tmp_path, 3) == crafted(door, tmp_path, 3)

@@ -1,6 +1,7 @@
 """Cases tried and judged: the exit code, what is said, the innocent's rows, CPU time and memory."""
 
 import atexit
+import importlib
 import os
 import re
 import resource
@@ -9,25 +10,37 @@ import signal
 import subprocess
 import sys
 import time
-import traceback
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 
-from factory.exits import EXIT_CODE_TEXT
+from factory.exits import EXIT_CODE_TEXT, INTERRUPTED
 from tests.chaos.hostile_files.doors import LOGS, PLAIN, SINGLES, Single, put_single
-from tests.chaos.hostile_files.grammars import ESCAPE, Rng
+from tests.chaos.hostile_files.grammars import ESCAPE, Crafted, Rng
+from tests.chaos.trials import leave_by
 
 REPOSITORY = Path(__file__).resolve().parents[3]
-BATCH = 25  # logs beside an innocent one
 CPU_S, GB = 8.0, 1.0  # beyond what it takes without the file
-LIMIT_S, LIMIT_CPU_S, LIMIT_BYTES = 600.0, 100, 6 << 30  # of what would take all of the machine
+LIMIT_S, LIMIT_CPU_S, LIMIT_BYTES = 600, 30, 6 << 30  # of one process that would take all of the machine
 MOST_SAID = 20_000  # characters that a file makes a command say
 EVERY = 50  # single files, of which one is read by the command as it is typed
+
+
+@dataclass(frozen=True)
+class Told:
+    """How a process ended."""
+
+    code: int  # below 0: by a signal
+    said: str  # on both outputs
+    cpu_s: float  # of it and all below it
+    gb: float  # of the largest of them
+
+
+NOTHING = Told(0, "", 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -47,50 +60,38 @@ class Verdict:
         return f"{self.door} {self.number} ({self.attack}): {self.finding}"
 
 
-@dataclass(frozen=True)
-class Told:
-    """How a process ended."""
-
-    code: int  # below 0: by a signal
-    said: str  # on both outputs
-    cpu_s: float  # of it and all below it
-    gb: float  # of the largest of them
-
-
 def rng_of(door: str, number: int) -> Rng:
     return np.random.default_rng([number, *door.encode()])
 
 
-def in_fork(work: Callable[[], int], said: Path) -> Told:
+def crafted(door: str, innocents: Path, number: int) -> Crafted:
+    """Attack and file of a case."""
+    return (LOGS.get(door) or SINGLES[door]).craft(innocents, rng_of(door, number))
+
+
+# Processes
+
+
+def in_fork(work: Callable[[], int], said: Path, cpu_s: int = LIMIT_CPU_S) -> Told:
     """Of a fork of this process: what is imported here costs it nothing. Its memory counts from here on."""
-    here = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss if sys.platform == "darwin" else _resident_kb()
+    here_kb = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() // 1024
     sys.stdout.flush()
     sys.stderr.flush()
-    pid = os.fork()
-    if pid == 0:
-        code = 70
-        try:
-            os.setsid()
-            to = os.open(said, os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
-            os.dup2(to, 1)
-            os.dup2(to, 2)
-            _limit()
-            code = work()
-        except SystemExit as error:
-            code = error.code if isinstance(error.code, int) else 1
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            try:
-                sys.stdout.flush()
-                sys.stderr.flush()
-                atexit._run_exitfuncs()
-            finally:
-                os._exit(code & 0xFF)
-    return _waited(pid, said, here)
+    if not (pid := os.fork()):
+        leave_by(partial(_limited, work, cpu_s), said)
+    return _waited(pid, said, here_kb)
 
 
-def as_typed(argv: Sequence[str], folder: Path, said: Path) -> Told:
+def _limited(work: Callable[[], int], cpu_s: int) -> int:
+    os.setsid()
+    _limit(cpu_s)
+    try:
+        return work()
+    finally:
+        atexit._run_exitfuncs()
+
+
+def as_typed(argv: Sequence[str], folder: Path, said: Path, cpu_s: int = LIMIT_CPU_S) -> Told:
     """Of the command itself."""
     with said.open("wb") as file:
         process = subprocess.Popen(
@@ -100,7 +101,7 @@ def as_typed(argv: Sequence[str], folder: Path, said: Path) -> Told:
             stdin=subprocess.DEVNULL,
             stdout=file,
             stderr=file,
-            preexec_fn=_limit,
+            preexec_fn=partial(_limit, cpu_s),
             start_new_session=True,
         )
     told = _waited(process.pid, said, 0)
@@ -108,51 +109,36 @@ def as_typed(argv: Sequence[str], folder: Path, said: Path) -> Told:
     return told
 
 
-def _limit() -> None:
-    resource.setrlimit(resource.RLIMIT_DATA, (LIMIT_BYTES, LIMIT_BYTES))
-    resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_CPU_S, LIMIT_CPU_S))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-
-
-def _resident_kb() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() // 1024
+def _limit(cpu_s: int) -> None:
+    for kind, most in ((resource.RLIMIT_DATA, LIMIT_BYTES), (resource.RLIMIT_CPU, cpu_s), (resource.RLIMIT_CORE, 0)):
+        resource.setrlimit(kind, (most, most))
 
 
 def _waited(pid: int, said: Path, less_kb: int) -> Told:
     """SIGKILL after LIMIT_S."""
     end = time.monotonic() + LIMIT_S
-    while True:
-        done, status, used = os.wait4(pid, os.WNOHANG)
-        if done:
-            break
+    while not (ended := os.wait4(pid, os.WNOHANG))[0]:
         if time.monotonic() > end:
             os.killpg(pid, signal.SIGKILL)
         time.sleep(0.005)
-    text = said.read_bytes().decode(errors="replace")
-    return Told(
-        os.waitstatus_to_exitcode(status), text, used.ru_utime + used.ru_stime, max(0, used.ru_maxrss - less_kb) / 2**20
-    )
+    _, status, used = ended
+    text, gb = said.read_bytes().decode(errors="replace"), max(0, used.ru_maxrss - less_kb) / 2**20
+    return Told(os.waitstatus_to_exitcode(status), text, used.ru_utime + used.ru_stime, gb)
 
 
-def what_is_wrong(told: Told, codes: Sequence[int]) -> str:
-    """With a process that a hostile file was given to."""
+def what_is_wrong(told: Told, before: Told, codes: Collection[int]) -> str:
+    """With a process that a hostile file was given to, beside one that had none."""
+    cpu_s, gb = told.cpu_s - before.cpu_s, told.gb - before.gb
     if told.code not in codes:
         return f"ended with {told.code}: {told.said[-600:]}"
     if "Traceback (most recent call last)" in told.said or "panicked at" in told.said:
         return f"a traceback: {told.said[-600:]}"
-    if ESCAPE in told.said or re.search(r"(?m)^FORGED", told.said):
-        at = told.said.index(ESCAPE if ESCAPE in told.said else "\nFORGED")
+    if forged := re.search(rf"(?m)^FORGED|{re.escape(ESCAPE)}", told.said):
+        at = forged.start()
         return f"wrote to the terminal as the file asked: {told.said[max(0, at - 200) : at + 100]!r}"
     if len(told.said) > MOST_SAID:
         return f"said {len(told.said):,} characters: {told.said[:300]!r}"
-    return ""
-
-
-def over(told: Told, before: Told) -> str:
-    """What of time and memory is too much."""
-    if (more := told.cpu_s - before.cpu_s) > CPU_S:
-        return f"{more:.1f} s of CPU time more"
-    return f"{more:.2f} GB more" if (more := told.gb - before.gb) > GB else ""
+    return f"{cpu_s:.1f} s of CPU time more" if cpu_s > CPU_S else f"{gb:.2f} GB more" if gb > GB else ""
 
 
 # Logs
@@ -178,54 +164,38 @@ def innocent_alone(innocents: Path, door: str) -> tuple[Told, list[str]]:
     return told, rows
 
 
-def _run(innocents: Path, folder: Path, door: str, hostile: dict[str, bytes]) -> tuple[Told, str]:
-    logs = LOGS[door]
+def _run(innocents: Path, folder: Path, door: str, hostile: Mapping[str, bytes]) -> tuple[Told, str]:
     (data := folder / "data").mkdir(parents=True)
-    name = logs.innocent(innocents, data)
-    for log_id, content in hostile.items():
-        logs.put(innocents, data, log_id, content)
-    words = ["factory", "run", *PLAIN, *logs.words(innocents, data), f"out={folder / 'out'}"]
-    return as_typed(words, folder, folder / "said"), name
+    name, *_ = [LOGS[door].put(innocents, data, *log) for log in (("innocent", None), *hostile.items())]
+    words = [word.format(innocents=innocents, data=data) for word in LOGS[door].words.split()]
+    command = ["factory", "run", *PLAIN, *words, f"out={folder / 'out'}"]
+    return as_typed(
+        command, folder, folder / "said", LIMIT_CPU_S if hostile else LIMIT_S
+    ), name  # compiles kernels once
 
 
-def judge_logs(innocents: Path, folder: Path, door: str, numbers: Sequence[int]) -> list[Verdict]:
+def judge_logs(innocents: Path, folder: Path, door: str, files: Mapping[int, Crafted]) -> list[Verdict]:
     """All beside one innocent log; where that is not well, in halves."""
-    files = {n: crafted(door, innocents, n) for n in numbers}
-    return _judged(innocents, folder, door, files)
-
-
-def _judged(innocents: Path, folder: Path, door: str, files: dict[int, tuple[str, bytes]]) -> list[Verdict]:
     before, rows = innocent_alone(innocents, door)
     here = folder / "-".join(map(str, (min(files), max(files), len(files))))
     told, name = _run(innocents, here, door, {f"h{n:06}": content for n, (_, content) in files.items()})
-    wrong = what_is_wrong(told, (0, 3)) or over(told, before)
-    how: dict[int, str] = {}
+    wrong, how = what_is_wrong(told, before, (0, 3)), dict[int, str]()
     if not wrong:
         found, failed = rows_of(here / "out"), rows_of(here / "out", "outcomes")
         if found.get(name) != rows:
             wrong = f"the innocent log has {len(found.get(name, []))} rows of {len(rows)}, or others"
         for n in files:
-            log_id = next(
-                (
-                    i
-                    for i in (f"h{n:06}", f"sd_h{n:06}")
-                    if re.search(rf"\b{i}\b", told.said) or i in found or i in failed
-                ),
-                "",
-            )
-            how[n] = "read" if log_id in found else "refused"
-            wrong = wrong or ("" if log_id else f"log h{n:06} is not named")
+            ids = {f"h{n:06}", f"sd_h{n:06}"}
+            how[n] = "read" if ids & found.keys() else "refused"
+            if not (wrong or ids & (found.keys() | failed.keys()) or re.search(rf"\b(sd_)?h{n:06}\b", told.said)):
+                wrong = f"log h{n:06} is not named"
     shutil.rmtree(here)
     if wrong and len(files) > 1:
-        items, half = list(files.items()), len(files) // 2
-        return [v for part in (items[:half], items[half:]) for v in _judged(innocents, folder, door, dict(part))]
-    more_s, more_gb = told.cpu_s - before.cpu_s, told.gb - before.gb
-    return [Verdict(door, n, attack, how.get(n, ""), wrong, more_s, more_gb) for n, (attack, _) in files.items()]
-
-
-def crafted(door: str, innocents: Path, number: int) -> tuple[str, bytes]:
-    """Attack and file of a case."""
-    return (LOGS.get(door) or SINGLES[door]).craft(innocents, rng_of(door, number))
+        numbers, half = list(files), len(files) // 2
+        parts = ({n: files[n] for n in part} for part in (numbers[:half], numbers[half:]))
+        return [verdict for part in parts for verdict in judge_logs(innocents, folder, door, part)]
+    more = told.cpu_s - before.cpu_s, told.gb - before.gb
+    return [Verdict(door, n, attack, how.get(n, ""), wrong, *more) for n, (attack, _) in files.items()]
 
 
 # Single files
@@ -234,13 +204,14 @@ def crafted(door: str, innocents: Path, number: int) -> tuple[str, bytes]:
 def _answer(single: Single, folder: Path, path: Path) -> int:
     """Of a command, or of the function that reads the file: 0, or 2 with the line of its refusal."""
     os.chdir(folder)
-    if argv := single.command.split():
+    if isinstance(single.reads, str):
         from factory.__main__ import main as factory
         from planners.__main__ import main as planners
 
-        return {"factory": factory, "planners": planners}[argv[0]](argv[1:])
+        program, *argv = single.reads.split()
+        return {"factory": factory, "planners": planners}[program](argv)
     try:
-        single.read(path)  # type: ignore[misc]
+        single.reads(path)
     except single.refusals as error:
         print(f"{type(error).__name__} {error}", file=sys.stderr)
         return 2
@@ -249,16 +220,14 @@ def _answer(single: Single, folder: Path, path: Path) -> int:
 
 def judge_single(innocents: Path, folder: Path, door: str, number: int) -> Verdict:
     """One case in a folder of its own, which is removed."""
-    single = SINGLES[door]
-    attack, content = crafted(door, innocents, number)
+    single, (attack, content), before = SINGLES[door], crafted(door, innocents, number), NOTHING
     path = put_single(single, innocents, folder, content)
-    argv = tuple(single.command.split())
-    if argv and number % EVERY == 0:
-        before = Told(0, "", _typed(argv[:2], innocents).cpu_s, _typed(argv[:2], innocents).gb)
-        told = as_typed(argv, folder, folder / "said")
+    if isinstance(single.reads, str) and number % EVERY == 0:
+        program, command, *_ = argv = single.reads.split()
+        before, told = _started(program, command, innocents), as_typed(argv, folder, folder / "said")
     else:
-        before, told = Told(0, "", 0.0, 0.0), in_fork(lambda: _answer(single, folder, path), folder / "said")
-    wrong = what_is_wrong(told, [code for code in EXIT_CODE_TEXT if code != 4]) or over(told, before)
+        told = in_fork(partial(_answer, single, folder, path), folder / "said")
+    wrong = what_is_wrong(told, before, EXIT_CODE_TEXT.keys() - {INTERRUPTED})
     if not wrong and told.code and (single.named or path.name) not in told.said:
         wrong = f"refused without its name: {told.said[-400:]}"
     shutil.rmtree(folder)
@@ -267,19 +236,17 @@ def judge_single(innocents: Path, folder: Path, door: str, number: int) -> Verdi
 
 
 @cache
-def _typed(argv: tuple[str, ...], innocents: Path) -> Told:
+def _started(program: str, command: str, innocents: Path) -> Told:
     """What it takes to start the command, by its help."""
-    return as_typed([*argv, "--help"], innocents, innocents.parent / "help")
+    return as_typed([program, command, "--help"], innocents, innocents.parent / "help")
+
+
+LOADED = ("factory.commands.exchange", "factory.graph.execute", "factory.pipeline", "factory.setup.settings")
+LOADED += ("factory.views.board.gallery", "tasks.experts.pdm_closed", "tasks.render.fit.reconstruct")
 
 
 def load_what_is_read_with(doors: Collection[str]) -> None:
-    """Once, before the first fork; nothing of it may start threads, as importing deltalake does."""
-    import factory.commands.exchange
-    import factory.run  # noqa: F401
-    import tasks.experts.pdm_closed
-    import tasks.render.fit.reconstruct  # noqa: F401
-
-    if any("checkpoint" in door for door in doors):
-        import planners.published.import_planner
-    if any("batch" in door for door in doors):
-        import planners.data.images  # noqa: F401
+    """Once, before the first fork. Who has opened a table is not to be forked: Delta's threads stay behind."""
+    planner = {"checkpoint": "planners.published.import_planner", "batch": "planners.data.images"}
+    for name in (*LOADED, *(planner[word] for word in planner if any(word in door for door in doors))):
+        importlib.import_module(name)
