@@ -12,9 +12,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from factory.files import broken_link, why_unread
+from factory.files import why_unread
 from factory.wording import MOST_SAID, one_line, printable, shown
 from tasks.world.arrays import Array, Bytes, Ints
 from tasks.world.clip import CLIP_STEPS, STEP_S, AgentKind, AgentTracks, Camera, Clip
@@ -78,35 +77,6 @@ def bytes_of(path: Path) -> bytes:
             return file.read()
     except OSError as error:
         raise BadClip(str(path), "file", f"cannot be read: {why_unread(path, error)}") from error
-
-
-def read_feather(path: Path, columns: tuple[str, ...], whole: bool = True) -> dict[str, NDArray[np.generic]]:
-    """Named columns of a feather file as writable arrays. Raises BadClip.
-
-    whole: nulls, NaN and infinity are refused, else they are NaN and None.
-    """
-    import pyarrow as pa
-    import pyarrow.feather
-
-    try:
-        table = pyarrow.feather.read_table(pa.BufferReader(path.read_bytes()))  # Arrow itself would look at it 8 times
-        table.validate(full=True)
-    except FileNotFoundError as error:
-        raise BadClip(str(path), "file", broken_link(path) or "missing") from error
-    except (pa.ArrowException, OSError, ValueError) as error:  # a name that is no text
-        raise BadClip(str(path), "file", f"cannot be read as feather, truncated? {error}") from error
-    if table.num_rows == 0:
-        raise BadClip(str(path), "file", "holds no rows")
-    out = {}
-    for name in columns:
-        if name not in table.column_names:
-            raise BadClip(str(path), name, "column is missing")
-        if whole and table[name].null_count:
-            raise BadClip(str(path), name, "holds nulls")
-        out[name] = np.array(table[name].to_numpy())
-        if whole and out[name].dtype.kind == "f" and not np.isfinite(out[name]).all():
-            raise BadClip(str(path), name, "holds NaN or infinity")
-    return out
 
 
 @dataclass(frozen=True, order=True)

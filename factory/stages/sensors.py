@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from factory.files import matching, why_unread
-from factory.readers.base import BadClip, read_feather
+from factory.readers.arrow import read_feather
+from factory.readers.base import BadClip
 from factory.readers.pictures import BadPicture, decode_grey, decode_rgb, file_and_frame, video_frames
 from factory.readers.points import read_pcd, read_points
 from tasks.render.scene.features import NOTHING_KNOWN, KnownPoints, driven_roads

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from factory.datasets.av2 import ANNOTATIONS, EXTRINSICS, INTRINSICS, POSES, log_folders
 from factory.files import broken_link, is_named, matching, why_unread
-from factory.readers.base import BadClip, ClipRef, folder_split, id_text, read_feather, stamps_sign
+from factory.readers.arrow import read_feather
+from factory.readers.base import BadClip, ClipRef, folder_split, id_text, stamps_sign
 from factory.readers.logs import (
     LoggedDrive,
     LogReader,

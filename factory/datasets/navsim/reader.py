@@ -477,6 +477,7 @@ class NavsimReader:
         self.name, self.only, self.split, self.traversals = name, tuple(given.only), given.split, given.traversals
         self.root, self.maps = (Path(folder).expanduser().absolute() for folder in (root, maps))
         self.sensors = None if given.sensors is None else Path(given.sensors).expanduser().absolute()
+        self.filter_name = f"the scene filter {given.scene_filter}"
         self.selection = read_selection(given.scene_filter, given.scene_filters) if given.scene_filter else None
         self.choice = WindowChoice(
             stride_frames=given.stride_frames,
@@ -486,10 +487,6 @@ class NavsimReader:
         )
         self.cache_dir = Path(given.cache_dir or user_cache() / "navsim").expanduser().absolute()
         self._logs: dict[str, OpenLog] = {}
-
-    @property
-    def _filter(self) -> str:
-        return f"the scene filter {self.selection.name}" if self.selection else "no scene filter"
 
     def __getstate__(self) -> dict[str, Any]:
         held = {**self.__dict__, "_logs": {}}
@@ -547,7 +544,7 @@ class NavsimReader:
             raise ValueError(" ".join(map(str, cities.values())))
         if tokens is not None and (absent := len(tokens - found_tokens)):
             if not found and not broken:
-                raise ValueError(f"{self.root}: none of the {len(tokens)} tokens of {self._filter} is in the logs here")
+                raise ValueError(f"{self.root}: none of the {len(tokens)} tokens of {self.filter_name} is in the logs")
             dropped[ABSENT] += absent
         return ClipIndex(tuple(refs), dict(dropped), skipped, broken)
 
@@ -649,7 +646,7 @@ class NavsimReader:
         wanted = frozenset(named)
         chosen = {log_id: path for log_id, path in chosen.items() if log_id in wanted}
         if not chosen:
-            raise ValueError(f"{self.root}: none of the {len(wanted)} logs that {self._filter} names is here")
+            raise ValueError(f"{self.root}: none of the {len(wanted)} logs that {self.filter_name} names is here")
         return chosen
 
     def _tables(self, logs: Mapping[str, Path]) -> Iterable[tuple[str, FrameTable | BadClip]]:

@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from factory.datasets.av2.reader import KIND_OF_CATEGORY
-from factory.files import broken_link
+from factory.readers.arrow import read_arrow
 from factory.readers.base import BadClip
 from factory.wording import shown
 from tasks.world.arrays import Array, Indices, Ints
@@ -78,16 +78,8 @@ class ArrowFile:
 
 
 def open_file(path: Path, rows: bool = True) -> ArrowFile:
-    """The file, checked whole, or without its rows. Raises BadClip where it is missing, cut or without metadata."""
-    try:
-        with pa.memory_map(str(path)) as source:
-            file = pa.ipc.open_file(source)
-            table = file.read_all() if rows else file.schema.empty_table()
-        table.validate(full=True)
-    except FileNotFoundError as error:
-        raise BadClip(str(path), "file", broken_link(path) or "missing") from error
-    except (pa.ArrowException, OSError, ValueError) as error:  # a name that is no text
-        raise BadClip(str(path), "file", f"cannot be read as an Arrow file, truncated? {error}") from error
+    """The file, checked whole, or without its rows. Raises BadClip as read_arrow does, and where it has no metadata."""
+    table = read_arrow(path, "an Arrow file", rows, mapped=True)
     packed = (table.schema.metadata or {}).get(b"metadata")
     if packed is None:
         raise BadClip(str(path), "metadata", "missing from the schema: not a file of py123d")

@@ -248,7 +248,7 @@ def columns_of(good: pa.Table, rng: Rng) -> tuple[str, pa.Table]:
         n = min(n, 10**9 // sum(pa.nulls(1000, field.type).nbytes // 1000 + 1 for field in good.schema))
         return what, pa.table([pa.nulls(n, field.type) for field in good.schema], schema=good.schema)
     if what == "rows of nothing":
-        return what, pa.table({name: pa.nulls(pick(rng, (10**6, 2**31 - 1)))})
+        return what, pa.table(dict.fromkeys(good.column_names, pa.nulls(pick(rng, (10**6, 2**31 - 1)))))
     if what == "many columns":
         return what, pa.table({f"{k}": pa.nulls(rows) for k in range(20_000)})
     if what == "names":
@@ -386,6 +386,7 @@ def checkpoint(rng: Rng) -> Crafted:
     """What torch's own loader takes for tensors, and what it should not."""
     import torch
 
+    torch.set_num_threads(1)  # others are not there in a fork, which would wait for them
     size, n, one, sink = pick(rng, (10**5, 2**40, 2**62)), pick(rng, MANY), torch.zeros(1), io.BytesIO()
     if rng.random() < 0.3:
         (name, body), method = program(rng), pick(rng, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))
