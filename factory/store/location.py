@@ -26,7 +26,7 @@ from pyarrow import fs
 
 from factory.files import DamagedFile, atomic_file, in_submitted_job, is_data
 from factory.store.schema import TableSpec
-from factory.wording import one_line
+from factory.wording import one_line, printable
 from tasks.caches import Damaged, with_checksum, without_checksum
 
 if TYPE_CHECKING:
@@ -179,6 +179,7 @@ def _remote(process: int, uri: str, options: tuple[tuple[str, str], ...]) -> tup
 # One Parquet file of a table: written under its content's name, opened with its checksums verified, and what damage
 # is called.
 
+LONGEST_PATH = 4096  # characters, of Linux
 ROW_GROUP_BYTES = 4 * 2**20  # uncompressed; one sample costs one group, and a group 13 kB of the file's footer
 
 
@@ -264,6 +265,7 @@ def read_parquet(location: Location, path: str, schema: pa.Schema, without: Coll
 @contextmanager
 def raising_damaged_file(path: str) -> Iterator[None]:
     """What is raised while a Parquet file is read, by a damaged page, footer or schema, is a DamagedFile."""
+    path = printable(path[:LONGEST_PATH])  # a log may name any
     try:
         yield
     except DamagedFile:

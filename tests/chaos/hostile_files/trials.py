@@ -7,13 +7,13 @@ import re
 import resource
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -75,8 +75,6 @@ def crafted(door: str, innocents: Path, number: int) -> Crafted:
 def in_fork(work: Callable[[], int], said: Path, cpu_s: int = LIMIT_CPU_S) -> Told:
     """Of a fork of this process: what is imported here costs it nothing. Its memory counts from here on."""
     here_kb = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() // 1024
-    sys.stdout.flush()
-    sys.stderr.flush()
     if not (pid := os.fork()):
         leave_by(partial(_limited, work, cpu_s), said)
     return _waited(pid, said, here_kb)
@@ -84,7 +82,9 @@ def in_fork(work: Callable[[], int], said: Path, cpu_s: int = LIMIT_CPU_S) -> To
 
 def _limited(work: Callable[[], int], cpu_s: int) -> int:
     os.setsid()
-    _limit(cpu_s)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    for kind, most in ((resource.RLIMIT_DATA, LIMIT_BYTES), (resource.RLIMIT_CPU, cpu_s), (resource.RLIMIT_CORE, 0)):
+        resource.setrlimit(kind, (most, most))
     try:
         return work()
     finally:
@@ -93,25 +93,12 @@ def _limited(work: Callable[[], int], cpu_s: int) -> int:
 
 def as_typed(argv: Sequence[str], folder: Path, said: Path, cpu_s: int = LIMIT_CPU_S) -> Told:
     """Of the command itself."""
-    with said.open("wb") as file:
-        process = subprocess.Popen(
-            [sys.executable, "-m", *argv],
-            cwd=folder,
-            env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
-            stdin=subprocess.DEVNULL,
-            stdout=file,
-            stderr=file,
-            preexec_fn=partial(_limit, cpu_s),
-            start_new_session=True,
-        )
-    told = _waited(process.pid, said, 0)
-    process.returncode = told.code
-    return told
 
+    def command() -> NoReturn:
+        os.chdir(folder)
+        os.execve(sys.executable, [sys.executable, "-m", *argv], os.environ | {"PYTHONPATH": str(REPOSITORY)})
 
-def _limit(cpu_s: int) -> None:
-    for kind, most in ((resource.RLIMIT_DATA, LIMIT_BYTES), (resource.RLIMIT_CPU, cpu_s), (resource.RLIMIT_CORE, 0)):
-        resource.setrlimit(kind, (most, most))
+    return in_fork(command, said, cpu_s)
 
 
 def _waited(pid: int, said: Path, less_kb: int) -> Told:

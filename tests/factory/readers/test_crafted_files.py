@@ -13,8 +13,10 @@ from pathlib import Path
 import pytest
 
 from factory.datasets.navsim.pickles import RewardFile
+from factory.files import DamagedFile
 from factory.readers.base import BadClip
 from factory.readers.pickles import load_plain
+from factory.store.location import raising_damaged_file
 from factory.wording import printable, shown
 from tests.factory.datasets.scenarionet.scenarionet_scenarios import nuscenes, save
 
@@ -285,3 +287,6 @@ def test_keys_that_share_a_hash_are_refused(how: str) -> None:
 def test_what_a_file_says_is_shown_without_what_a_terminal_obeys() -> None:
     assert str(BadClip("a.pkl", "x\x1b[2J", "is no\nlane")) == "a.pkl: x\\x1b[2J: is no\\nlane"
     assert printable("Straße 5 €, 街") == "Straße 5 €, 街"
+    with pytest.raises(DamagedFile) as told, raising_damaged_file("run/\x1b[2J" + "x" * 10**6):
+        raise OSError("cut off")
+    assert str(told.value).startswith("run/\\x1b[2Jxxx") and len(str(told.value)) < 5000
