@@ -34,7 +34,7 @@ from deltalake.transaction import AddAction, RemoveAction
 from numpy.typing import NDArray
 
 from factory.files import DamagedFile, machine_fault_of, naming_disk_errors
-from factory.store.commit_copies import COPIES, CommitCopies
+from factory.store.commit_copies import COPIES, LOG, CommitCopies
 from factory.store.location import Location, Shard, read_parquet, with_partition_columns, write_shard
 from factory.store.schema import TableSpec
 from factory.wording import one_line, shown
@@ -282,6 +282,19 @@ class DamagedLog(DamagedFile):
     """A file of the table's log is damaged."""
 
 
+DEEPEST = 10_000  # brackets open at once; delta-rs follows them with its stack, which ends behind 20,000
+_TEXT = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+"?', re.DOTALL)
+
+
+def refuse_deep_commits(table: Path) -> None:
+    """Raises DamagedLog where a commit's JSON would end this process while delta-rs reads it."""
+    for path in (table / LOG).glob("*.json"):
+        if path.stat().st_size > DEEPEST:
+            signs = np.frombuffer(re.sub(rb"[^][{}]+", b"", _TEXT.sub(b"", path.read_bytes())), np.uint8)
+            if np.where(np.isin(signs, list(b"[{")), 1, -1).cumsum().max(initial=0) > DEEPEST:
+                raise DamagedLog(f"{path}: more than {DEEPEST:,} brackets in one another, which no writer makes")
+
+
 class AnotherWriter(RuntimeError):
     """Another run claimed the table since this one did; what this one has not committed by now, it never will."""
 
@@ -323,6 +336,8 @@ class KeyedTable:
         """version: None: the newest."""
         options = dict(self.location.options)
         is_there = DeltaTable.is_deltatable(self.location.uri, storage_options=options)
+        if self.location.is_local:
+            refuse_deep_commits(Path(self.location.uri))
         return DeltaTable(self.location.uri, version, storage_options=options) if is_there else None
 
     @contextmanager

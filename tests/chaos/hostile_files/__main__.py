@@ -52,7 +52,7 @@ def main(
             for door in left:
                 for new in tried(innocents, door, left[door][at : at + BATCH], end):
                     if new.finding:
-                        print(new.text, file=sys.stderr, flush=True)
+                        print(f"{door} {new.number} ({new.attack}): {new.finding}", file=sys.stderr, flush=True)
                     print(json.dumps(new.__dict__), file=file, flush=True)
                     told.append(new)
     print(table_of(told))

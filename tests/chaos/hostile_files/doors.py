@@ -1,6 +1,7 @@
 """Where hostile files get in: data folders with an innocent log, and commands and functions that read one file."""
 
 import json
+import pickle
 import shutil
 import struct
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -18,6 +19,7 @@ import pyarrow.parquet as pq
 from factory.datasets.scenarionet.photos import cameras_in, load_sidecar, read_photographs
 from factory.exits import COMPLETE
 from factory.readers.base import BadClip
+from factory.readers.pictures import jpeg_size
 from factory.setup.vocabulary import load_recovery_table
 from factory.stages.sensors import decode_image, opened_photos
 from factory.store.episodes import check_episode
@@ -81,9 +83,9 @@ def _frames(innocents: Path, rng: Rng) -> Crafted:
         return grammars.program(rng)
     frames = [frame | {"log_name": "hostile"} for frame in load_writable(next(innocents.glob(FRAMES)))]
     if rng.random() < 0.1:
-        return "frames: many", grammars.dumped(frames * grammars.pick(rng, (100, 400)), rng)
-    name, what = grammars.value(rng)
-    return f"frames: {name}", grammars.dumped(grammars.planted(frames, rng, what, 0.9), rng)
+        return "frames: many", pickle.dumps(frames * grammars.pick(rng, (100, 400)), int(rng.integers(2, 6)))
+    name, what = grammars.valued("frames", rng)
+    return name, pickle.dumps(grammars.planted(frames, rng, what, 0.9), int(rng.integers(2, 6)))
 
 
 def _log(folder: Path) -> Path:
@@ -135,20 +137,23 @@ def _linked(folder: str, innocents: Path, data: Path, name: str, crafted: bytes 
 
 
 AV2_FILES = ("annotations.feather", "city_SE3_egovehicle.feather", "calibration/intrinsics.feather", "map/*.json")
+READ = "clips={} clips.root={{data}}"
 MAPPED = (
     "clips=navsim clips.root={data}/navsim_logs/mini clips.maps={innocents}/navsim/maps clips.cache_dir={data}/kept"
 )
+
+
+def _folders(clips: str, *files: str) -> Logs:
+    return Logs(partial(_of_log, clips, files), partial(_linked, clips), READ.format(clips))
+
+
 LOGS: Mapping[str, Logs] = {
     "scenarionet": Logs(
-        lambda _, rng: grammars.scenario(rng),
-        partial(_pickled, SCENARIO, "sd_{}.pkl"),
-        "clips=scenarionet clips.root={data}",
+        lambda _, rng: grammars.scenario(rng), partial(_pickled, SCENARIO, "sd_{}.pkl"), READ.format("scenarionet")
     ),
     "navsim": Logs(_frames, partial(_pickled, FRAMES, "navsim_logs/mini/{}.pkl"), MAPPED),
-    "av2": Logs(partial(_of_log, "av2", AV2_FILES), partial(_linked, "av2"), "clips=av2 clips.root={data}"),
-    "py123d": Logs(
-        partial(_of_log, "py123d", ("*.arrow",)), partial(_linked, "py123d"), "clips=py123d clips.root={data}"
-    ),
+    "av2": _folders("av2", *AV2_FILES),
+    "py123d": _folders("py123d", "*.arrow"),
 }
 
 
@@ -164,11 +169,11 @@ class Single:
     reads: str | Callable[[Path], Any]  # a command, factory or planners, and its words; a function of the file
     refusals: tuple[type[Exception], ...] = (BadClip, ValueError)  # of the function
     like: str = ""  # what of the innocents the file lies in a copy of
-    named: str = ""  # what a refusal must name; the file where it is empty
+    named: str | None = ""  # what a refusal must name; empty: the file; None: nothing, of a function of bytes alone
 
 
-def _alone(craft: Callable[[Rng], Crafted], name: str, reads: str | Callable[[Path], Any], like: str = "") -> Single:
-    return Single(lambda _, rng: craft(rng), name, reads.format(name) if isinstance(reads, str) else reads, like=like)
+def _alone(craft: Callable[[Rng], Crafted], name: str, reads: str | Callable[[Path], Any], **more: Any) -> Single:
+    return Single(lambda _, rng: craft(rng), name, reads.format(name) if isinstance(reads, str) else reads, **more)
 
 
 def _good_commit(innocents: Path) -> list[dict[str, Any]]:
@@ -178,34 +183,25 @@ def _good_commit(innocents: Path) -> list[dict[str, Any]]:
     return [action for action in actions if "commitInfo" not in action]
 
 
-def _shard(innocents: Path, rng: Rng) -> Crafted:
+SHARD, COMMIT = "run/samples/round=0/expert=human/hostile.parquet", f"run/samples/_delta_log/{0:020}.json"
+
+
+def _crafted_shard(innocents: Path, rng: Rng) -> Crafted:
     (good,) = (innocents / "run/samples").glob("*/*/*.parquet")
     return grammars.parquet(pq.ParquetFile(good).read(use_threads=False), rng)
 
 
-SHARD, COMMIT = "run/samples/round=0/expert=human/hostile.parquet", f"run/samples/_delta_log/{0:020}.json"
-
-
 def _of_run(name: str, reads: str | Callable[[Path], Any]) -> Single:
-    craft = _shard if name == SHARD else lambda innocents, rng: grammars.commit(_good_commit(innocents), rng)
+    craft = _crafted_shard if name == SHARD else lambda innocents, rng: grammars.commit(_good_commit(innocents), rng)
     named = Path(SHARD).name if name == SHARD and isinstance(reads, str) else "run"
     return Single(craft, name, reads, (Exception,), "run", named)
 
 
-def _named(read: Callable[[bytes], Any], path: Path) -> Any:
-    """Of a function that does not know the file's name."""
-    try:
-        return read(path.read_bytes())
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-def _read_batch(data: bytes) -> Any:
+def _read_batch(path: Path) -> Any:
     """By the decoder of a planner's batches."""
-    from factory.readers.pictures import jpeg_size
     from planners.data.images import _decode_jpeg
 
-    return _decode_jpeg(np.frombuffer(data, np.uint8), jpeg_size(data)[::-1])
+    return _decode_jpeg(np.frombuffer(data := path.read_bytes(), np.uint8), jpeg_size(data)[::-1])
 
 
 def _read_sidecar(path: Path) -> Any:
@@ -214,7 +210,6 @@ def _read_sidecar(path: Path) -> Any:
 
 
 def _read_photo(path: Path) -> Any:
-    """As a log's photos are read, which a camera of 64 x 36 took."""
     camera = Camera("front", 64, 36, np.eye(3), np.zeros(5), np.eye(4))
     return list(opened_photos([SensorFile("front", str(path), 0.0, np.eye(4))], [camera]))
 
@@ -227,29 +222,33 @@ def _read_samples(path: Path) -> Any:
     return [len(table[k]) for k in range(len(table))]
 
 
-CAMERA = {
-    "width": 64,
-    "height": 36,
-    "ego_from_camera": np.eye(4).tolist(),
-    "K": [[50.0, 0, 32], [0, 50, 18], [0, 0, 1]],
-}
+CAMERA: dict[str, Any] = {"width": 64, "height": 36, "ego_from_camera": np.eye(4).tolist()}
+CAMERA |= {"K": [[50.0, 0, 32], [0, 50, 18], [0, 0, 1]]}
 SIDECAR = {"cameras": {"front": CAMERA}, "frames": [{"camera": "front", "file": "a.jpg", "time_s": 0.1}]}
+PICTURES = (grammars.png, grammars.jpeg, grammars.jpeg, grammars.other_picture)
 RUN, IMPORT = f"factory run {' '.join(PLAIN)} out=out ", "factory scene import {} to=scene.safetensors"
 FILTERED = RUN + "clips=navsim clips.root=navsim/navsim_logs/mini clips.maps=navsim/maps clips.scene_filter={}"
 WITH_VOCABULARY = RUN + "clips=scenarionet clips.root=scenarionet vocabulary.file={}"
 SINGLES: Mapping[str, Single] = {
-    "yaml filter": _alone(grammars.yaml_text, "hostile.yaml", FILTERED, "navsim"),
-    "vocabulary": _alone(grammars.array_file, "hostile.npy", WITH_VOCABULARY, "scenarionet"),
+    "yaml filter": _alone(grammars.yaml_text, "hostile.yaml", FILTERED, like="navsim"),
+    "vocabulary": _alone(
+        lambda rng: (grammars.npz if rng.random() < 0.2 else grammars.npy)(rng),
+        "hostile.npy",
+        WITH_VOCABULARY,
+        like="scenarionet",
+    ),
     "recovery table": _alone(grammars.npz, "hostile.npz", load_recovery_table),
     "scene ply": _alone(grammars.ply, "hostile.ply", IMPORT),
     "scene spz": _alone(grammars.spz, "hostile.spz", IMPORT),
     "scene checkpoint": _alone(grammars.checkpoint, "hostile.ckpt", IMPORT),
     "scene file": _alone(grammars.safetensors, "hostile.safetensors", "factory scene info {}"),
     "planner checkpoint": _alone(grammars.checkpoint, "h.ckpt", "planners import {} planner=ltf_public out=planner"),
-    "picture": _alone(grammars.picture, "h.jpg", lambda path: decode_image(path.read_bytes(), str(path))),
-    "photo": _alone(grammars.picture, "hostile.jpg", _read_photo),
-    "picture of a batch": _alone(grammars.jpeg, "hostile.jpg", partial(_named, _read_batch)),
-    "episode": _alone(grammars.mcap, "hostile.mcap", partial(_named, check_episode)),
+    "picture": _alone(
+        lambda rng: grammars.pick(rng, PICTURES)(rng), "h.jpg", lambda path: decode_image(path.read_bytes(), str(path))
+    ),
+    "photo": _alone(lambda rng: grammars.pick(rng, PICTURES)(rng), "hostile.jpg", _read_photo),
+    "picture of a batch": _alone(grammars.jpeg, "hostile.jpg", _read_batch, named=None),
+    "episode": _alone(grammars.mcap, "hostile.mcap", lambda path: check_episode(path.read_bytes()), named=None),
     "sidecar": _alone(partial(grammars.json_text, SIDECAR), "hostile.json", _read_sidecar),
     "table, status": _of_run(COMMIT, "factory status out=run"),
     "table, verify": _of_run(COMMIT, "factory verify run"),

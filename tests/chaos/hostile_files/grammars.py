@@ -41,9 +41,6 @@ def one_of(kind: str, options: Mapping[str, Any], rng: Rng) -> tuple[str, Any]:
     return f"{kind}: {name}", options[name]
 
 
-# Values
-
-
 def shared(kind: type) -> Any:
     """3^60 or 2^60 values to whoever walks through them."""
     value: Any = kind()
@@ -80,9 +77,9 @@ VALUES: dict[str, Callable[[Rng], Any]] = {
 }
 
 
-def value(rng: Rng) -> tuple[str, Any]:
-    name = pick(rng, list(VALUES))
-    return name, VALUES[name](rng)
+def valued(kind: str, rng: Rng) -> tuple[str, Any]:
+    name, made = one_of(kind, VALUES, rng)
+    return name, made(rng)
 
 
 def planted(tree: Any, rng: Rng, what: Any, chance: float = 0.8) -> Any:
@@ -96,9 +93,6 @@ def planted(tree: Any, rng: Rng, what: Any, chance: float = 0.8) -> Any:
         k = int(rng.integers(len(tree)))
         return type(tree)([*tree[:k], planted(tree[k], rng, what, chance), *tree[k + 1 :]])
     return what
-
-
-# Pickles: whole logs with a value in them, and programs
 
 
 def told(raw: bytes) -> bytes:
@@ -156,19 +150,12 @@ def program(rng: Rng) -> Crafted:
     return name, pick(rng, (b"\x80\x02", b"\x80\x04", b"")) + body + pick(rng, (b".", b".", b""))
 
 
-def dumped(tree: Any, rng: Rng) -> bytes:
-    return pickle.dumps(tree, int(rng.integers(2, 6)))
-
-
 def scenario(rng: Rng) -> Crafted:
     if rng.random() < 0.35:
         return program(rng)
-    name, what = value(rng)
+    name, what = valued("scenario", rng)
     made = pick(rng, (nuscenes, waymo, nuplan))()
-    return f"scenario: {name}", dumped(planted(made, rng, what), rng)
-
-
-# numpy's arrays and archives
+    return name, pickle.dumps(planted(made, rng, what), int(rng.integers(2, 6)))
 
 
 def npy_header(text: str, version: int = 1, length: int | None = None) -> bytes:
@@ -222,13 +209,6 @@ def zipped(members: Iterable[tuple[str, str | bytes]], method: int) -> bytes:
     return sink.getvalue()
 
 
-def array_file(rng: Rng) -> Crafted:
-    return npz(rng) if rng.random() < 0.2 else npy(rng)
-
-
-# Arrow
-
-
 def columns_of(good: pa.Table, rng: Rng) -> tuple[str, pa.Table]:
     """A table like a good one, where a column is another, or all are longer."""
     rows, name, n = max(good.num_rows, 1), pick(rng, good.column_names), pick(rng, (10**6, 10**7))
@@ -265,9 +245,6 @@ def arrow(good: pa.Table, rng: Rng) -> Crafted:
     with pa.ipc.new_file(sink, table.schema, options=options) as writer:
         writer.write_table(table)
     return f"arrow: {what}", sink.getvalue()
-
-
-# JSON, YAML
 
 
 def json_text(good: Any, rng: Rng) -> Crafted:
@@ -309,9 +286,6 @@ def yaml_text(rng: Rng) -> Crafted:
     }
     name, body = one_of("yaml", bodies, rng)
     return name, f"{json.dumps(pick(rng, YAML_KEYS))}:{body}\n".encode()
-
-
-# Scenes: ply, spz, safetensors
 
 
 def ply(rng: Rng) -> Crafted:
@@ -379,9 +353,6 @@ def safetensors(rng: Rng) -> Crafted:
     return f"safetensors: {name}", save(tensors, {KEY: json.dumps(described | {"digest": digest, "kept_as": "x"})})
 
 
-# Checkpoints
-
-
 def checkpoint(rng: Rng) -> Crafted:
     """What torch's own loader takes for tensors, and what it should not."""
     import torch
@@ -412,9 +383,6 @@ def checkpoint(rng: Rng) -> Crafted:
     inside[pick(rng, [*inside, FORGED])] = tensor()
     torch.save(pick(rng, (inside, {"state_dict": inside}, {"pipeline": inside, "step": 10**4000})), sink)
     return name, sink.getvalue()
-
-
-# Pictures
 
 
 def chunk(kind: bytes, body: bytes) -> bytes:
@@ -496,14 +464,6 @@ def other_picture(rng: Rng) -> Crafted:
     return one_of("picture", heads, rng)
 
 
-def picture(rng: Rng) -> Crafted:
-    crafted: Crafted = pick(rng, (png, jpeg, jpeg, other_picture))(rng)
-    return crafted
-
-
-# MCAP
-
-
 def record(opcode: int, body: bytes, length: int | None = None) -> bytes:
     return bytes([opcode]) + struct.pack("<Q", len(body) if length is None else length) + body
 
@@ -521,9 +481,6 @@ def mcap(rng: Rng) -> Crafted:
     name, body = one_of("mcap", bodies, rng)
     footer = record(2, struct.pack("<QQI", pick(rng, (0, 30, size)), pick(rng, (0, size)), 0))
     return name, b"\x89MCAP0\r\n" + record(1, bytes(8)) + body + footer + b"\x89MCAP0\r\n"
-
-
-# Delta tables: a commit, a shard
 
 
 def commit(good: Sequence[dict[str, Any]], rng: Rng) -> Crafted:

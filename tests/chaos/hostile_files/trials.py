@@ -15,12 +15,12 @@ from functools import cache, partial
 from pathlib import Path
 from typing import NoReturn
 
-import numpy as np
 import pyarrow.parquet as pq
 
 from factory.exits import EXIT_CODE_TEXT, INTERRUPTED
+from tests.chaos.damaged_files.mutants_of_files import rng_of
 from tests.chaos.hostile_files.doors import LOGS, PLAIN, SINGLES, Single, put_single
-from tests.chaos.hostile_files.grammars import ESCAPE, Crafted, Rng
+from tests.chaos.hostile_files.grammars import ESCAPE, Crafted
 from tests.chaos.trials import leave_by
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -54,14 +54,6 @@ class Verdict:
     finding: str  # what is wrong; empty: nothing
     cpu_s: float  # beyond the baseline
     gb: float
-
-    @property
-    def text(self) -> str:
-        return f"{self.door} {self.number} ({self.attack}): {self.finding}"
-
-
-def rng_of(door: str, number: int) -> Rng:
-    return np.random.default_rng([number, *door.encode()])
 
 
 def crafted(door: str, innocents: Path, number: int) -> Crafted:
@@ -207,25 +199,18 @@ def _answer(single: Single, folder: Path, path: Path) -> int:
 
 def judge_single(innocents: Path, folder: Path, door: str, number: int) -> Verdict:
     """One case in a folder of its own, which is removed."""
-    single, (attack, content), before = SINGLES[door], crafted(door, innocents, number), NOTHING
+    single, (attack, content) = SINGLES[door], crafted(door, innocents, number)
     path = put_single(single, innocents, folder, content)
     if isinstance(single.reads, str) and number % EVERY == 0:
-        program, command, *_ = argv = single.reads.split()
-        before, told = _started(program, command, innocents), as_typed(argv, folder, folder / "said")
+        told = as_typed(single.reads.split(), folder, folder / "said")
     else:
         told = in_fork(partial(_answer, single, folder, path), folder / "said")
-    wrong = what_is_wrong(told, before, EXIT_CODE_TEXT.keys() - {INTERRUPTED})
-    if not wrong and told.code and (single.named or path.name) not in told.said:
+    wrong = what_is_wrong(told, NOTHING, EXIT_CODE_TEXT.keys() - {INTERRUPTED})
+    if not wrong and told.code and (path.name if single.named == "" else single.named or "") not in told.said:
         wrong = f"refused without its name: {told.said[-400:]}"
     shutil.rmtree(folder)
     how = "refused" if told.code else "read"
-    return Verdict(door, number, attack, how, wrong, told.cpu_s - before.cpu_s, told.gb - before.gb)
-
-
-@cache
-def _started(program: str, command: str, innocents: Path) -> Told:
-    """What it takes to start the command, by its help."""
-    return as_typed([program, command, "--help"], innocents, innocents.parent / "help")
+    return Verdict(door, number, attack, how, wrong, told.cpu_s, told.gb)
 
 
 LOADED = ("factory.commands.exchange", "factory.graph.execute", "factory.pipeline", "factory.setup.settings")

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,9 @@ from factory.datasets.navsim.pickles import RewardFile
 from factory.files import DamagedFile
 from factory.readers.base import BadClip
 from factory.readers.pickles import load_plain
+from factory.store.commit_copies import LOG
 from factory.store.location import raising_damaged_file
+from factory.store.table import DamagedLog, refuse_deep_commits
 from factory.wording import printable, shown
 from tests.factory.datasets.scenarionet.scenarionet_scenarios import nuscenes, save
 
@@ -290,3 +293,20 @@ def test_what_a_file_says_is_shown_without_what_a_terminal_obeys() -> None:
     with pytest.raises(DamagedFile) as told, raising_damaged_file("run/\x1b[2J" + "x" * 10**6):
         raise OSError("cut off")
     assert str(told.value).startswith("run/\\x1b[2Jxxx") and len(str(told.value)) < 5000
+
+
+@pytest.mark.parametrize(
+    ("text", "deep"),
+    [
+        (b"[" * 20_000, True),
+        (b'{"]]":[\n' * 20_000, True),
+        (b'"' + b"]" * 20_000 + b'"' + b"[" * 20_000, True),
+        (b'"\\"' + b"[" * 20_000, False),  # a text that is cut off
+        (b'{"add":{"stats":"{}"}}\n' * 20_000, False),
+    ],
+)
+def test_a_commit_that_would_end_the_process_that_reads_it_is_refused(text: bytes, deep: bool, tmp_path: Path) -> None:
+    (path := tmp_path / LOG / "0.json").parent.mkdir()
+    path.write_bytes(text)
+    with pytest.raises(DamagedLog, match=r"0\.json: more than 10,000 brackets") if deep else nullcontext():
+        refuse_deep_commits(tmp_path)
