@@ -17,16 +17,8 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from tests.chaos.hostile_files import trials
 from tests.chaos.hostile_files.doors import DOORS, LOGS, write_innocents
-from tests.chaos.hostile_files.trials import (
-    LIMIT_S,
-    Verdict,
-    crafted,
-    in_fork,
-    judge_logs,
-    judge_single,
-    load_what_is_read_with,
-)
 
 BATCH = 25  # logs beside an innocent one
 
@@ -36,7 +28,7 @@ def main(
 ) -> int:
     end, kept = time.monotonic() + 60.0 * float(minutes), Path(to).absolute() / "verdicts.jsonl"
     (innocents := kept.with_name("innocents")).mkdir(parents=True, exist_ok=True)
-    told = [Verdict(**json.loads(line)) for line in kept.read_text().splitlines()] if kept.exists() else []
+    told = [trials.Verdict(**json.loads(line)) for line in kept.read_text().splitlines()] if kept.exists() else []
     wanted = defaultdict[str, list[int]](list)
     for case in re.split(r"(?<=\d),", only) if only else ():
         wanted[case.partition(":")[0]].append(int(case.partition(":")[2]))
@@ -44,8 +36,8 @@ def main(
         wanted |= {door: [*range(int(cases))] for door in DOORS if any(word in door for word in doors.split(","))}
     known = {(verdict.door, verdict.number) for verdict in told}
     left = {door: [n for n in numbers if (door, n) not in known] for door, numbers in wanted.items()}
-    load_what_is_read_with(left)
-    if (made := in_fork(lambda: write_innocents(innocents, left), kept.with_name("made"), LIMIT_S)).code:
+    trials.load_what_is_read_with(left)
+    if (made := trials.in_fork(lambda: write_innocents(innocents, left), kept.with_name("made"), trials.LIMIT_S)).code:
         raise RuntimeError(made.said[-2000:])
     with kept.open("a") as file:
         for at in range(0, max(map(len, left.values())), BATCH):  # a part that ends early has some of every kind
@@ -59,17 +51,17 @@ def main(
     return sum(bool(verdict.finding) for verdict in told)
 
 
-def tried(innocents: Path, door: str, numbers: Sequence[int], end: float) -> Iterator[Verdict]:
+def tried(innocents: Path, door: str, numbers: Sequence[int], end: float) -> Iterator[trials.Verdict]:
     folder = Path(tempfile.mkdtemp())  # a TemporaryDirectory would be removed by forks that end
     if door in LOGS and numbers and time.monotonic() < end:
-        yield from judge_logs(innocents, folder, door, {n: crafted(door, innocents, n) for n in numbers})
+        yield from trials.judge_logs(innocents, folder, door, {n: trials.crafted(door, innocents, n) for n in numbers})
     for n in numbers if door not in LOGS else ():
         if time.monotonic() < end:
-            yield judge_single(innocents, folder / str(n), door, n)
+            yield trials.judge_single(innocents, folder / str(n), door, n)
     shutil.rmtree(folder)
 
 
-def table_of(told: Sequence[Verdict]) -> str:
+def table_of(told: Sequence[trials.Verdict]) -> str:
     lines = ["| door | cases | attacks | read | refused | findings | CPU s | GB |", "|---|---|---|---|---|---|---|---|"]
     for door in dict.fromkeys(verdict.door for verdict in told):
         some = [verdict for verdict in told if verdict.door == door]

@@ -265,25 +265,20 @@ def yaml_text(rng: Rng) -> Crafted:
     kind = pick(rng, ("[*a{0}, *a{0}, *a{0}]", "{{x: *a{0}, y: *a{0}}}"))
     aliases = ["&a0 [x]", *(f"&a{k} {kind.format(k - 1)}" for k in range(1, 60))]
     merge = "{{<<: [*a{0}, *a{0}, *a{0}]}}"
-    bodies = {
-        "aliases": "\n".join(f"  - {line}" for line in aliases),
-        "itself": " &a [*a, *a]",
-        "itself as a key": " &a {? *a : 1}",
-        "merges": " &a {<<: [*a, *a]}",
-        "merges of merges": "\n  - &a0 {x: 1}\n" + "".join(f"  - &a{k} {merge.format(k - 1)}\n" for k in range(1, 40)),
-        "digits": " " + pick(rng, ("", "-", "0x", "0b", "0")) + "1" * n,
+    bodies = {"aliases": "\n".join(f"  - {line}" for line in aliases), "itself": " &a [*a, *a]"}
+    bodies |= {"itself as a key": " &a {? *a : 1}", "merges": " &a {<<: [*a, *a]}"}
+    merges = "\n  - &a0 {x: 1}\n" + "".join(f"  - &a{k} {merge.format(k - 1)}\n" for k in range(1, 40))
+    bodies |= {"merges of merges": merges, "digits": " " + pick(rng, ("", "-", "0x", "0b", "0")) + "1" * n}
+    bodies |= {
         "sixties": " " + ":".join(["59"] * n),
         "deep": " " + "[" * n,
         "deep blocks": " " + "- " * min(n, 3000) + "1",
-        "a tag": " !!python/object/apply:os.system [true]",
-        "bytes": " !!binary " + "AAAA" * n,
-        "a date": " 9999-99-99T99:99:99Z",
-        "colliding keys": "\n" + "".join(f"  {k * PRIME}: 0\n" for k in range(1, n)),
-        "long text": " " + pick(rng, ("x", "é")) * n,
-        "forged": " " + json.dumps([FORGED]),
-        "many keys": "\n" + "".join(f"k{k}: 1\n" for k in range(n)),
-        "1e308": " [1.0e+308, .inf, .nan]",
     }
+    bodies |= {"a tag": " !!python/object/apply:os.system [true]", "bytes": " !!binary " + "AAAA" * n}
+    colliding = "\n" + "".join(f"  {k * PRIME}: 0\n" for k in range(1, n))
+    bodies |= {"a date": " 9999-99-99T99:99:99Z", "colliding keys": colliding}
+    bodies |= {"long text": " " + pick(rng, ("x", "é")) * n, "forged": " " + json.dumps([FORGED])}
+    bodies |= {"many keys": "\n" + "".join(f"k{k}: 1\n" for k in range(n)), "1e308": " [1.0e+308, .inf, .nan]"}
     name, body = one_of("yaml", bodies, rng)
     return name, f"{json.dumps(pick(rng, YAML_KEYS))}:{body}\n".encode()
 
