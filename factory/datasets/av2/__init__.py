@@ -40,11 +40,12 @@ def camera_names(clips: Mapping[str, Any]) -> tuple[str, ...]:
     What is wrong with the others is told when they are read. Raises ValueError for a root without logs.
     """
     folders = log_folders(Path(str(clips["root"])))
-    from pyarrow.feather import read_table
+    from factory.readers.arrow import read_feather
+    from factory.readers.base import BadClip
 
     for folder in (folder for log_id, folder in folders.items() if not clips["only"] or log_id in clips["only"]):
         try:
-            return tuple(read_table(folder / INTRINSICS, ["sensor_name"])["sensor_name"].to_pylist())
-        except (OSError, ValueError):  # Arrow's errors are of these kinds; not there, or no feather file
+            return tuple(read_feather(folder / INTRINSICS, ("sensor_name",))["sensor_name"].tolist())
+        except BadClip:
             continue
     return ()

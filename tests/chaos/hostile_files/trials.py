@@ -25,7 +25,7 @@ from tests.chaos.trials import leave_by
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 CPU_S, GB = 8.0, 1.0  # beyond what it takes without the file
-LIMIT_S, LIMIT_CPU_S, LIMIT_BYTES = 600, 30, 6 << 30  # of one process that would take all of the machine
+LIMIT_S, LIMIT_CPU_S, LIMIT_BYTES = 600, 20, 6 << 30  # of one process that would take all of the machine
 MOST_SAID = 20_000  # characters that a file makes a command say
 EVERY = 50  # single files, of which one is read by the command as it is typed
 
