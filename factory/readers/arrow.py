@@ -22,6 +22,8 @@ def read_feather(path: Path, columns: tuple[str, ...], whole: bool = True) -> di
 
     whole: nulls, NaN and infinity are refused, else they are NaN and None.
     """
+    import pyarrow as pa
+
     table = read_arrow(path, "feather")
     if table.num_rows == 0:
         raise BadClip(str(path), "file", "holds no rows")
@@ -29,6 +31,9 @@ def read_feather(path: Path, columns: tuple[str, ...], whole: bool = True) -> di
     for name in columns:
         if name not in table.column_names:
             raise BadClip(str(path), name, "column is missing")
+        kind = table[name].type
+        if any(map(pa.types.is_nested, (kind, getattr(kind, "value_type", kind)))):  # numpy's words for such never end
+            raise BadClip(str(path), name, "holds lists or records, expected one value a row")
         if whole and table[name].null_count:
             raise BadClip(str(path), name, "holds nulls")
         out[name] = np.array(table[name].to_numpy())

@@ -670,7 +670,7 @@ def read_cameras(folder: Path) -> tuple[Camera, ...]:
     turned = rotations(pose_path, poses).as_matrix()
     mount_of = {str(name): i for i, name in enumerate(mounts["sensor_name"])}
     cameras = []
-    for name, (fx, fy, cx, cy, height, width) in zip(table["sensor_name"].astype(str), numbers(path, table, columns)):
+    for name, (fx, fy, cx, cy, height, width) in zip(map(str, table["sensor_name"]), numbers(path, table, columns)):
         if name not in mount_of:
             raise BadClip(str(pose_path), "sensor_name", f"no pose of camera {name}")
         mount, row = np.eye(4), mount_of[name]
@@ -692,7 +692,8 @@ def read_lights(folder: Path, motion: LogMotion, times_s: Array) -> tuple[Traffi
     if not is_named(path):
         return TrafficLights((), np.zeros((len(times_s), 0), np.int8)), ()
     table = read_feather(path, ("timestamp_ns", "lane_id", "state"))
-    lanes, names = table["lane_id"].astype(str), table["state"].astype(str)
+    # As texts of one width each would be as long as the longest.
+    lanes, names = (np.array([*map(str, table[name])], object) for name in ("lane_id", "state"))
     unknown = ~np.isin(names, list(LightState.__members__))
     if unknown.sum() > MOST * len(names):
         raise BadClip(str(path), "state", f"unknown state {sorted(set(names[unknown].tolist()))}")

@@ -55,9 +55,6 @@ def write_innocents(folder: Path, doors: Collection[str]) -> int:
     return COMPLETE
 
 
-# Data folders
-
-
 @dataclass(frozen=True)
 class Logs:
     """A folder of logs that a run reads, where many hostile ones lie beside an innocent one."""
@@ -155,9 +152,6 @@ LOGS: Mapping[str, Logs] = {
     "av2": _folders("av2", *AV2_FILES),
     "py123d": _folders("py123d", "*.arrow"),
 }
-
-
-# Single files
 
 
 @dataclass(frozen=True)

@@ -40,9 +40,6 @@ class Told:
     gb: float  # of the largest of them
 
 
-NOTHING = Told(0, "", 0.0, 0.0)
-
-
 @dataclass(frozen=True)
 class Verdict:
     """Of one case; of logs `cpu_s` and `gb` are those of the run that it was in."""
@@ -61,15 +58,19 @@ def crafted(door: str, innocents: Path, number: int) -> Crafted:
     return (LOGS.get(door) or SINGLES[door]).craft(innocents, rng_of(door, number))
 
 
-# Processes
-
-
 def in_fork(work: Callable[[], int], said: Path, cpu_s: int = LIMIT_CPU_S) -> Told:
     """Of a fork of this process: what is imported here costs it nothing. Its memory counts from here on."""
     here_kb = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() // 1024
     if not (pid := os.fork()):
         leave_by(partial(_limited, work, cpu_s), said)
-    return _waited(pid, said, here_kb)
+    end = time.monotonic() + LIMIT_S
+    while not (ended := os.wait4(pid, os.WNOHANG))[0]:
+        if time.monotonic() > end:
+            os.killpg(pid, signal.SIGKILL)
+        time.sleep(0.005)
+    _, status, used = ended
+    text, gb = said.read_bytes().decode(errors="replace"), max(0, used.ru_maxrss - here_kb) / 2**20
+    return Told(os.waitstatus_to_exitcode(status), text, used.ru_utime + used.ru_stime, gb)
 
 
 def _limited(work: Callable[[], int], cpu_s: int) -> int:
@@ -93,18 +94,6 @@ def as_typed(argv: Sequence[str], folder: Path, said: Path, cpu_s: int = LIMIT_C
     return in_fork(command, said, cpu_s)
 
 
-def _waited(pid: int, said: Path, less_kb: int) -> Told:
-    """SIGKILL after LIMIT_S."""
-    end = time.monotonic() + LIMIT_S
-    while not (ended := os.wait4(pid, os.WNOHANG))[0]:
-        if time.monotonic() > end:
-            os.killpg(pid, signal.SIGKILL)
-        time.sleep(0.005)
-    _, status, used = ended
-    text, gb = said.read_bytes().decode(errors="replace"), max(0, used.ru_maxrss - less_kb) / 2**20
-    return Told(os.waitstatus_to_exitcode(status), text, used.ru_utime + used.ru_stime, gb)
-
-
 def what_is_wrong(told: Told, before: Told, codes: Collection[int]) -> str:
     """With a process that a hostile file was given to, beside one that had none."""
     cpu_s, gb = told.cpu_s - before.cpu_s, told.gb - before.gb
@@ -118,9 +107,6 @@ def what_is_wrong(told: Told, before: Told, codes: Collection[int]) -> str:
     if len(told.said) > MOST_SAID:
         return f"said {len(told.said):,} characters: {told.said[:300]!r}"
     return f"{cpu_s:.1f} s of CPU time more" if cpu_s > CPU_S else f"{gb:.2f} GB more" if gb > GB else ""
-
-
-# Logs
 
 
 def rows_of(out: Path, table: str = "samples") -> dict[str, list[str]]:
@@ -148,9 +134,8 @@ def _run(innocents: Path, folder: Path, door: str, hostile: Mapping[str, bytes])
     name, *_ = [LOGS[door].put(innocents, data, *log) for log in (("innocent", None), *hostile.items())]
     words = [word.format(innocents=innocents, data=data) for word in LOGS[door].words.split()]
     command = ["factory", "run", *PLAIN, *words, f"out={folder / 'out'}"]
-    return as_typed(
-        command, folder, folder / "said", LIMIT_CPU_S if hostile else LIMIT_S
-    ), name  # compiles kernels once
+    cpu_s = LIMIT_CPU_S if hostile else LIMIT_S  # the innocent alone may compile kernels
+    return as_typed(command, folder, folder / "said", cpu_s), name
 
 
 def judge_logs(innocents: Path, folder: Path, door: str, files: Mapping[int, Crafted]) -> list[Verdict]:
@@ -175,9 +160,6 @@ def judge_logs(innocents: Path, folder: Path, door: str, files: Mapping[int, Cra
         return [verdict for part in parts for verdict in judge_logs(innocents, folder, door, part)]
     more = told.cpu_s - before.cpu_s, told.gb - before.gb
     return [Verdict(door, n, attack, how.get(n, ""), wrong, *more) for n, (attack, _) in files.items()]
-
-
-# Single files
 
 
 def _answer(single: Single, folder: Path, path: Path) -> int:
@@ -205,7 +187,7 @@ def judge_single(innocents: Path, folder: Path, door: str, number: int) -> Verdi
         told = as_typed(single.reads.split(), folder, folder / "said")
     else:
         told = in_fork(partial(_answer, single, folder, path), folder / "said")
-    wrong = what_is_wrong(told, NOTHING, EXIT_CODE_TEXT.keys() - {INTERRUPTED})
+    wrong = what_is_wrong(told, Told(0, "", 0.0, 0.0), EXIT_CODE_TEXT.keys() - {INTERRUPTED})
     if not wrong and told.code and (path.name if single.named == "" else single.named or "") not in told.said:
         wrong = f"refused without its name: {told.said[-400:]}"
     shutil.rmtree(folder)

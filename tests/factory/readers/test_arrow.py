@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from factory.readers.arrow import read_arrow
+from factory.readers.arrow import read_arrow, read_feather
 from factory.readers.base import BadClip
 
 ROWS = np.arange(1000.0)
@@ -53,3 +53,12 @@ def test_a_footer_that_tells_of_something_else_is_refused(tmp_path: Path) -> Non
         (path := tmp_path / "a.arrow").write_bytes(many[: -ends[0]] + other[-ends[1] :])
         with pytest.raises(BadClip, match="its footer tells of others than its 2 batches and 1 columns"):
             read_arrow(path, "feather")
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_column_of_lists_is_refused_by_its_name(packed: bool, tmp_path: Path) -> None:
+    lists = pa.array([[[1]]] * 9)
+    column = pa.DictionaryArray.from_arrays(pa.array([0] * 9, pa.int32()), lists[:1]) if packed else lists
+    (path := tmp_path / "a.feather").write_bytes(ipc(column))
+    with pytest.raises(BadClip, match="a: holds lists or records"):
+        read_feather(path, ("a",), whole=False)
