@@ -32,7 +32,7 @@ from tests.pages import REPOSITORY
 OVER_S, LEFT_S = 400.0, 60.0  # until a command has ended, and then what it began
 NOBODY = 4242  # a user
 TRACE = re.compile(r"Traceback|Exception ignored|Fatal Python error|core dumped|Aborted|panicked")
-RAY_S_OWN = re.compile(r"^.*\(PlacementGroupCleaner pid=.*\n", re.M)  # an actor that fails at a second Ray on a machine
+RAY_S_OWN = re.compile(r"^.*\((PlacementGroupCleaner|TrainController) pid=.*\n", re.M)  # Ray Train
 GOES_ON = r"again|the same command goes on|free disk space|run it as a user|to=<another|out="  # how to go on
 SAID = re.compile(r"^error: |again|^interrupted|the same command goes on|^OpenBLAS error")
 
