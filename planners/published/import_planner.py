@@ -27,7 +27,7 @@ from factory.files import file_digest
 from factory.readers.pickles import load_tensors
 from factory.wording import listed
 from planners.models.settings import DiffusionDriveSettings, GtrsDenseSettings, LtfSettings, PlannerChoice, settings_of
-from planners.training.checkpoint import FOLDER, put_weights, save_checkpoint
+from planners.training.checkpoint import checkpoints, put_weights, save_checkpoint
 from planners.training.train import PlannerEntry
 from tasks.subscores import RECORDS
 from tasks.world.arrays import FloatArray
@@ -338,7 +338,7 @@ def import_to(config: ImportConfig) -> Path:
     Raises ConfigError, and ValueError where the numbers of its vocabulary or anchors mean something else.
     """
     out, path = Path(config.out).absolute(), Path(config.checkpoint)
-    if (out / FOLDER).exists():
+    if checkpoints(out):
         raise ConfigError(f"out={config.out} holds a training already: choose another folder")
     if not path.is_file():
         raise ConfigError(f"checkpoint={config.checkpoint}: there is no such file")
