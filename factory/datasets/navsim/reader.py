@@ -159,8 +159,10 @@ def scene_filter_of(content: Mapping[str, Any], file: str) -> SceneFilter:
         if key in _HYDRA_KEYS or (value is None and key not in ("num_history_frames", "num_future_frames", *_FLAGS)):
             continue
         if key in _COUNTS:
-            if isinstance(value, bool) or not isinstance(value, int) or value < _COUNTS[key]:
-                raise ValueError(f"{file}: {key}: expected a whole number from {_COUNTS[key]} on, not {shown(value)}")
+            least, most = _COUNTS[key], 10**9
+            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+                problem = f"expected a whole number from {least} to {most:,}, not {shown(value)}"
+                raise ValueError(f"{file}: {key}: {problem}")
             checked[key] = value
         elif key in _FLAGS:
             if not isinstance(value, bool):

@@ -13,7 +13,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # 25 s of CPU time, w
 
 SHORT = ("recovery table", "episode", "sidecar", "picture", "picture of a batch")  # 16 cases of each
 KEPT = [  # door, number, the attack that the number stands for: what did harm once, or would where a guard is gone
-    ("scenarionet", 6, "program: colliding keys"),
     ("scenarionet", 18, "program: a shared kind"),
     ("recovery table", 9, "npz: bomb"),
     ("episode", 0, "mcap: chunk bomb"),

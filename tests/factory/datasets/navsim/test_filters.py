@@ -56,7 +56,11 @@ def test_what_a_filter_does_not_say_is_the_public_default(tmp_path: Path) -> Non
     ("text", "says"),
     [
         ("frame_intervall: 1", "unknown key frame_intervall"),
-        ("num_history_frames: 0", "num_history_frames: expected a whole number from 1 on, not 0"),
+        ("num_history_frames: 0", "num_history_frames: expected a whole number from 1 to 1,000,000,000, not 0"),
+        (
+            "num_history_frames: 9" + "0" * 20,
+            "expected a whole number from 1 to 1,000,000,000, not 9000",
+        ),
         ("has_route: 1", "has_route: expected true or false, not 1"),
         ("has_route: null", "has_route: expected true or false, not None"),
         ("tokens: abc", "tokens: expected a list of text, not a str"),
