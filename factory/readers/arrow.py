@@ -60,22 +60,36 @@ def read_arrow(path: Path, kind: str, rows: bool = True, mapped: bool = False) -
         if not rows:
             return file.schema.empty_table()
         n_bytes, n_batches, most = 0, 0, UNPACKED_PER_BYTE * data.size + UNPACKED_BYTES
+        problem = f"unpacks to more than the {most:,} bytes that a file of {data.size:,} may: export it again"
+        too_large = BadClip(str(path), "size", problem)
         for message in pa.ipc.MessageReader.open_stream(pa.BufferReader(stream)):
             n_batches += message.type == "record batch"
             n_bytes += unpacked_bytes(message) if message.type != "schema" else 0
             if n_bytes > most:
-                problem = f"unpacks to more than the {most:,} bytes that a file of {data.size:,} may: export it again"
-                raise BadClip(str(path), "size", problem)
+                raise too_large
         table = pa.ipc.open_stream(pa.BufferReader(stream)).read_all()
         names = table.schema.names  # each is text
         if n_batches != file.num_record_batches or not file.schema.equals(table.schema, check_metadata=True):
             raise ValueError(f"its footer tells of others than its {n_batches} batches and {len(names)} columns")
         table.validate(full=True)
+        if sum(map(_bytes_of_texts, table.columns)) > most:
+            raise too_large
     except FileNotFoundError as error:
         raise BadClip(str(path), "file", broken_link(path) or "missing") from error
     except (pa.ArrowException, OSError, ValueError, struct.error) as error:  # ValueError also: a name that is no text
         raise BadClip(str(path), "file", f"cannot be read as {kind}, truncated? {error}") from error
     return table
+
+
+def _bytes_of_texts(column: "pa.ChunkedArray") -> int:
+    """Of a column of numbers into a dictionary of texts, once they are written out: one may stand in every row."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    if not pa.types.is_dictionary(column.type) or not pa.types.is_string(column.type.value_type):
+        return 0
+    lengths = (pc.binary_length(chunk.dictionary).take(chunk.indices) for chunk in column.chunks)
+    return sum(pc.sum(pc.cast(length, "int64")).as_py() or 0 for length in lengths)
 
 
 def unpacked_bytes(batch: "pa.Message") -> int:

