@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tasks.experts.pdm_closed import MIN_PROGRESS_M, PdmClosed, PdmPlan, PdmSettings, path_length_m, plan_for
-from tasks.experts.protocol import Expert, Plan
+from tasks.experts.protocol import Expert, Plan, plans_of
 from tasks.kernels.compiled import kernel
 from tasks.reward.areas import set_area_flags
 from tasks.reward.centerline import empty_body, place_body
@@ -31,7 +31,7 @@ from tasks.reward.label_bytes import ARRAYS, VocabularyLabels
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, next_scene, prepare_traffic, roll_out, roll_out_longer
 from tasks.settings import ExpertGate
-from tasks.stages import Rejected
+from tasks.stages import NOT_RECOVERED, Rejected
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.frames import (
@@ -152,23 +152,44 @@ def attempt(
     rng: np.random.Generator,
     timed: Timed = nullcontext,
 ) -> tuple[Judged, Rejected | None] | Rejected:
-    """Let `expert` plan from the perturbed scene, drive its plan and judge it.
+    """Let `expert` plan from the perturbed scene, drive its plan and judge it; of several plans up to one that passes.
 
-    Returns the judged drive and the verdict (None: accepted); Rejected where the route ends or the expert has no plan.
+    Returns the judged drive and the verdict (None: accepted), where none passes that of the first; Rejected where the
+    route ends or the expert has no plan.
     `timed(stage)` is entered around the work of each stage, for whoever wants to know where the time goes.
     """
     if not has_route(scene.centerline):
         return Rejected("rollout", "route_ended", "the perturbed ego stands at the end of its route")
     with timed("expert"):  # which may be the very planner that progress is held against: it plans once
         pdm_plan = plan_for(scene, planner) if expert == PdmClosed(planner) else None
-        plan = expert.plan(scene, rng) if pdm_plan is None else Plan(pdm_plan.poses)
-    if isinstance(plan, Rejected):
-        return plan
-    with timed("rollout"):
-        ready = prepare_traffic(scene, traffic)
-    judged = _driven_among(ready, plan, planner, timed, pdm_plan)
-    with timed("reward"):
-        return judged, verdict(judged.scores, gate) or end_verdict(judged, ready, gate)
+    plans = plans_of(expert, scene, rng) if pdm_plan is None else iter([Plan(pdm_plan.poses)])
+    ready: TrafficScene | None = None
+    refused: tuple[Judged, Rejected] | Rejected | None = None
+    while True:
+        with timed("expert"):
+            plan = next(plans, None)
+        if plan is None or isinstance(plan, Rejected):
+            refused = refused or plan
+            break
+        if ready is None:
+            with timed("rollout"):
+                ready = prepare_traffic(scene, traffic)
+            with timed("reward"):
+                pdm_plan = pdm_plan or plan_for(scene, planner)
+        judged = _driven_among(ready, plan, planner, timed, pdm_plan)
+        with timed("reward"):
+            found = verdict(judged.scores, gate) or end_verdict(judged, ready, gate) or _goal_verdict(judged)
+        if found is None:
+            return judged, None
+        refused = refused or (judged, found)
+    assert refused is not None, f"{expert.name} gave no plan and no reason"
+    return refused
+
+
+def _goal_verdict(judged: Judged) -> Rejected | None:
+    end, goal = judged.rollout.ego_states[-1], judged.plan.goal
+    missed = goal and goal.missed(end[: HEADING + 1], float(end[VX]))
+    return Rejected("reward", NOT_RECOVERED, missed) if missed else None
 
 
 def drive_under_log_replay(

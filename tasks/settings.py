@@ -165,6 +165,7 @@ class FeasibleSettings:
     weight_lateral: float = 1.0  # w_d, of distances beside it
     weight_heading: float = 10.0  # w_h
     weight_yaw_accel: float = 0.1  # w_u
+    weight_end: float = 10.0  # as many times do the last 0.3 s count
     max_iterations: int = 4000  # of a QP
     tolerance: float = 1e-4  # of a QP
 
@@ -174,9 +175,16 @@ FEASIBLE_DEFAULTS = FeasibleSettings()
 
 @dataclass(frozen=True)
 class RecoverySettings:
-    """How to retrieve and what to do with what was found."""
+    """How to find the way back to the log, and how near to it a drive has to end."""
 
-    smooth: bool = True  # False: the retrieved trajectory as it is, as published
-    # Of the matching vector: vx, vy, heading now; x, y, heading at the end. The paper weighs none.
-    weights: tuple[float, float, float, float, float, float] = constant((1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
-    feasible: FeasibleSettings = constant(FEASIBLE_DEFAULTS)  # of the smoothing
+    match: Literal["log", "paper"] = "log"  # paper: the one human trajectory of the published equation, as it is
+    retrieved: int = constant(8)  # human trajectories that are tried, behind the log's own from here
+    fades_s: tuple[float, ...] = constant((2.5, 1.5, 4.0))  # over which the log's own drive comes back to its lane
+    max_off_m: float = constant(2.0)  # from the log's pose and speed at T+2H
+    max_off_deg: float = constant(10.0)
+    max_off_mps: float = constant(5.0)
+    feasible: FeasibleSettings = constant(FEASIBLE_DEFAULTS)
+
+    def __post_init__(self) -> None:
+        if self.match not in ("log", "paper"):
+            raise ValueError(f"match must be log or paper, not {self.match!r}")

@@ -34,14 +34,15 @@ HUMAN = "human"  # the expert that is the log itself
 # The frames of a benchmark (tasks.hard_scenes): they stand where an expert's name does, in settings and tables.
 HUMAN_BEFORE, FOLLOW_UP, FOLLOW_UP_BEFORE = FRAMES = ("human_before", "follow_up", "follow_up_before")
 END_FAULTS = ("off_route", "after")  # of a drive that reaches every sub-score: what its end leads to (tasks.attempt)
+NOT_RECOVERED = "not_recovered"  # a drive that passes all else and ends too far from where its plan was to end
 PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred", "unlike_photos")  # tasks.render.gate
 
 STAGES: tuple[Stage, ...] = (
     Stage("clip", 5, "clip", ("ego_standing", "broken_tracks", "route_ended", "no_earlier_frame")),
     Stage("perturb", 3, "clip", ("no_gated_candidate", "no_good_candidate")),
     Stage("rollout", 4, "attempt", ("route_ended",)),
-    Stage("expert", 1, "attempt", ("no_plan",)),
-    Stage("reward", 1, "attempt", (*SUBSCORES, *END_FAULTS)),
+    Stage("expert", 2, "attempt", ("no_plan", "out_of_reach")),
+    Stage("reward", 1, "attempt", (*SUBSCORES, *END_FAULTS, NOT_RECOVERED)),
     Stage("render", 12, "attempt", ("psnr", *PICTURE_FAULTS)),
     Stage("write", 4, "attempt", ()),
 )

@@ -35,7 +35,7 @@ WATCHED = (
     "reward.progress_above",
     "reward.off_route",
     "reward.after",
-    "expert.recovery.smooth",
+    "expert.recovery.match",
     "render.mode",
     "render.frames",
     "render.width",

@@ -285,7 +285,7 @@ def recovery_expert(run: RunContext, **settings: Any) -> RecoveryExpert:
     """Of conf/expert/recovery.yaml. Raises ConfigError."""
     where = f"expert.{run.name}"
     sources = fill(RecoverySources, settings, where)
-    chosen = RecoverySettings(sources.smooth, sources.weights, sources.feasible)
+    chosen = RecoverySettings(sources.match)
     if sources.table is None:
         return RecoveryExpert(_recovery_table(run, sources.vocabularies), chosen)
     if not Path(sources.table).is_file():

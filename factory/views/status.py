@@ -229,6 +229,8 @@ REASON_WORDS = {
     "off_route": "the route does not go on where the drive ends",
     "after": "somebody is hit in the second after the drive",
     "no_plan": "the expert found no plan",
+    "out_of_reach": "the log's end cannot be reached from there",
+    "not_recovered": "it ends too far from the log",
     "route_ended": "no route is left to drive along",
     "psnr": "block reconstructed too poorly",
     "holes": "rendered where nothing was seen",

@@ -1,23 +1,31 @@
-"""The recovery expert: the human trajectory that leads back to the log (paper, section "Recovery-based Expert").
+"""The recovery expert: from the perturbed state back to the log's pose, heading and speed at T+2H.
 
-From a table of human trajectories it retrieves the one whose matching vector
+As published (`match=paper`; paper, section "Recovery-based Expert") it retrieves, from a table of human trajectories,
+the one whose matching vector
     m = [vx at the start, vy at the start, heading at the start, x, y, heading at the end],  in the start pose's frame,
-is nearest in the L1 norm to the ego's: its present velocity, heading 0, and the LOGGED pose 4 s later. As published the
-tracker follows it directly; by default it is first made feasible from the ego's actual start state.
+is nearest in the L1 norm to the ego's: its present velocity, heading 0, and the LOGGED pose 4 s later. The tracker
+follows it as it is. That ends metres off the log, says nothing of the speed there, and starts with a kick.
+
+By default several human trajectories are tried, each led to the log's end and made feasible from where the ego is: the
+log's own drive, onto which the ego comes back within a few seconds, then those of the table that are nearest in start
+velocity, end pose and end speed, each divided by its spread in the table. The first whose drive among answering
+traffic the reward accepts, and which ends at the log, is the sample. Where the limits of a car let none of them end
+there, as from 10 m ahead of a log that stops, the state is out of reach.
 """
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import osqp
 from scipy import sparse
 
-from tasks.experts.protocol import Plan
+from tasks.experts.protocol import Goal, Plan
 from tasks.settings import FEASIBLE_DEFAULTS, FeasibleSettings, RecoverySettings
 from tasks.stages import Rejected
-from tasks.world.arrays import Array
+from tasks.world.arrays import Array, Ints
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene
 from tasks.world.frames import AX, HEADING, PACIFICA, STEERING, VX, VY, to_local, to_world, wrap_angle
 from tasks.world.vocabulary import checked_trajectories, trajectories_digest
@@ -47,6 +55,8 @@ from tasks.world.vocabulary import checked_trajectories, trajectories_digest
 # margin, because the tracker adds its own.
 
 N = HORIZON_STEPS
+T_S: Array = STEP_S * np.arange(1, N + 1, dtype=np.float64)
+END_STEPS = 3  # that decide where and how fast a trajectory ends
 SLOW_MPS = 0.5  # limits that divide by the speed stop growing below it
 
 
@@ -98,9 +108,8 @@ def _integrators() -> tuple[Array, Array, Array]:
 def _along(wanted: Array, speed0: float, accel0: float, settings: FeasibleSettings) -> tuple[Array, Array] | str:
     """Distance and speed (41,) each at 0 .. 4.0 s."""
     to_accel, to_speed, to_distance = _integrators()
-    t = np.arange(1, N + 1) * STEP_S
-    free_speed = speed0 + accel0 * t
-    free_distance = speed0 * t + accel0 * t**2 / 2.0
+    free_speed = speed0 + accel0 * T_S
+    free_distance = speed0 * T_S + accel0 * T_S**2 / 2.0
 
     # what the start state can reach at the largest jerk towards rest of acceleration
     release, released = np.empty(N), np.empty(N)
@@ -112,9 +121,10 @@ def _along(wanted: Array, speed0: float, accel0: float, settings: FeasibleSettin
     low_speed = np.minimum(0.0, free_speed + to_speed @ release)
     low_accel = np.minimum(settings.accel_min_mps2, released)
     high_accel = np.maximum(settings.accel_max_mps2, released)
+    weight = settings.weight_progress * _at_the_end(settings)
     jerk = _solve(
-        hessian=settings.weight_progress * to_distance.T @ to_distance + settings.weight_jerk * np.eye(N),
-        gradient=settings.weight_progress * to_distance.T @ (free_distance - wanted),
+        hessian=to_distance.T @ (weight * to_distance) + settings.weight_jerk * np.eye(N),
+        gradient=to_distance.T @ (weight[:, 0] * (free_distance - wanted)),
         rows=np.concatenate([to_speed, to_accel, np.eye(N)]),
         low=np.concatenate([low_speed - free_speed, low_accel - accel0, np.full(N, -settings.jerk_max_mps3)]),
         high=np.concatenate([np.full(N, np.inf), high_accel - accel0, np.full(N, settings.jerk_max_mps3)]),
@@ -146,12 +156,13 @@ def _across(wanted: Array, speed: Array, kappa0: float, settings: FeasibleSettin
     bound = np.minimum(settings.curvature_max_1pm, settings.yaw_rate_max_radps / fast[1:])
     bound = np.minimum(bound, settings.lateral_accel_max_mps2 / fast[1:] ** 2)
     bound = np.maximum(bound, abs(kappa0) - STEP_S * np.cumsum(rate))
+    more = _at_the_end(settings)
     change = _solve(
-        hessian=settings.weight_lateral * to_lateral.T @ to_lateral
-        + settings.weight_heading * to_heading.T @ to_heading
+        hessian=to_lateral.T @ (settings.weight_lateral * more * to_lateral)
+        + to_heading.T @ (settings.weight_heading * more * to_heading)
         + settings.weight_yaw_accel * np.diag(np.maximum(mean_speed, SLOW_MPS) ** 2),
-        gradient=settings.weight_lateral * to_lateral.T @ free_lateral
-        + settings.weight_heading * to_heading.T @ (free_heading - wanted[1:]),
+        gradient=to_lateral.T @ (settings.weight_lateral * more[:, 0] * free_lateral)
+        + to_heading.T @ (settings.weight_heading * more[:, 0] * (free_heading - wanted[1:])),
         rows=np.concatenate([to_kappa, np.eye(N)]),
         low=np.concatenate([-bound - kappa0, -rate]),
         high=np.concatenate([bound - kappa0, rate]),
@@ -161,6 +172,13 @@ def _across(wanted: Array, speed: Array, kappa0: float, settings: FeasibleSettin
     if isinstance(change, str):
         return change
     return np.concatenate([[0.0], free_heading + to_heading @ change])
+
+
+def _at_the_end(settings: FeasibleSettings) -> Array:
+    """(40, 1) by how much each step counts: the last ones are where, and how fast, it has to end."""
+    share: Array = np.ones((N, 1))
+    share[-END_STEPS:] = settings.weight_end
+    return share
 
 
 def _solve(
@@ -197,7 +215,7 @@ def _solve(
 # The table of human trajectories, and the expert that searches it.
 
 FIT_STEPS = 5  # the start velocity is that of a parabola through the origin and the first 0.5 s
-START_HEADING, END_HEADING = 2, 5  # columns of the matching vector that are angles
+END_HEADING = 4  # column of a feature that is an angle
 
 
 def start_velocities(trajectories: Array) -> Array:
@@ -208,18 +226,26 @@ def start_velocities(trajectories: Array) -> Array:
     return velocities
 
 
+def end_speeds(trajectories: Array) -> Array:
+    """Speed (M,) [m/s] forward over the last 0.2 s of trajectories (M, 40, 3)."""
+    heading = trajectories[:, -1, 2]
+    step = trajectories[:, -1, :2] - trajectories[:, -3, :2]
+    speeds: Array = (step[:, 0] * np.cos(heading) + step[:, 1] * np.sin(heading)) / (2.0 * STEP_S)
+    return speeds
+
+
 @dataclass(frozen=True)
 class RecoveryTable:
     """M human trajectories, ready to be searched. Raises ValueError on a wrong shape or values that are not finite."""
 
     trajectories: Array  # (M, 40, 3) x [m], y [m], heading [rad] in the start pose's frame at 0.1 .. 4.0 s
-    features: Array = field(init=False)  # (M, 6) vx0, vy0, heading0, x_end, y_end, heading_end
+    features: Array = field(init=False)  # (M, 6) vx0, vy0, x_end, y_end, heading_end, speed_end
     digest: str = field(init=False)  # 16 hex digits of the trajectories
 
     def __post_init__(self) -> None:
         trajectories = checked_trajectories(np.asarray(self.trajectories), "recovery table")
-        start = np.zeros((len(trajectories), 1))  # heading 0 in the start pose's own frame
-        features = np.concatenate([start_velocities(trajectories), start, trajectories[:, -1]], axis=1)
+        ends = [trajectories[:, -1], end_speeds(trajectories)]
+        features = np.column_stack([start_velocities(trajectories), *ends])
         for name, value in (("trajectories", trajectories), ("features", features)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
@@ -228,12 +254,24 @@ class RecoveryTable:
     def __len__(self) -> int:
         return len(self.trajectories)
 
-    def nearest(self, target: Array, weights: Array) -> int:
-        """The first row with the least weighted L1 distance to `target` (6,); angles are compared around the circle."""
+    @cached_property
+    def spreads(self) -> Array:
+        """(6,) mean distance of each feature from its median, in its unit; 1 where all are alike."""
+        spreads: Array = np.abs(self.features - np.median(self.features, axis=0)).mean(axis=0)
+        return np.where(spreads > 0.0, spreads, 1.0)
+
+    def nearest(self, target: Array, k: int) -> Ints:
+        """The k rows, nearest first, whose features are nearest to `target` (6,) in L1, each over its spread."""
+        return self._nearest(target, 1.0 / self.spreads, k)
+
+    def published(self, target: Array) -> int:
+        """The row of the published equation: metres, radians and m/s alike, whatever the speed at the end."""
+        return int(self._nearest(target, np.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.0]), 1)[0])
+
+    def _nearest(self, target: Array, weights: Array, k: int) -> Ints:
         difference = self.features - target
-        for column in (START_HEADING, END_HEADING):
-            difference[:, column] = wrap_angle(difference[:, column])
-        return int((np.abs(difference) * weights).sum(axis=1).argmin())
+        difference[:, END_HEADING] = wrap_angle(difference[:, END_HEADING])
+        return np.argsort((np.abs(difference) * weights).sum(axis=1), kind="stable")[:k]
 
 
 @dataclass(frozen=True)
@@ -248,22 +286,92 @@ class RecoveryExpert:
         """Of the table and every setting."""
         return hashlib.sha256(f"{self.table.digest}\x1f{self.settings!r}".encode()).hexdigest()[:16]
 
-    def retrieve(self, scene: Scene) -> int:
-        """Row of the table for this scene. Raises ValueError where the clip ends within 4 s."""
-        end = scene.step + HORIZON_STEPS
-        if end >= len(scene.clip.ego_states):
-            raise ValueError(f"recovery needs the log at step {end}; the clip has {len(scene.clip.ego_states)}")
-        ego = scene.ego_state
-        goal = to_local(ego[: HEADING + 1], scene.clip.ego_states[end, : HEADING + 1])
-        target = np.concatenate([[ego[VX], ego[VY], 0.0], goal])
-        return self.table.nearest(target, np.array(self.settings.weights))
-
     def plan(self, scene: Scene, rng: np.random.Generator) -> Plan | Rejected:
-        """The retrieved trajectory from here; "no_plan" where the smoothing finds no solution."""
-        row = self.retrieve(scene)
-        trajectory: Array | str = self.table.trajectories[row]
-        if self.settings.smooth:
-            trajectory = make_feasible(self.table.trajectories[row], scene.ego_state, self.settings.feasible)
-        if isinstance(trajectory, str):
-            return Rejected("expert", "no_plan", f"table row {row}: {trajectory}")
-        return Plan(to_world(scene.ego_state[: HEADING + 1], trajectory))
+        """The plan that is tried first; "no_plan" and "out_of_reach" as of `plans`."""
+        return next(self.plans(scene, rng))
+
+    def plans(self, scene: Scene, rng: np.random.Generator) -> Iterator[Plan | Rejected]:
+        """The ways back that end at the log, its own drive from here first; where there is none, why.
+
+        "no_plan": a quadratic program found no solution; "out_of_reach": no way ends at the log. Where its own does not
+        the table is not asked. Raises ValueError where the clip ends within 4 s.
+        """
+        ego, log = scene.ego_state, _log_ahead(scene)
+        end = to_local(ego[: HEADING + 1], log[-1, : HEADING + 1])
+        target = np.concatenate([ego[[VX, VY]], end, log[-1, [VX]]])
+        if self.settings.match == "paper":
+            yield Plan(to_world(ego[: HEADING + 1], self.table.trajectories[self.table.published(target)]))
+            return
+        refused = list[Rejected]()
+        own = (fading_back(ego, log, fade_s) for fade_s in self.settings.fades_s)
+        for made in (self._led(wanted, ego, log[-1]) for wanted in own):
+            if isinstance(made, Plan):
+                yield made
+            else:
+                refused.append(made)
+        if len(refused) == len(self.settings.fades_s):
+            yield refused[0]
+            return
+        for row in self.table.nearest(target, self.settings.retrieved):
+            made = self._led(led_to(self.table.trajectories[row], end), ego, log[-1])
+            if isinstance(made, Plan):
+                yield made
+
+    def _led(self, wanted: Array, ego: Array, end: Array) -> Plan | Rejected:
+        """The drivable plan nearest to `wanted` (40, 3), the ego's frame, if it ends at the log's state `end` (11,)."""
+        made = make_feasible(wanted, ego, self.settings.feasible)
+        if isinstance(made, str):
+            return Rejected("expert", "no_plan", made)
+        chosen = self.settings
+        goal = Goal(end[: HEADING + 1], float(end[VX]), chosen.max_off_m, chosen.max_off_deg, chosen.max_off_mps)
+        poses = to_world(ego[: HEADING + 1], made)
+        missed = goal.missed(poses[-1], float(end_speeds(made[None])[0]))
+        return Plan(poses, goal) if missed is None else Rejected("expert", "out_of_reach", f"the way back {missed}")
+
+
+def _log_ahead(scene: Scene) -> Array:
+    """The log's states (41, 11) over the next 4 s. Raises ValueError where the clip ends before."""
+    end = scene.step + HORIZON_STEPS
+    if end >= len(scene.clip.ego_states):
+        raise ValueError(f"recovery needs the log at step {end}; the clip has {len(scene.clip.ego_states)}")
+    return scene.clip.ego_states[scene.step : end + 1]
+
+
+def fading_back(ego: Array, log: Array, fade_s: float) -> Array:
+    """The log's drive (40, 3) from where the ego is, in its frame: along, what it is off dies out in 4 s.
+
+    Beside the log and in heading it dies out within fade_s. ego: state (11,); log: states (41, 11).
+    """
+    start = to_local(log[0, : HEADING + 1], ego[: HEADING + 1])
+    along, aside = (1.0 - _step(T_S / seconds) for seconds in (N * STEP_S, fade_s))
+    poses = log[1:, : HEADING + 1].copy()
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    poses[:, 0] += c * start[0] * along - s * start[1] * aside
+    poses[:, 1] += s * start[0] * along + c * start[1] * aside
+    poses[:, 2] += wrap_angle(start[2]) * aside
+    return _headed_along(to_local(ego[: HEADING + 1], poses))
+
+
+def led_to(trajectory: Array, end: Array) -> Array:
+    """The trajectory (40, 3), its end moved to the pose `end` (3,), what is before it the less the earlier it is."""
+    share = _step(T_S / (N * STEP_S))
+    moved = trajectory + share[:, None] * (end - trajectory[-1])
+    moved[:, 2] = trajectory[:, 2] + share * wrap_angle(end[2] - trajectory[-1, 2])
+    return _headed_along(np.asarray(moved))
+
+
+def _headed_along(poses: Array) -> Array:
+    """Poses (40, 3) from the origin, headed where they go, which `make_feasible` follows; slow ones stay as given."""
+    places = np.concatenate([np.zeros((1, 2)), poses[:, :2], 2.0 * poses[-1:, :2] - poses[-2:-1, :2]])
+    ahead = places[2:] - places[:-2]
+    turn = wrap_angle(np.arctan2(ahead[:, 1], ahead[:, 0]) - poses[:, 2])
+    goes = (np.hypot(*ahead.T) > 2.0 * STEP_S * SLOW_MPS) & (np.abs(turn) < np.pi / 2.0)
+    headed = poses.copy()
+    headed[goes, 2] += turn[goes]
+    return headed
+
+
+def _step(share: Array) -> Array:
+    """From 0 at 0 to 1 at 1, at rest at both with no acceleration (minimum jerk)."""
+    u = np.clip(share, 0.0, 1.0)
+    return np.asarray(u**3 * (10.0 - 15.0 * u + 6.0 * u**2))

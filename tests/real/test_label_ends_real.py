@@ -1,5 +1,6 @@
 """What labels' ends lead to on the shared logs: no human is refused, and recovery's that leave the route are."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,13 @@ from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import ClipReader
 from tasks.attempt import ExpertGate, Judged, attempt, drive_under_log_replay, end_verdict, perturbed_scene
 from tasks.experts.pdm_closed import PdmSettings
-from tasks.experts.protocol import Human
-from tasks.experts.recovery import RecoveryExpert, RecoveryTable
+from tasks.experts.protocol import Human, Plan
+from tasks.experts.recovery import RecoveryExpert, RecoverySettings, RecoveryTable, make_feasible
 from tasks.perturb import Perturbation, PerturbSettings, perturb
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic
 from tasks.stages import Rejected
-from tasks.world.clip import Clip, random_stream, scene_of_clip
+from tasks.world.clip import Clip, Scene, random_stream, scene_of_clip
+from tasks.world.frames import HEADING, to_local, to_world
 from tasks.world.road_map import Rings
 from tasks.world.vocabulary import Vocabulary
 
@@ -48,14 +50,29 @@ def clip(shared_root: Path) -> Clip:
     return reader.read(next(ref for ref in reader.index().refs if ref.start_ms == START_MS))
 
 
+class Smoothed(RecoveryExpert):
+    """What the published equation retrieves, made drivable: where the log goes it looks at by the end pose alone."""
+
+    def plan(self, scene: Scene, rng: np.random.Generator) -> Plan:
+        return next(self.plans(scene, rng))
+
+    def plans(self, scene: Scene, rng: np.random.Generator) -> Iterator[Plan]:
+        (found,) = super().plans(scene, rng)
+        assert isinstance(found, Plan)
+        ego = scene.ego_state[: HEADING + 1]
+        drivable = make_feasible(to_local(ego, found.poses), scene.ego_state)
+        assert not isinstance(drivable, str)
+        yield Plan(to_world(ego, drivable))
+
+
 @pytest.fixture(scope="module")
 def driven(clip: Clip, shared_root: Path) -> list[tuple[Judged, Rejected | None, Rejected | None]]:
-    """Recovery's attempts: drive, the published gate's verdict, and that with the gates on ends."""
+    """Attempts of such a recovery: drive, the published gate's verdict, and that with the gates on ends."""
     human: NDArray[np.float64] = np.load(shared_root / "data" / "vocabulary" / "human_8192x40x3.npy")
     rng, traffic = random_stream(0, clip.clip_id, "perturb"), TrafficSettings()
     found = perturb(clip, Vocabulary(human), PerturbSettings(), traffic, PDM, rng)
     assert isinstance(found, Perturbation)
-    expert, out = RecoveryExpert(RecoveryTable(human)), []
+    expert, out = Smoothed(RecoveryTable(human), RecoverySettings(match="paper")), []
     for candidate in found.candidates:
         scene = perturbed_scene(clip, candidate.rollout)
         pair = [attempt(scene, expert, gate, traffic, PDM, RNG) for gate in (PUBLISHED, ExpertGate())]

@@ -1,6 +1,7 @@
 """One attempt: what the gate lets through, how the second stage starts, and what stays untouched."""
 
-from dataclasses import fields, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pytest
@@ -17,14 +18,14 @@ from tasks.attempt import (
     verdict,
 )
 from tasks.experts.pdm_closed import PdmClosed, PdmSettings
-from tasks.experts.protocol import Expert, Human, Plan
+from tasks.experts.protocol import Expert, Goal, Human, Plan
 from tasks.experts.recovery import RecoveryExpert, RecoveryTable
 from tasks.reward.epdms import Scores
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.stages import END_FAULTS, STAGES, Rejected
 from tasks.subscores import JUDGED
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
-from tasks.world.frames import to_world
+from tasks.world.frames import HEADING, VX, to_world
 from tasks.world.vocabulary import kinematic_trajectories
 from tests.tasks.bad_ends import Aside, Close, shift
 from tests.tasks.streets import moved, same_poses, street_clip
@@ -270,3 +271,50 @@ def test_moving_the_world_moves_a_whole_attempt_along(table: RecoveryTable, orig
         assert same_poses(to_world(frame, a.rollout.ego_states), b.rollout.ego_states[..., :3], 1e-5)
         assert same_poses(to_world(frame, a.rollout.agents.boxes), b.rollout.agents.boxes[..., :3], 1e-5)
         assert a.scores.pdm_score[1] == pytest.approx(b.scores.pdm_score[1], abs=1e-6)
+
+
+@dataclass(frozen=True)
+class Several:
+    """An expert with these plans."""
+
+    given: tuple[Plan | Rejected, ...]
+    name: str = "several"
+
+    def digest(self) -> str:
+        return "several"
+
+    def plan(self, scene: Scene, rng: np.random.Generator) -> Plan | Rejected:
+        return self.given[0]
+
+    def plans(self, scene: Scene, rng: np.random.Generator) -> Iterator[Plan | Rejected]:
+        yield from self.given
+
+
+def test_of_several_plans_the_first_that_is_accepted_is_driven_and_of_none_the_first_is_told(scene: Scene) -> None:
+    good = PdmClosed().plan(scene, RNG)
+    assert isinstance(good, Plan)
+    off, farther = (Plan(good.poses + np.array([0.0, aside_m, 0.0])) for aside_m in (30.0, 60.0))
+    judged, rejected = tried(scene, Several((off, good, farther)))
+    assert rejected is None and judged.plan is good
+    judged, rejected = tried(scene, Several((off, farther)))
+    assert rejected is not None and judged.plan is off
+    lost = Rejected("expert", "out_of_reach", "nowhere")
+    assert attempt(scene, Several((lost,)), GATE, TrafficSettings(), PdmSettings(), RNG) == lost
+
+
+@pytest.mark.parametrize(
+    ("off", "recovered"), [((1.9, 9.0, 2.4), True), ((2.2, 0, 0), False), ((0, 11, 0), False), ((0, 0, 3), False)]
+)
+def test_a_drive_that_ends_too_far_from_its_goal_is_not_recovered(
+    scene: Scene, off: tuple[float, float, float], recovered: bool
+) -> None:
+    good = PdmClosed().plan(scene, RNG)
+    assert isinstance(good, Plan)
+    end = tried(scene, Several((good,)))[0].rollout.ego_states[-1]
+    pose = end[: HEADING + 1] + np.array([off[0], 0.0, np.radians(off[1])])
+    judged, rejected = tried(scene, Several((Plan(good.poses, Goal(pose, end[VX] + off[2], 2.0, 10.0, 2.5)),)))
+    assert (rejected is None) == recovered
+    if rejected is not None:
+        assert (rejected.stage, rejected.reason) == ("reward", "not_recovered")
+        assert rejected.detail == f"ends {off[0]:.1f} m, {off[1]:.0f} degrees and {off[2]:.1f} m/s off the log"
+    np.testing.assert_array_equal(judged.rollout.ego_states[-1], end)

@@ -170,7 +170,7 @@ def test_an_expert_is_added_by_its_target_with_all_its_arguments() -> None:
         ([RECOVERY, "+expert.mine.speed=3"], r"expert\.mine\.speed: there is no such setting"),
         ([RECOVERY, "+expert.mine.table=[1]"], r"expert\.mine\.table"),
         ([RECOVERY, "+expert.mine.table=nowhere.npz"], r"expert\.mine\.table=nowhere.npz: there is no such file"),
-        ([RECOVERY, "+expert.mine.smoth=false"], r"expert\.mine\.smoth: .*; did you mean expert\.mine\.smooth="),
+        ([RECOVERY, "+expert.mine.mach=log"], r"expert\.mine\.mach: .*; did you mean expert\.mine\.match="),
     ],
 )
 def test_an_expert_that_cannot_be_made_is_an_error_that_names_what(overrides: list[str], message: str) -> None:

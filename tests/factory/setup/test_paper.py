@@ -53,7 +53,7 @@ def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:
     found = differences_from_paper(config, choose_vocabulary(config.vocabulary))
     assert found == [
         "vocabulary of 1,024 kinematic trajectories (16,384 human ones)",
-        "expert.recovery.smooth=True (False)",
+        "expert.recovery.match=log (paper)",
         "traffic.yields=True (False)",
         "reward.off_route=True (False)",
         "reward.after=True (False)",

@@ -12,6 +12,7 @@ from tasks.experts.recovery import (
     RecoveryExpert,
     RecoverySettings,
     RecoveryTable,
+    led_to,
     make_feasible,
     start_velocities,
 )
@@ -56,20 +57,32 @@ def drives(velocity: np.ndarray, accel: np.ndarray, yaw_rate: np.ndarray) -> np.
     return np.concatenate([xy, yaw_rate[:, None, None] * T[:, None]], axis=2)
 
 
-def test_a_row_is_matched_by_its_velocity_at_the_start_and_its_pose_at_four_seconds() -> None:
-    """The matching vector by hand: p(t) = v t + a t^2 / 2, and the heading 0 that every row starts with."""
+def test_a_row_is_matched_by_its_velocity_at_the_start_and_its_pose_and_speed_at_four_seconds() -> None:
+    """The features by hand: p(t) = v t + a t^2 / 2; the end speed is that of the last 0.2 s, 3.9 s in the mean."""
     rng = np.random.default_rng(0)
     velocity, accel, yaw_rate = rng.uniform(0, 12, (50, 2)), rng.uniform(-2, 2, (50, 2)), rng.uniform(-0.3, 0.3, 50)
-    expected = np.column_stack([velocity, np.zeros(50), 4.0 * velocity + 8.0 * accel, 4.0 * yaw_rate])
+    late, ahead = velocity + 3.9 * accel, np.stack([np.cos(4.0 * yaw_rate), np.sin(4.0 * yaw_rate)], axis=1)
+    ends = [4.0 * velocity + 8.0 * accel, 4.0 * yaw_rate, (late * ahead).sum(axis=1)]
+    expected = np.column_stack([velocity, *ends])
     table = RecoveryTable(drives(velocity, accel, yaw_rate))
     np.testing.assert_allclose(table.features, expected, atol=1e-9)
-    assert [table.nearest(vector + 1e-6, np.ones(6)) for vector in expected] == list(range(50))
+    assert [table.published(vector + 1e-6) for vector in expected] == list(range(50))
+    assert [table.nearest(vector + 1e-6, 3)[0] for vector in expected] == list(range(50))
 
 
 def ending_at(velocity: tuple[float, float], end: np.ndarray) -> np.ndarray:
     """(40, 3) from a velocity to an end pose (3,), at a constant acceleration."""
     start = np.array([velocity])
     return drives(start, (end[None, :2] - 4.0 * start) / 8.0, end[2:] / 4.0)[0]
+
+
+def published(rows: np.ndarray, scene: Scene) -> int:
+    """The row that the paper's expert follows from this scene, as it is."""
+    plan = RecoveryExpert(RecoveryTable(rows), RecoverySettings(match="paper")).plan(scene, RNG)
+    assert isinstance(plan, Plan) and plan.goal is None
+    found = [np.abs(plan.poses - to_world(scene.ego_state[: HEADING + 1], row)).max() < 1e-9 for row in rows]
+    assert sum(found) == 1
+    return found.index(True)
 
 
 def test_the_ego_s_velocity_is_matched_forward_with_forward_and_sideways_with_sideways(road: Road) -> None:
@@ -79,59 +92,88 @@ def test_the_ego_s_velocity_is_matched_forward_with_forward_and_sideways_with_si
     states[-1, VY] = 1.5
     scene = replace(scene, ego_history=states)
     goal = to_local(scene.ego_state[: HEADING + 1], scene.clip.ego_states[NOW + 40, : HEADING + 1])
-    rows = np.stack([ending_at(velocity, goal) for velocity in ((1.5, 10.0), (10.0, 1.5), (10.0, -1.5))])
-    assert RecoveryExpert(RecoveryTable(rows)).retrieve(scene) == 1
+    assert published(np.stack([ending_at(v, goal) for v in ((1.5, 10.0), (10.0, 1.5), (10.0, -1.5))]), scene) == 1
 
 
 def test_the_goal_is_the_log_s_pose_at_four_seconds_not_a_step_before_or_after(road: Road) -> None:
     scene = road(speed=10.0)
     ends = to_local(scene.ego_state[: HEADING + 1], scene.clip.ego_states[NOW + 39 : NOW + 42, : HEADING + 1])
-    rows = np.stack([ending_at((10.0, 0.0), end) for end in ends])
-    assert RecoveryExpert(RecoveryTable(rows)).retrieve(scene) == 1
+    assert published(np.stack([ending_at((10.0, 0.0), end) for end in ends]), scene) == 1
 
 
 def test_end_headings_are_compared_around_the_circle() -> None:
     left, right = straight(5.0), straight(5.0)
     left[:, 2], right[:, 2] = np.pi - 0.05, 2.0
+    target = np.array([5.0, 0.0, 20.0, 0.0, -np.pi + 0.05, -5.0])
     table = RecoveryTable(np.stack([right, left]))
-    target = np.array([5.0, 0.0, 0.0, 20.0, 0.0, -np.pi + 0.05])
-    assert table.nearest(target, np.ones(6)) == 1
-
-
-def test_weights_decide_between_speed_and_place() -> None:
-    table = RecoveryTable(
-        np.stack([straight(10.0, -2.0), straight(6.0)])
-    )  # both end at 24 m: 10 - 2 * 2 = 6 on average
-    target = np.array([10.0, 0.0, 0.0, 24.0, 0.0, 0.0])
-    assert table.nearest(target, np.ones(6)) == 0
-    assert table.nearest(target, np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])) == 0, "the first of equals"
+    assert (table.published(target), *table.nearest(target, 2)) == (1, 1, 0)
 
 
 def test_the_nearest_row_is_the_one_with_the_least_sum_of_differences() -> None:
     """One row is 3 m off along the road, the other 2 m along and 2 m aside: 3 against 4, by squares 9 against 8."""
-    ends = (23.0, 0.0), (22.0, 2.0)
-    table = RecoveryTable(np.stack([ending_at((5.0, 0.0), np.array([x, y, 0.0])) for x, y in ends]))
-    target = np.array([5.0, 0.0, 0.0, 20.0, 0.0, 0.0])
-    assert table.nearest(target, np.ones(6)) == 0
-    assert table.nearest(target, np.array([1.0, 1.0, 1.0, 1.0, 0.1, 1.0])) == 1
+    table = RecoveryTable(
+        np.stack([ending_at((5.0, 0.0), np.array([x, y, 0.0])) for x, y in ((23.0, 0.0), (22.0, 2.0))])
+    )
+    assert table.published(np.array([5.0, 0.0, 20.0, 0.0, 0.0, 0.0])) == 0
 
 
-def test_the_goal_is_the_logged_pose_four_seconds_later_seen_from_the_perturbed_ego(road: Road) -> None:
+def test_what_hardly_differs_in_the_table_counts_the_more() -> None:
+    """Ends spread over 100 m and 0.2 rad: 5 m less, or 0.1 rad less? The equation takes the metres for more."""
+    rows = np.stack([ending_at((5.0, 0.0), np.array([x, 0.0, a])) for x, a in zip(range(0, 100, 5), 10 * [0.0, 0.2])])
+    table = RecoveryTable(rows)
+    target = np.array([5.0, 0.0, 50.0, 0.0, 0.2, table.features[10, 5]])
+    assert table.published(target) == 10 and rows[10, -1, 2] == 0.0
+    assert rows[table.nearest(target, 1)[0], -1, 2] == pytest.approx(0.2)
+
+
+def test_the_published_expert_drives_as_some_human_did(road: Road) -> None:
     wanted = straight(10.0)
     wanted[:, 1] = -1.2 * (T / 4.0) ** 2 * (3.0 - 2.0 * T / 4.0)  # 1.2 m to the right, where the log is
-    table = RecoveryTable(np.stack([straight(10.0), wanted * [1, -1, 1], wanted, straight(4.0)]))
-    scene = road(speed=10.0, y=1.2)
-    raw = RecoveryExpert(table, RecoverySettings(smooth=False))
-    assert raw.retrieve(scene) == 2
-    plan = raw.plan(scene, RNG)
-    assert isinstance(plan, Plan)
-    np.testing.assert_allclose(plan.poses, to_world(scene.ego_state[: HEADING + 1], wanted), atol=1e-12)
-    np.testing.assert_allclose(plan.poses[-1], scene.clip.ego_states[NOW + 40, :3], atol=1e-9)
+    assert published(np.stack([straight(10.0), wanted * [1, -1, 1], wanted, straight(4.0)]), road(10.0, y=1.2)) == 2
 
 
 def test_a_clip_that_ends_before_the_goal_is_refused(road: Road) -> None:
     with pytest.raises(ValueError, match="needs the log at step 96; the clip has 96"):
-        RecoveryExpert(RecoveryTable(straight(5.0)[None])).retrieve(replace(road(), step=56))
+        RecoveryExpert(RecoveryTable(straight(5.0)[None])).plan(replace(road(), step=56), RNG)
+
+
+@pytest.mark.parametrize("y", [0.0, 1.2, -1.5])
+def test_every_way_back_ends_at_the_log_and_the_log_s_own_comes_first(road: Road, y: float) -> None:
+    scene = road(speed=10.0, y=y)
+    expert = RecoveryExpert(RecoveryTable(kinematic_trajectories(200, 2)))
+    plans = list(expert.plans(scene, RNG))
+    log = scene.clip.ego_states[NOW + 1 : NOW + 41]
+    assert len(plans) > len(expert.settings.fades_s)
+    for plan in plans:
+        assert isinstance(plan, Plan) and plan.goal is not None
+        assert np.hypot(*(plan.poses[-1, :2] - log[-1, :2])) < 2.0
+        assert plan.goal.missed(log[-1, : HEADING + 1], float(log[-1, VX])) is None
+    first, quick = plans[0], plans[1]
+    assert isinstance(first, Plan) and isinstance(quick, Plan)
+    aside = [np.abs(np.asarray(plan.poses)[14, 1] - log[14, 1]) for plan in (first, quick)]
+    assert aside[1] <= aside[0] <= max(abs(y), 1e-6), "after 1.5 s the one that fades within 1.5 s is nearer"
+
+
+def test_from_far_ahead_of_a_log_that_goes_slower_there_is_no_way_back(road: Road) -> None:
+    """12 m ahead at 10 m/s of a log that does 4 m/s: it would have to stop within 4 m."""
+    scene = road(speed=4.0)
+    states = scene.ego_history.copy()
+    states[:, 0] += 12.0
+    states[:, VX] = 10.0
+    ahead = replace(scene, ego_history=states)
+    found = list(RecoveryExpert(RecoveryTable(kinematic_trajectories(200, 2))).plans(ahead, RNG))
+    assert [made.reason for made in found if isinstance(made, Rejected)] == ["out_of_reach"] and len(found) == 1
+    assert "m/s off the log" in found[0].detail
+
+
+def test_a_trajectory_that_is_led_to_an_end_starts_as_it_did() -> None:
+    end = np.array([31.0, -2.0, 0.0])
+    led = led_to(straight(8.0), end)
+    np.testing.assert_allclose(led[-1], end, atol=1e-3)
+    slope = np.gradient(led[:, 1], led[:, 0])
+    np.testing.assert_allclose(led[1:-1, 2], np.arctan(slope)[1:-1], atol=1e-2, err_msg="it looks where it goes")
+    np.testing.assert_allclose(led[:4], straight(8.0)[:4], atol=0.03)
+    np.testing.assert_allclose(led_to(straight(8.0), straight(8.0)[-1]), straight(8.0), atol=1e-12)
 
 
 def test_a_drivable_trajectory_stays_as_it_is() -> None:
@@ -180,7 +222,7 @@ def test_the_same_problem_gives_the_same_bits() -> None:
 
 def test_a_solver_that_does_not_converge_is_a_rejection_and_never_the_raw_trajectory(road: Road) -> None:
     hurried = RecoverySettings(feasible=FeasibleSettings(max_iterations=1, tolerance=1e-12))
-    result = RecoveryExpert(RecoveryTable(kinematic_trajectories(50, 2)), hurried).plan(road(), RNG)
+    result = RecoveryExpert(RecoveryTable(kinematic_trajectories(50, 2)), hurried).plan(road(y=1.0), RNG)
     assert isinstance(result, Rejected)
     assert (result.stage, result.reason) == ("expert", "no_plan")
     assert "longitudinal QP" in result.detail
@@ -191,8 +233,8 @@ def test_the_digest_knows_the_table_and_the_settings() -> None:
     digests = {
         RecoveryExpert(table).digest(),
         RecoveryExpert(other).digest(),
-        RecoveryExpert(table, RecoverySettings(smooth=False)).digest(),
-        RecoveryExpert(table, RecoverySettings(weights=(2.0, 1.0, 1.0, 1.0, 1.0, 1.0))).digest(),
+        RecoveryExpert(table, RecoverySettings(match="paper")).digest(),
+        RecoveryExpert(table, RecoverySettings(retrieved=1)).digest(),
     }
     assert len(digests) == 4
     assert RecoveryExpert(table).digest() == RecoveryExpert(RecoveryTable(kinematic_trajectories(5, 0))).digest()
