@@ -175,7 +175,7 @@ FEASIBLE_DEFAULTS = FeasibleSettings()
 
 @dataclass(frozen=True)
 class RecoverySettings:
-    """How to find the way back to the log, and how near to it a drive has to end."""
+    """How the recovery trajectory is chosen, and how near to the log its drive has to end."""
 
     match: Literal["log", "paper"] = "log"  # paper: the one human trajectory of the published equation, as it is
     retrieved: int = constant(8)  # human trajectories that are tried, behind the log's own from here

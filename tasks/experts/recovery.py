@@ -304,7 +304,7 @@ class RecoveryExpert:
             return
         refused = list[Rejected]()
         own = (fading_back(ego, log, fade_s) for fade_s in self.settings.fades_s)
-        for made in (self._led(wanted, ego, log[-1]) for wanted in own):
+        for made in (self._drivable_plan(wanted, ego, log[-1]) for wanted in own):
             if isinstance(made, Plan):
                 yield made
             else:
@@ -313,11 +313,11 @@ class RecoveryExpert:
             yield refused[0]
             return
         for row in self.table.nearest(target, self.settings.retrieved):
-            made = self._led(led_to(self.table.trajectories[row], end), ego, log[-1])
+            made = self._drivable_plan(warped_to_end(self.table.trajectories[row], end), ego, log[-1])
             if isinstance(made, Plan):
                 yield made
 
-    def _led(self, wanted: Array, ego: Array, end: Array) -> Plan | Rejected:
+    def _drivable_plan(self, wanted: Array, ego: Array, end: Array) -> Plan | Rejected:
         """The drivable plan nearest to `wanted` (40, 3), the ego's frame, if it ends at the log's state `end` (11,)."""
         made = make_feasible(wanted, ego, self.settings.feasible)
         if isinstance(made, str):
@@ -326,7 +326,7 @@ class RecoveryExpert:
         goal = Goal(end[: HEADING + 1], float(end[VX]), chosen.max_off_m, chosen.max_off_deg, chosen.max_off_mps)
         poses = to_world(ego[: HEADING + 1], made)
         missed = goal.missed(poses[-1], float(end_speeds(made[None])[0]))
-        return Plan(poses, goal) if missed is None else Rejected("expert", "out_of_reach", f"the way back {missed}")
+        return Plan(poses, goal) if missed is None else Rejected("expert", "out_of_reach", f"the plan {missed}")
 
 
 def _log_ahead(scene: Scene) -> Array:
@@ -352,7 +352,7 @@ def fading_back(ego: Array, log: Array, fade_s: float) -> Array:
     return _headed_along(to_local(ego[: HEADING + 1], poses))
 
 
-def led_to(trajectory: Array, end: Array) -> Array:
+def warped_to_end(trajectory: Array, end: Array) -> Array:
     """The trajectory (40, 3), its end moved to the pose `end` (3,), what is before it the less the earlier it is."""
     share = _step(T_S / (N * STEP_S))
     moved = trajectory + share[:, None] * (end - trajectory[-1])

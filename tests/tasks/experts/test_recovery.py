@@ -12,9 +12,9 @@ from tasks.experts.recovery import (
     RecoveryExpert,
     RecoverySettings,
     RecoveryTable,
-    led_to,
     make_feasible,
     start_velocities,
+    warped_to_end,
 )
 from tasks.stages import Rejected
 from tasks.world.clip import NOW, Scene
@@ -168,12 +168,12 @@ def test_from_far_ahead_of_a_log_that_goes_slower_there_is_no_way_back(road: Roa
 
 def test_a_trajectory_that_is_led_to_an_end_starts_as_it_did() -> None:
     end = np.array([31.0, -2.0, 0.0])
-    led = led_to(straight(8.0), end)
+    led = warped_to_end(straight(8.0), end)
     np.testing.assert_allclose(led[-1], end, atol=1e-3)
     slope = np.gradient(led[:, 1], led[:, 0])
     np.testing.assert_allclose(led[1:-1, 2], np.arctan(slope)[1:-1], atol=1e-2, err_msg="it looks where it goes")
     np.testing.assert_allclose(led[:4], straight(8.0)[:4], atol=0.03)
-    np.testing.assert_allclose(led_to(straight(8.0), straight(8.0)[-1]), straight(8.0), atol=1e-12)
+    np.testing.assert_allclose(warped_to_end(straight(8.0), straight(8.0)[-1]), straight(8.0), atol=1e-12)
 
 
 def test_a_drivable_trajectory_stays_as_it_is() -> None:
