@@ -31,7 +31,7 @@ from tasks.reward.label_bytes import ARRAYS, VocabularyLabels
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, next_scene, prepare_traffic, roll_out, roll_out_longer
 from tasks.settings import ExpertGate
-from tasks.stages import NOT_RECOVERED, Rejected
+from tasks.stages import NEAR_LOG, NOT_RECOVERED, Rejected
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.frames import (
@@ -48,6 +48,7 @@ from tasks.world.frames import (
     Y,
     ego_boxes,
     touching,
+    wrap_angle,
 )
 from tasks.world.road_map import CenterlineFinder, RoadMap, Route, centerline_from
 from tasks.world.vocabulary import Vocabulary
@@ -178,12 +179,33 @@ def attempt(
                 pdm_plan = pdm_plan or plan_for(scene, planner)
         judged = _driven_among(ready, plan, planner, timed, pdm_plan)
         with timed("reward"):
-            found = verdict(judged.scores, gate) or end_verdict(judged, ready, gate) or _goal_verdict(judged)
+            found = verdict(judged.scores, gate) or end_verdict(judged, ready, gate)
+            found = found or _near_log_verdict(judged, gate) or _goal_verdict(judged)
         if found is None:
             return judged, None
         refused = refused or (judged, found)
     assert refused is not None, f"{expert.name} gave no plan and no reason"
     return refused
+
+
+# Within these over its whole length a drive is the log's own: where, how turned and how fast the log is each instant.
+NEAR_LOG_M, NEAR_LOG_RAD, NEAR_LOG_MPS = 1.0, math.radians(5.0), 1.0
+
+
+def off_log(judged: Judged) -> Array:
+    """(40, 3) how far [m], turned [rad] and how much faster or slower [m/s] a drive is than the log at 0.1 .. 4.0 s."""
+    off = judged.rollout.ego_states[1:] - judged.scene.log_ahead[1:]
+    return np.column_stack([np.hypot(off[:, X], off[:, Y]), np.abs(wrap_angle(off[:, HEADING])), np.abs(off[:, VX])])
+
+
+def _near_log_verdict(judged: Judged, gate: ExpertGate) -> Rejected | None:
+    if not gate.near_log:
+        return None
+    metres, turn, mps = off_log(judged).max(axis=0)
+    if metres > NEAR_LOG_M or turn > NEAR_LOG_RAD or mps > NEAR_LOG_MPS:
+        return None
+    detail = f"at most {metres:.2f} m, {math.degrees(turn):.1f} degrees and {mps:.1f} m/s off the log"
+    return Rejected("reward", NEAR_LOG, detail)
 
 
 def _goal_verdict(judged: Judged) -> Rejected | None:

@@ -54,13 +54,14 @@ class PerturbSettings:
 class ExpertGate:
     """Which sub-scores an expert's rollout must reach (paper, supplement: S_m = 1 for all but EP, EP > 0.5).
 
-    And what its end must lead to (docs/reward.md 2m), of which the paper says nothing.
+    And what the paper does not ask: what its end leads to, and that it is not the log again (docs/reward.md 2m).
     """
 
     full: tuple[str, ...] = JUDGED  # EC needs an earlier plan: there is none
     progress_above: float = 0.5  # EP that a drive must exceed
     off_route: bool = True  # refuse a drive that ends beside the route's lanes, or where none of them goes on
     after: bool = True  # refuse one after which somebody is hit within a second, at its speed and braking alike
+    near_log: bool = True  # refuse one that is the log's own, to which a perturbation adds nothing
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.full if name not in JUDGED]

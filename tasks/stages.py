@@ -34,6 +34,7 @@ HUMAN = "human"  # the expert that is the log itself
 # The frames of a benchmark (tasks.hard_scenes): they stand where an expert's name does, in settings and tables.
 HUMAN_BEFORE, FOLLOW_UP, FOLLOW_UP_BEFORE = FRAMES = ("human_before", "follow_up", "follow_up_before")
 END_FAULTS = ("off_route", "after")  # of a drive that reaches every sub-score: what its end leads to (tasks.attempt)
+NEAR_LOG = "near_log"  # a drive that passes all else and is the log's own
 NOT_RECOVERED = "not_recovered"  # a drive that passes all else and ends too far from where its plan was to end
 PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred", "unlike_photos")  # tasks.render.gate
 
@@ -42,9 +43,9 @@ STAGES: tuple[Stage, ...] = (
     Stage("perturb", 3, "clip", ("no_gated_candidate", "no_good_candidate")),
     Stage("rollout", 4, "attempt", ("route_ended",)),
     Stage("expert", 2, "attempt", ("no_plan", "out_of_reach")),
-    Stage("reward", 1, "attempt", (*SUBSCORES, *END_FAULTS, NOT_RECOVERED)),
+    Stage("reward", 2, "attempt", (*SUBSCORES, *END_FAULTS, NEAR_LOG, NOT_RECOVERED)),
     Stage("render", 12, "attempt", ("psnr", *PICTURE_FAULTS)),
-    Stage("write", 4, "attempt", ()),
+    Stage("write", 5, "attempt", ()),
 )
 
 

@@ -17,7 +17,7 @@ from factory.config.words import ConfigError, did_you_mean
 from factory.files import broken_link, in_submitted_job, matching
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
 from tasks.settings import ExpertGate, PdmSettings, PerturbSettings, RecoverySettings, TrafficSettings
-from tasks.stages import FRAMES, TASKS
+from tasks.stages import FRAMES, HUMAN, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
 Repairs = Literal["make", "refuse"]
@@ -160,6 +160,8 @@ class RunConfig:
                 raise ValueError(f"{name}={value}: must be positive, or null for no bound")
         if not 0.0 <= self.gpu_share <= 1.0:
             raise ValueError(f"gpu_share={self.gpu_share}: the share of one GPU that a task which draws claims, 0 to 1")
+        if self.perturb.at_log and self.reward.near_log and set(self.experts) - {HUMAN, *FRAMES}:
+            raise ValueError("perturb.at_log=true: what is driven from the log is refused by reward.near_log: false it")
         known = sorted({*self.expert, *FRAMES})
         unknown = [name for name in self.experts if name not in known]
         if unknown:

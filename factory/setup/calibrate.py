@@ -35,6 +35,7 @@ WATCHED = (
     "reward.progress_above",
     "reward.off_route",
     "reward.after",
+    "reward.near_log",
     "expert.recovery.match",
     "render.mode",
     "render.frames",

@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 
 from factory.store.schema import AGENT_STEPS, MAP_RADIUS_M, NOW_INDEX
-from tasks.attempt import Judged
+from tasks.attempt import Judged, off_log
 from tasks.perturb import Candidate, end_speed_mps
 from tasks.reward.epdms import Scores
 from tasks.reward.label_bytes import VocabularyLabels, encode
@@ -28,6 +28,7 @@ def sample_row(clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[
     scene, pose = judged.scene, judged.scene.ego_state[: HEADING + 1]
     human = candidate is None
     label = judged.plan.poses if human else judged.rollout.ego_states[1:, : HEADING + 1]
+    off = None if human else off_log(judged)
     command = driving_command(scene.centerline, pose)
     place = pose_on_ground(clip.world_from_ego, scene.ego_state[None])[0]
     return {
@@ -39,6 +40,8 @@ def sample_row(clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[
         "proposal_10hz": None if human else to_local(pose, judged.plan.poses),
         "perturbed_states": None if candidate is None else candidate.rollout.ego_states,
         "candidate_end": None if candidate is None else np.append(candidate.end_pose, end_speed_mps(candidate)),
+        "off_log_end": None if off is None else off[-1],
+        "off_log_most": None if off is None else off.max(axis=0),
         **({} if candidate is None else score_columns("stage1", candidate.reactive_scores)),
         **score_columns("stage2", judged.scores),
     }

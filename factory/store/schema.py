@@ -266,7 +266,7 @@ def attempt_id(clip_id: str, candidate: int, vocabulary_digest: str, expert: str
 # `now` is T+H for simulated rows and T for `human` rows. Ego poses are rear-axle. Timings are not here: a row's bytes
 # do not depend on when or where it was made.
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 MAP_RADIUS_M = 64.0
 AGENT_STEPS = 56  # -1.5 .. 4.0 s at 10 Hz; index 15 is now
 NOW_INDEX = 15
@@ -311,7 +311,7 @@ def _lineage() -> tuple[Column, ...]:
 
 
 def _ego() -> tuple[Column, ...]:
-    pose = "x, y [m], heading [rad]"
+    pose, off = "x, y [m], heading [rad]", "distance [m], turn [rad], speed [m/s], all >= 0"
     return (
         Column("now_pose", "float64", (3,), pose, WORLD, "ego at now; the origin of all that is in its frame"),
         Column("world_from_ego", "float64", (4, 4), "m", WORLD, "3-D pose of the ego at now", nullable=True),
@@ -332,6 +332,8 @@ def _ego() -> tuple[Column, ...]:
             "reached at T+H; null human",
             nullable=True,
         ),
+        Column("off_log_end", "float32", (3,), off, about="label's last pose from the log; null human", nullable=True),
+        Column("off_log_most", "float32", (3,), off, about="most of each over the label; null human", nullable=True),
     )
 
 

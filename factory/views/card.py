@@ -185,7 +185,8 @@ def _reward_gate_text(store: Store) -> str:
     ends = ["lead on along the route"] if settings.get("reward.off_route") else []
     ends += ["allow for a second after it without a collision"] if settings.get("reward.after") else []
     scored = f"Such a drive had to earn {' and '.join(asked)}." if asked else "No such drive was refused for its score."
-    return f"{scored} Its end had to {' and '.join(ends)}." if ends else scored
+    near = " One that is the log's own was left out." if settings.get("reward.near_log") else ""
+    return f"{scored} Its end had to {' and '.join(ends)}.{near}" if ends else scored + near
 
 
 def _newest_run_record(store: Store) -> dict[str, Any]:

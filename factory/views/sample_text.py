@@ -1,6 +1,7 @@
 """One sample, or any other attempt, in words: which is meant, its numbers and labels, and where it comes from."""
 
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -116,6 +117,9 @@ def sample_facts(row: Mapping[str, Any]) -> dict[str, str]:
         facts["perturbed by"] = f"{x:+.2f} m along, {side_text(y)}, {turn_text(heading)}, at {speed:.2f} m/s"
     x, y, heading = row["label_10hz"][-1]
     facts["label"] = f"ends {x:+.2f} m ahead, {side_text(y)}, turned {turn_text(heading)} after 4 s"
+    if row["off_log_end"] is not None:
+        metres, turn, mps = row["off_log_end"]
+        facts["off the log"] = f"{metres:.2f} m, {math.degrees(turn):.1f} deg, {mps:.2f} m/s at the label's end"
     tags = ", ".join(row["tags"]) or "-"
     facts["world"] = f"{len(row['agent_ids'])} agents, {len(row['lane_ids'])} lanes; tags {tags}"
     images = row["images"] or ()

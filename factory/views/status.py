@@ -228,6 +228,7 @@ REASON_WORDS = {
     **{record.name: record.wrong for record in RECORDS},
     "off_route": "the route does not go on where the drive ends",
     "after": "somebody is hit in the second after the drive",
+    "near_log": "it is the log's own drive",
     "no_plan": "the expert found no plan",
     "out_of_reach": "the log's end cannot be reached from there",
     "not_recovered": "it ends too far from the log",

@@ -31,7 +31,7 @@ from planners.evaluation.scoring import Plans
 from tasks.trajectories import at_ten_hz
 from tasks.world.arrays import Array, Bytes
 
-SCORES = ("stage1_", "stage2_", *LABEL_COLUMNS)
+SCORES = ("stage1_", "stage2_", "off_log_", *LABEL_COLUMNS)
 LATER_NAN = ("agent_boxes", "agent_velocities", "agent_center_z")
 LATER_ZERO = ("agent_valid", "light_states")
 EGO_COLUMNS = ("attempt_id", "expert", "command", "ego_status", "ego_history_2hz")
@@ -41,7 +41,7 @@ def without_future(sample: Mapping[str, Any]) -> Sample:
     """A copy of a sample, or of some of its columns, without what comes after now.
 
     label_*, proposal_10hz                      zeros (the drive that followed)
-    stage1_*, stage2_*, label_subscores, ...    None (scores)
+    stage1_*, stage2_*, label_subscores, off_log_*, ...    None (scores)
     agent_boxes, agent_velocities, ...          NaN, and agent_valid False, after now
     light_states                                0, unknown, after now
     parent_states                               the logged state at T+H is NaN in frames at or before T

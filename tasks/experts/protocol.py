@@ -13,7 +13,7 @@ import numpy as np
 from tasks.settings import PdmSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
-from tasks.world.clip import HORIZON_STEPS, Scene
+from tasks.world.clip import Scene
 from tasks.world.frames import HEADING, wrap_angle
 
 
@@ -104,10 +104,7 @@ class Human:
 
     def plan(self, scene: Scene, rng: np.random.Generator) -> Plan:
         """The logged poses of the next 4 s. Raises ValueError where the clip ends before."""
-        after = scene.clip.ego_states[scene.step + 1 : scene.step + 1 + HORIZON_STEPS, : HEADING + 1]
-        if len(after) < HORIZON_STEPS:
-            raise ValueError(f"the clip ends {len(after)} steps after step {scene.step}; a plan needs {HORIZON_STEPS}")
-        return Plan(after.copy())
+        return Plan(scene.log_ahead[1:, : HEADING + 1].copy())
 
 
 @dataclass(frozen=True)

@@ -296,7 +296,7 @@ class RecoveryExpert:
         "no_plan": a quadratic program found no solution; "out_of_reach": no way ends at the log. Where its own does not
         the table is not asked. Raises ValueError where the clip ends within 4 s.
         """
-        ego, log = scene.ego_state, _log_ahead(scene)
+        ego, log = scene.ego_state, scene.log_ahead
         end = to_local(ego[: HEADING + 1], log[-1, : HEADING + 1])
         target = np.concatenate([ego[[VX, VY]], end, log[-1, [VX]]])
         if self.settings.match == "paper":
@@ -327,14 +327,6 @@ class RecoveryExpert:
         poses = to_world(ego[: HEADING + 1], made)
         missed = goal.missed(poses[-1], float(end_speeds(made[None])[0]))
         return Plan(poses, goal) if missed is None else Rejected("expert", "out_of_reach", f"the plan {missed}")
-
-
-def _log_ahead(scene: Scene) -> Array:
-    """The log's states (41, 11) over the next 4 s. Raises ValueError where the clip ends before."""
-    end = scene.step + HORIZON_STEPS
-    if end >= len(scene.clip.ego_states):
-        raise ValueError(f"recovery needs the log at step {end}; the clip has {len(scene.clip.ego_states)}")
-    return scene.clip.ego_states[scene.step : end + 1]
 
 
 def fading_back(ego: Array, log: Array, fade_s: float) -> Array:

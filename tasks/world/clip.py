@@ -244,6 +244,15 @@ class Scene:
         """(11,) the ego now."""
         return self.ego_history[-1]
 
+    @property
+    def log_ahead(self) -> Array:
+        """(41, 11) the logged ego from now to 4 s later. Raises ValueError where the clip ends before."""
+        ahead = self.clip.ego_states[self.step : self.step + HORIZON_STEPS + 1]
+        if len(ahead) <= HORIZON_STEPS:
+            missing = f"{len(ahead) - 1} steps after step {self.step}; {HORIZON_STEPS} are needed"
+            raise ValueError(f"the clip ends {missing}")
+        return ahead
+
 
 @dataclass(frozen=True)
 class Rollout:

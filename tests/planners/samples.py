@@ -91,6 +91,8 @@ def sample(
         "command": COMMANDS[number % 4],
         "ego_status": np.array([number, 0.5, -0.25, 0.125], np.float32),
         "candidate_end": None if human else np.array([number % 20 - 10.0, number % 5 / 2.0 - 1.0, 0.1, 5.0]),
+        "off_log_end": None if human else np.full(3, 0.25),
+        "off_log_most": None if human else np.full(3, 0.5),
         "stage2_score": number % 10 / 10.0,
         "cameras": None,
         "images": None,

@@ -24,7 +24,7 @@ from tasks.world.vocabulary import Vocabulary
 
 AV2 = ("data", "av2", "sensor", "val")
 LOG, START_MS = "7fab2350-7eaf-3b7e-a39d-6937a4c1bede", 1000  # the route turns left at a junction
-PUBLISHED = ExpertGate(off_route=False, after=False)
+PUBLISHED = ExpertGate(off_route=False, after=False, near_log=False)
 PDM, RNG = PdmSettings(), np.random.default_rng(0)  # who drives here draws nothing
 
 
@@ -75,7 +75,7 @@ def driven(clip: Clip, shared_root: Path) -> list[tuple[Judged, Rejected | None,
     expert, out = Smoothed(RecoveryTable(human), RecoverySettings(match="paper")), []
     for candidate in found.candidates:
         scene = perturbed_scene(clip, candidate.rollout)
-        pair = [attempt(scene, expert, gate, traffic, PDM, RNG) for gate in (PUBLISHED, ExpertGate())]
+        pair = [attempt(scene, expert, gate, traffic, PDM, RNG) for gate in (PUBLISHED, ExpertGate(near_log=False))]
         if not isinstance(pair[0], Rejected) and not isinstance(pair[1], Rejected):
             out.append((pair[0][0], pair[0][1], pair[1][1]))
     return out

@@ -41,8 +41,8 @@ def scores(**values: float) -> Scores:
 
 
 def first_stage(clip: Clip) -> Rollout:
-    """Ends 0.7 m to the left of the log."""
-    return simulate(scene_of_clip(clip), to_world(clip.ego_states[NOW, :3], shift(8.0, 0.7)), TrafficSettings())
+    """Ends 1.2 m to the left of the log."""
+    return simulate(scene_of_clip(clip), to_world(clip.ego_states[NOW, :3], shift(8.0, 1.2)), TrafficSettings())
 
 
 @pytest.fixture(scope="module")
@@ -300,6 +300,40 @@ def test_of_several_plans_the_first_that_is_accepted_is_driven_and_of_none_the_f
     assert rejected is not None and judged.plan is off
     lost = Rejected("expert", "out_of_reach", "nowhere")
     assert attempt(scene, Several((lost,)), GATE, TrafficSettings(), PdmSettings(), RNG) == lost
+
+
+@pytest.mark.parametrize(
+    ("aside_m", "turned_deg", "faster_mps", "near"),
+    [
+        *[(0.9, 0.0, 0.0, True), (1.1, 0.0, 0.0, False), (0.0, 4.9, 0.0, True), (0.0, 5.1, 0.0, False)],
+        *[(0.0, 0.0, 0.9, True), (0.0, 0.0, 1.1, False)],
+    ],
+)
+def test_a_drive_that_is_the_log_s_own_is_refused_unless_that_is_off(
+    scene: Scene, aside_m: float, turned_deg: float, faster_mps: float, near: bool
+) -> None:
+    """The log is laid beside the drive, as far off as said at one instant or another."""
+    good = PdmClosed().plan(scene, RNG)
+    assert isinstance(good, Plan)
+    driven = tried(scene, Several((good,)))[0].rollout.ego_states
+    log = scene.clip.ego_states.copy()
+    log[scene.step : scene.step + len(driven)] = driven
+    log[scene.step + 7, 1] -= aside_m
+    log[scene.step + 19, HEADING] += np.radians(turned_deg)
+    log[scene.step + 40, VX] -= faster_mps
+    beside = replace(scene, clip=replace(scene.clip, ego_states=log))
+    assert tried(beside, Several((good,)))[1] == (
+        Rejected(
+            "reward",
+            "near_log",
+            f"at most {aside_m:.2f} m, {turned_deg:.1f} degrees and {faster_mps:.1f} m/s off the log",
+        )
+        if near
+        else None
+    )
+    open_gate = replace(GATE, near_log=False)
+    result = attempt(beside, Several((good,)), open_gate, TrafficSettings(), PdmSettings(), RNG)
+    assert not isinstance(result, Rejected) and result[1] is None
 
 
 @pytest.mark.parametrize(

@@ -57,6 +57,7 @@ def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:
         "traffic.yields=True (False)",
         "reward.off_route=True (False)",
         "reward.after=True (False)",
+        "reward.near_log=True (False)",
         "render.frames=history (all)",
         "render.width=320 (1920)",
         "render.height=180 (1080)",

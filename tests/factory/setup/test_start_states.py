@@ -78,6 +78,8 @@ def test_what_is_no_such_file_is_refused_and_so_is_one_beside_the_log_alone(
         assert line.startswith(f"error: perturb.starts={tmp_path / name}: ") and said in line
     assert run.main(words(towns, tmp_path / "out", "perturb.starts=x", "perturb.at_log=true")) == BAD_CONFIG
     assert "leave one out" in capsys.readouterr().err
+    assert run.main(words(towns, tmp_path / "out", "perturb.at_log=true", "reward.near_log=true")) == BAD_CONFIG
+    assert "reward.near_log" in capsys.readouterr().err
 
 
 def test_with_starts_clips_are_prepared_anew_and_attempts_have_other_names() -> None:
@@ -106,6 +108,7 @@ def words(towns: Path, out: Path, *more: str) -> list[str]:
     clips = [f"clips.cache_dir={towns}", "clips.n_clips=2", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0"]
     quick = ["experts=[pdm_closed]", "render=none", "reward.labels=none", "vocabulary.k=256", "executor=local"]
     takes_all = ["reward.full=[]", "reward.progress_above=-1", "reward.off_route=false", "reward.after=false"]
+    takes_all += ["reward.near_log=false"]
     return [*clips, *quick, *takes_all, f"out={out}", *more]
 
 

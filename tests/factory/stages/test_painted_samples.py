@@ -55,7 +55,7 @@ def now(row: dict[str, object]) -> np.ndarray:
 @pytest.mark.slow
 def test_a_perturbed_drive_is_painted_where_it_has_come_to_and_the_log_alone_where_the_log_was(towns: Path) -> None:
     free = ["experts=[logged]", "reward.full=[]", "reward.progress_above=-1", "reward.off_route=false"]
-    free += ["reward.after=false", "vocabulary.k=4096"]
+    free += ["reward.after=false", "reward.near_log=false", "vocabulary.k=4096"]
     moved = row_of(*prepared_by(towns, *PAINTED, *free), 0, "logged")
     logged = row_of(*prepared_by(towns, *PAINTED, *free, "perturb.at_log=true", "traffic=replay"), 0, "logged")
     assert moved["image_source"] == logged["image_source"] == "painter"

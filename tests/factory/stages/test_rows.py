@@ -22,6 +22,7 @@ RNG = np.random.default_rng(0)  # nothing here draws from it
 END = NOW + HORIZON_STEPS
 WORLD_COLUMNS = {"parent_states", "now_pose", "world_from_ego", "perturbed_states"}
 POSE_COLUMNS = {name for name, column in COLUMNS.items() if column.shape and column.shape[-1] in (3, 5)}
+POSE_COLUMNS -= {"off_log_end", "off_log_most"}  # distances
 
 
 def human(clip: Clip) -> dict[str, object]:
@@ -52,10 +53,26 @@ def test_both_kinds_of_row_fit_the_schema(row: dict[str, object]) -> None:
     }
     table = sample_rows_to_table([row | no_images | books, human(street_clip()) | no_images | books])
     assert table.num_rows == 2
-    for name in ("vocabulary_index", "proposal_10hz", "perturbed_states", "candidate_end", "stage1_score"):
+    of_simulated = ("vocabulary_index", "proposal_10hz", "perturbed_states", "candidate_end", "off_log_end")
+    for name in (*of_simulated, "off_log_most", "stage1_score"):
         assert table[name].is_null().to_pylist() == [False, True], f"{name} is null for the human alone"
     for name in ("stage1_ec", "stage2_ec"):
         assert table[name].null_count == 2, "there is no earlier plan to compare comfort with"
+
+
+def test_a_simulated_row_says_how_far_off_the_log_it_ends_and_gets_at_most(
+    candidate_and_judged: tuple[Candidate, Judged], row: dict[str, object]
+) -> None:
+    """The log keeps its lane and speed along x: what is off is y, heading and speed themselves, and x less its way."""
+    judged = candidate_and_judged[1]
+    states = judged.rollout.ego_states[1:]
+    logged_x = judged.scene.clip.ego_states[END, 0] + 0.1 * SPEED_MPS * np.arange(1, 41)
+    logged_y = judged.scene.clip.ego_states[END, 1]
+    metres = np.sqrt((states[:, 0] - logged_x) ** 2 + (states[:, 1] - logged_y) ** 2)
+    off = np.column_stack([metres, abs(states[:, 2]), abs(states[:, 3] - SPEED_MPS)])
+    np.testing.assert_allclose(row["off_log_end"], off[-1], atol=1e-9)  # type: ignore[arg-type]
+    np.testing.assert_allclose(row["off_log_most"], off.max(axis=0), atol=1e-9)  # type: ignore[arg-type]
+    assert off.max(axis=0).min() > 1e-3, "something is to be seen in each"
 
 
 def test_the_human_s_label_is_the_log() -> None:

@@ -133,7 +133,7 @@ def test_the_published_expert_drives_as_some_human_did(road: Road) -> None:
 
 
 def test_a_clip_that_ends_before_the_goal_is_refused(road: Road) -> None:
-    with pytest.raises(ValueError, match="needs the log at step 96; the clip has 96"):
+    with pytest.raises(ValueError, match="ends 39 steps after step 56; 40 are needed"):
         RecoveryExpert(RecoveryTable(straight(5.0)[None])).plan(replace(road(), step=56), RNG)
 
 
