@@ -290,10 +290,11 @@ def _places(clips: NDArray[np.object_], column: pa.ChunkedArray) -> Ints:
 # The acceptance funnel: per expert and round, what was tried, accepted, turned down and why; from the tables alone.
 #
 # An attempt belongs to the round it was tried for: the number of accepted candidates before it in its walk. The rates.
-# Attempts: accepted of tried. First try: of the clips that had the round before, those accepted without a second try,
-# as one random draw a round would be. Clips: those with at least r+1 accepted samples, of those with at least r and of
-# all.
+# Attempts: accepted of tried. First drive: of the clips that had the round before, those of which the first drive was
+# accepted, as one random draw a round would be; an attempt without a plan is no drive. Clips: those with at least r+1
+# accepted samples, of those with at least r and of all.
 
+BEFORE_A_DRIVE = ("rollout.", "expert.")  # reasons for which an attempt has nothing that could be driven
 LIST_COLUMNS = ["clip_id", "n_candidates", "gate_counts", "stage", "reason", "repairs"]
 
 
@@ -310,7 +311,7 @@ class FunnelRow:
     clips: int  # with at least round + 1 accepted samples
     clips_total: int  # in which this expert was to drive
     reasons: Mapping[str, int] = field(default_factory=dict)  # "stage.reason" or "failed.kind" -> attempts
-    first_tries: int = 0  # clips whose first attempt of this round was accepted
+    first_drives: int = 0  # clips whose first drive of this round was accepted
     simulated: bool = True  # from candidates; False: the log's own drive, tried once a clip
 
     @property
@@ -327,9 +328,9 @@ class FunnelRow:
         return self.clips / self.clips_before if self.clips_before else float("nan")
 
     @property
-    def first_try_rate(self) -> float:
-        """Of the clips that had the round before: accepted without a second try, as one random draw would be."""
-        return self.first_tries / self.clips_before if self.clips_before else float("nan")
+    def first_drive_rate(self) -> float:
+        """Of the clips that had the round before: accepted without a second drive, as one random draw would be."""
+        return self.first_drives / self.clips_before if self.clips_before else float("nan")
 
     @property
     def clip_rate_of_all(self) -> float:
@@ -380,12 +381,21 @@ class Funnel:
         if self.repaired.clips:
             head += f"\n{self.repaired.text}"
         table = Table(
-            "expert", "round", "tried", "accepted", "attempts %", "1st try %", "clips", "clips %", "of all %", "why not"
+            "expert",
+            "round",
+            "tried",
+            "accepted",
+            "attempts %",
+            "1st drive %",
+            "clips",
+            "clips %",
+            "of all %",
+            "why not",
         )
         for r in self.rows:
             why = ", ".join(f"{name.removeprefix('reward.')} {n}" for name, n in r.reasons.items())
             numbers = map(str, (r.round, r.tried, r.accepted))
-            tries = map(_percent_text, (r.attempt_rate, r.first_try_rate))
+            tries = map(_percent_text, (r.attempt_rate, r.first_drive_rate))
             clips = map(_percent_text, (r.clip_rate, r.clip_rate_of_all))
             table.add_row(r.expert, *numbers, *tries, f"{r.clips}/{r.clips_before}", *clips, why)
         sink = io.StringIO()
@@ -462,8 +472,10 @@ def expert_rows(attempts: Attempts, number: int) -> list[FunnelRow]:
     at, why, accepted = attempts.round[tried], attempts.why[tried], attempts.accepted[tried]
     rounds, n_whys = int(at.max()) + 1, len(attempts.whys)
     counts = np.bincount(at * n_whys + why, minlength=rounds * n_whys).reshape(rounds, n_whys)
-    first = accepted & (np.diff(attempts.clip[tried].astype(np.int64) * (rounds + 1) + at, prepend=-1) != 0)
-    first_tries = np.bincount(at[first], minlength=rounds)
+    drove = ~np.array([name.startswith(BEFORE_A_DRIVE) for name in attempts.whys])[why]
+    walk_round = attempts.clip[tried][drove].astype(np.int64) * (rounds + 1) + at[drove]
+    first = accepted[drove] & (np.diff(walk_round, prepend=-1) != 0)
+    first_drives = np.bincount(at[drove][first], minlength=rounds)
     simulated = bool((attempts.candidate[tried] >= 0).any())
     rows, before = [], clips
     for round_ in range(rounds):
@@ -471,12 +483,9 @@ def expert_rows(attempts: Attempts, number: int) -> list[FunnelRow]:
         made = reasons.pop(ACCEPTED, 0)  # one sample per clip and round
         failed = sum(n for why, n in reasons.items() if why.startswith("failed."))
         rejected = sum(reasons.values()) - failed
-        tries = int(first_tries[round_])
-        rows.append(
-            FunnelRow(
-                attempts.experts[number], round_, made, rejected, failed, before, made, clips, reasons, tries, simulated
-            )
-        )
+        counts_of = (made, rejected, failed, before, made, clips)
+        drives = int(first_drives[round_])
+        rows.append(FunnelRow(attempts.experts[number], round_, *counts_of, reasons, drives, simulated))
         before = made
     return rows
 

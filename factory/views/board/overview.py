@@ -135,7 +135,7 @@ def _acceptance(funnel: Funnel) -> list[Json]:
     for row in funnel.rows:
         published = PAPER_CLIP_PERCENT.get(row.expert, ())
         named = ("expert", "round", "simulated", "tried", "accepted", "rejected", "failed", "clips", "clips_before")
-        rates = {name: getattr(row, name) for name in ("attempt_rate", "first_try_rate", "clip_rate")}
+        rates = {name: getattr(row, name) for name in ("attempt_rate", "first_drive_rate", "clip_rate")}
         found.append(
             {name: getattr(row, name) for name in named}
             | {name: None if np.isnan(rate) else rate for name, rate in rates.items()}

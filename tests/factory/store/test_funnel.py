@@ -49,24 +49,24 @@ def attempts(walks: Walks) -> Attempts:
 
 def slow_rows(expert: str, clips: dict[str, list[tuple[int, str]]]) -> list[FunnelRow]:
     """Attempt by attempt."""
-    accepted, first_tries, reasons = Counter[int](), Counter[int](), defaultdict[int, Counter[str]](Counter)
+    accepted, first_drives, reasons = Counter[int](), Counter[int](), defaultdict[int, Counter[str]](Counter)
     tried = {clip: [one for one in sorted(tries) if one[1] != "exhausted"] for clip, tries in clips.items()}
     for tries in tried.values():
         at, fresh = 0, True
         for _, why in tries:
             if why:
                 reasons[at][why] += 1
-                fresh = False
+                fresh = fresh and why.split(".")[0] in ("rollout", "expert")
             else:
                 accepted[at] += 1
-                first_tries[at] += fresh
+                first_drives[at] += fresh
                 at, fresh = at + 1, True
     rows, before = [], len(clips)
     simulated = any(candidate >= 0 for tries in tried.values() for candidate, _ in tries)
     for number in range(max([*accepted, *reasons], default=-1) + 1):
         failed = sum(n for why, n in reasons[number].items() if why.startswith("failed."))
         counts = (accepted[number], reasons[number].total() - failed, failed, before, accepted[number], len(clips))
-        rows.append(FunnelRow(expert, number, *counts, dict(reasons[number]), first_tries[number], simulated))
+        rows.append(FunnelRow(expert, number, *counts, dict(reasons[number]), first_drives[number], simulated))
         before = accepted[number]
     return rows
 
@@ -74,14 +74,15 @@ def slow_rows(expert: str, clips: dict[str, list[tuple[int, str]]]) -> list[Funn
 def test_an_attempt_belongs_to_the_round_it_was_tried_for() -> None:
     clips = {
         "a": [(0, "reward.nc"), (1, ""), (2, "reward.ep"), (3, "")],
-        "b": [(0, ""), (1, "reward.nc")],
+        "b": [(0, "expert.out_of_reach"), (1, ""), (2, "reward.nc")],
         "c": [(0, "failed.bug")],
     }
     first, second = expert_rows(attempts({"recovery": clips}), 0)[:2]
-    assert first == FunnelRow("recovery", 0, 2, 1, 1, 3, 2, 3, {"reward.nc": 1, "failed.bug": 1}, 1)
+    reasons = {"expert.out_of_reach": 1, "failed.bug": 1, "reward.nc": 1}
+    assert first == FunnelRow("recovery", 0, 2, 2, 1, 3, 2, 3, reasons, 1)
     assert second == FunnelRow("recovery", 1, 1, 2, 0, 2, 1, 3, {"reward.ep": 1, "reward.nc": 1})
-    assert first.first_try_rate == pytest.approx(1 / 3) and second.first_try_rate == 0.0  # clip b; nobody
-    assert first.attempt_rate == 0.5 and first.clip_rate == pytest.approx(2 / 3)
+    assert first.first_drive_rate == pytest.approx(1 / 3) and second.first_drive_rate == 0.0  # clip b; nobody
+    assert first.attempt_rate == 0.4 and first.clip_rate == pytest.approx(2 / 3)
     assert second.clip_rate == 0.5 and second.clip_rate_of_all == pytest.approx(1 / 3)
 
 
@@ -91,7 +92,9 @@ def test_an_attempt_belongs_to_the_round_it_was_tried_for() -> None:
         st.dictionaries(
             st.sampled_from("abcdef"),
             st.lists(
-                st.sampled_from(["", "reward.nc", "render.holes", "failed.bug", "exhausted"]), min_size=1, max_size=9
+                st.sampled_from(["", "expert.no_plan", "reward.nc", "render.holes", "failed.bug", "exhausted"]),
+                min_size=1,
+                max_size=9,
             ),
             min_size=1,
         ),

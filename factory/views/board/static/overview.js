@@ -88,12 +88,12 @@ function acceptance(o) {
     h("tr", null, named(a.expert, a.simulated ? "" : EXPERT_WORDS[a.expert]),
       h("td", { class: "n" }, count(a.round)), h("td", { class: "n roomy" }, count(a.tried)), h("td", { class: "n roomy" }, count(a.accepted)),
       h("td", null, bar(a.attempt_rate, percent(a.attempt_rate))),
-      h("td", { class: "roomy" }, bar(a.first_try_rate, percent(a.first_try_rate), a.paper)),
+      h("td", { class: "roomy" }, bar(a.first_drive_rate, percent(a.first_drive_rate), a.paper)),
       h("td", null, bar(a.clip_rate, percent(a.clip_rate), a.paper))));
-  const lead = "Round r holds the (r+1)-th accepted sample of each clip and expert. Of attempts: accepted of tried. Of first tries: clips accepted without a second try, as one random draw a round would be. Of clips: clips with a sample of this round, of those with one of the round before.";
+  const lead = "Round r holds the (r+1)-th accepted sample of each clip and expert. Of attempts: accepted of tried. Of first drives: clips whose first drive is accepted, as one random draw a round would be; where an expert has no plan there is none. Of clips: clips with a sample of this round, of those with one of the round before.";
   const ended = Object.entries(o.exhausted).map(([expert, n]) => h("p", { class: "note" }, `${expert}: ${plural(n, "walk")} came to the end of the candidates`));
   const key = h("p", { class: "keys" }, h("span", null, h("i", { class: "key paper" }), "the paper's share of clips"));
-  return fold("Acceptance by round and expert", "beside the paper's", h("p", { class: "lead" }, lead), key, table("acceptance", ["expert", "round", "tried*", "accepted*", "of attempts", "of first tries*", "of clips"], rows), ended);
+  return fold("Acceptance by round and expert", "beside the paper's", h("p", { class: "lead" }, lead), key, table("acceptance", ["expert", "round", "tried*", "accepted*", "of attempts", "of first drives*", "of clips"], rows), ended);
 }
 
 function reasons(o) {
