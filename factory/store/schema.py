@@ -319,8 +319,8 @@ def _ego() -> tuple[Column, ...]:
         Column("ego_history_2hz", "float32", (4, 3), pose, EGO, "-1.5, -1.0, -0.5, 0 s"),
         Column("ego_status", "float32", (4,), "vx, vy [m/s], ax, ay [m/s2]", "ego body", "at now"),
         Column("command", "string", about="left, straight, right or unknown, from the route"),
-        Column("label_10hz", "float32", (40, 3), pose, EGO, "simulated states, of `human` the log's, 0.1 .. 4.0 s"),
-        Column("label_2hz", "float32", (8, 3), pose, EGO, "simulated states, of `human` the log's, 0.5 .. 4.0 s"),
+        Column("label_10hz", "float32", (40, 3), pose, EGO, "simulated; `human`: as logged, unsmoothed; 0.1 .. 4.0 s"),
+        Column("label_2hz", "float32", (8, 3), pose, EGO, "simulated; `human`: as logged, unsmoothed; 0.5 .. 4.0 s"),
         Column("proposal_10hz", "float32", (40, 3), pose, EGO, "what the expert asked for; null human", nullable=True),
         Column("perturbed_states", "float64", (41, 11), STATE, WORLD, "stage one, T .. T+H; null human", nullable=True),
         Column(
