@@ -10,10 +10,11 @@ import json
 import logging
 import time
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from factory.stages.sensors import (
     load_sensors,
     masks_digest,
     opened_photos,
-    read_masks,
+    own_body_masks,
 )
 from factory.store.location import Location
 from factory.wording import time_text
@@ -147,7 +148,7 @@ def read_rig_file(said: Path) -> dict[str, Any]:
 
 
 def read_or_correct_rig(
-    path: Path, block: Block, cameras: Sequence[Camera], own_body: Mapping[str, Bools] = NO_MASKS
+    path: Path, block: Block, cameras: Sequence[Camera], own_body: Callable[[], Mapping[str, Bools]] = dict
 ) -> CorrectedRig | None:
     """The rig as it is told beside `path`, found first where nothing is told there; None where nothing can be found.
 
@@ -159,7 +160,7 @@ def read_or_correct_rig(
     except (FileNotFoundError, Damaged) as error:
         if isinstance(error, Damaged):
             log.warning("%s: %s; it is written again", said, error)
-        correct_block_rig(path, block, cameras, own_body)
+        correct_block_rig(path, block, cameras, own_body())
         told = read_rig_file(said)
     used: dict[str, dict[str, Any]] = {
         row["name"]: {key: np.array(row[key], np.float64) for key in CALIBRATED} for row in told["used"]
@@ -298,7 +299,7 @@ def _resumed(begun: Path, start: FitState) -> FitState:
         return start
 
 
-ASSET_VERSION = 10  # raised by hand when the same sensors give another scene, or it is kept otherwise
+ASSET_VERSION = 11  # raised by hand when the same sensors give another scene, or it is kept otherwise
 PARALLAX_SHARE = 0.9  # without lidar, the least share of photos with another one close enough for stereo
 
 
@@ -347,7 +348,7 @@ def load_or_build_scene(
     cameras = block_cameras(block, rig)
     if block_sensing(clip, settings) is Sensing.NOTHING:
         return None
-    path, masks = scene_path(clip, settings, cache_dir), block_masks(cameras, read_masks(settings.own_body, rig))
+    path, masks = scene_path(clip, settings, cache_dir), _own_body(block, cameras, rig, settings)
     with builder_lock(path):
         if path.exists():
             try:
@@ -361,10 +362,10 @@ def load_or_build_scene(
         agents, taken, found = block.agents, tuple[PhotoPose, ...](), None
         if needs_rig_correction(block, settings.rig):
             given = block.images
-            block, cameras, found = correct_block_rig(path, block, cameras, masks)
+            block, cameras, found = correct_block_rig(path, block, cameras, masks())
             taken = photo_poses(given, block.images) if found is not None else ()
             agents = lift_tracks(agents, *photo_rises(taken))
-        data = load_sensors(block, cameras, settings.width, settings.height, masks)
+        data = load_sensors(block, cameras, settings.width, settings.height, masks())
         if found is not None:
             data = replace(data, known=known_points(data, block, found))
         if settings.scene is SceneFrom.FIT:
@@ -386,7 +387,7 @@ def load_or_correct_rig(clip: Clip, settings: RenderSettings, cache_dir: str | P
     if block_sensing(clip, settings) is Sensing.NOTHING or not needs_rig_correction(block, settings.rig):
         return None
     cameras = block_cameras(block, rig)
-    path, masks = scene_path(clip, settings, cache_dir), block_masks(cameras, read_masks(settings.own_body, rig))
+    path, masks = scene_path(clip, settings, cache_dir), _own_body(block, cameras, rig, settings)
     with builder_lock(path):
         return read_or_correct_rig(path, block, cameras, masks)
 
@@ -402,6 +403,21 @@ def without_other_logs(asset: RenderAsset) -> RenderAsset:
         bodies=tuple(body for body in asset.bodies if not is_of_other_log(body.camera)),
         shifts=asset.shifts.select([name for name in asset.shifts.track_ids if not is_of_other_log(name)]),
     )
+
+
+def _own_body(
+    block: Block, cameras: Sequence[Camera], rig: Sequence[Camera], settings: RenderSettings
+) -> Callable[[], Mapping[str, Bools]]:
+    """What a block's cameras see of the car that carries them, which is found when it is first asked for."""
+
+    @cache
+    def masks() -> Mapping[str, Bools]:
+        own = own_body_masks(settings.own_body, block.images, rig)
+        for name, mask in own.items():
+            log.info("%s: %.1f %% of the picture is the car itself", name, 100.0 * mask.mean())
+        return block_masks(cameras, own)
+
+    return masks
 
 
 def block_masks(cameras: Sequence[Camera], own: Mapping[str, Bools]) -> dict[str, Bools]:

@@ -14,25 +14,51 @@ from factory.readers.arrow import read_feather
 from factory.readers.base import BadClip
 from factory.readers.pictures import BadPicture, decode_grey, decode_rgb, file_and_frame, video_frames
 from factory.readers.points import read_pcd, read_points
+from tasks.render.rig.own_body import choose_photos, find_own_body, shrink
 from tasks.render.scene.features import NOTHING_KNOWN, KnownPoints, driven_roads
 from tasks.render.scene.sensed import Photo, Sweep, is_on_ego
 from tasks.render.views import straightened, undistorted
 from tasks.world.arrays import Array, Bools, Bytes
 from tasks.world.clip import Block, Camera, Clip, SensorFile, own_name
 
-# Masks of what a rig sees of the car that carries it: `<camera>.png` in a folder of the user's, white where it is.
+# What a rig sees of the car that carries it: found in its photos, or masks `<camera>.png` in a folder of the user's,
+# white where it is. All are of the photos as `opened_photos` gives them.
 
 WHITE = 128  # grey level from which on a pixel is of the body
+NOBODY = "none"  # in place of a folder: no camera sees anything of it
 NO_MASKS: Mapping[str, Bools] = MappingProxyType({})
 
 
+def own_body_masks(said: str, images: Sequence[SensorFile], cameras: Sequence[Camera]) -> Mapping[str, Bools]:
+    """(H, W) of the photos by camera, of a folder that is `said`, none, or, where nothing is, found in `images`.
+
+    Raises BadClip for a broken photo, ValueError as `read_masks`.
+    """
+    if said:
+        return NO_MASKS if said == NOBODY else read_masks(said, cameras)
+    files = sorted(files_of_cameras(cameras, images), key=lambda file: file.time_s)
+    chosen: dict[str, list[SensorFile]] = {}
+    for camera in cameras:
+        mine = [file for file in files if file.sensor == camera.name]
+        if mine:
+            chosen[camera.name] = [mine[row] for row in choose_photos(ego_poses_of_files(mine)[0])]
+    wanted = [file for mine in chosen.values() for file in mine]
+    small = {(wanted[row].sensor, wanted[row].time_s): shrink(image) for row, image in opened_photos(wanted, cameras)}
+    found = {}
+    for camera in cameras:
+        if mine := chosen.get(camera.name, []):
+            pictures = [small[file.sensor, file.time_s] for file in mine]
+            mask = find_own_body(pictures, camera, ego_poses_of_files(mine)[0])
+            if mask is not None:
+                found[camera.name] = mask
+    return found
+
+
 def read_masks(folder: str, cameras: Sequence[Camera]) -> Mapping[str, Bools]:
-    """(H, W) of the photos as they were taken, by camera; a camera without a file sees nothing of the body.
+    """(H, W) of the photos by camera; a camera without a file sees nothing of the body.
 
     Raises ValueError for a folder without masks, and for a mask that is no picture of its camera's size.
     """
-    if not folder:
-        return NO_MASKS
     files = _files(folder)
     found = {}
     for camera in cameras:
@@ -43,14 +69,15 @@ def read_masks(folder: str, cameras: Sequence[Camera]) -> Mapping[str, Bools]:
             mask = decode_grey(path.read_bytes(), (camera.width, camera.height))
         except BadPicture as error:
             raise ValueError(f"render.own_body: {path} is {error}") from error
-        found[camera.name] = np.asarray(mask >= WHITE)
+        seen = mask if camera.fisheye is None else straightened(mask, camera.fisheye)
+        found[camera.name] = np.asarray(seen >= WHITE)
     return found
 
 
 def masks_digest(folder: str) -> str:
-    """Of all masks' names and bytes; empty without a folder. Raises ValueError as `read_masks`."""
-    if not folder:
-        return ""
+    """Of all masks' names and bytes, else what stands in place of a folder. Raises ValueError as `read_masks`."""
+    if folder in ("", NOBODY):
+        return folder
     digest = hashlib.sha256()
     for name, path in sorted(_files(folder).items()):
         digest.update(f"{name}\x1f".encode() + hashlib.sha256(path.read_bytes()).digest())
@@ -59,7 +86,7 @@ def masks_digest(folder: str) -> str:
 
 def refuse_unknown_masks(folder: str, rig: Sequence[Camera]) -> None:
     """Raises ValueError for a mask of a camera that the rig does not have, and as `read_masks`."""
-    if not folder:
+    if folder in ("", NOBODY):
         return
     names = [camera.name for camera in rig]
     unknown = sorted(set(_files(folder)) - set(names))
@@ -69,12 +96,9 @@ def refuse_unknown_masks(folder: str, rig: Sequence[Camera]) -> None:
 
 
 def resized_mask(mask: Bools, camera: Camera, width: int, height: int) -> Bools:
-    """A mask (H, W) as its camera's photos are shown: without distortion, the middle, width x height."""
+    """A mask (H, W) as its camera's opened photos are shown: without distortion, the middle, width x height."""
     left, top, w, h = camera.window(width, height)
-    grey = mask.astype(np.uint8) * 255
-    if camera.fisheye is not None:
-        grey = straightened(grey, camera.fisheye)
-    flat = undistorted(grey, camera)[top : top + h, left : left + w]
+    flat = undistorted(mask.astype(np.uint8) * 255, camera)[top : top + h, left : left + w]
     return np.asarray(cv2.resize(flat, (width, height), interpolation=cv2.INTER_AREA) >= WHITE)
 
 

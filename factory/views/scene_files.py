@@ -306,6 +306,8 @@ def info_text(path: Path, asset: RenderAsset) -> str:
     held_out = f"{asset.psnr_db:.2f} dB over {asset.n_held_out} held-out photos"
     lines.append(f"psnr        {held_out if np.isfinite(asset.psnr_db) else 'not measured'}")
     lines += [f"camera      {row.camera}: {row.text}" for row in camera_rows(asset.views)]
+    for body in asset.bodies:
+        lines.append(f"own body    {body.camera}: {100.0 * (body.rgba[..., 3] > 0).mean():.1f} % of its picture")
     lines += [
         f"view        {view.camera} at {view.time_s:.2f} s: {view.psnr_db:.2f} dB, SSIM {view.ssim:.3f}"
         f"{', held out' if view.held_out else ''}"

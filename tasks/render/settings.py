@@ -215,7 +215,7 @@ class RenderSettings:
     gate: GateSettings = field(default_factory=GateSettings)  # what every rendered picture of a drive must come up to
     scene: SceneFrom = SceneFrom.FIT  # discs: built in one go, seconds a block; fit: then fitted to its photos, minutes
     scene_dtype: SceneDtype = constant(SceneDtype.FLOAT16)  # of scenes' files; float16: all but the places of Gaussians
-    own_body: str = ""  # folder of masks, <camera>.png, of what the rig sees of the ego itself
+    own_body: str = ""  # folder of masks, <camera>.png, of what the rig sees of the ego itself; empty: found; none
     rig: RigSettings = field(default_factory=RigSettings)  # whether cameras and poses are corrected first
     asset: AssetSettings = constant(DISCS)
     fit: FitSettings = field(default_factory=FitSettings)

@@ -260,5 +260,5 @@ def test_the_log_s_own_drive_alone_needs_no_candidates_and_no_block(small_town: 
     logged = work.reader.read(ref).ego_states[NOW : NOW + 1 + HORIZON_STEPS, :3]
     label = to_local(logged[0], logged[1:])  # to the last bit of a float32: no tracker drove it
     assert np.array_equal(np.float32(accepted.row["label_10hz"]), np.float32(label))  # type: ignore[arg-type]
-    assert "of `human` the log's" in COLUMNS["label_10hz"].about
+    assert "`human`: as logged" in COLUMNS["label_10hz"].about
     assert not list(tmp_path.rglob("block-*"))
