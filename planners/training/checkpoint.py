@@ -16,6 +16,7 @@ import hashlib
 import json
 import os
 import shutil
+import sys
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -73,7 +74,7 @@ def save_checkpoint(
         save_file(weights, unfinished / WEIGHTS)
         np.savez(unfinished / ARRAYS, **planner.arrays)  # type: ignore[arg-type]
         with (unfinished / TRAINING).open("wb") as file:  # by its path PyTorch writes itself, and says not what failed
-            torch.save(dict(training), file)
+            torch.save(_interned(training), file)
         files = {FILES: {name: _sha256(unfinished / name) for name in (WEIGHTS, ARRAYS, TRAINING)}}
         (unfinished / RECORD).write_text(json_with_checksum({**who, **record, **files}))
         shutil.rmtree(folder, ignore_errors=True)
@@ -83,6 +84,16 @@ def save_checkpoint(
         if old != stays and not (keep.every and int(old.name) % keep.every == 0):
             shutil.rmtree(old)
     return folder
+
+
+def _interned(value: Any) -> Any:
+    """The same with one string for all equal keys: pickle writes them by identity, which a checkpoint read back has not
+    as the one that it was written from, and a training that went on would end with other bytes."""
+    if isinstance(value, Mapping):
+        return {sys.intern(k) if isinstance(k, str) else k: _interned(of) for k, of in value.items()}
+    if type(value) in (list, tuple):
+        return type(value)(_interned(of) for of in value)
+    return value
 
 
 def best_checkpoint(out: Path, measure: str) -> Path | None:

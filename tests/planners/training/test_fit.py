@@ -95,6 +95,8 @@ def test_an_interrupted_training_resumes_to_the_identical_curve_and_weights(tmp_
     assert (out / VALIDATION).read_text() == (tmp_path / "whole" / VALIDATION).read_text()
     for name, value in whole.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
+    ends = [(newest_checkpoint(at) / "training.pt").read_bytes() for at in (tmp_path / "whole", out)]
+    assert ends[0] == ends[1], "to the byte: a copy is told by its checksum"
 
 
 def test_a_killed_training_repeats_what_came_after_its_last_checkpoint(tmp_path: Path) -> None:
