@@ -161,7 +161,7 @@ def test_a_sample_in_two_tables_is_named_with_both(out: str, tmp_path: Path) -> 
 def test_a_table_of_another_version_is_named(tmp_path: Path) -> None:
     write_table(tmp_path, [sample(0)])
     Store(tmp_path).samples.set_property("factory.schema_version", "1")
-    with pytest.raises(ValueError, match=f"{tmp_path}.*schema_version 1, this version reads and writes 5"):
+    with pytest.raises(ValueError, match=f"{tmp_path}.*schema_version 1, this version reads and writes 6"):
         open_data(DataSettings(real=str(tmp_path)))
 
 

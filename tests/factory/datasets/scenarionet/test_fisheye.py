@@ -9,7 +9,7 @@ import numpy as np
 
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.stages.scene_file import read_scene, write_scene
-from factory.stages.sensors import load_photos, resized_mask
+from factory.stages.sensors import load_photos, read_masks, resized_mask
 from factory.store.location import ClipCache, Location
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
@@ -75,7 +75,10 @@ def test_a_sidecar_says_so_and_photos_and_masks_come_out_straight(tmp_path: Path
     assert np.abs(photo.rgb.astype(int) - pattern(*pixels())).mean() < 2.5
     low = np.zeros((SIZE[1], SIZE[0]), bool)
     low[100:] = True
-    straight = resized_mask(low, clip.cameras[0], *SIZE)
+    (tmp_path / "masks").mkdir()
+    assert cv2.imwrite(str(tmp_path / "masks" / "front.png"), low.astype(np.uint8) * 255)
+    opened = read_masks(str(tmp_path / "masks"), clip.cameras)["front"]  # of photos as they are opened: straight
+    straight = resized_mask(opened, clip.cameras[0], *SIZE)
     assert straight[:, 78].sum() < low[:, 78].sum() and straight[:, 2].sum() < straight[:, 78].sum()
 
     cache = ClipCache(Location.parse(tmp_path / "cache"))
