@@ -1,13 +1,12 @@
 """What the cameras of a nuPlan rig see of their own car: by eye a strip of the flanks, a fender, a post."""
 
-import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from factory.stages.sensors import own_body_masks
-from tasks.world.clip import Camera, SensorFile
+from tasks.world.clip import SensorFile
+from tests.bench.bench_rig import read_block
 
 # Pixels (x, y as shares of the picture) that show the car, and the street close by.
 ON_THE_CAR = {
@@ -21,24 +20,9 @@ WITHOUT = {"CAM_L1", "CAM_B0"}
 MOST = 0.05  # of any picture
 
 
-def rig(shared_root: Path) -> tuple[list[Camera], list[SensorFile]]:
-    root = shared_root / "data" / "openscene_0101"
-    told = json.loads((root / "cameras.json").read_text())
-    cameras, files = [], []
-    for name, row in told["cameras"].items():
-        mount = np.eye(4)
-        mount[:3, :3], mount[:3, 3] = row["cam_to_ego"]["R"], row["cam_to_ego"]["t"]
-        arrays = np.array(row["K"], np.float64), np.array(row["dist_k1k2p1p2k3"], np.float64), mount
-        cameras.append(Camera(name, told["width"], told["height"], *arrays))
-        for k, frame in enumerate(told["frames"]):
-            path = root / f"frame_{frame['frame']}" / f"{name}.jpg"
-            files.append(SensorFile(name, str(path), 0.5 * k, np.array(frame["ego_to_world"])))
-    return cameras, files
-
-
 @pytest.mark.slow
 def test_the_own_car_is_found_and_nothing_of_the_street(shared_root: Path) -> None:
-    cameras, files = rig(shared_root)
+    cameras, files, _ = read_block(shared_root / "data" / "openscene_0101", ())
     found = own_body_masks("", files, cameras)
     for name, places in ON_THE_CAR.items():
         height, width = found[name].shape
@@ -51,6 +35,6 @@ def test_the_own_car_is_found_and_nothing_of_the_street(shared_root: Path) -> No
 @pytest.mark.slow
 def test_of_a_rig_that_stands_nothing_is_masked(shared_root: Path) -> None:
     """All keeps its place in each of its photos."""
-    cameras, files = rig(shared_root)
+    cameras, files, _ = read_block(shared_root / "data" / "openscene_0101", ())
     standing = [SensorFile(file.sensor, file.uri, file.time_s, files[0].world_from_ego) for file in files[:16]]
     assert own_body_masks("", standing, cameras[:1]) == {}
