@@ -25,7 +25,7 @@ from factory.readers.base import BadClip, ClipReader, ClipRef, Unreadable, paint
 from factory.stages.assets import running_fits
 from factory.stages.imaging import Imaging, scene_cache_counts
 from factory.stages.rows import label_columns, sample_row
-from factory.store.samples import MOST_RECORDS, CandidateRow
+from factory.store.samples import CAMERA_LEFT_OUT, MOST_RECORDS, CandidateRow
 from factory.store.schema import UNLISTED, RunIdentity
 from tasks.attempt import (
     ExpertGate,
@@ -83,6 +83,7 @@ class WholeClip:
     clip: Clip
     found: Perturbation | Rejected  # Rejected by render or perturb: no simulated expert has anything to try
     seconds: Mapping[str, float]  # by stage
+    cameras_left_out: tuple[str, ...] = field(default=(), kw_only=True)  # too poor in its block to be drawn
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -203,21 +204,27 @@ class FactoryWork:
     def _perturbed(self, clip: Clip, watch: Stopwatch) -> WholeClip:
         with watch.timing("render"):  # before perturb work is spent; without a gate only a block that will be needed
             asked = self.render.refuses_blocks or self._simulates
-            blocked = self.imaging.block_verdict(clip) if asked else None
+            block = self.imaging.block_verdict(clip) if asked else None
         self._refuse_another_policy()
         with watch.timing("perturb"):
             rng, starts = random_stream(self.seed, clip.clip_id, "perturb"), self.starts.get(clip.clip_id, NO_STARTS)
-            found = blocked or perturb(clip, self.vocabulary, self.perturb, self.traffic, self.pdm, rng, starts)
-        return WholeClip(clip, found, watch.seconds)
+            found: Perturbation | Rejected
+            if block is not None and block.fault is not None:
+                found = Rejected("render", "psnr", block.fault)
+            else:
+                found = perturb(clip, self.vocabulary, self.perturb, self.traffic, self.pdm, rng, starts)
+        left_out = tuple(block.left_out) if block is not None else ()
+        return WholeClip(clip, found, watch.seconds, cameras_left_out=left_out)
 
     def prepared_clip(self, ref: ClipRef, made: WholeClip) -> PreparedClip:
         """What attempts start from."""
         clip, found = without_sensors(made.clip), made.found
+        gates = found.counts if isinstance(found, Rejected) else found.gate_counts
         return PreparedClip(
             clip_id=clip.clip_id,
             content_digest=clip.content_digest,
             candidates=tuple(_candidate_row(index, candidate) for index, candidate in enumerate(made.candidates)),
-            gate_counts=found.counts if isinstance(found, Rejected) else found.gate_counts,
+            gate_counts={**gates, **{f"{CAMERA_LEFT_OUT}{name}": 1 for name in made.cameras_left_out}},
             payload=PerturbedClip(ref, clip, made.candidates),
             dropped=found if isinstance(found, Rejected) else None,
             seconds=made.seconds,
@@ -454,7 +461,7 @@ class BenchmarkWork(FactoryWork):
         if isinstance(before, Rejected):
             return before
         made = self._perturbed(clip, watch)
-        return WholeClipPair(made.clip, made.found, made.seconds, before)
+        return WholeClipPair(made.clip, made.found, made.seconds, before, cameras_left_out=made.cameras_left_out)
 
     def _earlier(self, ref: ClipRef, watch: Stopwatch) -> Clip | Rejected:
         earlier = _earlier_ref(ref)

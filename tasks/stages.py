@@ -45,7 +45,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("expert", 2, "attempt", ("no_plan", "out_of_reach")),
     Stage("reward", 2, "attempt", (*SUBSCORES, *END_FAULTS, NEAR_LOG, NOT_RECOVERED)),
     Stage("render", 13, "attempt", ("psnr", *PICTURE_FAULTS)),
-    Stage("write", 5, "attempt", ()),
+    Stage("write", 6, "attempt", ()),
 )
 
 

@@ -5,7 +5,7 @@ A human sample of a clip with photos keeps them, whatever its block. Every other
 Photos without lidar give coarse pictures, tagged `photos_only`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -28,13 +28,14 @@ from factory.stages.sensors import block_of, choose_cameras, encode_jpeg, files_
 from tasks.attempt import Judged
 from tasks.perturb import Candidate
 from tasks.render.gate import (
+    BlockVerdict,
     VehiclePhoto,
     VehiclePhotos,
-    block_fault,
     check_drive_pictures,
     estimate_fading,
     find_sightings,
     gate_picture_size,
+    judge_block,
     likeness_to_photo,
 )
 from tasks.render.scene.asset import RenderAsset
@@ -83,20 +84,18 @@ class Imaging:
         load_or_correct_rig(clip, self.settings, self.cache_dir)
         return said.exists() == before
 
-    def block_verdict(self, clip: Clip) -> Rejected | None:
-        """Build the clip's block, once, and say whether it is good enough to be rendered from.
+    def block_verdict(self, clip: Clip) -> BlockVerdict:
+        """Build the clip's block, once, and say what it is good for: `psnr_gate=mark` leaves nothing out.
 
         Raises BadClip for a broken sensor file.
         """
-        if self.settings.mode is not RenderMode.AUTO:
-            return None
+        fit_for_all = BlockVerdict({}, float("nan"), None)
+        if self.settings.mode is not RenderMode.AUTO or self.settings.psnr_gate is PsnrGate.MARK:
+            return fit_for_all
         if block_sensing(clip, self.settings) is Sensing.NOTHING:
-            return None
-        asset = _scene_of_block(clip, self.settings, self.cache_dir)
-        found = block_fault(asset, self.settings)
-        if found is not None and self.settings.psnr_gate is PsnrGate.REJECT:
-            return Rejected("render", "psnr", found)
-        return None
+            return fit_for_all
+        rig = choose_cameras(clip.cameras, self.settings.cameras)
+        return judge_block(_scene_of_block(clip, self.settings, self.cache_dir), rig, self.settings)
 
     def pictures(self, clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[str, object]:
         """The image columns of a sample, the `tags` they add to its own, and heights as its pictures show them.
@@ -119,10 +118,15 @@ class Imaging:
         if made_of is Sensing.NOTHING:
             return NO_IMAGES
         asset = scene_in_clip_time(clip, _scene_of_block(clip, self.settings, self.cache_dir))
-        tags = [PHOTOS_ONLY] if made_of is Sensing.PHOTOS_ONLY else []
-        if block_fault(asset, self.settings) is not None:
-            tags.append(LOW_PSNR)
-        return self._drawn(clip, judged, asset, asset.as_corrected(cameras)) | {"tags": tags}
+        tags, said = [PHOTOS_ONLY] if made_of is Sensing.PHOTOS_ONLY else [], judge_block(asset, cameras, self.settings)
+        if self.settings.psnr_gate is PsnrGate.MARK:
+            if said.fault is not None or said.left_out:
+                tags.append(LOW_PSNR)
+            said = BlockVerdict({}, asset.psnr_db, None)
+        drawn = self._drawn(clip, judged, asset, asset.as_corrected(cameras), tuple(said.left_out))
+        psnr = said.psnr_db if np.isfinite(said.psnr_db) else None
+        left_out = [{"camera": name, "why": why} for name, why in said.left_out.items()]
+        return drawn | {"tags": tags, "psnr": psnr, "cameras_left_out": left_out}
 
     def unfit(self, clip: Clip, candidate: Candidate, judged: Judged, shared: Sequence[int] = ()) -> Rejected | None:
         """Why a simulated drive cannot be shown: what `tasks.render.gate` finds on its pictures from T to T+2H.
@@ -136,6 +140,8 @@ class Imaging:
         if block_sensing(clip, self.settings) is Sensing.NOTHING:
             return None
         start, now = candidate.rollout.start_step, judged.scene.step
+        rig = choose_cameras(clip.cameras, self.settings.cameras)
+        left_out = self.block_verdict(clip).left_out
         steps: Sequence[int] = range(start, now + HORIZON_STEPS + 1, GATE_STRIDE)
         stored = sorted({at + offset for at in shared or (now,) for offset in STEPS_OF[self.settings.frames]})
         if shared:
@@ -147,7 +153,7 @@ class Imaging:
         agents = judged.scene.agents.overwritten(now, judged.rollout.agents)
         return check_drive_pictures(
             asset,
-            asset.as_corrected(choose_cameras(clip.cameras, self.settings.cameras)),
+            asset.as_corrected([camera for camera in rig if camera.name not in left_out]),
             pose_on_ground(asset.on_road(clip.world_from_ego), states[[step - start for step in steps]]),
             asset.lifted(agents, clip_offset_s(clip)),
             steps,
@@ -164,8 +170,14 @@ class Imaging:
         return driven[[offset + NOW for offset in STEPS_OF[self.settings.frames]]]
 
     def _drawn(
-        self, clip: Clip, judged: Judged, asset: RenderAsset | None, cameras: Sequence[Camera]
+        self,
+        clip: Clip,
+        judged: Judged,
+        asset: RenderAsset | None,
+        rig: Sequence[Camera],
+        left_out: Collection[str] = (),
     ) -> dict[str, object]:
+        cameras = [camera for camera in rig if camera.name not in left_out]
         scene, rollout = judged.scene, judged.rollout
         offsets = STEPS_OF[self.settings.frames]
         logged = clip.world_from_ego if asset is None else asset.on_road(clip.world_from_ego)
@@ -186,10 +198,10 @@ class Imaging:
         source = ImageSource.MAP if asset is None else ImageSource.RENDER
         measured: dict[str, object] = {}
         if asset is not None:
-            measured = {"asset_digest": asset.digest, "psnr": asset.psnr_db if np.isfinite(asset.psnr_db) else None}
+            measured = {"asset_digest": asset.digest}
             if asset.taken:
                 measured |= height_columns(scene, asset.on_road(logged), lifted)
-        return {"cameras": self.rig(cameras), "images": found, "image_source": str(source), **measured}
+        return {"cameras": self.rig(rig), "images": found, "image_source": str(source), **measured}
 
     def _painted(self, clip: Clip, judged: Judged) -> dict[str, object]:
         assert self.painter is not None, "render.mode=painter goes with a reader that has one"

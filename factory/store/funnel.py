@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from factory.store.samples import MADE_UNDER, Kind, Store, plans_of, run_number_lookup
+from factory.store.samples import CAMERA_LEFT_OUT, MADE_UNDER, Kind, Store, plans_of, run_number_lookup
 from factory.store.table import Codes, Ints, distinct_texts, text_codes
 from tasks.stages import ATTEMPT, STAGES, TASKS
 from tasks.world.repair.records import RepairCount, counts_text
@@ -366,6 +366,13 @@ class Funnel:
     exhausted: Mapping[str, int]  # expert -> walks that came to the end of their list
     balance: BalanceSheet  # of what was planned
     repaired: Repaired
+    cameras_left_out: Mapping[str, int] = field(default_factory=dict)  # too poor in their block -> clips
+
+    @property
+    def cameras_text(self) -> str:
+        """One line, empty where none is: `cameras too poor in their block, left out: CAM_R1 in 12 clips`."""
+        each = ", ".join(f"{name} in {n:,} clip{'s' * (n != 1)}" for name, n in self.cameras_left_out.items())
+        return f"cameras too poor in their block, left out: {each}" if each else ""
 
     def text(self, width: int = 120) -> str:
         """The funnel as a table for a terminal."""
@@ -378,8 +385,8 @@ class Funnel:
         ):
             if counts:
                 head += f"\n{title}: " + ", ".join(f"{name} {n}" for name, n in counts.items())
-        if self.repaired.clips:
-            head += f"\n{self.repaired.text}"
+        for line in filter(None, (self.cameras_text, self.repaired.text)):
+            head += f"\n{line}"
         table = Table(
             "expert",
             "round",
@@ -436,6 +443,8 @@ def funnel_of_tables(
     if "" in attempts.experts:
         whole = attempts.why[attempts.expert == attempts.experts.index("")]
         of_clips = np.bincount(whole, minlength=len(attempts.whys))
+    gates = _gates(lists["gate_counts"])
+    cameras = [gate for gate in gates if gate.startswith(CAMERA_LEFT_OUT)]
     empty = lists.select(["stage", "reason"]).filter(pc.not_equal(lists["reason"], "")).unify_dictionaries()
     without = empty.group_by(["stage", "reason"]).aggregate([([], "count_all")])
     return Funnel(
@@ -447,7 +456,8 @@ def funnel_of_tables(
             {f"{row['stage']}.{row['reason']}": row["count_all"] for row in without.to_pylist()}
         ),
         clip_outcomes=_sorted_counts(dict(zip(attempts.whys, of_clips.tolist()))),
-        gates=_gates(lists["gate_counts"]),
+        cameras_left_out={gate.removeprefix(CAMERA_LEFT_OUT): gates.pop(gate) for gate in sorted(cameras)},
+        gates=gates,
         candidates=pc.sum(lists["n_candidates"]).as_py() or 0,
         exhausted={name: n for name, n in zip(attempts.experts, exhausted.tolist()) if n},
         balance=balance_sheet(plans, attempts, lists),

@@ -136,6 +136,7 @@ class ClipCandidates:
     repair_records: tuple[Repair, ...] = ()  # one by one, the first MOST_RECORDS
 
 
+CAMERA_LEFT_OUT = "camera "  # with its name a key of gate_counts, 1 where the clip's block shows it too poorly
 MOST_RECORDS = 200  # of a clip; some 10 kB
 
 

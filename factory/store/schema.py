@@ -266,7 +266,7 @@ def attempt_id(clip_id: str, candidate: int, vocabulary_digest: str, expert: str
 # `now` is T+H for simulated rows and T for `human` rows. Ego poses are rear-axle. Timings are not here: a row's bytes
 # do not depend on when or where it was made.
 
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 MAP_RADIUS_M = 64.0
 AGENT_STEPS = 56  # -1.5 .. 4.0 s at 10 Hz; index 15 is now
 NOW_INDEX = 15
@@ -395,11 +395,22 @@ def _sensors() -> tuple[Column, ...]:
         Column("ego_pose", "float64", (16,), "m", WORLD, "4x4, ego at this time"),
         Column("jpeg", "binary"),
     )
+    left_out = Column("camera", "string"), Column("why", "string", about="PSNR of its held-out photos, and the bound")
     return (
         Column("cameras", "struct", ("C",), about="rig; null where there is none", nullable=True, members=camera),
         Column("images", "struct", ("I",), about="null: image_source is none", nullable=True, members=image),
         Column("image_source", "string", about="photo, render, map, painter or none"),
-        Column("psnr", "float64", unit="dB", about="of the block's reconstruction", nullable=True),
+        Column(
+            "cameras_left_out",
+            "struct",
+            ("L",),
+            about="of the rig, too poor in its block to be drawn; null: drawn from no block",
+            nullable=True,
+            members=left_out,
+        ),
+        Column(
+            "psnr", "float64", unit="dB", about="of the block's cameras that are drawn, held-out photos", nullable=True
+        ),
         Column("asset_digest", "string", about="of the reconstruction the images were rendered from", nullable=True),
         Column("tags", "string", ("T",), about="what is in the scene"),
     )

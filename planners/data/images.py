@@ -43,9 +43,9 @@ from factory.readers.pictures import jpeg_size
 from factory.store.reader import TIME_TOLERANCE_S
 from planners.data.batch import ImageLayout
 from tasks.world.arrays import Array, Bytes
+from tasks.world.clip import front_camera
 
 SAME_YAW = math.radians(5.0)  # cameras of a stereo pair are no neighbours
-AS_GOOD = math.radians(2.0)  # of cameras that look ahead equally well the first by name is the front one
 FACTORS = (1, 2, 4, 8)  # by which a JPEG can be decoded smaller, without its finer waves
 _THREAD = local()  # what each thread decodes into, so that memory is asked for once
 
@@ -83,10 +83,8 @@ def chosen_cameras(names: Sequence[str], axes: Array, layout: ImageLayout) -> tu
         return layout.cameras
     yaw = dict(zip(names, np.arctan2(axes[:, 1], axes[:, 0]).tolist()))
     ahead = {name: angle for name, angle in yaw.items() if abs(angle) < math.pi / 2}
-    if not ahead:
+    if (front := front_camera(names, axes)) is None:
         raise ValueError(f"no camera looks ahead; there are {sorted(names)}")
-    best = min(map(abs, ahead.values()))
-    front = min(name for name, angle in ahead.items() if abs(angle) <= best + AS_GOOD)
     left = {name: angle for name, angle in ahead.items() if angle > ahead[front] + SAME_YAW}
     right = {name: -angle for name, angle in ahead.items() if angle < ahead[front] - SAME_YAW}
     return (*_nearest(left), front, *_nearest(right))

@@ -6,6 +6,7 @@ is what a planner's needs make of it.
 """
 
 import hashlib
+import logging
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -27,6 +28,8 @@ from planners.data.images import chosen_cameras
 from planners.data.mix import MixSettings, OrderInputs, check_sides
 from tasks.settings import constant
 from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
+
+log = logging.getLogger(__name__)
 
 HUMAN = "human"
 INDEX_COLUMNS = ("attempt_id", "clip_id", "settings_hash", "stage_versions", "image_source", "psnr", "label_vocabulary")
@@ -277,6 +280,7 @@ def _shuffled_places(names: Sequence[str], seed: int) -> list[int]:
 
 
 PLAN_COLUMNS = ("command", "ego_status", "ego_history_2hz", "label_2hz", "label_10hz")
+PICTURE_COLUMNS = ("cameras.name", "cameras.ego_from_camera", "images.camera", "images.time_s", "cameras_left_out")
 IMAGE_COLUMNS = ("images.camera", "images.time_s", "images.jpeg")
 AGENT_COLUMNS = ("agent_kinds", "agent_boxes", "agent_valid")
 BEV_COLUMNS = (
@@ -324,15 +328,31 @@ def make_feed(dataset: Dataset, needs: Needs) -> Feed:
     numbers = np.unique(dataset.rows.file)
     with ThreadPoolExecutor(OPEN_FILES) as pool:
         parts = list(pool.map(lambda number: _file_part(dataset, needs, columns, number), numbers))
-    cameras: list[tuple[str, ...]] = [()] * len(dataset)
+    cameras: list[tuple[str, ...] | None] = [()] * len(dataset)
     size = np.zeros(len(dataset), np.int64)
     for here, names, sizes in parts:
         size[here] = sizes
         for sample, chosen in zip(here.tolist(), names):
             cameras[sample] = chosen
+    seen = np.flatnonzero([chosen is not None for chosen in cameras])
+    if len(seen) < len(dataset):
+        dataset, size = _without_unseen(dataset, seen), size[seen]
     if needs.bev is not None:
         size += math.prod((len(needs.bev.times_s), *needs.bev.shape))  # its raster is kept beside it
-    return Feed(dataset, needs, columns, tuple(cameras), size)
+    return Feed(dataset, needs, columns, tuple(chosen for chosen in cameras if chosen is not None), size)
+
+
+def _without_unseen(dataset: Dataset, seen: Ints) -> Dataset:
+    """The samples of which every camera of the picture was drawn; how many were not is told.
+
+    Raises ValueError where none is left.
+    """
+    said = f"{len(dataset) - len(seen)} of {len(dataset)} samples: their block shows a camera of the picture too poorly"
+    how = "planner.settings.image.cameras=[...] names others, a table of render.camera_psnr_min=0 has all"
+    if len(seen) == 0:
+        raise ValueError(f"{said} (cameras_left_out): {how}")
+    log.warning("left out %s (cameras_left_out); %s", said, how)
+    return replace(dataset, rows=dataset.rows.select(seen))
 
 
 def order_inputs(feed: Feed) -> OrderInputs:
@@ -369,22 +389,22 @@ def _and_more(samples: Ints) -> str:
 
 def _file_part(
     dataset: Dataset, needs: Needs, columns: Sequence[str], number: int
-) -> tuple[Ints, list[tuple[str, ...]], Ints]:
-    """Of one file the places in the dataset of its samples, their cameras and their sizes."""
+) -> tuple[Ints, list[tuple[str, ...] | None], Ints]:
+    """Of one file the places in the dataset of its samples, their cameras (see `_cameras`) and their sizes."""
     here = np.flatnonzero(dataset.rows.file == number)
     parquet = dataset.files[number].open()
     rows, groups = row_group_sizes(parquet), dataset.rows.group[here]
     kept = np.ones((len(rows), len(columns)))  # share of a column's bytes
-    cameras: list[tuple[str, ...]] = [()] * len(here)
+    cameras: list[tuple[str, ...] | None] = [()] * len(here)
     if needs.image is not None:
         places = (np.cumsum(rows) - rows)[groups] + dataset.rows.place[here]
-        members = leaf_paths(parquet, ["cameras.name", "cameras.ego_from_camera", "images.camera", "images.time_s"])
+        members = leaf_paths(parquet, PICTURE_COLUMNS)
         with raising_damaged_file(dataset.files[number].where):
             seen = read_all(parquet, members)
         cameras = _cameras(dataset, here, seen, places, needs.image)
         stored = np.add.reduceat(np.diff(_list(seen, "images").offsets.to_numpy()), np.cumsum(rows) - rows)
         share = rows / np.maximum(np.bincount(groups, minlength=len(rows)), 1)
-        wanted = share * np.bincount(groups, weights=[len(names) for names in cameras], minlength=len(rows))
+        wanted = share * np.bincount(groups, weights=[len(names or ()) for names in cameras], minlength=len(rows))
         kept[:, list(columns).index("images.jpeg")] = wanted / np.maximum(stored, 1)
     sizes = (group_bytes(parquet, columns) * kept).sum(axis=1) / rows
     return here, cameras, np.ceil(sizes[groups]).astype(np.int64)
@@ -392,16 +412,20 @@ def _file_part(
 
 def _cameras(
     dataset: Dataset, samples: Ints, seen: pa.Table, places: Ints, layout: ImageLayout
-) -> list[tuple[str, ...]]:
-    """The cameras of each sample's picture. Raises ValueError where it has none, or no image of one at now."""
+) -> list[tuple[str, ...] | None]:
+    """The cameras of each sample's picture; None where the row says that one of them was left out.
+
+    Raises ValueError where it has none, or no image of one at now.
+    """
     rig, images = _list(seen, "cameras"), _list(seen, "images")
     names = rig.values.field("name").to_pylist()
     axes = rig.values.field("ego_from_camera").flatten().to_numpy().reshape(-1, 4, 4)[:, :2, 2]
     taken_by = images.values.field("camera").to_pylist()
     at_now = np.abs(images.values.field("time_s").to_numpy()) <= TIME_TOLERANCE_S
     rig_at, images_at = rig.offsets.to_numpy(), images.offsets.to_numpy()
+    left_out = seen["cameras_left_out"].to_pylist()
     known: dict[tuple[tuple[str, ...], bytes], tuple[str, ...]] = {}
-    found = []
+    found: list[tuple[str, ...] | None] = []
     for sample, place in zip(samples, places):
         there = slice(rig_at[place], rig_at[place + 1])
         key = tuple(names[there]), axes[there].tobytes()
@@ -410,7 +434,11 @@ def _cameras(
                 known[key] = chosen_cameras(key[0], axes[there], layout)
             start, stop = images_at[place], images_at[place + 1]
             have = {taken_by[i] for i in range(start, stop) if at_now[i]}
-            if missing := [name for name in known[key] if name not in have]:
+            missing = [name for name in known[key] if name not in have]
+            if missing and {*missing} <= {one["camera"] for one in left_out[place] or ()}:
+                found.append(None)
+                continue
+            if missing:
                 raise ValueError(f"no image of camera {', '.join(missing)} at now; there are {sorted(have)}")
         except ValueError as error:
             raise ValueError(f"{dataset.name(sample)}: {error}") from error

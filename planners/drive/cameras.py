@@ -15,7 +15,7 @@ from factory.stages.rows import scene_columns
 from factory.stages.sensors import choose_cameras
 from factory.store.reader import Sample
 from factory.store.schema import COLUMNS
-from tasks.render.gate import block_fault
+from tasks.render.gate import judge_block
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderSettings
 from tasks.render.views import render_views
@@ -181,9 +181,8 @@ def open_rendered_cameras(clip: Clip, settings: RenderSettings, cache_dir: str) 
     built = load_or_build_scene(clip, settings, cache_dir)
     if built is None:
         raise BadClip(f"log {clip.log_id}", "cameras", "no photos and no lidar to build a scene from: pictures=none")
-    if settings.psnr_gate is PsnrGate.REJECT and (why := block_fault(built, settings)) is not None:
+    rig = choose_cameras(clip.cameras, settings.cameras)
+    if settings.psnr_gate is PsnrGate.REJECT and (why := judge_block(built, rig, settings).fault) is not None:
         raise BadClip(f"log {clip.log_id}", "scene", f"{why}; render.psnr_gate=mark drives in it all the same")
     asset = scene_in_clip_time(clip, built)
-    return RenderedCameras(
-        clip, settings, asset, tuple(asset.as_corrected(choose_cameras(clip.cameras, settings.cameras)))
-    )
+    return RenderedCameras(clip, settings, asset, tuple(asset.as_corrected(rig)))

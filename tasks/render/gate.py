@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from tasks.render.scene.asset import OwnBody, RenderAsset, camera_psnr_db, compose_gaussians
+from tasks.render.scene.asset import OwnBody, RenderAsset, camera_psnr_db, compose_gaussians, mean_psnr_db
 from tasks.render.scene.engine import Backend, PlacedAgents, agents_at_time, render
 from tasks.render.scene.movers import BEYOND_M, behind_boxes, boxes_at, world_from_boxes
 from tasks.render.scene.sensed import Photo
@@ -25,7 +25,7 @@ from tasks.render.splatting.gaussians import Gaussians, rotations_of
 from tasks.render.splatting.raster import View
 from tasks.stages import Rejected
 from tasks.world.arrays import F32, Array, Bools, Bytes, Ints
-from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Camera, Pinhole, SensorFile
+from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Camera, Pinhole, SensorFile, front_camera
 
 # How like its photos a vehicle near the camera looks, judged by the photo that was taken from nearest to here.
 #
@@ -530,20 +530,40 @@ def _on_the_lens(scene: Gaussians, eye: Array) -> Gaussians:
 # PSNR depends on that size: fine texture, which no scene has in full, is averaged away in small pictures.
 
 
-def block_fault(asset: RenderAsset, settings: RenderSettings) -> str | None:
-    """In what a block does not come up to `psnr_min` and, camera by camera, `camera_psnr_min`.
+@dataclass(frozen=True)
+class BlockVerdict:
+    """What a block is good for."""
 
-    None where it does, where nothing was held out, and where `psnr_min` is 0: then any block will do.
+    left_out: Mapping[str, str]  # cameras that come out too poor to be drawn, and how poor
+    psnr_db: float  # of the held-out photos of the others; NaN where none was held out
+    fault: str | None  # why nothing is drawn from it
+
+
+def judge_block(asset: RenderAsset, rig: Sequence[Camera], settings: RenderSettings) -> BlockVerdict:
+    """A camera below `camera_psnr_min` is left out. Nothing is drawn where that is the one that looks ahead or one that
+    was asked for by name, or where the others come out below `psnr_min`.
+
+    rig: the cameras that are to be drawn. Where nothing was held out nothing is known, and where `psnr_min` is 0 any
+    block will do.
     """
     if settings.psnr_min == 0.0:
-        return None
-    photos = f"{asset.n_held_out} held-out photos at {settings.width}x{settings.height}"
-    if asset.psnr_db < settings.psnr_min:
-        return f"block at {asset.psnr_db:.2f} dB over {photos}, below {settings.psnr_min:g}"
-    cameras = camera_psnr_db(asset)
-    below = sorted((value, name) for name, value in cameras.items() if value < settings.camera_psnr_min)
-    if below:
-        value, name = below[0]
-        like = f"{settings.camera_psnr_min:g} like {len(below)} of {len(cameras)} cameras"
-        return f"{name} at {value:.2f} dB, below {like}; block at {asset.psnr_db:.2f} dB over {photos}"
-    return None
+        return BlockVerdict({}, asset.psnr_db, None)
+    known = camera_psnr_db(asset)
+    poor = {c.name: known[c.name] for c in rig if known.get(c.name, np.inf) < settings.camera_psnr_min}
+    bound, size = f"below {settings.camera_psnr_min:g}", f"{settings.width}x{settings.height}"
+    left_out = {name: f"{value:.2f} dB, {bound}" for name, value in poor.items()}
+    held_out = [view for view in asset.views if view.held_out and view.camera not in poor]
+    psnr_db = mean_psnr_db(held_out) if poor else asset.psnr_db
+    axes = np.array([camera.ego_from_camera[:2, 2] for camera in rig]).reshape(-1, 2)
+    front = front_camera([camera.name for camera in rig], axes)
+    needed = [name for name in poor if name == front or name in settings.cameras]
+    fault = None
+    if needed or (poor and len(poor) == len(rig)):
+        name = min(needed or poor, key=lambda name: poor[name])
+        others = f" like {len(poor)} of {len(rig)} cameras" if len(rig) > 1 else ""
+        fault = f"{name} at {left_out[name]}{others}; {asset.n_held_out} held-out photos at {size}"
+    elif psnr_db < settings.psnr_min:
+        without = f" of {len(rig) - len(poor)} of {len(rig)} cameras" if poor else ""
+        fault = f"block at {psnr_db:.2f} dB over {len(held_out) or asset.n_held_out} held-out photos{without} at {size}"
+        fault += f", below {settings.psnr_min:g}"
+    return BlockVerdict(left_out, psnr_db, fault)

@@ -209,9 +209,9 @@ class RenderSettings:
     width: int = 320  # pixels
     height: int = 180  # pixels
     jpeg_quality: int = 90  # 1 to 100
-    psnr_min: float = 27.0  # [dB] what a block's held-out photos must come out with; 0: anything
-    camera_psnr_min: float = 20.0  # [dB] and those of each of its cameras; 0: anything
-    psnr_gate: PsnrGate = PsnrGate.REJECT  # what becomes of a block below psnr_min
+    camera_psnr_min: float = 20.0  # [dB] a camera whose held-out photos come out worse is left out; 0: none
+    psnr_min: float = 24.0  # [dB] what those of the others must come out with, else the block is refused; 0: anything
+    psnr_gate: PsnrGate = PsnrGate.REJECT  # what becomes of a block that comes up to neither
     gate: GateSettings = field(default_factory=GateSettings)  # what every rendered picture of a drive must come up to
     scene: SceneFrom = SceneFrom.FIT  # discs: built in one go, seconds a block; fit: then fitted to its photos, minutes
     scene_dtype: SceneDtype = constant(SceneDtype.FLOAT16)  # of scenes' files; float16: all but the places of Gaussians

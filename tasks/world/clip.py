@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -135,6 +136,17 @@ class Camera:
         cut = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top], [0.0, 0.0, 1.0]])
         scale = np.diag([width / w, height / h, 1.0])
         return Camera(self.name, width, height, scale @ cut @ self.intrinsics, self.distortion, self.ego_from_camera)
+
+
+AS_STRAIGHT = math.radians(2.0)  # of cameras that look ahead equally well the first by name is the front one
+
+
+def front_camera(names: Sequence[str], axes: Array) -> str | None:
+    """The camera whose optical axis is nearest to ahead; None where none looks ahead. axes: (C, 2) x, y, ego frame."""
+    off = np.abs(np.arctan2(axes[:, 1], axes[:, 0])).tolist()
+    ahead = [(name, angle) for name, angle in zip(names, off) if angle < math.pi / 2]
+    best = min((angle for _, angle in ahead), default=0.0)
+    return min((name for name, angle in ahead if angle <= best + AS_STRAIGHT), default=None)
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,7 @@ def overview(shot: Snapshot, where: str, now_s: float) -> Json:
             "sample_bytes": shot.sample_bytes,
         },
         "facts": _facts(shot),
+        "cameras_left_out": funnel.cameras_text,  # empty: none was
         "repaired": funnel.repaired.text,  # empty: nothing was
         "notes": [] if shot.run.goes_on else [*filter(None, [last.get("message")]), *last.get("notes", [])],
         "steps": _steps(funnel),

@@ -62,6 +62,7 @@ def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:
         "render.width=320 (1920)",
         "render.height=180 (1080)",
         "render.camera_psnr_min=20.0 (0.0)",
+        "render.psnr_min=24.0 (27.0)",
         "render.gate.enabled=True (False)",
     ]
     said = paper_deviations_line(config, choose_vocabulary(config.vocabulary), {"recovery": 8192, "mine": 103_288})

@@ -112,7 +112,7 @@ GOLDEN: dict[str, Golden] = {
         tolerance=1e-3,
     ),
     "write": Golden(
-        5,
+        6,
         {
             "simulated": (492.8868, 15.6325),
             "simulated text": (3059.41967, -31.4213067),
@@ -121,7 +121,7 @@ GOLDEN: dict[str, Golden] = {
             "label_subscores": (549.77183, 63.7185064),
             "label_progress": (478.196993, -18.9944372),
             "labels text": (947.357383, -11.9462762),
-            "schema": (5595.79828, -18.1599904),
+            "schema": (5647.78648, -17.9900049),
         },
     ),
 }

@@ -9,13 +9,17 @@ import numpy as np
 import pytest
 
 from factory.config.run import load_config
+from factory.datasets.town.reader import SyntheticReader
+from factory.datasets.town.settings import TownSettings
 from factory.graph.steps import HUMAN_CANDIDATE, PreparedClip, RejectedAttempt, SampleColumns, run_attempt
 from factory.pipeline import FactoryWork, WholeClip
-from factory.readers.base import BadClip
+from factory.readers.base import BadClip, read_clip
 from factory.setup.settings import assemble, run_identity
+from factory.stages.assets import load_or_build_scene
 from factory.store.schema import COLUMNS, UNLISTED
 from tasks import stages
 from tasks.perturb import Perturbation, perturb
+from tasks.render.scene.asset import camera_psnr_db
 from tasks.stages import HUMAN, HUMAN_BEFORE
 from tasks.world.clip import HORIZON_STEPS, NOW, random_stream
 from tasks.world.frames import to_local
@@ -69,6 +73,30 @@ def test_a_marked_block_keeps_its_candidates_and_tags_its_samples(small_town: Pa
     assert marked.row["image_source"] == "render" and "low_psnr" in marked.row["tags"]  # type: ignore[operator]
     human = run_attempt(work, prepared, HUMAN_CANDIDATE, HUMAN)
     assert isinstance(human, SampleColumns) and "low_psnr" not in human.row["tags"]  # type: ignore[operator]
+
+
+@pytest.mark.slow
+def test_a_camera_too_poor_is_left_out_of_what_is_drawn_and_the_human_s_photos_are_all_there(tmp_path: Path) -> None:
+    cameras = ("ring_front_center", "ring_front_left")
+    town = SyntheticReader(tmp_path / "town", 1, 0, TownSettings(cameras, 64, 36, lidar_beams=32, lidar_azimuths=300))
+    town.index()
+    work = work_on(town.root, tmp_path)
+    clip = read_clip(work.reader, work.reader.index().refs[0])
+    asset = load_or_build_scene(clip, work.render, tmp_path / "cache")
+    assert asset is not None
+    front, left = (camera_psnr_db(asset)[name] for name in cameras)
+    assert left < front, "a street whose side is the harder"
+    between = (front + left) / 2.0
+    work = work_on(town.root, tmp_path, "render.psnr_min=1", f"render.camera_psnr_min={between}")
+    prepared = prepared_by(work)
+    assert prepared.gate_counts["camera ring_front_left"] == 1 and prepared.dropped is None
+    drawn, human = first_sample(work, prepared).row, run_attempt(work, prepared, HUMAN_CANDIDATE, HUMAN)
+    assert isinstance(human, SampleColumns)
+    assert drawn["cameras_left_out"] == [{"camera": "ring_front_left", "why": f"{left:.2f} dB, below {between:g}"}]
+    assert drawn["psnr"] == pytest.approx(front)
+    for row, seen in ((drawn, {"ring_front_center"}), (human.row, set(cameras))):
+        assert {camera["name"] for camera in row["cameras"]} == set(cameras)  # type: ignore[attr-defined]
+        assert {image["camera"] for image in row["images"]} == seen  # type: ignore[attr-defined]
 
 
 @pytest.mark.slow

@@ -64,7 +64,7 @@ def test_the_tables_metadata_names_version_and_licences_those_of_later_commits_t
     properties = Store(tmp_path).samples.properties
     named = set(properties["factory.licences"].split("; "))
     assert named == set(SampleTable(tmp_path).table(["licence"])["licence"].to_pylist()) and len(named) > 1
-    assert properties["factory.schema_version"] == "6"
+    assert properties["factory.schema_version"] == "7"
 
 
 def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_tables_of_another_version_are_refused_in_one_line_and_left_as_they_are(
         assert dispatch([name, where, *more], COMMANDS, "") == BAD_CONFIG, name
         (line,) = capsys.readouterr().err.splitlines()
         assert line == (
-            f"error: {tmp_path}: schema_version 4, this version reads and writes 6: make the tables again, "
+            f"error: {tmp_path}: schema_version 4, this version reads and writes 7: make the tables again, "
             "by the command that made them with another out="
         )
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before

@@ -161,7 +161,7 @@ def test_a_sample_in_two_tables_is_named_with_both(out: str, tmp_path: Path) -> 
 def test_a_table_of_another_version_is_named(tmp_path: Path) -> None:
     write_table(tmp_path, [sample(0)])
     Store(tmp_path).samples.set_property("factory.schema_version", "1")
-    with pytest.raises(ValueError, match=f"{tmp_path}.*schema_version 1, this version reads and writes 6"):
+    with pytest.raises(ValueError, match=f"{tmp_path}.*schema_version 1, this version reads and writes 7"):
         open_data(DataSettings(real=str(tmp_path)))
 
 
@@ -184,6 +184,26 @@ def test_cameras_that_are_missing_are_refused_by_name(tmp_path: Path) -> None:
         make_feed(data, Needs(image=ImageLayout(cameras=("rear",))))
     rigs = make_feed(data, Needs(image=ImageLayout(cameras=("front",)))).cameras
     assert rigs == (("front",), ("front",))
+
+
+def test_samples_without_a_wanted_camera_that_was_too_poor_are_left_out_and_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    views = dict.fromkeys(FRONT_YAWS, jpeg(plain((1, 2, 3))))
+    rig = pictures(views)
+    without = rig | {
+        "images": [image for image in rig["images"] if image["camera"] != "right"],
+        "cameras_left_out": [{"camera": "right", "why": "19.30 dB, below 20"}],
+    }
+    write_table(tmp_path, [sample(0, **rig), sample(1, **without)])
+    data = open_data(DataSettings(real=str(tmp_path)))
+    feed = make_feed(data, PICTURE)
+    assert feed.dataset.rows.attempt_id.tolist() == ["attempt00000"] and len(feed.cameras) == len(feed.size) == 1
+    assert "left out 1 of 2 samples: their block shows a camera of the picture too poorly" in caplog.text
+    assert len(make_feed(data, Needs(image=ImageLayout(cameras=("front",)))).cameras) == 2
+    with pytest.raises(ValueError, match=r"2 of 2 samples: .* planner.settings.image\.cameras=\[\.\.\.\] names others"):
+        write_table(tmp_path / "poor", [sample(0, **without), sample(1, **without)])
+        make_feed(open_data(DataSettings(real=str(tmp_path / "poor"))), PICTURE)
 
 
 def test_labels_that_are_missing_or_of_another_vocabulary_are_refused_by_name(tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ function header(o) {
   return h("header", null, h("div", null, h("h1", null, o.where.split("/").filter(Boolean).pop()), state), h("p", { class: "path" }, o.where),
     h("div", { class: "tiles" }, tiles),
     s.live && p.planned ? bar(1 - p.pending / p.planned, planned) : p.planned ? h("p", { class: "note" }, planned) : null,
+    o.cameras_left_out ? h("p", { class: "note", "data-cameras-left-out": "" }, o.cameras_left_out) : null,
     o.repaired ? h("p", { class: "note", "data-repaired": "" }, `logs: ${o.repaired}`) : null,
     s.live && !s.left ? h("p", { class: "note" }, s.detail) : null, o.notes.map((note) => h("p", { class: "note" }, note)));
 }
