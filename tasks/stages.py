@@ -36,7 +36,7 @@ HUMAN_BEFORE, FOLLOW_UP, FOLLOW_UP_BEFORE = FRAMES = ("human_before", "follow_up
 END_FAULTS = ("off_route", "after")  # of a drive that reaches every sub-score: what its end leads to (tasks.attempt)
 NEAR_LOG = "near_log"  # a drive that passes all else and is the log's own
 NOT_RECOVERED = "not_recovered"  # a drive that passes all else and ends too far from where its plan was to end
-PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred", "unlike_photos")  # tasks.render.gate
+PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred", "guessed", "unlike_photos")  # tasks.render.gate
 
 STAGES: tuple[Stage, ...] = (
     Stage("clip", 5, "clip", ("ego_standing", "broken_tracks", "route_ended", "no_earlier_frame")),
@@ -44,7 +44,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("rollout", 4, "attempt", ("route_ended",)),
     Stage("expert", 2, "attempt", ("no_plan", "out_of_reach")),
     Stage("reward", 2, "attempt", (*SUBSCORES, *END_FAULTS, NEAR_LOG, NOT_RECOVERED)),
-    Stage("render", 13, "attempt", ("psnr", *PICTURE_FAULTS)),
+    Stage("render", 14, "attempt", ("psnr", *PICTURE_FAULTS)),
     Stage("write", 6, "attempt", ()),
 )
 

@@ -41,6 +41,7 @@ from tasks.render.gate import (
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import agents_at_time
 from tasks.render.scene.sensed import Photo
+from tasks.render.seen import PhotoSights, photo_sights
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
 from tasks.render.views import MAP_RIG, draw_map_views, render_views
 from tasks.stages import Rejected
@@ -146,8 +147,9 @@ class Imaging:
         stored = sorted({at + offset for at in shared or (now,) for offset in STEPS_OF[self.settings.frames]})
         if shared:
             steps = stored
-        looks = self.settings.gate.vehicle_min > 0.0  # at vehicles
-        album = _cached_vehicle_photos(_block_key(clip, self.settings, self.cache_dir)) if looks else None
+        looks, block = self.settings.gate.vehicle_min > 0.0, _block_key(clip, self.settings, self.cache_dir)
+        album = _cached_vehicle_photos(block) if looks else None  # at vehicles
+        sights = _cached_sights(block) if self.settings.gate.guessed_max < 1.0 else None
         states = np.concatenate([candidate.rollout.ego_states, judged.rollout.ego_states[1:]])
         asset = scene_in_clip_time(clip, _scene_of_block(clip, self.settings, self.cache_dir))
         agents = judged.scene.agents.overwritten(now, judged.rollout.agents)
@@ -162,6 +164,7 @@ class Imaging:
             self.settings.backend,
             album,
             stored,
+            sights,
         )
 
     def _ego_states(self, judged: Judged) -> Array:
@@ -383,3 +386,13 @@ def lazy_vehicle_photos(clip: Clip, asset: RenderAsset, settings: RenderSettings
 @lru_cache(maxsize=2)
 def _cached_vehicle_photos(block: _BlockKey) -> VehiclePhotos:
     return lazy_vehicle_photos(block.clip, _scene_of_block(block.clip, block.settings, block.cache_dir), block.settings)
+
+
+@lru_cache(maxsize=2)
+def _cached_sights(block: _BlockKey) -> PhotoSights | None:
+    """Of the photos that the clip's block was made of; None where it was made of lidar alone."""
+    clip, settings = block.clip, block.settings
+    asset = _scene_of_block(clip, settings, block.cache_dir)
+    files, cameras = asset.photos_of(block_of(clip).images), choose_cameras(clip.cameras, settings.cameras)
+    sights = photo_sights(asset, files, asset.as_corrected(cameras), settings.backend)
+    return sights if len(sights) else None

@@ -238,6 +238,7 @@ REASON_WORDS = {
     "lens_covered": "something covers the lens",
     "blank": "nothing to be seen on a picture",
     "blurred": "a picture without detail",
+    "guessed": "a part of a picture that photos do not show, or not like that",
     "unlike_photos": "a vehicle nearby looks like none of its photos",
     "ego_standing": "ego stands",
     "no_earlier_frame": "the log begins too late for a frame before it",

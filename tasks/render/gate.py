@@ -20,6 +20,7 @@ from tasks.render.scene.movers import BEYOND_M, behind_boxes, boxes_at, world_fr
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky import pixel_directions
 from tasks.render.scene.stereo import FAR_M
+from tasks.render.seen import PhotoSights, guessed_pixels
 from tasks.render.settings import GateSettings, RenderSettings
 from tasks.render.splatting.gaussians import Gaussians, rotations_of
 from tasks.render.splatting.raster import View
@@ -366,12 +367,14 @@ def check_drive_pictures(
     backend: Backend = Backend.CPU,
     album: VehiclePhotos | None = None,
     stored: Collection[int] = (),
+    sights: PhotoSights | None = None,
 ) -> Rejected | None:
     """The first picture of a drive that is not fit to be a sample's; None where all are.
 
     `world_from_ego` (F, 4, 4) in 3-D, `steps` (F,) rows of `agents` at these instants, whose first is the scene's time
     0, `size` width, height [px] of the pictures to be stored, whose shape the small ones have. Of the `stored` steps
-    alone vehicles are held against the photos of an `album`: what is torn elsewhere nobody learns from.
+    alone vehicles are held against the photos of an `album`, and the street against what photos have in their `sights`:
+    what is torn elsewhere nobody learns from.
     """
     width, height = gate_picture_size(size, settings)
     rig = [camera.resized(width, height) for camera in cameras]
@@ -383,12 +386,14 @@ def check_drive_pictures(
         views = render(scene, eyes, backend=backend, affines=affines)
         own = [asset.own_body(camera.name) for camera in cameras]
         looked_at = measure_rendered_views(scene, eyes, views, pose, backend, own)
-        for camera, eye, view, found in zip(rig, eyes, views, looked_at, strict=True):
+        for camera, eye, view, found, body in zip(rig, eyes, views, looked_at, own, strict=True):
             away = eye.world_from_camera[:3, 3] - there.boxes[:, :3]
             local = np.einsum("nij,ni->nj", world_from_boxes(there.boxes)[:, :3, :3], away)
             within = (np.abs(local) < there.boxes[:, 4:7] / 2.0).all(axis=1)
             inside = [there.track_ids[j] for j in np.flatnonzero(within)]
             fault = ("lens_covered", f"inside track {inside[0]}") if inside else picture_fault(found, settings)
+            if fault is None and sights is not None and step in stored:
+                fault = guess_fault(asset, sights, there, camera, pose, body, settings, backend)
             if fault is None and album is not None and step in stored:
                 fault = vehicle_fault(album, there, eye, view, settings)
             if fault is not None:
@@ -420,6 +425,34 @@ def vehicle_fault(
                 f"track {track_id} on {share:.0%} of the picture, likeness {alike:.2f} beside a photo",
             )
     return None
+
+
+def guess_fault(
+    asset: RenderAsset,
+    sights: PhotoSights,
+    there: PlacedAgents,
+    camera: Camera,
+    world_from_ego: Array,
+    body: OwnBody | None,
+    settings: GateSettings,
+    backend: Backend = Backend.CPU,
+) -> tuple[str, str] | None:
+    """(reason, detail) of a picture that in its worst quarter is a guess, however far away."""
+    guessed = guessed_pixels(asset, sights, camera, world_from_ego, there.boxes, backend)
+    if body is not None:
+        guessed &= ~body.in_front(*guessed.shape[::-1])
+    share = worst_quarter(guessed)
+    if share <= settings.guessed_max:
+        return None
+    return "guessed", f"{share:.0%} of a quarter of the picture is a guess: photos do not show it, or not like that"
+
+
+def worst_quarter(found: Bools) -> float:
+    """Share of the pixels found (H, W) in whichever window of half the width and height has most of them."""
+    height, width = (size // 2 for size in found.shape)
+    sums = np.pad(found.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    inside = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    return float(inside.max() / (height * width))
 
 
 def likeness_to_nearest_photo(album: VehiclePhotos, there: PlacedAgents, j: int, eye: Pinhole, view: View) -> float:

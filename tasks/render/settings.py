@@ -191,10 +191,13 @@ class GateSettings:
     vehicle_min: float = 0.75  # likeness to its photos to be expected of a large vehicle; 0: no look at vehicles
     # Likeness that it must have beside a photo from near, place by place; 0: no such look.
     beside_min: float = constant(0.75)
+    guessed_max: float = 0.36  # share of a picture's worst quarter that may be a guess; 1: no such look
     vehicle_share: float = constant(0.02)  # of a picture, from which on a vehicle is large
 
     def __post_init__(self) -> None:
-        shares = dict.fromkeys(("contrast_min", "vehicle_min", "beside_min", "vehicle_share"), (0.0, 1.0))
+        shares = dict.fromkeys(
+            ("contrast_min", "vehicle_min", "beside_min", "guessed_max", "vehicle_share"), (0.0, 1.0)
+        )
         _check("render gate", self, {"width": (16, math.inf), "reach_m": (0.0, math.inf), **shares})
 
 

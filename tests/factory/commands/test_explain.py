@@ -27,7 +27,7 @@ def logs(small_town: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def arguments(logs: Path, out: Path, *more: str) -> list[str]:
     size = ["render.width=64", "render.height=36", "render.scene=discs", "vocabulary.k=300"]
-    size += ["render.psnr_min=0", "render.gate.vehicle_min=0"]
+    size += ["render.psnr_min=0", "render.gate.vehicle_min=0", "render.gate.guessed_max=1"]
     return ["clips=av2", f"clips.root={logs}", f"out={out}", *size, *more]
 
 

@@ -197,7 +197,14 @@ def test_a_pair_falls_together_at_the_pictures(tmp_path: Path) -> None:
     small = ["clips.settings.width=64", "clips.settings.height=36", "clips.settings.lidar_azimuths=300"]
     small += ["clips.settings.steps_per_photo=5"]
     render = ["render=auto", "render.frames=now", "render.width=64", "render.height=36", "render.scene=discs"]
-    lenient = [*small, *render, "render.psnr_min=0", "render.gate.vehicle_min=0", "vocabulary.k=300"]
+    lenient = [
+        *small,
+        *render,
+        "render.psnr_min=0",
+        "render.gate.vehicle_min=0",
+        "render.gate.guessed_max=1",
+        "vocabulary.k=300",
+    ]
     drawn = assemble(load_config(overrides(tmp_path, *lenient, settings=SMALL))).work
     strict = replace(drawn, render=replace(drawn.render, gate=replace(drawn.render.gate, contrast_min=1.0)))
     prepared = strict.prepare(strict.reader.index().refs[1])

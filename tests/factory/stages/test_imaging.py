@@ -25,7 +25,7 @@ from tasks.world.clip import Clip
 CAMERAS = ("ring_front_left", "ring_front_center")
 SMALL = TownSettings(cameras=CAMERAS, width=64, height=36, lidar_beams=0)
 SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "vocabulary.k=300"]
-SIZE += ["render.psnr_min=0", "render.gate.vehicle_min=0", "experts=[pdm_closed,human]"]
+SIZE += ["render.psnr_min=0", "render.gate.vehicle_min=0", "render.gate.guessed_max=1", "experts=[pdm_closed,human]"]
 
 
 @pytest.fixture(scope="module")

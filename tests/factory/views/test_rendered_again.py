@@ -34,7 +34,7 @@ from tests.factory.toy import executed
 main = COMMANDS["show"].load()
 
 SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "vocabulary.k=300"]
-SIZE += ["render.psnr_min=0", "render.gate.vehicle_min=0", "experts=[pdm_closed,human]"]
+SIZE += ["render.psnr_min=0", "render.gate.vehicle_min=0", "render.gate.guessed_max=1", "experts=[pdm_closed,human]"]
 
 
 @pytest.fixture(scope="module")

@@ -147,7 +147,7 @@ def test_every_fault_is_a_reason_of_the_render_stage() -> None:
         for name in ("holes", "lens", "contrast", "detail")
         if (fault := picture_fault(replace(good, **{name: getattr(bad, name)}), SETTINGS)) is not None
     }
-    assert told | {"unlike_photos"} == set(PICTURE_FAULTS)
+    assert told | {"unlike_photos", "guessed"} == set(PICTURE_FAULTS)
     assert set(PICTURE_FAULTS) <= set(next(stage.reasons for stage in STAGES if stage.name == "render"))
 
 

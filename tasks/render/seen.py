@@ -1,0 +1,162 @@
+"""What of a picture from a new place is a guess, told without a photo from there.
+
+A scene is only known from where its photos were taken. So each pixel of a picture is taken to its place in the scene,
+and that place to every photo. How well a photo shows it is
+
+    exp(-(a / 15 degrees)^2) min(1, d / d_photo),
+
+a the angle between the two lines of sight, d and d_photo how far the place is from here and from the photo; 0 where it
+is out of the photo's frame, or behind what the photo shows there. A pixel is a guess where no photo shows its place
+well, or where the picture does not look like the best of them does there: what was fitted at a wrong depth, a torn car
+or scraps before a facade, looks right from the photo's own place alone. Photos are taken as the scene shows them from
+their places, which the fit has made near enough.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from tasks.kernels.compiled import kernel
+from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.engine import Backend, render
+from tasks.render.scene.movers import behind_boxes
+from tasks.render.scene.sky import pixel_directions
+from tasks.world.arrays import F32, Array, Bools
+from tasks.world.clip import Camera, Pinhole, SensorFile
+
+WIDTH = 80  # pixels of photos and pictures that are looked at
+ANGLE_RAD = np.deg2rad(15.0)
+BEHIND, BEHIND_M = 1.15, 0.5  # a place this much farther than what a photo shows there, and this many metres, is hidden
+NEAREST_M = 0.1
+SOLID = 0.5  # alpha from which a pixel is a place and not sky
+LOOKS_ELSEWHERE = -0.5  # cosine between two optical axes below which one photo says nothing of what the other shows
+# Chosen on pictures labelled by eye (docs/reconstruction.md).
+SIGHT_MIN = 0.3  # of the best photo of a pixel
+LIKE_MIN = 0.6  # SSIM (Wang et al. 2004) of the grey pictures around it
+SIGMA_PX, C1, C2 = 1.0, 0.01**2, 0.03**2
+
+
+@dataclass(frozen=True)
+class PhotoSights:
+    """P photos of a scene, as it shows them."""
+
+    eyes: Array  # (P, 3) [m] in the world
+    cameras_from_world: Array  # (P, 4, 4)
+    lenses: Array  # (P, 4) focal lengths, principal point [px]
+    depths: tuple[F32, ...]  # (P) of (H, W) [m], 0 where nothing is
+    pictures: tuple[F32, ...]  # (P) of (H, W, 3)
+
+    def __len__(self) -> int:
+        return len(self.eyes)
+
+
+def photo_sights(
+    asset: RenderAsset, files: Sequence[SensorFile], cameras: Sequence[Camera], backend: Backend = Backend.CPU
+) -> PhotoSights:
+    """Of photos at the poses that the scene was made with; its vehicles are left out."""
+    rig = {camera.name: _small(camera) for camera in cameras}
+    eyes = [_eye(rig[file.sensor], file.world_from_ego) for file in files if file.sensor in rig]
+    poses = np.array([eye.world_from_camera for eye in eyes]).reshape(-1, 4, 4)
+    lenses = np.array([eye.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] for eye in eyes]).reshape(-1, 4)
+    views = [render(asset, [eye], backend=backend)[0] for eye in eyes]
+    depths, pictures = tuple(view.depth for view in views), tuple(np.ascontiguousarray(view.rgb) for view in views)
+    return PhotoSights(poses[:, :3, 3].copy(), np.linalg.inv(poses), lenses, depths, pictures)
+
+
+def guessed_pixels(
+    asset: RenderAsset,
+    sights: PhotoSights,
+    camera: Camera,
+    world_from_ego: Array,
+    boxes: Array,
+    backend: Backend = Backend.CPU,
+) -> Bools:
+    """(H, WIDTH) which pixels of the street are a guess, as a camera of the ego at a pose (4, 4) sees the scene.
+
+    Sky is none, nor what vehicles in boxes (N, 7), world, hide: they are known by other photos.
+    """
+    eye = _eye(_small(camera), world_from_ego)
+    view = render(asset, [eye], backend=backend)[0]
+    rays = pixel_directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height)
+    here, ahead = (np.ascontiguousarray(eye.world_from_camera[:3, k]) for k in (3, 2))
+    places = here + (view.depth / (rays @ ahead))[..., None] * rays
+    street = view.alpha >= SOLID
+    if len(boxes):
+        hidden = behind_boxes(places.reshape(-1, 3), here, np.ascontiguousarray(boxes))
+        street &= ~np.asarray(hidden, bool).reshape(street.shape)
+    best, shown = best_sights(sights, places, here, ahead, view.rgb)
+    return street & ((best < SIGHT_MIN) | (_likeness(view.rgb, shown) < LIKE_MIN))
+
+
+def best_sights(sights: PhotoSights, places: Array, here: Array, ahead: Array, rgb: F32) -> tuple[F32, F32]:
+    """(H, W) how well the best photo shows each place (H, W, 3) to an eye that looks `ahead` (3,) from `here` (3,).
+
+    And what that photo shows there (H, W, 3); where none shows it `rgb`, the picture itself.
+    """
+    best, shown = np.zeros(places.shape[:2], np.float32), rgb.copy()
+    for i, depth in enumerate(sights.depths):
+        photo_from_world = sights.cameras_from_world[i]
+        if photo_from_world[2, :3] @ ahead > LOOKS_ELSEWHERE:
+            photo = sights.eyes[i], photo_from_world, sights.lenses[i], depth, sights.pictures[i]
+            _look(places, here, *photo, best, shown)
+    return best, shown
+
+
+def _small(camera: Camera) -> Camera:
+    return camera.resized(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
+
+
+def _eye(camera: Camera, world_from_ego: Array) -> Pinhole:
+    return Pinhole(camera.intrinsics, world_from_ego @ camera.ego_from_camera, camera.width, camera.height)
+
+
+def _likeness(rgb: F32, other: F32) -> Array:
+    """SSIM (H, W) of two pictures (H, W, 3), in grey."""
+
+    def blurred(image: Array) -> Array:
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), SIGMA_PX))
+
+    a, b = (picture.mean(axis=-1, dtype=np.float64) for picture in (rgb, other))
+    mean_a, mean_b = blurred(a), blurred(b)
+    spread = blurred(a * a) - mean_a**2 + blurred(b * b) - mean_b**2
+    cross = blurred(a * b) - mean_a * mean_b
+    return (2.0 * mean_a * mean_b + C1) * (2.0 * cross + C2) / ((mean_a**2 + mean_b**2 + C1) * (spread + C2))
+
+
+@kernel
+def _look(
+    places: Any, here: Any, eye: Any, photo_from_world: Any, lens: Any, depth: Any, picture: Any, best: Any, shown: Any
+) -> None:
+    m = photo_from_world
+    height, width = depth.shape
+    for row in range(places.shape[0]):
+        for column in range(places.shape[1]):
+            x, y, z = places[row, column, 0], places[row, column, 1], places[row, column, 2]
+            away = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+            if away < NEAREST_M:
+                continue
+            u = lens[0] * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / away + lens[2]
+            v = lens[1] * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / away + lens[3]
+            if not (0.0 <= u < width and 0.0 <= v < height):
+                continue
+            first = depth[int(v), int(u)]
+            if first > 0.0 and away > BEHIND * first + BEHIND_M:
+                continue
+            mine = np.sqrt((x - here[0]) ** 2 + (y - here[1]) ** 2 + (z - here[2]) ** 2)
+            its = np.sqrt((x - eye[0]) ** 2 + (y - eye[1]) ** 2 + (z - eye[2]) ** 2)
+            dot = (x - here[0]) * (x - eye[0]) + (y - here[1]) * (y - eye[1]) + (z - here[2]) * (z - eye[2])
+            angle = np.arccos(min(1.0, max(-1.0, dot / max(mine * its, 1.0e-9))))
+            score = np.exp(-((angle / ANGLE_RAD) ** 2)) * min(1.0, mine / max(its, 1.0e-9))
+            if score > best[row, column]:
+                best[row, column] = score
+                # between the middles of the four pixels around it
+                right, down = min(max(u - 0.5, 0.0), width - 1.0), min(max(v - 0.5, 0.0), height - 1.0)
+                i, j = min(int(right), width - 2), min(int(down), height - 2)
+                a, b = right - i, down - j
+                for k in range(3):
+                    upper = (1.0 - a) * picture[j, i, k] + a * picture[j, i + 1, k]
+                    lower = (1.0 - a) * picture[j + 1, i, k] + a * picture[j + 1, i + 1, k]
+                    shown[row, column, k] = (1.0 - b) * upper + b * lower
