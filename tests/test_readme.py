@@ -196,6 +196,8 @@ def test_every_command_is_one_its_program_takes(
             assert set(pairs(given(arguments))) <= FIT | {"validate", "first", "last", "by"}
         case ["python", "-m", "tests.bench.bench_gate", *arguments]:
             assert set(pairs(arguments)) <= {"chosen", "held", "clips", "out", "drives", "every"}
+        case ["python", "-m", "tests.bench.bench_guess", *arguments]:
+            assert set(pairs(given(arguments))) <= {"front", "rig", "town", "out"}
         case ["python", "-m", "tests.bench.bench_town", *arguments]:
             assert set(pairs(given(arguments))) <= FIT | {"log", "width", "height", "lpips"}
         case ["python", "-m", "examples.csv_logs", folder]:
