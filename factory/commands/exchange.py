@@ -1,14 +1,21 @@
 """Commands that exchange samples and scenes with other programs: export, import, scene."""
 
+import logging
+import os
+import re
+import shutil
 import sys
+import time
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from factory.config.arguments import POSITIONAL, Refused, run_command
+from factory.config.arguments import GIVEN_ALONE, POSITIONAL, RUN_SETTINGS, Refused, request_keys, run_command
 from factory.config.datasets import find_function
+from factory.config.words import did_you_mean
 from factory.exits import COMPLETE, INTERRUPTED, Stopped
 from factory.views.sample_text import find_sample_id, logged_drive, open_samples
 from factory.views.status import open_store
@@ -16,7 +23,9 @@ from factory.wording import one_line
 
 if TYPE_CHECKING:
     from factory.store.samples import Store
+    from tasks.render.scene.asset import RenderAsset
     from tasks.world.arrays import Array
+    from tasks.world.clip import PhotoDrive
 
 
 Row = Mapping[str, Any]
@@ -302,11 +311,21 @@ def _import_nuscenes_cameras(request: ImportRequest) -> int:
     return 0
 
 
+SCENE_KEYS = {  # of each action
+    "info": (),
+    "export": ("to", "format", "out"),
+    "import": ("to", "like", "origin", "traversal", "transforms", "antialiased"),
+    "build": ("to", "root", "width", "masks", "settings"),
+    "film": ("to", "root", "width", "camera", "aside", "turn"),
+}
+SCENE_WIDTH, FILM_WIDTH = 480, 640  # pixels, of photos that are no narrower
+
+
 @dataclass(frozen=True)
 class SceneRequest:
     """The command line."""
 
-    action: Literal["info", "export", "import"] = field(metadata=POSITIONAL)
+    action: Literal["info", "export", "import", "build", "film"] = field(metadata=POSITIONAL)
     files: tuple[str, ...] = field(metadata=POSITIONAL)
     to: str | None = None
     like: str | None = None
@@ -316,28 +335,45 @@ class SceneRequest:
     transforms: str | None = None
     antialiased: bool | None = None
     out: str | None = None
+    root: str | None = None
+    width: int | None = None
+    masks: str | None = None
+    camera: str | None = None
+    aside: float | None = None
+    turn: float | None = None
+    settings: tuple[str, ...] = field(default=(), metadata=RUN_SETTINGS | GIVEN_ALONE)
 
     def __post_init__(self) -> None:
-        if self.action != "info" and len(self.files) != 1:
+        if self.action == "film" and len(self.files) != 2:
+            raise ValueError("scene film takes a scene and its cameras.json; see --help")
+        if self.action not in ("info", "film") and len(self.files) != 1:
             raise ValueError(f"scene {self.action} takes one file; see --help")
-        if self.action in ("export", "import") and self.to is None:
+        if self.action != "info" and self.to is None:
             raise ValueError(f"scene {self.action} takes to=...; see --help")
-        takes = {
-            "info": (),
-            "export": ("to", "format", "out"),
-            "import": ("to", "like", "origin", "traversal", "transforms", "antialiased"),
-        }[self.action]
-        for name in ("to", "like", "origin", "format", "traversal", "transforms", "antialiased", "out"):
+        takes = SCENE_KEYS[self.action]
+        for word in self.settings:
+            key = word.partition("=")[0]
+            if "settings" not in takes or not key.startswith("render.") or key in ("render.width", "render.height"):
+                known = [f"{name}=" for name in (*request_keys(SceneRequest), "render.fit.iterations")]
+                raise ValueError(f"scene {self.action} takes no {key}=; see --help{did_you_mean(key, known)}")
+        for name in [name for name in request_keys(SceneRequest) if name not in ("action", "files")]:
             if getattr(self, name) is not None and name not in takes:
                 raise ValueError(f"scene {self.action} takes no {name}=; see --help")
         if self.action == "export" and self.out is not None and self.format != "ckpt":
             raise ValueError("out= brings vehicles' poses into a checkpoint: format=ckpt")
         if self.like is not None and self.origin is not None:
             raise ValueError("give origin= or like=: the other scene has an origin of its own")
+        if self.width is not None and self.width < 16:
+            raise ValueError(f"width={self.width}: must be 16 pixels or more")
+        if self.action == "film" and not str(self.to).endswith(".mp4"):
+            raise ValueError(f"to={self.to}: must end in .mp4")
+        for name, value in (("aside", self.aside), ("turn", self.turn)):
+            if value is not None and not abs(value) <= 180.0:
+                raise ValueError(f"{name}={value}: must be a number from -180 to 180")
 
 
 def scene(request: SceneRequest) -> None:
-    """`python -m factory scene info|export|import ...`: the scene file of a block, looked into and exchanged.
+    """`python -m factory scene info|export|import|build|film ...`: scenes of 3D Gaussians, one file each.
 
     info SCENE...                       what is in it: Gaussians, nodes, sky, range, quality, digest
     export SCENE to=FOLDER              background.ply, one node-<track id>.ply a vehicle, sky.png, scene.json
@@ -347,16 +383,25 @@ def scene(request: SceneRequest) -> None:
     import FILE to=SCENE                a .ply, .spz or checkpoint (.ckpt, .pt, .pth: splatfacto, MTGS, WorldEngine) as
                                         a scene under a plain sky; origin=x,y,z puts it into the world [m]
     import FILE to=SCENE like=OTHER     the same with the origin, nodes, sky and range of another scene
+    build cameras.json to=SCENE         a scene of photos and their poses (docs/photos.md), fitted and measured as in a
+                                        run; the same command goes on where it was stopped
+    film SCENE cameras.json to=MP4      photo beside the scene from aside=1 m to the left of it (below 0: to the right),
+                                        turned by turn=0 degrees to the left; camera=NAME: not the one that looks ahead
 
     traversal=N takes the colours of an MTGS checkpoint's N-th traversal (default: their mean), transforms=FILE
     takes back nerfstudio's dataparser_transforms.json. antialiased=true|false: how a file was made to be drawn
     (rasterize_mode of gsplat), where it does not say so; .spz, MTGS and WorldEngine do, of others it is that of
     like=, or false.
 
+    root=FOLDER is what paths in cameras.json count from (default: its folder), width=N that of the pictures in pixels
+    (default: 480 of a scene, 640 of a film, or the photos'). build takes masks=FOLDER|none of the car that carries the
+    cameras (default: found in the photos), and a run's settings render.*, such as render.fit.iterations=4000.
+
     The .ply files are standard 3D Gaussian splatting (gsplat, nerfstudio, SuperSplat). A background is in metres
     from the scene's origin, a node in its box's frame. A block's scene lies in <out>/cache/block-*.safetensors; an
     edited one put back under the same name is what the next run draws.
     """
+    from factory.readers.base import BadClip
     from factory.stages.scene_file import read_scene, write_scene
     from factory.views.scene_files import export_scene, info_text, logged_vehicles, read_splats, scene_from_splats
     from factory.views.status import open_store
@@ -384,5 +429,86 @@ def scene(request: SceneRequest) -> None:
                 )
                 if found.left_out:
                     print(f"left out    {', '.join(found.left_out)}: bodies that bend need their network")
-    except (ValueError, OSError) as error:
+            case "build":
+                _build_scene(request, file, to)
+            case "film":
+                _film_scene(request, read_scene(file), Path(request.files[1]), to)
+    except (BadClip, ValueError, OSError) as error:
         raise Refused(str(error)) from error
+
+
+def _build_scene(request: SceneRequest, sidecar: Path, to: Path) -> None:
+    """Fit, and say what came out. Raises ValueError, BadClip and OSError."""
+    from factory.config.compose import compose, fill
+    from factory.stages.assets import load_or_build_scene, scene_path, why_no_scene
+    from factory.views.scene_files import info_text
+    from tasks.render.settings import RenderSettings
+
+    if to.is_dir():
+        raise ValueError(f"to={to}: is a folder; name a file in it")
+    drive, began = _read_drive(request, sidecar), time.monotonic()
+    first = drive.cameras[0]
+    width = request.width or min(first.width, SCENE_WIDTH)
+    words = [f"render.width={width}", f"render.height={round(width * first.height / first.width)}", *request.settings]
+    words += [] if request.masks is None else [f"render.own_body={request.masks}"]
+    settings = fill(RenderSettings, compose("run", words)["render"], "render")
+    if why := why_no_scene(drive, settings):
+        raise ValueError(f"{sidecar}: {why}")
+    parts = to.with_name(f"{to.name}.parts")  # what is half done, by what it is made of
+    with progress_on_stderr("factory.stages"):
+        asset = load_or_build_scene(drive, settings, parts, os.cpu_count() or 1)
+    assert asset is not None
+    scene_path(drive, settings, parts).replace(to)
+    shutil.rmtree(parts)
+    n_photos, n_sweeps = len(drive.block.images), len(drive.block.sweeps)
+    print(info_text(to, asset))
+    print(f"made of     {n_photos:,} photos of {len(drive.cameras)} cameras, {n_sweeps:,} sweeps", end="")
+    print(f" in {time.monotonic() - began:,.0f} s")
+
+
+@contextmanager
+def progress_on_stderr(name: str) -> Iterator[None]:
+    """What the modules below `name` log of their work, line by line."""
+
+    class Plain(logging.Formatter):
+        def format(self, record: logging.LogRecord) -> str:
+            return re.sub(r"^block-\w+: ", "", super().format(record))
+
+    told, logger = logging.StreamHandler(), logging.getLogger(name)
+    told.setFormatter(Plain())
+    level = logger.level
+    logger.addHandler(told)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(told)
+        logger.setLevel(level)
+
+
+def _film_scene(request: SceneRequest, asset: "RenderAsset", sidecar: Path, to: Path) -> None:
+    """Write the film. Raises ValueError, BadClip and OSError."""
+    import numpy as np
+
+    from factory.stages.sensors import choose_cameras
+    from factory.views.pictures import write_mp4
+    from factory.views.rendered_again import shifted_film
+    from tasks.world.clip import front_camera
+
+    drive = _read_drive(request, sidecar)
+    if asset.block is None or (asset.block.log_id, asset.block.start_s) != (drive.log_id, drive.block.start_s):
+        raise ValueError(f"{request.files[0]}: is no scene that was built of {sidecar}")
+    axes = np.array([camera.ego_from_camera[:2, 2] for camera in drive.cameras])
+    ahead = front_camera([camera.name for camera in drive.cameras], axes) or drive.cameras[0].name
+    (camera,) = choose_cameras(drive.cameras, [request.camera or ahead])
+    times_s = [file.time_s for file in drive.block.images if file.sensor == camera.name]
+    rate = round(1.0 / float(np.median(np.diff(times_s)))) if len(times_s) > 1 else 1
+    aside_m, width = 1.0 if request.aside is None else request.aside, request.width or min(camera.width, FILM_WIDTH)
+    write_mp4(to, shifted_film(asset, drive, camera, aside_m, request.turn or 0.0, width), max(rate, 1))
+    print(f"{to.resolve()}: {len(times_s)} photos of {camera.name}, {max(rate, 1)} a second")
+
+
+def _read_drive(request: SceneRequest, sidecar: Path) -> "PhotoDrive":
+    """What a sidecar says without a log. Raises BadClip."""
+    drive: PhotoDrive = find_function("DRIVES", "photos")(sidecar, Path(request.root or sidecar.parent))
+    return drive

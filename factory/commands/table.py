@@ -46,7 +46,7 @@ COMMANDS: Mapping[str, Command] = {
     "import": Command("SimScale's samples, NAVSIM's benchmarks, nuScenes' photos", EXCHANGE, "import_"),
     "explain": Command("one clip: every candidate, why it fell, a film", LOOK, "explain"),
     "vocabulary": Command("build a vocabulary or a recovery table from logs", PREPARE, "vocabulary"),
-    "scene": Command("scene files of 3D Gaussians: info, import, export", EXCHANGE, "scene"),
+    "scene": Command("scenes of 3D Gaussians: from photos, info, import, film", EXCHANGE, "scene"),
     "verify": Command("check a run's tables and caches; repair them", KEEP, "verify"),
     "clean": Command("remove orphans and temporary files of a run", KEEP, "clean"),
     "compact": Command("merge a run's small shards", KEEP, "compact"),

@@ -11,6 +11,7 @@ and by these words -> `module:function`, which is imported when the word is used
 
     IMPORTS, SIDECARS   of `python -m factory import`: it writes samples, or sidecars of photos
     EXPORTS             of `python -m factory export`: it writes all samples
+    DRIVES              of `python -m factory scene`: it reads a drive that is known by its photos alone
     BENCHMARKS          of `python -m planners evaluate benchmark=`: it makes the folder
 """
 

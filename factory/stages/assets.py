@@ -52,7 +52,7 @@ from tasks.render.scene.sensed import median_own_bodies
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
 from tasks.render.settings import Adjust, Backend, FitSettings, RenderSettings, RigSettings, SceneDtype, SceneFrom
 from tasks.world.arrays import Array, Bools
-from tasks.world.clip import AgentTracks, Block, Camera, Clip, SensorFile, is_of_other_log, own_name
+from tasks.world.clip import AgentTracks, Block, Camera, Clip, PhotoDrive, SensorFile, is_of_other_log, own_name
 
 # A block's cameras and poses corrected by its photos before anything is made of them, and what that changed, on disk.
 #
@@ -311,7 +311,7 @@ class Sensing(Enum):
     NOTHING = "nothing"
 
 
-def block_sensing(clip: Clip, settings: RenderSettings) -> Sensing:
+def block_sensing(clip: Clip | PhotoDrive, settings: RenderSettings) -> Sensing:
     """What the block can be made of; nothing without photos, or without lidar and parallax.
 
     Raises ValueError for a camera the rig does not have.
@@ -321,6 +321,18 @@ def block_sensing(clip: Clip, settings: RenderSettings) -> Sensing:
     if block.sweeps and photos:
         return Sensing.PHOTOS
     return Sensing.PHOTOS_ONLY if photos and _parallax_share(photos) >= PARALLAX_SHARE else Sensing.NOTHING
+
+
+def why_no_scene(drive: PhotoDrive, settings: RenderSettings) -> str:
+    """What a drive lacks for a scene, in one line; empty where it can be made. Raises ValueError as `block_sensing`."""
+    if block_sensing(drive, settings) is not Sensing.NOTHING:
+        return ""
+    photos = files_of_cameras(choose_cameras(drive.cameras, settings.cameras), drive.block.images)
+    have = f"{_parallax_share(photos):.0%} of {len(photos)}" if photos else "none"
+    return (
+        f"without lidar {PARALLAX_SHARE:.0%} of the photos need another of their camera {MIN_BASELINE_M:g} to "
+        f"{MAX_BASELINE_M:g} m away, {have} have one: the car stands, or poses are not in metres"
+    )
 
 
 def _parallax_share(photos: Sequence[SensorFile]) -> float:
@@ -336,7 +348,11 @@ def _parallax_share(photos: Sequence[SensorFile]) -> float:
 
 
 def load_or_build_scene(
-    clip: Clip, settings: RenderSettings, cache_dir: str | Path, threads: int = 1, stopped: StopCheck = never_stop
+    clip: Clip | PhotoDrive,
+    settings: RenderSettings,
+    cache_dir: str | Path,
+    threads: int = 1,
+    stopped: StopCheck = never_stop,
 ) -> RenderAsset | None:
     """The scene of the clip's block with its digest; None where the clip has nothing to make one from.
 
@@ -428,12 +444,12 @@ def block_masks(cameras: Sequence[Camera], own: Mapping[str, Bools]) -> dict[str
     return {name: mask for name, mask in masks.items() if mask is not None and mask.shape == size[name]}
 
 
-def scene_path(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> Path:
+def scene_path(clip: Clip | PhotoDrive, settings: RenderSettings, cache_dir: str | Path) -> Path:
     """Where the scene of the clip's block is kept."""
     return Path(cache_dir) / f"block-{block_id(clip, settings)}{SUFFIX}"
 
 
-def block_range(clip: Clip, block: Block) -> BlockRange:
+def block_range(clip: Clip | PhotoDrive, block: Block) -> BlockRange:
     """When and where the sensors of a clip's block were."""
     files = [file for file in (*block.images, *block.sweeps) if file.time_s <= block.own_s]
     places = np.stack([file.world_from_ego[:2, 3] for file in files])
@@ -452,7 +468,7 @@ def builder_lock(path: Path) -> Iterator[None]:
         yield
 
 
-def block_id(clip: Clip, settings: RenderSettings) -> str:
+def block_id(clip: Clip | PhotoDrive, settings: RenderSettings) -> str:
     """16 hex digits of everything the scene depends on; of the sensor files, which are not opened, names and sizes."""
     digest = hashlib.sha256()
     block = block_of(clip)

@@ -19,7 +19,7 @@ from tasks.render.scene.features import NOTHING_KNOWN, KnownPoints, driven_roads
 from tasks.render.scene.sensed import Photo, Sweep, is_on_ego
 from tasks.render.views import straightened, undistorted
 from tasks.world.arrays import Array, Bools, Bytes
-from tasks.world.clip import Block, Camera, Clip, SensorFile, own_name
+from tasks.world.clip import Block, Camera, Clip, PhotoDrive, SensorFile, own_name
 
 # What a rig sees of the car that carries it: found in its photos, or masks `<camera>.png` in a folder of the user's,
 # white where it is. All are of the photos as `opened_photos` gives them.
@@ -122,8 +122,10 @@ class SensorData:
     known: KnownPoints = NOTHING_KNOWN  # of blocks without lidar, world
 
 
-def block_of(clip: Clip) -> Block:
+def block_of(clip: Clip | PhotoDrive) -> Block:
     """What the clip is rendered from: its block, else its own window."""
+    if isinstance(clip, PhotoDrive):
+        return clip.block
     return clip.block or Block(clip.start_s, clip.agents, clip.images, clip.sweeps)
 
 

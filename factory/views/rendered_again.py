@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from factory.stages.scene_file import BadScene, find_scene
+from factory.stages.sensors import load_photos
 from factory.store.reader import SampleTable, decode_stored_image
 from factory.store.samples import Store
 from factory.store.schema import AGENT_STEPS, NOW_INDEX, SCHEMA
@@ -32,9 +33,9 @@ from tasks.caches import user_cache
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import agents_at_time, render
 from tasks.render.settings import ImageSource
-from tasks.render.views import VISIBLE_M
+from tasks.render.views import VISIBLE_M, render_views
 from tasks.world.arrays import Array, Image
-from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Pinhole
+from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Camera, PhotoDrive, Pinhole
 from tasks.world.frames import pose_on_ground, to_world
 
 Row = Mapping[str, Any]
@@ -189,6 +190,27 @@ def sample_film(row: Row, asset: RenderAsset | None, logged: Array | None = None
         whole = side_by_side(sample_bev(row, logged, (720, 720), step=step), tiles)
         height, width = whole.shape[:2]
         yield padded_to(whole, height + height % 2, width + width % 2)  # H.264 takes even sides
+
+
+def shifted_film(
+    asset: RenderAsset, drive: PhotoDrive, camera: Camera, aside_m: float, turn_deg: float, width: int
+) -> Iterator[Image]:
+    """Photo by photo of a camera: left the photo, right the scene from the ego's pose moved to the left by `aside_m`
+    and turned to the left by `turn_deg`. Raises BadClip for a photo that is broken.
+    """
+    (camera,), height = asset.as_corrected([camera]), round(width * camera.height / camera.width)
+    files = [file for file in asset.photos_of(drive.block.images) if file.sensor == camera.name]
+    angle, shift, agents = np.radians(turn_deg), np.eye(4), asset.settled(drive.block.agents, 0.0)
+    shift[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    shift[1, 3] = aside_m
+    side = f"{abs(aside_m):g} m to the {'left' if aside_m >= 0.0 else 'right'}"
+    side += f", turned by {turn_deg:g} deg" if turn_deg else ""
+    size = width + width % 2, height + height % 2 + CAPTION_PX + 4
+    for file, photo in zip(files, load_photos(files, [camera], width, height)):
+        pose, step = file.world_from_ego @ shift, file.time_s / STEP_S
+        drawn = render_views(asset, [camera], pose[None], agents, [step], width, height)
+        shown = (photo.rgb, f"{camera.name}  photo at {file.time_s:.1f} s"), (drawn[0, 0], f"rendered, {side}")
+        yield tile_grid([captioned_tile(pixels, caption, size) for pixels, caption in shown], 2)
 
 
 def _stored_image_tiles(row: Row, time_s: float) -> Iterable[Image]:

@@ -22,17 +22,17 @@ def render_views(
     cameras: Sequence[Camera],
     world_from_ego: Array,
     agents: AgentTracks,
-    steps: Sequence[int],
+    steps: Sequence[float],
     width: int,
     height: int,
     backend: Backend = Backend.CPU,
 ) -> Bytes:
     """Images (F, C, height, width, 3) rgb.
 
-    `world_from_ego` (F, 4, 4) in 3-D (`pose_on_ground`), `steps` (F,) rows of `agents` at these instants. The images
-    are those of ideal pinholes, `camera.resized(width, height)` with distortion zero: photos are undistorted before
-    they enter the scene. Each camera shows the scene in its own colours at that time, step 0 being the scene's 0
-    (`RenderAsset.since`), and before it what it sees of the car that carries it.
+    `world_from_ego` (F, 4, 4) in 3-D (`pose_on_ground`), `steps` (F,) rows of `agents` at these instants, or between
+    two. The images are those of ideal pinholes, `camera.resized(width, height)` with distortion zero: photos are
+    undistorted before they enter the scene. Each camera shows the scene in its own colours at that time, step 0 being
+    the scene's 0 (`RenderAsset.since`), and before it what it sees of the car that carries it.
     Raises BackendMissing where the backend cannot work on this machine.
     """
     out = np.empty((len(steps), len(cameras), height, width, 3), np.uint8)

@@ -201,6 +201,17 @@ class Block:
     other_cameras: tuple[Camera, ...] = ()  # of those drives
 
 
+@dataclass(frozen=True)
+class PhotoDrive:
+    """A drive of which nothing is known but what its sensors saw: one block, without a map and an ego at 10 Hz."""
+
+    dataset: str
+    log_id: str
+    content_digest: str  # of what says where its files are
+    cameras: tuple[Camera, ...]
+    block: Block
+
+
 def is_of_other_log(name: str) -> bool:
     """Whether a track, camera or lidar of a block is of another log than the block."""
     return OTHER_LOG in name

@@ -10,6 +10,7 @@ from factory.datasets.scenarionet.settings import ScenarioNetClips
 READERS = {"ScenarioNetReader": ScenarioNetClips}
 READS = "nuscenes waymo nuplan", "clips=scenarionet clips.root=<ScenarioNet's conversion> (docs/tutorials/nuscenes.md)"
 SIDECARS = {"nuscenes-cameras": "factory.datasets.scenarionet.nuscenes_cameras:import_cameras"}
+DRIVES = {"photos": "factory.datasets.scenarionet.photos:read_photo_drive"}
 
 
 def camera_names(clips: Mapping[str, Any]) -> tuple[str, ...]:

@@ -1,20 +1,33 @@
-"""Photos and sweeps beside a ScenarioNet log, which has none itself: what its sidecar says, checked. docs/photos.md."""
+"""Photos and sweeps beside a ScenarioNet log, which has none itself, or alone: what a sidecar says. docs/photos.md."""
 
+import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from factory.files import broken_link, is_named, why_unread
-from factory.readers.base import BadClip, camera_sign, stamps_sign
-from factory.readers.pictures import frame_uri
+from factory.readers.base import BadClip, camera_sign, id_text, stamps_sign
+from factory.readers.pictures import file_and_frame, frame_uri
 from factory.wording import shown
 from tasks.world.arrays import Array
-from tasks.world.clip import ROTATION_SLACK, STEP_S, Camera, Fisheye, SensorFile
-from tasks.world.frames import HEADING, X, Y, all_within, planar_matrices, wrap_angle
+from tasks.world.clip import (
+    MOVING_KINDS,
+    OTHER_LOG,
+    ROTATION_SLACK,
+    STEP_S,
+    AgentKind,
+    AgentTracks,
+    Block,
+    Camera,
+    Fisheye,
+    PhotoDrive,
+    SensorFile,
+)
+from tasks.world.frames import EGO_STATE_SIZE, HEADING, X, Y, all_within, planar_matrices, wrap_angle
 
 # Where the photos of ScenarioNet's logs are said to be: `cameras.json`, one of each log. Format: docs/photos.md.
 
@@ -236,7 +249,7 @@ def _pose(
     elif "ego_to_world" in entry:
         key, pose = "ego_to_world", _rigid(entry["ego_to_world"], file, f"{field}.ego_to_world")
     elif logged is None:
-        problem = f"missing, and the log has no drive at {time_s:g} s to take it from"
+        problem = f"missing, and there is no drive at {time_s:g} s to take it from"
         raise BadClip(file, f"{field}.ego_to_world", problem)
     else:
         return logged
@@ -244,6 +257,63 @@ def _pose(
         problem = f"{apart:,.0f} m from where the log's ego was at {time_s:g} s: another log's, or another world frame?"
         raise BadClip(file, f"{field}.{key}", problem)
     return pose
+
+
+BOX_REACH_S = 0.55  # from an instant at which a thing's box is given: so far its place is known
+
+
+def read_photo_drive(path: Path, root: Path) -> PhotoDrive:
+    """What a sidecar says where there is no log: a drive from its first photo or sweep to the last one.
+
+    Raises BadClip as `read_photographs`, and for files that are not there.
+    """
+    found = read_photographs(path, root, np.full((1, EGO_STATE_SIZE), np.nan))
+    files = (*found.images, *found.sweeps)
+    if lost := [file.uri for file in files if not file_and_frame(file.uri)[0].is_file()]:
+        problem = f"{len(lost):,} of {len(files):,} files are not there, such as {lost[0]}: do paths count from {root}?"
+        raise BadClip(str(path), "frames", problem)
+    first_s, last_s = min(file.time_s for file in files), max(file.time_s for file in files)
+    images, sweeps = (
+        tuple(replace(file, time_s=file.time_s - first_s) for file in part) for part in (found.images, found.sweeps)
+    )
+    steps_s = first_s + STEP_S * np.arange(int((last_s - first_s) / STEP_S) + 2)
+    block = Block(first_s, _boxed(json.loads(found.data), steps_s, str(path)), images, sweeps)
+    name = path.absolute().parent.name
+    return PhotoDrive("photos", name, hashlib.sha256(found.data).hexdigest(), found.cameras, block)
+
+
+def _boxed(content: Mapping[str, Any], steps_s: Array, file: str) -> AgentTracks:
+    """The things whose boxes a sidecar has, at times (S,): linear between two, absent far from any."""
+    kinds, rows = dict[str, AgentKind](), dict[str, dict[float, Array]]()
+    for i, entry in enumerate(_entries(content, "boxes", file) if "boxes" in content else ()):
+        field, name, kind = f"boxes[{i}]", id_text(entry.get("id")), entry.get("kind", AgentKind.VEHICLE.value)
+        if not name or OTHER_LOG in name:
+            raise BadClip(file, f"{field}.id", f"{shown(entry.get('id'))}: expected text without {OTHER_LOG}")
+        if kind not in sorted(MOVING_KINDS):
+            raise BadClip(file, f"{field}.kind", f"{shown(kind)} is none of {', '.join(sorted(MOVING_KINDS))}")
+        time_s = _time(entry, file, field)
+        if time_s in rows.setdefault(name, {}):
+            raise BadClip(file, f"{field}.t_s", f"{name} has two boxes at {time_s:g} s")
+        yaw = _array([entry["yaw"]] if "yaw" in entry else None, (1,), file, f"{field}.yaw")
+        center, size = (_array(entry.get(key), (3,), file, f"{field}.{key}") for key in ("center", "size"))
+        if size.min() <= 0.0:
+            raise BadClip(file, f"{field}.size", "expected length, width and height above 0")
+        kinds[name], rows[name][time_s] = AgentKind(kind), np.concatenate([center, yaw, size])
+    shape = len(steps_s), len(rows)
+    boxes, center_z, valid, heights = np.full((*shape, 5), np.nan), np.full(shape, np.nan), np.zeros(shape, bool), []
+    for j, given in enumerate(rows.values()):
+        times = np.array(sorted(given))
+        at = np.stack([given[time_s] for time_s in times])
+        near = np.abs(steps_s[:, None] - times).min(axis=1) <= BOX_REACH_S
+        there = near & (steps_s >= times[0] - STEP_S / 2) & (steps_s <= times[-1] + STEP_S / 2)
+        columns = (*at[:, :3].T, np.unwrap(at[:, 3]))
+        x, y, z, yaw = (np.interp(steps_s[there], times, column) for column in columns)
+        length, width, height = np.median(at[:, 4:], axis=0)
+        boxes[there, j] = np.column_stack([x, y, wrap_angle(yaw), np.full_like(x, length), np.full_like(x, width)])
+        center_z[there, j], valid[:, j] = z, there
+        heights.append(height)
+    velocities = np.gradient(boxes[..., :2], STEP_S, axis=0)
+    return AgentTracks(tuple(rows), tuple(kinds.values()), boxes, velocities, valid, center_z, np.array(heights))
 
 
 def start_step_nearest_photos(found: Photographs, first: int, n_steps: int) -> int:
