@@ -19,7 +19,7 @@ from factory.config.words import did_you_mean
 from factory.exits import COMPLETE, INTERRUPTED, Stopped
 from factory.views.sample_text import find_sample_id, logged_drive, open_samples
 from factory.views.status import open_store
-from factory.wording import one_line
+from factory.wording import one_line, time_text
 
 if TYPE_CHECKING:
     from factory.store.samples import Store
@@ -441,6 +441,7 @@ def _build_scene(request: SceneRequest, sidecar: Path, to: Path) -> None:
     """Fit, and say what came out. Raises ValueError, BadClip and OSError."""
     from factory.config.compose import compose, fill
     from factory.stages.assets import load_or_build_scene, scene_path, why_no_scene
+    from factory.stages.sensors import choose_cameras, files_of_cameras, refuse_unknown_masks
     from factory.views.scene_files import info_text
     from tasks.render.settings import RenderSettings
 
@@ -452,6 +453,8 @@ def _build_scene(request: SceneRequest, sidecar: Path, to: Path) -> None:
     words = [f"render.width={width}", f"render.height={round(width * first.height / first.width)}", *request.settings]
     words += [] if request.masks is None else [f"render.own_body={request.masks}"]
     settings = fill(RenderSettings, compose("run", words)["render"], "render")
+    cameras = choose_cameras(drive.cameras, settings.cameras)
+    refuse_unknown_masks(settings.own_body, drive.cameras)
     if why := why_no_scene(drive, settings):
         raise ValueError(f"{sidecar}: {why}")
     parts = to.with_name(f"{to.name}.parts")  # what is half done, by what it is made of
@@ -460,10 +463,12 @@ def _build_scene(request: SceneRequest, sidecar: Path, to: Path) -> None:
     assert asset is not None
     scene_path(drive, settings, parts).replace(to)
     shutil.rmtree(parts)
-    n_photos, n_sweeps = len(drive.block.images), len(drive.block.sweeps)
+    photos, took_s = files_of_cameras(cameras, drive.block.images), time.monotonic() - began
     print(info_text(to, asset))
-    print(f"made of     {n_photos:,} photos of {len(drive.cameras)} cameras, {n_sweeps:,} sweeps", end="")
-    print(f" in {time.monotonic() - began:,.0f} s")
+    print(
+        f"made of     {len(photos):,} photos of {len(cameras)} cameras, {len(drive.block.sweeps):,} sweeps, "
+        f"in {time_text(took_s)}"
+    )
 
 
 @contextmanager

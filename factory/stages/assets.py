@@ -331,7 +331,7 @@ def why_no_scene(drive: PhotoDrive, settings: RenderSettings) -> str:
     have = f"{_parallax_share(photos):.0%} of {len(photos)}" if photos else "none"
     return (
         f"without lidar {PARALLAX_SHARE:.0%} of the photos need another of their camera {MIN_BASELINE_M:g} to "
-        f"{MAX_BASELINE_M:g} m away, {have} have one: the car stands, or poses are not in metres"
+        f"{MAX_BASELINE_M:g} m away, {have} have one: the car stands, photos are rare, or poses not in metres"
     )
 
 

@@ -95,7 +95,10 @@ def match_corners(a: PhotoCorners, b: PhotoCorners) -> tuple[Indices, Indices]:
     if len(keep) < LEAST_MATCHES:
         return nobody
     pairs = [c.at[r] / c.pixel for c, r in ((a, keep), (b, best[keep]))]
-    _, agree = cv2.findFundamentalMat(pairs[0], pairs[1], cv2.USAC_MAGSAC, EPIPOLAR_PX, 0.999, 2000)
+    try:
+        _, agree = cv2.findFundamentalMat(pairs[0], pairs[1], cv2.USAC_MAGSAC, EPIPOLAR_PX, 0.999, 2000)
+    except cv2.error:  # its own assertion, of points that no geometry fits: those of small photos on a grid, say
+        return nobody
     if agree is None or agree.sum() < LEAST_MATCHES:
         return nobody
     keep = keep[agree.ravel() > 0]

@@ -121,7 +121,7 @@ def test_what_cannot_be_done_is_an_error_that_says_why(
         (["info", str(tmp_path / "none")], "none: cannot be read"),
         (["info", ball], "bad.ply: cannot be read"),
         (["export", str(stored)], "export takes to="),
-        (["fly", str(stored)], "'fly': must be one of info, export, import"),
+        (["fly", str(stored)], "'fly': must be one of info, export, import, build, film"),
         (["info", str(stored), to], "info takes no to="),
         (["export", str(stored), to, "format=obj"], "format=obj"),
         (["import", str(stored), to], "expected a name that ends in .ply, .spz, .ckpt, .pt, .pth"),
