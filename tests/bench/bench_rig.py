@@ -13,9 +13,11 @@ import sys
 import time
 from dataclasses import fields, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from factory.datasets.scenarionet.photos import read_photo_drive
 from factory.stages.assets import rig_report_lines
 from factory.stages.sensors import load_photos, opened_photos
 from tasks.render.fit.corrections import apply_exposure
@@ -28,11 +30,12 @@ from tasks.render.scene.features import KnownPoints, driven_road
 from tasks.render.settings import FitSettings
 from tasks.world.arrays import Array
 from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Camera, SensorFile
+from tests.bench.sidecars import OPENSCENE_INSTANT_S, openscene_sidecar
 from tests.bench.stored_scene import affine_between, kept
 
 SIZE = (480, 270)
 HELD_OUT, VALIDATED = (20, 27), (18, 24)
-FIRST, INSTANT_S = 16, 0.5
+FIRST = 16
 # Of each vehicle length, width, height [m] and where its middle is at an instant in the ego's frame [m], ahead and to
 # the left, read off the photos: it faces the other way. An instant between two is half way.
 MOVERS = {
@@ -51,29 +54,20 @@ SETTINGS = replace(FitSettings(), iterations=6000, start_gaussians=300_000, most
 
 def read_block(root: Path, left_out: tuple[int, ...]) -> tuple[list[Camera], list[SensorFile], list[int]]:
     """The rig, its photos and the instant of each."""
-    told = json.loads((root / "cameras.json").read_text())
-    cameras = []
-    for name, row in told["cameras"].items():
-        mount = np.eye(4)
-        mount[:3, :3], mount[:3, 3] = row["cam_to_ego"]["R"], row["cam_to_ego"]["t"]
-        arrays = np.array(row["K"], np.float64), np.array(row["dist_k1k2p1p2k3"], np.float64), mount
-        cameras.append(Camera(name, told["width"], told["height"], *arrays))
-    files, instants = [], []
-    for k, frame in enumerate(told["frames"]):
-        pose, number = np.array(frame["ego_to_world"]), frame["frame"]
-        for camera in cameras if number not in left_out else ():
-            path = root / f"frame_{number}" / f"{camera.name}.jpg"
-            files.append(SensorFile(camera.name, str(path), 0.5 * k, pose))
-            instants.append(number)
-    return cameras, files, instants
+    with TemporaryDirectory() as folder:
+        sidecar = Path(folder, "cameras.json")
+        sidecar.write_text(json.dumps(openscene_sidecar(root, left_out)))
+        drive = read_photo_drive(sidecar, root)
+    instants = [int(Path(file.uri).parent.name.removeprefix("frame_")) for file in drive.block.images]
+    return list(drive.cameras), list(drive.block.images), instants
 
 
 def movers(files: list[SensorFile], instants: list[int], ground_m: float) -> AgentTracks:
     """MOVERS on the road `ground_m` above the ego's origin, by the poses as corrected; away before and after."""
     poses = {instant: file.world_from_ego for file, instant in zip(files, instants)}
-    n_steps, n = round((max(instants) - FIRST) * INSTANT_S / STEP_S) + 1, len(MOVERS)
+    n_steps, n = round((max(instants) - FIRST) * OPENSCENE_INSTANT_S / STEP_S) + 1, len(MOVERS)
     boxes, centre_z, valid = np.zeros((n_steps, n, 5)), np.zeros((n_steps, n)), np.zeros((n_steps, n), bool)
-    steps = FIRST + np.arange(n_steps) * STEP_S / INSTANT_S
+    steps = FIRST + np.arange(n_steps) * STEP_S / OPENSCENE_INSTANT_S
     for j, (size, places) in enumerate(MOVERS.values()):
         known = [instant for instant in places if instant in poses]
         at = np.array([poses[i] @ [*places[i], ground_m + 0.5 * size[2], 1.0] for i in known])[:, :3]

@@ -34,10 +34,13 @@ CHEAPER = {  # of a command with these words; the others are run as they are, an
     "clips=synthetic": TINY_TOWN,
     "<town>": TINY,
     "/data/av2/sensor/train": TINY,
+    "scene build": "width=96 render.fit.iterations=60 render.fit.start_every=4 render.fit.start_gaussians=4000",
 }
 # Lines of outputs but those with a rate.
 COMPARED = re.compile(r"(human|pdm_closed|recovery) +\d|clips: |clips prepared|  filtered|vocabulary|experts|executed")
 OF_A_SAMPLE = re.compile(r"(sample|clip|expert|perturbed by|label|world) {3}|scores|  +perturbed|  +driven")
+
+OF_A_SCENE = re.compile(r"(block|sensors at|drawn) {2}|(CAM_FRONT|ego): moved")  # the rest hangs on the pictures' size
 
 CONTINUED = re.compile(r" *│\n│( +│)+ +")  # a cell on a second line
 
@@ -108,3 +111,14 @@ def test_your_own_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: 
     for command in follower.commands:
         follower.runs(command, {})
     assert follower.was_told(COMPARED) == []
+
+
+def test_a_scene_from_photos_alone(
+    shared_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    follower = Follower("docs/tutorials/photos.md", capsys)
+    for command in follower.commands:
+        follower.runs(command, {"/data/nuscenes_front": shared_root / "data" / "nuscenes_front"})
+    assert follower.was_told(OF_A_SCENE) == []
+    assert {path.name for path in Path("runs").iterdir()} == {"street", "street.mp4", "street.scene"}

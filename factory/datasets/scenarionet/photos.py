@@ -276,7 +276,7 @@ def read_photo_drive(path: Path, root: Path) -> PhotoDrive:
     images, sweeps = (
         tuple(replace(file, time_s=file.time_s - first_s) for file in part) for part in (found.images, found.sweeps)
     )
-    steps_s = first_s + STEP_S * np.arange(int((last_s - first_s) / STEP_S) + 2)
+    steps_s = first_s + STEP_S * np.arange(int((last_s - first_s) / STEP_S) + 2, dtype=np.float64)
     block = Block(first_s, _boxed(json.loads(found.data), steps_s, str(path)), images, sweeps)
     name = path.absolute().parent.name
     return PhotoDrive("photos", name, hashlib.sha256(found.data).hexdigest(), found.cameras, block)
