@@ -1,7 +1,7 @@
 """What a block of eight cameras takes at three sizes: `python -m tests.bench.bench_sizes <openscene_0101> [n=v]`.
 
 Each size is fitted for a few iterations in a process of its own: CPU seconds to prepare, an iteration and a picture,
-and memory at most. Calibration is as given: how well it comes out is `bench_rig`'s question. `iterations=` are timed
+and memory at most. Calibration is as given: how well it comes out is `bench_scenes`' question. `iterations=` are timed
 after as many that are not; `threads=` share them; other names are those of `FitSettings`.
 """
 
@@ -21,10 +21,11 @@ from tasks.render.scene.asset import psnr
 from tasks.render.scene.engine import PlacedAgents, render
 from tasks.render.settings import FitSettings
 from tasks.world.clip import Pinhole
-from tests.bench.bench_rig import HELD_OUT, read_block
+from tests.bench.sidecars import read_openscene
 
 SIZES = ((480, 270), (960, 540), (1920, 1080))
 SETTINGS = replace(FitSettings(), start_gaussians=300_000, most_gaussians=350_000)
+HELD_OUT_S = (2.0, 5.5)
 JPEG_QUALITY = 90  # the default of runs
 MB = 2**10  # of ru_maxrss, which is in KB
 
@@ -43,9 +44,9 @@ def one(size: str, root: Path, options: dict[str, str]) -> None:
     n, threads = int(options.pop("iterations", "40")), int(options.pop("threads", "2"))
     kinds = {name: type(value) for name, value in vars(SETTINGS).items()}
     settings = replace(SETTINGS, iterations=2 * n, **{k: kinds[k](float(v)) for k, v in options.items()})
-    cameras, files, instants = read_block(root, ())
-    photos = load_photos(files, cameras, width, height)
-    held_out = [row for row, instant in enumerate(instants) if instant in HELD_OUT]
+    drive = read_openscene(root)
+    photos = load_photos(drive.block.images, drive.cameras, width, height)
+    held_out = [row for row, photo in enumerate(photos) if photo.time_s in HELD_OUT_S]
     started = time.process_time()
     problem, state = prepare_fit(photos, [], None, settings, held_out, threads)
     prepared = time.process_time() - started

@@ -3,17 +3,34 @@
 import json
 import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
+from factory.datasets.scenarionet.photos import read_photo_drive
+from tasks.world.clip import PhotoDrive
 from tests.bench.kitti import IMU_HEIGHT_M, KittiDrive
 
-OPENSCENE_INSTANT_S = 0.5
+OPENSCENE_INSTANT_S, FIRST_INSTANT = 0.5, 16
+EGO_ABOVE_ROAD_M = 0.28  # as the photos have it
+# Of each vehicle that drives by in openscene_0101, which has no boxes, length, width, height [m] and where its middle
+# is at an instant in the ego's frame [m], ahead and to the left, read off the photos: it faces the other way.
+MOVERS = {
+    "saloon": (
+        (4.9, 1.86, 1.45),
+        {16: (26.2, 3.6), 17: (18.8, 3.1), 18: (12.3, 3.1), 19: (6.4, 3.6), 20: (-0.4, 4.0), 21: (-6.3, 3.6)}
+        | {22: (-10.4, 3.1), 23: (-15.6, 3.2), 24: (-19.4, 3.1), 25: (-26.0, 3.5), 27: (-32.5, 3.0), 30: (-48.8, 2.9)},
+    ),
+    "van": (
+        (5.15, 2.0, 1.75),
+        {17: (-1.2, 4.6), 18: (-4.8, 4.6), 19: (-7.5, 4.2), 20: (-11.2, 4.3), 21: (-14.8, 4.2), 22: (-23.0, 4.4)},
+    ),
+}
 
 
-def openscene_sidecar(root: Path, left_out: tuple[int, ...] = ()) -> dict[str, Any]:
-    """Of openscene_0101, whose photos count from `root`, without some instants."""
+def openscene_sidecar(root: Path, movers: bool = False) -> dict[str, Any]:
+    """Of openscene_0101, whose photos count from `root`; with boxes of MOVERS."""
     told = json.loads((root / "cameras.json").read_text())
     size = {name: told[name] for name in ("width", "height")}
     cameras = {
@@ -24,9 +41,30 @@ def openscene_sidecar(root: Path, left_out: tuple[int, ...] = ()) -> dict[str, A
         {"camera": name, "t_s": OPENSCENE_INSTANT_S * k, "ego_to_world": frame["ego_to_world"]}
         | {"file": f"frame_{frame['frame']}/{name}.jpg"}
         for k, frame in enumerate(told["frames"])
-        for name in (cameras if frame["frame"] not in left_out else ())
+        for name in cameras
     ]
-    return {"cameras": cameras, "frames": frames}
+    content = {"cameras": cameras, "frames": frames}
+    return content | {"boxes": _boxes_of_movers(told["frames"])} if movers else content
+
+
+def _boxes_of_movers(frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    poses = {frame["frame"]: np.array(frame["ego_to_world"]) for frame in frames}
+    return [
+        {"id": name, "t_s": OPENSCENE_INSTANT_S * (instant - FIRST_INSTANT), "size": list(size)}
+        | {"center": (poses[instant] @ [*place, size[2] / 2.0 - EGO_ABOVE_ROAD_M, 1.0])[:3].tolist()}
+        | {"yaw": float(np.arctan2(poses[instant][1, 0], poses[instant][0, 0]) + np.pi)}
+        for name, (size, places) in MOVERS.items()
+        for instant, place in places.items()
+    ]
+
+
+def read_openscene(root: Path, movers: bool = False) -> PhotoDrive:
+    """The drive of openscene_0101, by its sidecar."""
+    with TemporaryDirectory() as folder:
+        sidecar = Path(folder, "openscene_0101", "cameras.json")
+        sidecar.parent.mkdir()
+        sidecar.write_text(json.dumps(openscene_sidecar(root, movers=movers)))
+        return read_photo_drive(sidecar, root)
 
 
 def write_kitti_sidecar(drive: KittiDrive, folder: Path, camera: str = "image_02", lidar: bool = True) -> Path:

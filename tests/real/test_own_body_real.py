@@ -6,7 +6,7 @@ import pytest
 
 from factory.stages.sensors import own_body_masks
 from tasks.world.clip import SensorFile
-from tests.bench.bench_rig import read_block
+from tests.bench.sidecars import read_openscene
 
 # Pixels (x, y as shares of the picture) that show the car, and the street close by.
 ON_THE_CAR = {
@@ -22,8 +22,8 @@ MOST = 0.05  # of any picture
 
 @pytest.mark.slow
 def test_the_own_car_is_found_and_nothing_of_the_street(shared_root: Path) -> None:
-    cameras, files, _ = read_block(shared_root / "data" / "openscene_0101", ())
-    found = own_body_masks("", files, cameras)
+    drive = read_openscene(shared_root / "data" / "openscene_0101")
+    found = own_body_masks("", drive.block.images, drive.cameras)
     for name, places in ON_THE_CAR.items():
         height, width = found[name].shape
         assert all(found[name][int(y * height), int(x * width)] for x, y in places), name
@@ -35,6 +35,7 @@ def test_the_own_car_is_found_and_nothing_of_the_street(shared_root: Path) -> No
 @pytest.mark.slow
 def test_of_a_rig_that_stands_nothing_is_masked(shared_root: Path) -> None:
     """All keeps its place in each of its photos."""
-    cameras, files, _ = read_block(shared_root / "data" / "openscene_0101", ())
+    drive = read_openscene(shared_root / "data" / "openscene_0101")
+    cameras, files = drive.cameras, drive.block.images
     standing = [SensorFile(file.sensor, file.uri, file.time_s, files[0].world_from_ego) for file in files[:16]]
     assert own_body_masks("", standing, cameras[:1]) == {}
