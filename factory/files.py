@@ -287,7 +287,7 @@ def why_not_written(error: BaseException) -> tuple[str, str]:
 def why_no_memory(error: BaseException) -> str:
     """What was said where memory was refused, also to a library or a thread, where that is behind the error."""
     for seen in _errors_behind(error):
-        if isinstance(seen, MemoryError) or NO_ROOM.search(str(seen)):
+        if isinstance(seen, MemoryError) or _number_of(seen) == errno.ENOMEM or NO_ROOM.search(str(seen)):
             return f"out of memory or threads: {one_line(seen)}"
     return ""
 

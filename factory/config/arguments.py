@@ -146,7 +146,7 @@ def _exit_of_error(
     if isinstance(error, (Refused, ConfigError, *refused)):
         return BAD_CONFIG, f"error: {error}{helps}"
     if refused_memory := why_no_memory(error):
-        return BAD_CONFIG, f"error: {refused_memory}"
+        return BAD_CONFIG, f"error: {refused_memory}; give it more and run the same command again"
     if resumes and isinstance(error, DiskFull):
         return INTERRUPTED, f"error: {error}; free disk space and run the same command again"
     if resumes and machine_fault_of(error):

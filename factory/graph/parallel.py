@@ -2,15 +2,22 @@
 
 import multiprocessing
 import os
+import pickle
+import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from itertools import islice
-from typing import Literal, ParamSpec, TypeVar
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from traceback import format_exc
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar
 
 from factory.exits import calling_on_stop_signal, end_with_parent, ignore_terminal_signals, terminal_signals_blocked
-from factory.graph.steps import TaskStopped
-from factory.store.location import Location
+
+if TYPE_CHECKING:  # a worker imports this file before it can tell its driver of what fails: nothing heavy is above
+    from factory.store.location import Location
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -27,7 +34,7 @@ def parallel_map(
     items: Iterable[T],
     executor: Literal["local", "ray"] = "local",
     workers: int | None = None,
-    to: Location | None = None,
+    to: "Location | None" = None,
 ) -> Generator[R, None, None]:
     """function(item) of each item, in whatever order they are done. What one raises is raised here and ends it.
 
@@ -56,11 +63,13 @@ def parallel_map(
                     raise WorkerDied(f"{item}: its worker died ({error}); run the same command again") from error
                 yield result
         if stopped and any(True for _ in waiting):
+            from factory.graph.steps import TaskStopped
+
             raise TaskStopped
 
 
 @contextmanager
-def _pool(executor: str, workers: int | None, to: Location | None) -> Iterator[tuple[Executor, int]]:
+def _pool(executor: str, workers: int | None, to: "Location | None") -> Iterator[tuple[Executor, int]]:
     """What runs the function, and how many items it is to hold. What has not begun when it is left is dropped."""
     pool: Executor
     if executor == "ray":
@@ -71,9 +80,7 @@ def _pool(executor: str, workers: int | None, to: Location | None) -> Iterator[t
     elif workers is None or workers == 1:
         pool, most = _InThisProcess(), 1
     else:
-        with terminal_signals_blocked():  # what keeps the pool's semaphores is a process, too
-            pool = _Processes(workers, multiprocessing.get_context("spawn"), _detach_worker)
-        most = IN_HAND * workers
+        pool, most = _Processes(workers), IN_HAND * workers
     try:
         yield pool, most
     finally:
@@ -92,16 +99,83 @@ class _InThisProcess(Executor):
         return future
 
 
-class _Processes(ProcessPoolExecutor):
-    """Processes that a terminal does not reach, also while they start."""
+class _Processes(ThreadPoolExecutor):
+    """A process for each thread, begun with its first item; a terminal does not reach it, also while it starts.
+
+    Unlike of a ProcessPoolExecutor, each thread is begun by who submits and each failure ends as a future's exception:
+    where memory is short, that one's threads die with a traceback and their futures never end.
+    """
+
+    def __init__(self, workers: int) -> None:
+        super().__init__(workers)
+        self._begun: list[tuple[BaseProcess, Connection[Any, Any]]] = []
+        self._of_thread, self._died = threading.local(), False
+        with terminal_signals_blocked():  # what spawning begins first is a process, too
+            resource_tracker.ensure_running()
 
     def submit(self, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        with terminal_signals_blocked():  # they begin with the first item
-            return super().submit(function, *args, **kwargs)
+        return super().submit(self._call, function, *args, **kwargs)
+
+    def _call(self, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
+        if not hasattr(self._of_thread, "process"):
+            self._of_thread.process = self._begin()
+        return self._ask(*self._of_thread.process, function, *args, **kwargs)
+
+    def _begin(self) -> tuple[BaseProcess, "Connection[Any, Any]"]:
+        ours, theirs = multiprocessing.Pipe()
+        process = multiprocessing.get_context("spawn").Process(target=_answer_all, args=(theirs,))
+        with theirs, terminal_signals_blocked():
+            process.start()
+        self._begun.append((process, ours))
+        self._ask(process, ours, end_with_parent, 1)
+        return process, ours
+
+    def _ask(
+        self,
+        process: BaseProcess,
+        pipe: "Connection[Any, Any]",
+        function: Callable[P, R],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> R:
+        question = pickle.dumps((function, args, kwargs))
+        try:
+            pipe.send_bytes(question)
+            answer = pipe.recv_bytes()
+        except (EOFError, ConnectionError) as error:
+            self._died = True
+            process.join()
+            raise BrokenExecutor(f"exit code {process.exitcode}") from error
+        result, raised = pickle.loads(answer)  # noqa: S301 (our own worker's)
+        if raised is not None:
+            raise raised
+        found: R = result
+        return found
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """What is in hand is waited for, unless a process has died."""
+        if self._died:
+            for process, _ in self._begun:
+                process.terminate()
+        super().shutdown(wait, cancel_futures=cancel_futures)
+        for process, pipe in self._begun:
+            pipe.close()
+            process.join()
 
 
-def _detach_worker() -> None:
-    """A worker process out of reach of what is sent to all of a terminal, that ends when its driver was killed."""
+def _answer_all(pipe: "Connection[Any, Any]") -> None:
+    """A worker process out of reach of what is sent to all of a terminal, until its pipe closes."""
     ignore_terminal_signals()
     os.setpgrp()
-    end_with_parent(1)
+    while True:
+        try:
+            question = pipe.recv_bytes()
+        except EOFError:
+            return
+        try:
+            function, args, kwargs = pickle.loads(question)  # noqa: S301 (our own driver's)
+            answer = pickle.dumps((function(*args, **kwargs), None))
+        except Exception as error:
+            error.add_note(format_exc())
+            answer = pickle.dumps((None, error))
+        pipe.send_bytes(answer)

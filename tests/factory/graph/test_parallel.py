@@ -145,6 +145,28 @@ def test_workers_that_are_just_starting_do_not_hear_what_a_terminal_sends_to_all
         assert driver.communicate(timeout=60) == ("halted\n", "")
 
 
+SHORT = """
+import resource, sys
+from factory.config.arguments import run_command
+from factory.graph.parallel import parallel_map
+from tests.factory.items import squared
+name, more = sys.argv[1], int(sys.argv[2])
+held = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize() if name == "RLIMIT_AS" else 0
+resource.setrlimit(getattr(resource, name), (held + more, resource.RLIM_INFINITY))
+sys.exit(run_command((), lambda _: print(sum(parallel_map(squared, range(9), workers=2))), str))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limit", [("RLIMIT_STACK", 2**40), *(("RLIMIT_AS", 2**n) for n in (20, 23, 24, 25))])
+def test_where_memory_for_a_thread_is_refused_one_line_says_so(limit: tuple[str, int]) -> None:
+    """In a worker, whose threads ask for such a stack; here, where so much room lets one begin, two, then all."""
+    done = subprocess.run([sys.executable, "-c", SHORT, *map(str, limit)], cwd=ROOT, capture_output=True, timeout=60)
+    line = b"error: out of memory or threads: can't start new thread; give it more and run the same command again\n"
+    ended = done.returncode, done.stdout, done.stderr
+    assert ended == (2, b"", line) or (ended == (0, b"204\n", b"") and limit[0] == "RLIMIT_AS")
+
+
 def alive(pid: int) -> bool:
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
