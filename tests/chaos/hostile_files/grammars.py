@@ -16,6 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import torch
 from safetensors.numpy import save
 
 from factory.stages.scene_file import KEY, scene_digest, scene_header, scene_tensors
@@ -30,6 +31,7 @@ FORGED = f"\n{ESCAPE}FORGED"
 PRIME = 2**61 - 1  # integers are hashed modulo it
 SIZES = (2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63 - 1)
 MANY = (100, 10_000, 200_000)
+YAML_KEYS = ("tokens", "log_names", "max_scenes", "num_history_frames", "all_mapping", "_target_", FORGED[1:])
 
 
 def pick(rng: Rng, options: Sequence[Any]) -> Any:
@@ -49,19 +51,13 @@ def shared(kind: type) -> Any:
     return value
 
 
-def endless(kind: type) -> Any:
-    value: Any = kind()
-    value.append(value) if kind is list else value.update(a=value)
-    return value
-
-
 def nested(depth: int) -> Any:
     return [nested(depth - 1)] if depth else 0
 
 
 VALUES: dict[str, Callable[[Rng], Any]] = {
     "shared": lambda rng: shared(pick(rng, (tuple, list, dict))),
-    "holds itself": lambda rng: endless(pick(rng, (list, dict))),
+    "holds itself": lambda rng: pickle.loads(pick(rng, (b"]q\0h\0a.", b"}q\0U\1ah\0s."))),  # a list, a dict
     "nested": lambda rng: nested(pick(rng, (90, 150, 300))),
     "huge integer": lambda rng: pick(rng, (1, -1)) * 10 ** pick(rng, (30, 308, 309, 400, 5000, 100_000)),
     "huge text": lambda rng: pick(rng, ("x", "\n", "é", "\ud800")) * pick(rng, MANY),
@@ -77,11 +73,6 @@ VALUES: dict[str, Callable[[Rng], Any]] = {
 }
 
 
-def valued(kind: str, rng: Rng) -> tuple[str, Any]:
-    name, made = one_of(kind, VALUES, rng)
-    return name, made(rng)
-
-
 def planted(tree: Any, rng: Rng, what: Any, chance: float = 0.8) -> Any:
     """The tree with a value at a place of it; containers on the way are copies."""
     if isinstance(tree, dict) and tree and rng.random() < chance:
@@ -95,9 +86,9 @@ def planted(tree: Any, rng: Rng, what: Any, chance: float = 0.8) -> Any:
     return what
 
 
-def told(raw: bytes) -> bytes:
-    """Behind its length."""
-    return struct.pack("<I", len(raw)) + raw
+def told(raw: bytes, form: str = "<I", more: int = 0) -> bytes:
+    """Behind its length, and so many bytes more."""
+    return struct.pack(form, len(raw) + more) + raw
 
 
 def long4(n: int) -> bytes:
@@ -153,15 +144,18 @@ def program(rng: Rng) -> Crafted:
 def scenario(rng: Rng) -> Crafted:
     if rng.random() < 0.35:
         return program(rng)
-    name, what = valued("scenario", rng)
-    made = pick(rng, (nuscenes, waymo, nuplan))()
-    return name, pickle.dumps(planted(made, rng, what), int(rng.integers(2, 6)))
+    name, make = one_of("scenario", VALUES, rng)
+    what, good = make(rng), pick(rng, (nuscenes, waymo, nuplan))()
+    return name, pickle.dumps(planted(good, rng, what), int(rng.integers(2, 6)))
 
 
-def npy_header(text: str, version: int = 1, length: int | None = None) -> bytes:
-    n = len(text) if length is None else length
-    packed = struct.pack("<H", n & 0xFFFF) if version == 1 else struct.pack("<I", n & 0xFFFFFFFF)
-    return b"\x93NUMPY" + bytes([version, 0]) + packed + text.encode("latin1" if version < 3 else "utf-8")
+def frames(good: list[dict[str, Any]], rng: Rng) -> Crafted:
+    if rng.random() < 0.25:
+        return program(rng)
+    if rng.random() < 0.1:
+        return "frames: many", pickle.dumps(good * pick(rng, (100, 400)), int(rng.integers(2, 6)))
+    name, make = one_of("frames", VALUES, rng)
+    return name, pickle.dumps(planted(good, rng, make(rng), 0.9), int(rng.integers(2, 6)))
 
 
 def npy(rng: Rng) -> Crafted:
@@ -176,8 +170,14 @@ def npy(rng: Rng) -> Crafted:
         "keys": "{" + ", ".join(f"'{k}': {k}" for k in range(n // 20)) + "}",
         "an expression": "__import__('os').system('true')",
     }
-    (name, text), length = one_of("npy", texts, rng), pick(rng, (None, None, None, size))
-    return name, npy_header(text, int(rng.integers(1, 4)), length) + bytes(pick(rng, (0, 8640)))
+    (name, text), length, version = one_of("npy", texts, rng), pick(rng, (0, 0, 0, size)), int(rng.integers(1, 4))
+    length = struct.pack("<I", (length or len(text)) & 0xFFFFFFFF)[: 2 if version == 1 else 4]
+    raw = text.encode("latin1" if version < 3 else "utf-8")
+    return name, b"\x93NUMPY" + bytes([version, 0]) + length + raw + bytes(pick(rng, (0, 8640)))
+
+
+def array_file(rng: Rng) -> Crafted:
+    return (npz if rng.random() < 0.2 else npy)(rng)
 
 
 def deflated(head: bytes, n_bytes: int, wbits: int) -> bytes:
@@ -192,12 +192,13 @@ def npz(rng: Rng) -> Crafted:
     what, name = pick(rng, ("bomb", "members", "headers")), "trajectories.npy"
     if what == "bomb":
         n = 960 * pick(rng, (10**5, 2 * 10**6))
-        head = npy_header(f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({n // 960},40,3), }}\n")
+        text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({n // 960},40,3), }}\n"
+        head = b"\x93NUMPY\1\0" + told(text.encode(), "<H")
         body = deflated(head, n, -15)
-        told = struct.pack("<HHHHHIIIHH", 20, 0, 8, 0, 0, 0, len(body), n + len(head), len(name), 0)
-        entry = b"PK\1\2\x14\0" + told + bytes(14) + name.encode()
+        facts = struct.pack("<HHHHHIIIHH", 20, 0, 8, 0, 0, 0, len(body), n + len(head), len(name), 0)
+        entry = b"PK\1\2\x14\0" + facts + bytes(14) + name.encode()
         end = struct.pack("<HHHHIIH", 0, 0, 1, 1, len(entry), 30 + len(name) + len(body), 0)
-        return "npz: bomb", b"PK\3\4" + told + name.encode() + body + entry + b"PK\5\6" + end
+        return "npz: bomb", b"PK\3\4" + facts + name.encode() + body + entry + b"PK\5\6" + end
     names = [name, "digest.npy"] if what == "headers" else [f"../{FORGED}{k}.npy" for k in range(2_000)]
     return f"npz: {what}", zipped(((each, npy(rng)[1]) for each in names), zipfile.ZIP_DEFLATED)
 
@@ -209,10 +210,13 @@ def zipped(members: Iterable[tuple[str, str | bytes]], method: int) -> bytes:
     return sink.getvalue()
 
 
-def columns_of(good: pa.Table, rng: Rng) -> tuple[str, pa.Table]:
+def arrow(good: pa.Table, rng: Rng) -> Crafted:
     """A table like a good one, where a column is another, or all are longer."""
+    if rng.random() < 0.1:
+        length = struct.pack("<I", pick(rng, SIZES) & 0x7FFFFFFF)
+        return "arrow: length of its footer", b"ARROW1\0\0" + bytes(64) + length + b"ARROW1"
     rows, name, n = max(good.num_rows, 1), pick(rng, good.column_names), pick(rng, (10**6, 10**7))
-    kind = good.schema.field(name).type
+    kind, most = good.schema.field(name).type, sum(pa.nulls(1000, f.type).nbytes // 1000 + 1 for f in good.schema)
     extremes = (1e308, -1e308, np.nan) if pa.types.is_floating(kind) else (2**63 - 1, -(2**63), 2**31)
     columns: dict[str, Callable[[], pa.Array]] = {
         "extremes": lambda: pa.array([pick(rng, extremes)] * rows),
@@ -223,24 +227,14 @@ def columns_of(good: pa.Table, rng: Rng) -> tuple[str, pa.Table]:
         "runs": lambda: pa.RunEndEncodedArray.from_arrays(pa.array([rows], pa.int64()), pa.array([1e308])),
         "odd stamps": lambda: pa.array([2**62] * rows, pa.timestamp("ns")),
     }
-    what = pick(rng, [*columns, "rows", "rows of nothing", "many columns", "names"])
-    if what == "rows":
-        n = min(n, 10**9 // sum(pa.nulls(1000, field.type).nbytes // 1000 + 1 for field in good.schema))
-        return what, pa.table([pa.nulls(n, field.type) for field in good.schema], schema=good.schema)
-    if what == "rows of nothing":
-        return what, pa.table(dict.fromkeys(good.column_names, pa.nulls(pick(rng, (10**6, 2**31 - 1)))))
-    if what == "many columns":
-        return what, pa.table({f"{k}": pa.nulls(rows) for k in range(20_000)})
-    if what == "names":
-        return what, good.rename_columns([FORGED if c == name else c for c in good.column_names])
-    return what, good.set_column(good.column_names.index(name), name, columns[what]())
-
-
-def arrow(good: pa.Table, rng: Rng) -> Crafted:
-    if rng.random() < 0.1:
-        length = struct.pack("<I", pick(rng, SIZES) & 0x7FFFFFFF)
-        return "arrow: length of its footer", b"ARROW1\0\0" + bytes(64) + length + b"ARROW1"
-    what, table = columns_of(good, rng)
+    tables: dict[str, Callable[[], pa.Table]] = {
+        "rows": lambda: pa.table([pa.nulls(min(n, 10**9 // most), f.type) for f in good.schema], schema=good.schema),
+        "rows of nothing": lambda: pa.table(dict.fromkeys(good.column_names, pa.nulls(pick(rng, (10**6, 2**31 - 1))))),
+        "many columns": lambda: pa.table({f"{k}": pa.nulls(rows) for k in range(20_000)}),
+        "names": lambda: good.rename_columns([FORGED if c == name else c for c in good.column_names]),
+    }
+    what, at = pick(rng, [*columns, *tables]), good.column_names.index(name)
+    table = tables[what]() if what in tables else good.set_column(at, name, columns[what]())
     sink, options = io.BytesIO(), pa.ipc.IpcWriteOptions(compression=pick(rng, ("zstd", "lz4")))
     with pa.ipc.new_file(sink, table.schema, options=options) as writer:
         writer.write_table(table)
@@ -257,26 +251,18 @@ def json_text(good: Any, rng: Rng) -> Crafted:
     return name, text.replace(f'"{mark}"', word, 1).encode()
 
 
-YAML_KEYS = ("tokens", "log_names", "max_scenes", "num_history_frames", "all_mapping", "_target_", FORGED[1:])
-
-
 def yaml_text(rng: Rng) -> Crafted:
-    n = pick(rng, (60, 3_000, 60_000))
-    kind = pick(rng, ("[*a{0}, *a{0}, *a{0}]", "{{x: *a{0}, y: *a{0}}}"))
+    n, kind = pick(rng, (60, 3_000, 60_000)), pick(rng, ("[*a{0}, *a{0}, *a{0}]", "{{x: *a{0}, y: *a{0}}}"))
     aliases = ["&a0 [x]", *(f"&a{k} {kind.format(k - 1)}" for k in range(1, 60))]
-    merge = "{{<<: [*a{0}, *a{0}, *a{0}]}}"
+    merges = ["&a0 {x: 1}", *("&a{} {{<<: [*a{}, *a{}, *a{}]}}".format(k, *[k - 1] * 3) for k in range(1, 40))]
     bodies = {"aliases": "\n".join(f"  - {line}" for line in aliases), "itself": " &a [*a, *a]"}
     bodies |= {"itself as a key": " &a {? *a : 1}", "merges": " &a {<<: [*a, *a]}"}
-    merges = "\n  - &a0 {x: 1}\n" + "".join(f"  - &a{k} {merge.format(k - 1)}\n" for k in range(1, 40))
-    bodies |= {"merges of merges": merges, "digits": " " + pick(rng, ("", "-", "0x", "0b", "0")) + "1" * n}
-    bodies |= {
-        "sixties": " " + ":".join(["59"] * n),
-        "deep": " " + "[" * n,
-        "deep blocks": " " + "- " * min(n, 3000) + "1",
-    }
+    bodies |= {"merges of merges": "\n" + "".join(f"  - {line}\n" for line in merges)}
+    bodies |= {"digits": " " + pick(rng, ("", "-", "0x", "0b", "0")) + "1" * n, "sixties": " " + ":".join(["59"] * n)}
+    bodies |= {"deep": " " + "[" * n, "deep blocks": " " + "- " * min(n, 3000) + "1"}
     bodies |= {"a tag": " !!python/object/apply:os.system [true]", "bytes": " !!binary " + "AAAA" * n}
-    colliding = "\n" + "".join(f"  {k * PRIME}: 0\n" for k in range(1, n))
-    bodies |= {"a date": " 9999-99-99T99:99:99Z", "colliding keys": colliding}
+    bodies |= {"a date": " 9999-99-99T99:99:99Z"}
+    bodies |= {"colliding keys": "\n" + "".join(f"  {k * PRIME}: 0\n" for k in range(1, n))}
     bodies |= {"long text": " " + pick(rng, ("x", "é")) * n, "forged": " " + json.dumps([FORGED])}
     bodies |= {"many keys": "\n" + "".join(f"k{k}: 1\n" for k in range(n)), "1e308": " [1.0e+308, .inf, .nan]"}
     name, body = one_of("yaml", bodies, rng)
@@ -350,8 +336,6 @@ def safetensors(rng: Rng) -> Crafted:
 
 def checkpoint(rng: Rng) -> Crafted:
     """What torch's own loader takes for tensors, and what it should not."""
-    import torch
-
     torch.set_num_threads(1)  # others are not there in a fork, which would wait for them
     size, n, one, sink = pick(rng, (10**5, 2**40, 2**62)), pick(rng, MANY), torch.zeros(1), io.BytesIO()
     if rng.random() < 0.3:
@@ -373,8 +357,7 @@ def checkpoint(rng: Rng) -> Crafted:
     name, tensor = one_of("checkpoint", tensors, rng)
     widths = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "features_dc": 3, "features_rest": 0}
     gauss = {f"_model.gauss_params.{key}": torch.zeros(2, width) for key, width in widths.items()}
-    public = {"agent._transfuser_model._status_encoding.weight": torch.zeros(2)}
-    inside = dict(pick(rng, (gauss, public)))
+    inside = dict(pick(rng, (gauss, {"agent._transfuser_model._status_encoding.weight": torch.zeros(2)})))
     inside[pick(rng, [*inside, FORGED])] = tensor()
     torch.save(pick(rng, (inside, {"state_dict": inside}, {"pipeline": inside, "step": 10**4000})), sink)
     return name, sink.getvalue()
@@ -384,34 +367,27 @@ def chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
-def png_of(head: bytes, between: bytes, pixels: bytes) -> bytes:
-    chunks = (chunk(b"IHDR", head), between, chunk(b"IDAT", pixels), chunk(b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
-
-
 def png(rng: Rng) -> Crafted:
     if rng.random() < 0.2:  # a whole one
-        side = pick(rng, (10_000, 20_000, 30_000))
-        head, zeros = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0), deflated(b"", side * (side + 1) + 10**6, 15)
-        return f"png: {side} a side", png_of(head, b"", zeros)
-    width, height = (pick(rng, (0, 1, 64, 8192, 65_535, 2**31 - 1, 2**32 - 1)) for _ in range(2))
-    form = struct.pack("BBBBB", pick(rng, (1, 8, 16, 3)), pick(rng, (0, 2, 3, 6, 7)), 0, 0, pick(rng, (0, 1, 9)))
-    bomb = deflated(b"", pick(rng, (0, 10**6, 10**9)), 15)
-    extra = {
-        "plain": b"",
-        "second header": chunk(b"IHDR", struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)),
-        "profile": chunk(b"iCCP", b"a\0\0" + bomb),
-        "text": chunk(b"zTXt", b"a\0\0" + bomb) * 20,
-        "palette": chunk(b"PLTE", b"\0" * 3 * 300),
-        "length": struct.pack(">I", 2**31 - 1) + b"tEXt",
-        "many": chunk(b"tEXt", b"a\0b") * 100_000,
-    }
-    name, between = one_of("png", extra, rng)
-    return name, png_of(struct.pack(">II", width, height) + form, between, bomb)
-
-
-def segment(marker: int, body: bytes) -> bytes:
-    return bytes([0xFF, marker]) + struct.pack(">H", len(body) + 2) + body
+        side, between = pick(rng, (10_000, 20_000, 30_000)), b""
+        name, head = f"png: {side} a side", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
+        pixels = deflated(b"", side * (side + 1) + 10**6, 15)
+    else:
+        width, height = (pick(rng, (0, 1, 64, 8192, 65_535, 2**31 - 1, 2**32 - 1)) for _ in range(2))
+        form = pick(rng, (1, 8, 16, 3)), pick(rng, (0, 2, 3, 6, 7)), 0, 0, pick(rng, (0, 1, 9))
+        head, pixels = struct.pack(">II5B", width, height, *form), deflated(b"", pick(rng, (0, 10**6, 10**9)), 15)
+        extra = {
+            "plain": b"",
+            "second header": chunk(b"IHDR", struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)),
+            "profile": chunk(b"iCCP", b"a\0\0" + pixels),
+            "text": chunk(b"zTXt", b"a\0\0" + pixels) * 20,
+            "palette": chunk(b"PLTE", b"\0" * 3 * 300),
+            "length": struct.pack(">I", 2**31 - 1) + b"tEXt",
+            "many": chunk(b"tEXt", b"a\0b") * 100_000,
+        }
+        name, between = one_of("png", extra, rng)
+    chunks = (chunk(b"IHDR", head), between, chunk(b"IDAT", pixels), chunk(b"IEND", b""))
+    return name, b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
 def jpeg(rng: Rng) -> Crafted:
@@ -419,14 +395,16 @@ def jpeg(rng: Rng) -> Crafted:
     parts = pick(rng, (1, 3, 4))
     sizes = bytes(f for k in range(parts) for f in (k + 1, pick(rng, (0x11, 0x22, 0x44)), 0))
 
+    def segment(marker: int, body: bytes) -> bytes:
+        return bytes([0xFF, marker]) + told(body, ">H", 2)
+
     def frame(kind: int, width: int, height: int) -> bytes:
         return segment(kind, struct.pack(">BHHB", 8, height, width, parts) + sizes)
 
     width, height = (pick(rng, (0, 1, 64, 4096, 8192, 65_535)) for _ in range(2))
     all_parts = bytes([parts, *(f for k in range(parts) for f in (k + 1, 0))])
     tables = segment(0xDB, b"\0" + b"\1" * 64) + b"".join(segment(0xC4, bytes([k, 1, *[0] * 16])) for k in (0, 0x10))
-    one = tables + segment(0xDA, all_parts + bytes([0, 63, 0])) + b"\0" * 64
-    first = tables + segment(0xDA, all_parts + bytes([0, 0, 1])) + b"\0" * 64
+    one, first = (tables + segment(0xDA, all_parts + bytes(to)) + b"\0" * 64 for to in ((0, 63, 0), (0, 0, 1)))
     runs = segment(0xC4, bytes([0x10, 1, *[0] * 15, 0xE0]))  # 16,384 blocks without a coefficient in 15 bits
     idle = runs + (segment(0xDA, bytes([1, 1, 0, 1, 63, 0])) + b"\x7f" * 4) * pick(rng, (20, 400))
     plain = frame(pick(rng, (0xC0, 0xC3, 0xC9)), width, height) + one
@@ -445,7 +423,9 @@ def jpeg(rng: Rng) -> Crafted:
     return name, b"\xff\xd8" + body + b"\xff\xd9"
 
 
-def other_picture(rng: Rng) -> Crafted:
+def picture(rng: Rng) -> Crafted:
+    if made := pick(rng, (png, jpeg, jpeg, None)):
+        return made(rng)
     side = pick(rng, SIZES) & 0x7FFFFFFF
     heads = {
         "bmp": b"BM" + struct.pack("<IHHIIiiHHIIiiII", 54, 0, 0, 54, 40, side, side, 1, 24, *[0] * 6),
@@ -459,23 +439,19 @@ def other_picture(rng: Rng) -> Crafted:
     return one_of("picture", heads, rng)
 
 
-def record(opcode: int, body: bytes, length: int | None = None) -> bytes:
-    return bytes([opcode]) + struct.pack("<Q", len(body) if length is None else length) + body
-
-
 def mcap(rng: Rng) -> Crafted:
     size, kind, squeezed = pick(rng, SIZES), pick(rng, (b"zstd", b"lz4", FORGED.encode())), zstd_zeros(15 * 10**8)
-    told = struct.pack("<QQQII", 0, 1, pick(rng, (15 * 10**8, size)), 0, len(kind)) + kind
+    head = struct.pack("<QQQI", 0, 1, pick(rng, (15 * 10**8, size)), 0) + told(kind)
     bodies = {
-        "chunk bomb": record(6, told + struct.pack("<Q", len(squeezed)) + squeezed) * pick(rng, (1, 4)),
-        "length": record(6, b"", size),
-        "length of a text": record(3, struct.pack("<HI", 1, size & 0xFFFFFFFF)),
-        "many": record(15, struct.pack("<I", 0)) * 100_000,
-        "opcodes": record(int(rng.integers(16, 256)), b"x" * 100),
+        "chunk bomb": (b"\6" + told(head + told(squeezed, "<Q"), "<Q")) * pick(rng, (1, 4)),
+        "length": b"\6" + struct.pack("<Q", size),
+        "length of a text": b"\3" + told(struct.pack("<HI", 1, size & 0xFFFFFFFF), "<Q"),
+        "many": (b"\x0f" + told(bytes(4), "<Q")) * 100_000,
+        "opcodes": bytes([int(rng.integers(16, 256))]) + told(b"x" * 100, "<Q"),
     }
     name, body = one_of("mcap", bodies, rng)
-    footer = record(2, struct.pack("<QQI", pick(rng, (0, 30, size)), pick(rng, (0, size)), 0))
-    return name, b"\x89MCAP0\r\n" + record(1, bytes(8)) + body + footer + b"\x89MCAP0\r\n"
+    footer = b"\2" + told(struct.pack("<QQI", pick(rng, (0, 30, size)), pick(rng, (0, size)), 0), "<Q")
+    return name, b"\x89MCAP0\r\n\1" + told(bytes(8), "<Q") + body + footer + b"\x89MCAP0\r\n"
 
 
 def commit(good: Sequence[dict[str, Any]], rng: Rng) -> Crafted:
@@ -495,8 +471,7 @@ def commit(good: Sequence[dict[str, Any]], rng: Rng) -> Crafted:
         "properties": ("metaData", {"configuration": {FORGED: "x" * n}}),
         "protocol": ("protocol", {"minReaderVersion": size & 0x7FFFFFFF, "readerFeatures": [FORGED]}),
     }
-    what = pick(rng, [*lies, "many", "text"])
-    if what == "text":
+    if (what := pick(rng, [*lies, "many", "text"])) == "text":
         return "commit: text", json_text(list(good), rng)[1]
     key, lie = lies.get(what, ("", {}))
     actions = [{name: body | lie if name == key else body for name, body in action.items()} for action in good]

@@ -7,27 +7,25 @@ from pathlib import Path
 
 import pytest
 
-from tests.chaos.hostile_files.trials import REPOSITORY, crafted
+from tests.chaos.hostile_files.__main__ import crafted
+from tests.pages import REPOSITORY
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # 25 s of CPU time, which a busy machine spreads
 
 SHORT = ("recovery table", "episode", "sidecar", "picture", "picture of a batch")  # 16 cases of each
-KEPT = [  # door, number, the attack that the number stands for: what did harm once, or would where a guard is gone
-    ("scenarionet", 18, "program: a shared kind"),
-    ("recovery table", 9, "npz: bomb"),
-    ("episode", 0, "mcap: chunk bomb"),
-    ("picture", 5, "png: length"),
-    ("picture", 10, "png: 30000 a side"),
-    ("scene checkpoint", 4, "checkpoint: empty"),
-    ("scene checkpoint", 9, "checkpoint: sparse"),
-    ("scene file", 1, "safetensors: tensors"),
-]
+KEPT = {  # door and number: the attack that it stands for; it did harm once, or would where a guard is gone
+    ("scenarionet", 18): "program: a shared kind",
+    ("recovery table", 9): "npz: bomb",
+    ("episode", 0): "mcap: chunk bomb",
+    ("picture", 5): "png: length",
+    ("picture", 10): "png: 30000 a side",
+    ("scene checkpoint", 4): "checkpoint: empty",
+    ("scene checkpoint", 9): "checkpoint: sparse",
+    ("scene file", 1): "safetensors: tensors",
+}
 
 
-CASES = {"some": [(door, n) for door in SHORT for n in range(16)], "kept": [(door, n) for door, n, _ in KEPT]}
-
-
-@pytest.mark.parametrize("cases", CASES.values(), ids=CASES)
+@pytest.mark.parametrize("cases", [[(door, n) for door in SHORT for n in range(16)], [*KEPT]], ids=["some", "kept"])
 def test_crafted_files_hurt_nobody(cases: list[tuple[str, int]], tmp_path: Path) -> None:
     only = ",".join(f"{door}:{n}" for door, n in cases)
     command = [sys.executable, "-m", "tests.chaos.hostile_files", f"to={tmp_path}", f"only={only}"]
@@ -36,8 +34,7 @@ def test_crafted_files_hurt_nobody(cases: list[tuple[str, int]], tmp_path: Path)
     verdicts = [json.loads(line) for line in (tmp_path / "verdicts.jsonl").read_text().splitlines()]
     attacks = {(verdict["door"], verdict["number"]): verdict["attack"] for verdict in verdicts}
     assert attacks.keys() == set(cases)
-    stood_for = {(door, n): attack for door, n, attack in KEPT}
-    assert all(attacks[case] == stood_for.get(case, attacks[case]) for case in cases), "a grammar changed: find others"
+    assert all(attacks[case] == KEPT.get(case, attacks[case]) for case in cases), "a grammar changed: find others"
 
 
 def test_a_case_is_the_same_again(tmp_path: Path) -> None:
