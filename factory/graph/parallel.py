@@ -6,7 +6,7 @@ import pickle
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import islice
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
@@ -167,15 +167,13 @@ def _answer_all(pipe: "Connection[Any, Any]") -> None:
     """A worker process out of reach of what is sent to all of a terminal, until its pipe closes."""
     ignore_terminal_signals()
     os.setpgrp()
-    while True:
-        try:
+    with suppress(EOFError, ConnectionError):  # its driver is done with it, or gone
+        while True:
             question = pipe.recv_bytes()
-        except EOFError:
-            return
-        try:
-            function, args, kwargs = pickle.loads(question)  # noqa: S301 (our own driver's)
-            answer = pickle.dumps((function(*args, **kwargs), None))
-        except Exception as error:
-            error.add_note(format_exc())
-            answer = pickle.dumps((None, error))
-        pipe.send_bytes(answer)
+            try:
+                function, args, kwargs = pickle.loads(question)  # noqa: S301 (our own driver's)
+                answer = pickle.dumps((function(*args, **kwargs), None))
+            except Exception as error:
+                error.add_note(format_exc())
+                answer = pickle.dumps((None, error))
+            pipe.send_bytes(answer)
