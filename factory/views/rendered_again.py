@@ -205,7 +205,7 @@ def shifted_film(
     shift[1, 3] = aside_m
     side = f"{abs(aside_m):g} m to the {'left' if aside_m >= 0.0 else 'right'}"
     side += f", turned by {turn_deg:g} deg" if turn_deg else ""
-    size = width + width % 2, height + height % 2 + CAPTION_PX + 4
+    size = width + 8, height + height % 2 + CAPTION_PX + 4  # H.264 takes even sides
     for file, photo in zip(files, load_photos(files, [camera], width, height)):
         pose, step = file.world_from_ego @ shift, file.time_s / STEP_S
         drawn = render_views(asset, [camera], pose[None], agents, [step], width, height)

@@ -11,6 +11,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from factory.commands.table import COMMANDS
 from factory.datasets.scenarionet.photos import read_photo_drive
@@ -20,6 +21,7 @@ from factory.stages.assets import load_or_build_scene
 from factory.stages.scene_file import read_scene
 from tasks.render.scene.asset import psnr
 from tasks.render.settings import FitSettings, RenderSettings
+from tasks.render.views import render_views
 from tasks.world.clip import STEP_S, AgentKind, Block, Clip
 
 main = COMMANDS["scene"].load()
@@ -88,6 +90,7 @@ def test_a_sidecar_alone_gives_the_scene_that_a_run_makes_and_a_film_of_it(
     assert [path.name for path in tmp_path.iterdir()] == ["town.scene"]
     assert main(["info", str(to)]) == 0 and capsys.readouterr().out.strip() in said.out
     built = read_scene(to)
+    assert drive.clip.block is not None
     assert built.n_held_out == 4 and built.psnr_db > 26.0  # 26.7; their mean colour alone: 13
     of_run = load_or_build_scene(
         drive.clip, RenderSettings(width=WIDTH, height=HEIGHT, fit=FitSettings(**FIT)), tmp_path / "cache"
@@ -98,17 +101,24 @@ def test_a_sidecar_alone_gives_the_scene_that_a_run_makes_and_a_film_of_it(
         np.testing.assert_array_equal(one.colours, other.colours)
 
     films = {}
-    for aside in (0, 1):
-        film = tmp_path / f"{aside}.mp4"
-        assert main(["film", str(to), str(drive.sidecar), root, f"to={film}", f"aside={aside}"]) == 0
+    for aside_m, turn_deg in ((0.0, 0.0), (1.0, 8.0)):
+        film = tmp_path / f"{aside_m:g}.mp4"
+        more = [root, f"to={film}", f"aside={aside_m}", f"turn={turn_deg}"]
+        assert main(["film", str(to), str(drive.sidecar), *more]) == 0
         with av.open(str(film)) as container:
             assert container.streams.video[0].average_rate == 10
-            films[aside] = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    assert len(films[0]) == len(films[1]) == 36
-    for at_pose, aside_m in zip(films[0], films[1]):
-        halves = [np.split(frame[4 : 4 + HEIGHT], 2, axis=1) for frame in (at_pose, aside_m)]
-        (photo, same), (_, moved) = halves
-        assert psnr(photo, same) > 22.0 and psnr(photo, same) > psnr(photo, moved) + 4.0
+            frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        films[aside_m] = [[half[4 : 4 + HEIGHT, 4:-4] for half in np.split(frame, 2, axis=1)] for frame in frames]
+    assert len(films[0.0]) == len(films[1.0]) == 36
+    assert all(psnr(photo, same) > 22.0 for photo, same in films[0.0])
+    files, settled = built.photos_of(drive.clip.block.images), built.settled(drive.clip.block.agents, 0.0)
+    for k in (0, 20, 35):
+        there = files[k].world_from_ego.copy()
+        there[:3, 3] += there[:3, 1]  # y is left
+        there[:3, :3] = there[:3, :3] @ Rotation.from_euler("z", 8.0, degrees=True).as_matrix()
+        rig = built.as_corrected(drive.clip.cameras)
+        drawn = render_views(built, rig, there[None], settled, [files[k].time_s / STEP_S], WIDTH, HEIGHT)[0, 0]
+        assert psnr(films[1.0][k][1], drawn) > 30.0
     (tmp_path / "elsewhere").mkdir()
     other = tmp_path / "elsewhere" / "cameras.json"
     other.write_text(drive.sidecar.read_text())
