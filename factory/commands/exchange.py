@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -448,12 +448,11 @@ def _build_scene(request: SceneRequest, sidecar: Path, to: Path) -> None:
     if to.is_dir():
         raise ValueError(f"to={to}: is a folder; name a file in it")
     drive, began = _read_drive(request, sidecar), time.monotonic()
-    first = drive.cameras[0]
-    width = request.width or min(first.width, SCENE_WIDTH)
-    words = [f"render.width={width}", f"render.height={round(width * first.height / first.width)}", *request.settings]
-    words += [] if request.masks is None else [f"render.own_body={request.masks}"]
-    settings = fill(RenderSettings, compose("run", words)["render"], "render")
+    words = [] if request.masks is None else [f"render.own_body={request.masks}"]
+    settings = fill(RenderSettings, compose("run", [*words, *request.settings])["render"], "render")
     cameras = choose_cameras(drive.cameras, settings.cameras)
+    width = request.width or min(cameras[0].width, SCENE_WIDTH)
+    settings = replace(settings, width=width, height=round(width * cameras[0].height / cameras[0].width))
     refuse_unknown_masks(settings.own_body, drive.cameras)
     if why := why_no_scene(drive, settings):
         raise ValueError(f"{sidecar}: {why}")

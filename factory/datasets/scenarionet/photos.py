@@ -259,6 +259,7 @@ def _pose(
     return pose
 
 
+LONGEST_S = 600.0  # of a drive that one scene is made of
 BOX_REACH_S = 0.55  # from an instant at which a thing's box is given: so far its place is known
 
 
@@ -273,6 +274,9 @@ def read_photo_drive(path: Path, root: Path) -> PhotoDrive:
         problem = f"{len(lost):,} of {len(files):,} files are not there, such as {lost[0]}: do paths count from {root}?"
         raise BadClip(str(path), "frames", problem)
     first_s, last_s = min(file.time_s for file in files), max(file.time_s for file in files)
+    if last_s - first_s > LONGEST_S:
+        problem = f"{last_s - first_s:,.0f} s from the first to the last: a scene is of some 20 s, make several files"
+        raise BadClip(str(path), "frames.t_s", problem)
     images, sweeps = (
         tuple(replace(file, time_s=file.time_s - first_s) for file in part) for part in (found.images, found.sweeps)
     )
@@ -304,7 +308,9 @@ def _boxed(content: Mapping[str, Any], steps_s: Array, file: str) -> AgentTracks
     for j, given in enumerate(rows.values()):
         times = np.array(sorted(given))
         at = np.stack([given[time_s] for time_s in times])
-        near = np.abs(steps_s[:, None] - times).min(axis=1) <= BOX_REACH_S
+        after = np.minimum(np.searchsorted(times, steps_s), len(times) - 1)
+        apart = [np.abs(steps_s - times[row]) for row in (after, np.maximum(after - 1, 0))]
+        near = np.minimum(*apart) <= BOX_REACH_S
         there = near & (steps_s >= times[0] - STEP_S / 2) & (steps_s <= times[-1] + STEP_S / 2)
         columns = (*at[:, :3].T, np.unwrap(at[:, 3]))
         x, y, z, yaw = (np.interp(steps_s[there], times, column) for column in columns)

@@ -146,6 +146,10 @@ WRONG: list[tuple[Callable[[Sidecar], object], str]] = [
     (without("ego_to_world"), r"frames\[0\].ego_to_world: missing, and there is no drive at 0 s to take it from"),
     (lambda c: c["frames"][2]["ego_to_world"][0].__setitem__(3, math.nan), r"frames\[2\].ego_to_world: holds NaN"),
     (lambda c: c["frames"][2].update(file="gone.jpg"), "1 of 36 files are not there, such as .*/gone.jpg: do paths"),
+    (
+        lambda c: c["frames"][-1].update(t_s=700.0),
+        "frames.t_s: 700 s from the first to the last: a scene is of some 20",
+    ),
     (box(id=None), r"boxes\[3\].id: None: expected text"),
     (box(kind="TREE"), r"boxes\[3\].kind: 'TREE' is none of BICYCLE, PEDESTRIAN, VEHICLE"),
     (box(t_s="now"), r"boxes\[3\].t_s: 'now': expected seconds"),
