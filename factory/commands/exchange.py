@@ -406,6 +406,7 @@ def scene(request: SceneRequest) -> None:
     from factory.views.scene_files import export_scene, info_text, logged_vehicles, read_splats, scene_from_splats
     from factory.views.status import open_store
     from tasks.render.splatting.formats import LoggedVehicle
+    from tasks.render.splatting.gsplat_backend import BackendMissing
 
     file, to = Path(request.files[0]), Path(request.to or "")
     try:
@@ -433,16 +434,17 @@ def scene(request: SceneRequest) -> None:
                 _build_scene(request, file, to)
             case "film":
                 _film_scene(request, read_scene(file), Path(request.files[1]), to)
-    except (BadClip, ValueError, OSError) as error:
+    except (BadClip, BackendMissing, ValueError, OSError) as error:
         raise Refused(str(error)) from error
 
 
 def _build_scene(request: SceneRequest, sidecar: Path, to: Path) -> None:
-    """Fit, and say what came out. Raises ValueError, BadClip and OSError."""
+    """Fit, and say what came out. Raises ValueError, BadClip, BackendMissing and OSError."""
     from factory.config.compose import compose, fill
     from factory.stages.assets import load_or_build_scene, scene_path, why_no_scene
     from factory.stages.sensors import choose_cameras, files_of_cameras, refuse_unknown_masks
     from factory.views.scene_files import info_text
+    from tasks.render.scene.engine import require_backend
     from tasks.render.settings import RenderSettings
 
     if to.is_dir():
@@ -454,6 +456,7 @@ def _build_scene(request: SceneRequest, sidecar: Path, to: Path) -> None:
     width = request.width or min(cameras[0].width, SCENE_WIDTH)
     settings = replace(settings, width=width, height=round(width * cameras[0].height / cameras[0].width))
     refuse_unknown_masks(settings.own_body, drive.cameras)
+    require_backend(settings.backend)
     if why := why_no_scene(drive, settings):
         raise ValueError(f"{sidecar}: {why}")
     parts = to.with_name(f"{to.name}.parts")  # what is half done, by what it is made of
