@@ -203,7 +203,7 @@ def shifted_film(
     angle, shift, agents = np.radians(turn_deg), np.eye(4), asset.settled(drive.block.agents, 0.0)
     shift[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     shift[1, 3] = aside_m
-    side = f"{abs(aside_m):g} m to the {'left' if aside_m >= 0.0 else 'right'}"
+    side = f"{abs(aside_m):g} m to the {'left' if aside_m > 0.0 else 'right'}" if aside_m else "from its place"
     side += f", turned by {turn_deg:g} deg" if turn_deg else ""
     size = width + 8, height + height % 2 + CAPTION_PX + 4  # H.264 takes even sides
     for file, photo in zip(files, load_photos(files, [camera], width, height)):
