@@ -360,6 +360,7 @@ def compact(store: Store) -> Iterator[tuple[str, int, int]]:
                 shard = write_shard(table.location, table.spec, rows)
                 add.append((shard, max(facts[path].written_ms for path in paths)))
                 drop += paths
+                del rows  # before the next are read
         if add:
             table.replace_files(drop, add)
         yield table.spec.name, len(facts), len(table.file_facts())

@@ -159,4 +159,4 @@ def _commits(out: Path) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(run_request_command(sys.modules[__name__], sys.argv[1:]))
+    sys.exit(run_request_command(main, sys.argv[1:]))

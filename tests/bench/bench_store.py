@@ -4,8 +4,9 @@
 
 The rows are written straight to the tables, as a run that made a third of them samples would leave them: clips of two
 experts and five rounds, in `commits` commits of a file a round and expert. An `out` that is there is taken as it is.
-Every step is a process of its own; seconds are of its CPU, over what its imports take, and memory is its peak. `go on`
-is asked for by name alone, for it changes the table: one more round for two minutes, on a Ray of two workers.
+Every step is a process of its own; seconds are of its CPU, over what its imports take, and memory is its peak. Two are
+asked for by name alone, as `step=compact`, for they change the table: `compact`, and `go on`, one more round for two
+minutes on a Ray of two workers.
 """
 
 import math
@@ -38,7 +39,7 @@ from tests.factory.toy import ToyWork, row_of, stream
 EXPERTS = ("pdm_closed", "recovery")
 ROUNDS, TRIES = 5, 15  # of a walk: every third attempt is accepted
 WORK = ToyWork(n_candidates=40)
-GO_ON = "go on"
+CHANGING = ("compact", "go on")
 Step = Callable[[Path], object]
 
 
@@ -63,7 +64,7 @@ def main(request: Request) -> None:
         write(out, request.attempts, request.commits)
         print(f"written in {time.perf_counter() - began:.0f} s")
     print(f"{'step':<12}{'CPU s':>8}{'s':>8}{'MB':>7}")
-    for name in [name for name in STEPS if name != GO_ON]:
+    for name in [name for name in STEPS if name not in CHANGING]:
         command = [sys.executable, "-m", "tests.bench.bench_store", f"out={out}", f"step={name}"]
         said = subprocess.run(command, capture_output=True, text=True, check=False)
         print(f"{name:<12}{said.stdout.strip() or said.stderr.strip().splitlines()[-1]}", flush=True)
@@ -254,7 +255,8 @@ STEPS: dict[str, Step] = {
     "card": card,
     "failed": command("failed"),
     "verify": command("verify"),
-    GO_ON: go_on,
+    "compact": command("compact"),
+    "go on": go_on,
 }
 
 
@@ -264,4 +266,4 @@ def _cpu_s() -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(run_request_command(sys.modules[__name__], sys.argv[1:]))
+    sys.exit(run_request_command(main, sys.argv[1:]))
