@@ -119,7 +119,9 @@ class _Processes(ThreadPoolExecutor):
     def _call(self, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
         if not hasattr(self._of_thread, "process"):
             self._of_thread.process = self._begin()
-        return self._ask(*self._of_thread.process, function, *args, **kwargs)
+        process, pipe = self._of_thread.process
+        result: R = self._ask(process, pipe, (function, args, kwargs))
+        return result
 
     def _begin(self) -> tuple[BaseProcess, "Connection[Any, Any]"]:
         ours, theirs = multiprocessing.Pipe()
@@ -127,18 +129,11 @@ class _Processes(ThreadPoolExecutor):
         with theirs, terminal_signals_blocked():
             process.start()
         self._begun.append((process, ours))
-        self._ask(process, ours, end_with_parent, 1)
+        self._ask(process, ours, (end_with_parent, (1,), {}))
         return process, ours
 
-    def _ask(
-        self,
-        process: BaseProcess,
-        pipe: "Connection[Any, Any]",
-        function: Callable[P, R],
-        *args: P.args,
-        **kwargs: P.kwargs,
-    ) -> R:
-        question = pickle.dumps((function, args, kwargs))
+    def _ask(self, process: BaseProcess, pipe: "Connection[Any, Any]", call: tuple[Any, ...]) -> Any:
+        question = pickle.dumps(call)
         try:
             pipe.send_bytes(question)
             answer = pipe.recv_bytes()
@@ -149,8 +144,7 @@ class _Processes(ThreadPoolExecutor):
         result, raised = pickle.loads(answer)  # noqa: S301 (our own worker's)
         if raised is not None:
             raise raised
-        found: R = result
-        return found
+        return result
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """What is in hand is waited for, unless a process has died."""
