@@ -4,6 +4,7 @@ Seen is a wall across the way, by a lens on the axle.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -96,6 +97,9 @@ def test_a_guess_is_what_photos_do_not_show_and_what_does_not_look_like_there() 
     assert not guessed(scrap, pose(0.0), pose(0.0)).any()
     seen = guessed(scrap, pose(0.0, 1.5), pose(0.0))
     assert 0.02 < seen.mean() < 0.3
+    shown = sights_of(plain, pose(0.0))
+    other = replace(shown, pictures=(np.ascontiguousarray(shown.pictures[0][:, ::-1]),))
+    assert guessed_pixels(plain, other, LENS, pose(0.0), NOBODY).mean() > 0.5
 
 
 def test_the_sky_and_what_vehicles_hide_is_no_guess() -> None:
