@@ -2,11 +2,12 @@
 
     python -m tests.bench.bench_scale                                the same run on 1, 2 and 4 nodes of this machine
     python -m tests.bench.bench_scale nodes=1 attempts=100000 wait_ms=0      a long run, as fast as it goes
+    ... nodes=1 attempts=3000000 accepted=0.03 wait_ms=0 row_kb=0 out=<folder>     its tables stay; killed, it goes on
 
 Nodes are Ray's own (`ray start` on loopback), with `cpus` each in name; stages sleep, so that the cores of this machine
 are no limit before the graph is. A row carries `row_kb` of incompressible bytes for its pictures. `ideal` is the time
 that all the sleeping takes on so many CPUs. Memory and CPU time are the driver's; `again` is how long the same command
-takes to find that all is done.
+takes to find that all is done, `found` the attempts of a run before it in the same folder.
 """
 
 import json
@@ -49,6 +50,7 @@ class Request:
     rounds: int = 5
     row_kb: int = 20
     accepted: float = 0.5  # share of the attempts; the others cost a worker hardly anything
+    out: str = ""  # kept, for the same command to go on in; else a temporary folder
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[1-9]\d*(,[1-9]\d*)*", self.nodes):
@@ -91,8 +93,9 @@ class WaitingWork(ToyWork):
 def main(request: Request) -> None:
     """Print the table, a row for each number of nodes."""
     print(f"{request.cpus} CPUs a node, stages of {request.wait_ms} ms, rows of {request.row_kb} kB")
-    print(f"{'nodes':>5}{'attempts':>10}{'samples':>9}{'seconds':>9}{'ideal':>8}{'efficiency':>12}{'per s':>8}"
-           f"{'driver CPU ms':>15}{'driver MB':>11}{'commits':>9}{'files':>7}{'MB':>8}{'again s':>9}")  # fmt: skip
+    print(f"{'nodes':>5}{'found':>9}{'attempts':>10}{'samples':>9}{'seconds':>9}{'ideal':>8}{'efficiency':>12}"
+           f"{'per s':>8}{'driver CPU ms':>15}{'driver MB':>11}"
+           f"{'commits':>9}{'files':>7}{'MB':>8}{'again s':>9}")  # fmt: skip
     for nodes in request.each:
         print(measured(request, nodes), flush=True)
 
@@ -111,7 +114,7 @@ def measured(request: Request, nodes: int) -> str:
             cluster.add_node(num_cpus=request.cpus)
         ray.init(address=cluster.address, log_to_driver=False)
         with tempfile.TemporaryDirectory() as folder:
-            return _row(request, nodes, refs, work, Path(folder) / "out")
+            return _row(request, nodes, refs, work, Path(request.out or folder) / f"nodes-{nodes}")
     finally:
         ray.shutdown()
         cluster.shutdown()
@@ -127,17 +130,17 @@ def _row(request: Request, nodes: int, refs: Sequence[ClipRef], work: WaitingWor
     began = time.perf_counter()
     again = execute(work, refs, EXPERTS, request.rounds, Store(out), Execution("ray"), say=lambda line: None)
     again_s = time.perf_counter() - began
-    attempts = summary.executed.attempts
-    if (again.executed.attempts, again.executed.found_done) != (0, attempts):
-        raise RuntimeError(f"the second run found {again.executed.found_done} of {attempts} attempts done")
+    attempts, found = summary.executed.attempts, summary.executed.found_done
+    if (again.executed.attempts, again.executed.found_done) != (0, attempts + found):
+        raise RuntimeError(f"the second run found {again.executed.found_done} of {attempts} + {found} attempts done")
     ideal = work.seconds * (attempts + summary.executed.prepared) / (nodes * request.cpus)
     store = Store(out)
     files = list(out.rglob("*.parquet"))
     size = sum(path.stat().st_size for path in files) / 2**20
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return (f"{nodes:5d}{attempts:10d}{len(store.samples):9d}{took:9.1f}{ideal:8.1f}{100 * ideal / took:11.1f}%"
-            f"{attempts / took:8.1f}{1000 * cpu_s / attempts:15.2f}{peak:11.0f}{_commits(out):9d}{len(files):7d}"
-            f"{size:8.0f}{again_s:9.1f}")  # fmt: skip
+    return (f"{nodes:5d}{found:9d}{attempts:10d}{len(store.samples):9d}{took:9.1f}{ideal:8.1f}"
+            f"{100 * ideal / took:11.1f}%{attempts / took:8.1f}{1000 * cpu_s / attempts:15.2f}{peak:11.0f}"
+            f"{_commits(out):9d}{len(files):7d}{size:8.0f}{again_s:9.1f}")  # fmt: skip
 
 
 @ray.remote(num_cpus=1)
