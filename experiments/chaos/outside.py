@@ -146,6 +146,7 @@ NO_USER = ("unshare", "--user", f"--map-user={NOBODY}", f"--map-group={NOBODY}")
 ASCII = {"LC_ALL": "C", "LANG": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 ENDED = (COMPLETE, INTERRUPTED)
 BAD = (*ENDED, BAD_CONFIG)
+NO_THREAD_DATA = 127  # glibc's, where a thread's own variables find no place
 NONE_ANSWERS = f"{GOES_ON}|unset it"
 RAN = ("run", "isolated", "train", "evaluate", "drive", "export navsim", "import simscale")
 Same = partial(Row, each_once=True)  # the trouble is always the same: no command is tried twice
@@ -160,13 +161,13 @@ ROWS: Mapping[str, Row] = {
     ),
     "ascii": Same("with LANG=C and an output of ASCII alone", trouble.started_with(**ASCII), EVERY),
     "files": Same("with 64 open files", trouble.started_with("prlimit", "--nofile=64"), EVERY, BAD, "files"),
-    # Where it is refused, Rust ends by SIGABRT, other native code by SIGSEGV, OpenBLAS by exit code 1 and a line of its
-    # own, or without threads by raise(SIGINT).
+    # Where it is refused, Rust ends by SIGABRT, other native code by SIGSEGV, glibc by 127, OpenBLAS by exit code 1, both
+    # with a line of their own, or without threads by raise(SIGINT).
     "memory": Same(
         "with 512 MB less memory than it takes",
         trouble.short_of_memory,
         EVERY,
-        (*BAD, -signal.SIGABRT, -signal.SIGSEGV, DAMAGED),
+        (*BAD, -signal.SIGABRT, -signal.SIGSEGV, DAMAGED, NO_THREAD_DATA),
         "(?i)memory|again|interrupted",
     ),
     "no-shm": Same("without /dev/shm", trouble.no_shared_memory, (*EVERY, "ray"), BAD, needs_root=True),

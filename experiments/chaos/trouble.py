@@ -34,7 +34,7 @@ NOBODY = 4242  # a user
 TRACE = re.compile(r"Traceback|Exception ignored|Fatal Python error|core dumped|Aborted|panicked")
 RAY_S_OWN = re.compile(r"^.*\((PlacementGroupCleaner|TrainController) pid=.*\n", re.M)  # Ray Train
 GOES_ON = r"again|the same command goes on|free disk space|run it as a user|to=<another|out="  # how to go on
-SAID = re.compile(r"^error: |again|^interrupted|the same command goes on|^OpenBLAS error")
+SAID = re.compile(r"^error: |again|^interrupted|the same command goes on|^OpenBLAS error|thread-local data: ABORT$")
 
 
 # Processes.
