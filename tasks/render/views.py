@@ -42,7 +42,7 @@ def render_views(
         there = agents_at_time(agents, step * STEP_S, world_from_ego[f, :2, 3], VISIBLE_M)
         eyes = [Pinhole(c.intrinsics, world_from_ego[f] @ c.ego_from_camera, width, height) for c in rig]
         for c, view in enumerate(render(asset, eyes, there, backend, affines=affines)):
-            out[f, c] = np.rint(view.rgb * 255.0).astype(np.uint8)
+            cv2.convertScaleAbs(view.rgb, out[f, c], 255.0)
             if (body := asset.own_body(cameras[c].name)) is not None:
                 out[f, c] = body.drawn_on(out[f, c])
     return out

@@ -30,6 +30,7 @@ from tasks.render.fit.reconstruct import finish_scene, run_iterations
 from tasks.render.fit.start import FitPhoto, FitProblem, PhotoTarget
 from tasks.render.fit.state import BACKGROUND, AdamArray, FitState, logits_of
 from tasks.render.scene.asset import psnr
+from tasks.render.scene.engine import BLACK
 from tasks.render.scene.movers import SHIFT_SIZE
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.render.scene.sky import COLUMNS, ROWS
@@ -65,7 +66,7 @@ class Place:
     device: str
     draw: Draw
     plain: Callable[[SceneTensors, Sequence[Eye], bool], Tensor]  # rgb (C, H, W, 3), packed or not, by nothing of ours
-    engine: Callable[[Gaussians, Sequence[Pinhole], Sequence[NDArray[np.float32]], bool], list[View]]
+    engine: Callable[[Gaussians, Sequence[Pinhole], bool], list[View]]
     least_s: float = 2.0  # that something is timed
 
     def done(self) -> None:
@@ -103,10 +104,8 @@ def on_cuda(rasterization: Callable[..., Any]) -> Place:
         rgb: Tensor = rasterization(**each[0] | cameras | {"packed": packed, "render_mode": "RGB"})[0]
         return rgb
 
-    def engine(
-        scene: Gaussians, cameras: Sequence[Pinhole], behind: Sequence[NDArray[np.float32]], packed: bool
-    ) -> list[View]:
-        return rasterize_all(scene, cameras, behind, packed=packed)
+    def engine(scene: Gaussians, cameras: Sequence[Pinhole], packed: bool) -> list[View]:
+        return rasterize_all(scene, cameras, packed=packed)
 
     return Place("render.backend=gsplat", "cuda", by_gsplat, plain, engine)
 
@@ -115,12 +114,8 @@ def _of_tensors(scene: SceneTensors, eyes: Sequence[Eye], packed: bool) -> Tenso
     return torch.stack([by_kernels(scene, eye).rgb for eye in eyes])
 
 
-def _of_arrays(
-    scene: Gaussians, cameras: Sequence[Pinhole], behind: Sequence[NDArray[np.float32]], packed: bool
-) -> list[View]:
-    return [
-        forward(scene, c.intrinsics, c.world_from_camera, c.width, c.height, b).view for c, b in zip(cameras, behind)
-    ]
+def _of_arrays(scene: Gaussians, cameras: Sequence[Pinhole], packed: bool) -> list[View]:
+    return [forward(scene, c.intrinsics, c.world_from_camera, c.width, c.height, BLACK).view for c in cameras]
 
 
 ON_CPU = Place("tensors through the kernels", "cpu", by_kernels, _of_tensors, _of_arrays)
@@ -136,8 +131,8 @@ def parity(place: Place) -> bool:
         if "d means" in ours:
             theirs = answers(place.draw, scene, intrinsics, torch.float32, place.device)
         else:  # light that depends on the side: drawn, not learned
-            eye, behind = Pinhole(np.array(intrinsics), pose(), WIDTH, HEIGHT), np.zeros((HEIGHT, WIDTH, 3), np.float32)
-            theirs = pictures_of(place.engine(scene, [eye], [behind], True)[0], ours["index"])
+            eye = Pinhole(np.array(intrinsics), pose(), WIDTH, HEIGHT)
+            theirs = pictures_of(place.engine(scene, [eye], True)[0], ours["index"])
         found = apart(ours, theirs)
         most = [
             max((v for what, v in found.items() if what.startswith("d ") is by), default=0.0) for by in (False, True)
@@ -251,15 +246,14 @@ def views(place: Place, n: int, sizes: Sequence[tuple[int, int]], threads: int) 
     on_device = SceneTensors(*leaves, logits, colours)
     for width, height in sizes:
         k = np.array([[0.6 * width, 0.0, width / 2], [0.0, 0.6 * width, height / 2], [0.0, 0.0, 1.0]])
-        behind = np.full((height, width, 3), SKY, np.float32)
         cameras = [Pinhole(k, _shifted(0.1 * i), width, height) for i in range(RIG)]
         eyes = [Eye(k, c.world_from_camera, width, height, still) for c in cameras]
-        draw = partial(forward, scene, k, np.eye(4), width, height, behind, threads)
+        draw = partial(forward, scene, k, np.eye(4), width, height, BLACK, threads)
         on_cpu = place.timed(draw)
-        expected = [forward(scene, k, c.world_from_camera, width, height, behind, threads).view.rgb for c in cameras]
-        single = [view.rgb for c in cameras for view in place.engine(scene, [c], [behind], True)]
+        expected = [forward(scene, k, c.world_from_camera, width, height, BLACK, threads).view.rgb for c in cameras]
+        single = [view.rgb for c in cameras for view in place.engine(scene, [c], True)]
         for many, at_once, packed in WAYS:
-            engine = partial(_by_engine, place, scene, cameras[:many], behind, at_once, packed)
+            engine = partial(_by_engine, place, scene, cameras[:many], at_once, packed)
             alone = partial(_alone, place, on_device, eyes[:many], at_once, packed)
             drawn = engine()
             score = min(psnr(view.rgb, right) for view, right in zip(drawn, expected))
@@ -272,13 +266,10 @@ def views(place: Place, n: int, sizes: Sequence[tuple[int, int]], threads: int) 
     return well
 
 
-def _by_engine(
-    place: Place, scene: Gaussians, cameras: Sequence[Pinhole], behind: NDArray[np.float32], at_once: int, packed: bool
-) -> list[View]:
+def _by_engine(place: Place, scene: Gaussians, cameras: Sequence[Pinhole], at_once: int, packed: bool) -> list[View]:
     drawn: list[View] = []
     for i in range(0, len(cameras), at_once):
-        some = cameras[i : i + at_once]
-        drawn += place.engine(scene, some, [behind] * len(some), packed)
+        drawn += place.engine(scene, cameras[i : i + at_once], packed)
     return drawn
 
 

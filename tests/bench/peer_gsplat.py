@@ -209,7 +209,7 @@ def of_gsplat(scene: Gaussians, intrinsics: Any) -> Arrays:
         given = arguments(scene, [Pinhole(np.array(intrinsics), pose(), WIDTH, HEIGHT)])
         tensors = {k: torch.as_tensor(v).double() if isinstance(v, np.ndarray) else v for k, v in given.items()}
         drawn, alpha, meta = rasterization(**tensors)
-        view = view_of(drawn[0].numpy(), alpha[0].numpy(), np.zeros(3, np.float32))
+        view = view_of(drawn[0].numpy(), alpha[0].numpy())
         return pictures_of(view, meta["gaussian_ids"].numpy())
     return answers(lambda tensors, eye: splatted(rasterization, tensors, eye), scene, intrinsics, torch.float64)
 

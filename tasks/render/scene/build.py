@@ -18,7 +18,7 @@ from tasks.render.scene.engine import PlacedAgents, render
 from tasks.render.scene.features import NOTHING_KNOWN, KnownPoints, SurfacePoints, points_without_lidar
 from tasks.render.scene.movers import box_of_points, world_from_boxes
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse_sweeps, shift_pose
-from tasks.render.scene.sky import SkyMap, pixel_directions, sky_of_views
+from tasks.render.scene.sky import SkyMap, look_up_sky, pixel_directions, sky_cells, sky_of_views
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.scene.surfels import (
     BACKGROUND,
@@ -200,7 +200,7 @@ def _refit_colours(
         )
         spans = [0, *(place[name] for name in ids)]
         rows = np.concatenate([np.arange(starts[k], starts[k + 1]) for k in spans])[splats.index]
-        drawn = shade(splats, colours[rows], asset.sky.seen_by(*camera)).rgb
+        drawn = shade(splats, colours[rows], look_up_sky(asset.sky.cells, sky_cells(*camera))).rgb
         # The background must not learn the colour of a car that drives by.
         residual = photo.rgb.astype(np.float32) / 255.0 - drawn
         sums, weights = backproject(splats, residual, sight.passing, len(asset.background))

@@ -13,7 +13,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from tasks.render.scene.asset import RenderAsset, apply_affine, compose_gaussians
+from tasks.render.scene.asset import RenderAsset, compose_gaussians
 from tasks.render.scene.movers import boxes_at
 from tasks.render.scene.sensed import shift_pose
 from tasks.render.settings import Backend
@@ -68,11 +68,15 @@ def render(
     local = [
         replace(camera, world_from_camera=shift_pose(camera.world_from_camera, -asset.origin)) for camera in cameras
     ]
-    backdrops = [asset.sky.seen_by(c.intrinsics, c.world_from_camera, c.width, c.height, threads) for c in local]
-    views = RASTERISERS[backend](scene, local, backdrops, threads, asset.screen)
-    if affines is not None:
-        views = [replace(view, rgb=apply_affine(view.rgb, affine)) for view, affine in zip(views, affines, strict=True)]
-    return [replace(view, rgb=np.clip(view.rgb, 0.0, 1.0)) for view in views]
+    views = RASTERISERS[backend](scene, local, threads, asset.screen)
+    for view, camera, affine in zip(
+        views, local, [SCENE_S_OWN] * len(views) if affines is None else affines, strict=True
+    ):
+        asset.sky.finish(view.rgb, view.alpha, affine, camera.intrinsics, camera.world_from_camera, threads)
+    return views
+
+
+SCENE_S_OWN = np.eye(3, 4, dtype=np.float32)  # colours
 
 
 def require_backend(backend: Backend) -> None:
@@ -83,31 +87,27 @@ def require_backend(backend: Backend) -> None:
         require()
 
 
-Rasteriser = Callable[[Gaussians, Sequence[Pinhole], Sequence[F32], int, ScreenFilter], list[View]]
-"""Gaussians, cameras and (H, W, 3) backdrops in one frame, threads, what all is drawn through -> views; colours may
-leave [0, 1]."""
+Rasteriser = Callable[[Gaussians, Sequence[Pinhole], int, ScreenFilter], list[View]]
+"""Gaussians and cameras in one frame, threads, what all is drawn through -> views before black, contiguous; colours
+may leave [0, 1]."""
 
 
-def _on_cpu(
-    scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32], threads: int, screen: ScreenFilter
-) -> list[View]:
+def _on_cpu(scene: Gaussians, cameras: Sequence[Pinhole], threads: int, screen: ScreenFilter) -> list[View]:
     return [
-        forward(scene, c.intrinsics, c.world_from_camera, c.width, c.height, backdrop, threads, screen).view
-        for c, backdrop in zip(cameras, backdrops)
+        forward(scene, c.intrinsics, c.world_from_camera, c.width, c.height, BLACK, threads, screen).view
+        for c in cameras
     ]
 
 
+BLACK = np.zeros(3, np.float32)
+
+
 def _with_gsplat(
-    scene: Gaussians,
-    cameras: Sequence[Pinhole],
-    backdrops: Sequence[F32],
-    threads: int,
-    screen: ScreenFilter,
-    packed: bool = True,
+    scene: Gaussians, cameras: Sequence[Pinhole], threads: int, screen: ScreenFilter, packed: bool = True
 ) -> list[View]:
     from tasks.render.splatting.gsplat_backend import rasterize_all  # torch is loaded only where it is asked for
 
-    return rasterize_all(scene, cameras, backdrops, screen, packed)
+    return rasterize_all(scene, cameras, screen, packed)
 
 
 RASTERISERS: Mapping[Backend, Rasteriser] = MappingProxyType(

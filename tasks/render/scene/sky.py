@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from tasks.kernels.compiled import kernel
+from tasks.kernels.compiled import inlined, kernel
 from tasks.kernels.threads import run_in_chunks
 from tasks.world.arrays import F32, Array, Bools, ShortInts
 
@@ -35,16 +35,23 @@ def sky_cells(intrinsics: Array, scene_from_camera: Array, width: int, height: i
     return found
 
 
+@inlined
+def _place(k: Any, turn: Any, column: Any, row: Any) -> Any:
+    """Row and column of the sky, with fractions, that a pixel looks at."""
+    a, b = (column + 0.5 - k[0, 2]) / k[0, 0], (row + 0.5 - k[1, 2]) / k[1, 1]
+    x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2]
+    y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2]
+    z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2]
+    v = (0.5 - np.arctan2(z, np.sqrt(x * x + y * y)) / np.pi) * ROWS - 0.5
+    u = (np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * COLUMNS - 0.5
+    return v, u
+
+
 @kernel
 def _find(k: Any, turn: Any, corners: Any, shares: Any, first: int, last: int) -> None:
     for row in range(first, last):
         for column in range(corners.shape[1]):
-            a, b = (column + 0.5 - k[0, 2]) / k[0, 0], (row + 0.5 - k[1, 2]) / k[1, 1]
-            x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2]
-            y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2]
-            z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2]
-            v = (0.5 - np.arctan2(z, np.sqrt(x * x + y * y)) / np.pi) * ROWS - 0.5
-            u = (np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * COLUMNS - 0.5
+            v, u = _place(k, turn, column, row)
             v0, u0 = min(max(int(np.floor(v)), 0), ROWS - 2), int(np.floor(u))
             corners[row, column, 0] = v0
             corners[row, column, 1] = u0 % COLUMNS
@@ -72,6 +79,56 @@ def _look_up(cells: Any, corners: Any, shares: Any, out: Any, first: int, last: 
                 out[row, column, c] = top * (1.0 - fv) + low * fv
 
 
+# A picture needs no cells and no angles of each pixel: over so small a square they run straight to 0.02 cells, but near
+# the poles and at the seam.
+
+SQUARE_RAD = 0.01
+STRAIGHT = 3.0  # columns of the sky that a square spans at most: below some 57 degrees of elevation
+LEAST_LIGHT = 1.0 / 1024.0  # that passes, for the sky to be looked up: what less adds is a quarter of a step of 8 bits
+
+
+@kernel
+def _finish(cells: Any, k: Any, turn: Any, step: int, affine: Any, alpha: Any, rgb: Any, first: int, last: int) -> None:
+    """Rows of a picture (H, W, 3): the sky put behind them, in the camera's colours, from 0 to 1. The sky's places are
+    those of the corners of squares of `step` pixels."""
+    width, zero, one = rgb.shape[1], np.float32(0.0), np.float32(1.0)
+    for top in range(first, last, step):
+        bottom = min(top + step, last)
+        v_right, u_right = _place(k, turn, 0, top)
+        v_under, u_under = _place(k, turn, 0, bottom)
+        for start in range(0, width, step):
+            v_here, u_here, v_below, u_below = v_right, u_right, v_under, u_under
+            v_right, u_right = _place(k, turn, start + step, top)
+            v_under, u_under = _place(k, turn, start + step, bottom)
+            most, least = max(u_here, u_right, u_below, u_under), min(u_here, u_right, u_below, u_under)
+            for row in range(top, bottom):
+                share = (row - top) / (bottom - top)
+                v_first, u_first = v_here + share * (v_below - v_here), u_here + share * (u_below - u_here)
+                dv = (v_right + share * (v_under - v_right) - v_first) / step
+                du = (u_right + share * (u_under - u_right) - u_first) / step
+                for column in range(start, min(start + step, width)):
+                    light = one - alpha[row, column]
+                    if light <= LEAST_LIGHT:
+                        continue
+                    u, v = u_first + (column - start) * du, v_first + (column - start) * dv
+                    if most - least > STRAIGHT:
+                        v, u = _place(k, turn, column, row)
+                    v = min(max(v, 0.0), ROWS - 1.0)
+                    v0, u0 = min(int(v), ROWS - 2), int(u + COLUMNS)  # which rounds down, being positive
+                    fu, fv = np.float32(u + COLUMNS - u0), np.float32(v - v0)
+                    left, right = v0 * COLUMNS + (u0 & (COLUMNS - 1)), v0 * COLUMNS + ((u0 + 1) & (COLUMNS - 1))
+                    for c in range(3):
+                        high = cells[left, c] + (cells[right, c] - cells[left, c]) * fu
+                        low = cells[left + COLUMNS, c] + (cells[right + COLUMNS, c] - cells[left + COLUMNS, c]) * fu
+                        rgb[row, column, c] += light * (high + (low - high) * fv)
+        for row in range(top, bottom):
+            for column in range(width):
+                red, green, blue = rgb[row, column, 0], rgb[row, column, 1], rgb[row, column, 2]
+                for c in range(3):
+                    seen = affine[c, 0] * red + affine[c, 1] * green + affine[c, 2] * blue + affine[c, 3]
+                    rgb[row, column, c] = min(max(seen, zero), one)
+
+
 WINDOWS = 96  # side by side in a picture, in which it is smooth or not
 SMOOTH, SMOOTH_SHARE = 0.02, 0.3  # deviation of the grey of a smooth window, and the share of them that makes it sky
 SKY_WEIGHT = 1.0e4  # against one pixel of something else in the same direction
@@ -84,13 +141,21 @@ class SkyMap:
 
     rgb: F32  # (ROWS, COLUMNS, 3) from 0 on, above 1 where a photo of mean exposure is white; world directions
 
-    def seen_by(self, intrinsics: Array, world_from_camera: Array, width: int, height: int, threads: int = 1) -> F32:
-        """The backdrop (H, W, 3) of a camera. Raises ValueError for a map of another size, which a file may hold."""
+    @property
+    def cells(self) -> F32:
+        """(ROWS * COLUMNS, 3). Raises ValueError for a map of another size, which a file may hold."""
         if self.rgb.shape != (ROWS, COLUMNS, 3):
             raise ValueError(f"sky: {self.rgb.shape}, expected ({ROWS}, {COLUMNS}, 3)")
-        where = sky_cells(intrinsics, world_from_camera, width, height, threads)
-        cells = np.require(self.rgb, np.float32, ["C", "W"])  # kernels compile once more for read-only arrays
-        return look_up_sky(cells.reshape(-1, 3), where, threads)
+        return np.require(self.rgb, np.float32, ["C", "W"]).reshape(-1, 3)  # kernels compile once more for read-only
+
+    def finish(
+        self, rgb: F32, alpha: F32, affine: F32, intrinsics: Array, world_from_camera: Array, threads: int = 1
+    ) -> None:
+        """Makes a picture (H, W, 3) of a scene's own light, in place: the sky behind it where `alpha` (H, W) lets it
+        through, then all in the colours of a camera with `affine` (3, 4), from 0 to 1. Raises ValueError as `cells`."""
+        camera = np.array(intrinsics, np.float64), np.array(world_from_camera, np.float64)
+        step, colours = max(1, int(SQUARE_RAD * intrinsics[0, 0])), np.ascontiguousarray(affine, np.float32)
+        run_in_chunks(partial(_finish, self.cells, *camera, step, colours, alpha, rgb), len(rgb), ROWS_CHUNK, threads)
 
 
 SKY_RGB, HAZE_RGB = (0.72, 0.78, 0.85), (0.30, 0.30, 0.31)  # above and below the horizon

@@ -87,17 +87,15 @@ def plain_arguments(
     }
 
 
-def view_of(colours_and_depth: F32, alpha: F32, backdrop: F32) -> View:
-    """One camera's (H, W, 4) and (H, W, 1) over a backdrop (H, W, 3), which gsplat cannot draw itself."""
-    covered = alpha[..., 0]
-    rgb = colours_and_depth[..., :3] + (1.0 - alpha) * backdrop
-    return View(rgb.astype(np.float32), np.where(covered > 0.0, colours_and_depth[..., 3], 0.0), covered)
+def view_of(colours_and_depth: F32, alpha: F32) -> View:
+    """One camera's (H, W, 4) and (H, W, 1), before black."""
+    rgb, covered = (np.ascontiguousarray(of, np.float32) for of in (colours_and_depth[..., :3], alpha[..., 0]))
+    return View(rgb, np.where(covered > 0.0, colours_and_depth[..., 3], np.float32(0.0)), covered)
 
 
 def rasterize_all(
     scene: Gaussians,
     cameras: Sequence[Pinhole],
-    backdrops: Sequence[F32],
     screen: ScreenFilter = FITTED,
     packed: bool = True,
 ) -> list[View]:
@@ -110,14 +108,13 @@ def rasterize_all(
             drawn, covered, _ = gsplat.rasterization(**on_device)
         return drawn.cpu().numpy(), covered.cpu().numpy()
 
-    return drawn_by(draw, scene, cameras, backdrops, screen, packed)
+    return drawn_by(draw, scene, cameras, screen, packed)
 
 
 def drawn_by(
     draw: Callable[[dict[str, Any]], tuple[F32, F32]],
     scene: Gaussians,
     cameras: Sequence[Pinhole],
-    backdrops: Sequence[F32],
     screen: ScreenFilter = FITTED,
     packed: bool = True,
 ) -> list[View]:
@@ -132,5 +129,5 @@ def drawn_by(
         if len(scene):
             pictures, alphas = draw(arguments(scene, [cameras[i] for i in rows], screen, packed))
         for i, picture, alpha in zip(rows, pictures, alphas):
-            views[i] = view_of(picture.astype(np.float32), alpha.astype(np.float32), backdrops[i])
+            views[i] = view_of(picture, alpha)
     return [views[i] for i in range(len(cameras))]

@@ -202,8 +202,10 @@ def blend(
     first_tile: int,
     last_tile: int,
 ) -> None:
-    """Fills rgb (H, W, 3), depth and alpha (H, W) on some tiles, and where in `tile_splats` each was opaque."""
+    """Fills rgb (H, W, 3), depth and alpha (H, W) on some tiles, and where in `tile_splats` each was opaque. `behind`
+    (H, W, 3), or (1, 1, 3)."""
     height, width = alpha.shape
+    many = behind.shape[0] > 1
     tiles_x = (width + TILE - 1) // TILE
     buffer = aligned_memory(TILE * 5 * TILE)  # by row: light that still passes; sums of red, green, blue, depth
     for t in range(first_tile, last_tile):
@@ -246,9 +248,10 @@ def blend(
                 pixel = np.uint64(y * 5 * TILE + x)
                 light = buffer[pixel]
                 covered = ALL - light
+                v, u = (y0 + y, x0 + x) if many else (0, 0)
                 for channel in range(3):
                     total = buffer[pixel + np.uint64((channel + 1) * TILE)]
-                    rgb[y0 + y, x0 + x, channel] = light * behind[y0 + y, x0 + x, channel] + total
+                    rgb[y0 + y, x0 + x, channel] = light * behind[v, u, channel] + total
                 alpha[y0 + y, x0 + x] = covered
                 depth[y0 + y, x0 + x] = buffer[pixel + np.uint64(4 * TILE)] / covered if covered > NOTHING else NOTHING
 
@@ -413,7 +416,7 @@ def shade(splats: Splats, colours: F32, background: F32, threads: int = 1) -> Vi
 
 def _shade(splats: Splats, background: F32, threads: int) -> tuple[View, Ints]:
     height, width = splats.height, splats.width
-    behind = np.ascontiguousarray(np.broadcast_to(background, (height, width, 3)), np.float32)
+    behind = np.ascontiguousarray(background, np.float32).reshape(-1, 1 if background.ndim == 1 else width, 3)
     view = View(*(np.empty((height, width, *more), np.float32) for more in ((3,), (), ())))
     dealt = (splats.projected, splats.tile_start, splats.tile_splats)
     ends = np.empty(len(splats.tile_start) - 1, np.int64)

@@ -5,7 +5,7 @@ import pytest
 from slow_raster import covariances_of
 
 from tasks.render.scene.depth import dense_depth, sparse_depth
-from tasks.render.scene.sky import pixel_directions, sky_of_views
+from tasks.render.scene.sky import look_up_sky, pixel_directions, sky_cells, sky_of_views
 from tasks.render.scene.surfels import BACKGROUND, PhotoDiscs, choose_discs, discs_of_photo, discs_to_gaussians
 
 INTRINSICS = np.array([[80.0, 0.0, 40.0], [0.0, 80.0, 30.0], [0.0, 0.0, 1.0]])
@@ -108,7 +108,7 @@ def test_the_sky_is_the_colour_that_was_seen_in_its_direction() -> None:
     colours[..., 0] = np.linspace(0, 1, 80)[None, :]
     sky = sky_of_views([(rays[up], colours[up], np.ones(up.sum(), bool))])
     pose = np.array([[0, 0, 1.0, 50.0], [-1, 0, 0, -9.0], [0, -1, 0, 3.0], [0, 0, 0, 1]])  # elsewhere, same heading
-    seen = sky.seen_by(INTRINSICS, pose, 80, 60)
+    seen = look_up_sky(sky.cells, sky_cells(INTRINSICS, pose, 80, 60))
     inside = np.zeros((60, 80), bool)
     inside[2:24, 3:77] = True
     assert np.abs(seen[inside] - colours[inside]).max() < 0.05

@@ -4,16 +4,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap, pixel_directions
+from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap, look_up_sky, pixel_directions, sky_cells
 
 RNG = np.random.default_rng(4)
 SIZE = (53, 31)
 K = np.array([[40.0, 0.0, 24.0], [0.0, 43.0, 17.5], [0.0, 0.0, 1.0]])
 
 
-def slow_lookup(sky: SkyMap, pose: NDArray[np.float64]) -> NDArray[np.float32]:
+def slow_lookup(
+    sky: SkyMap, pose: NDArray[np.float64], k: NDArray[np.float64] = K, size: tuple[int, int] = SIZE
+) -> NDArray[np.float32]:
     """(H, W, 3), linear between the four cells around each direction; columns go round, rows end at the poles."""
-    rays = pixel_directions(K, pose, *SIZE)
+    rays = pixel_directions(k, pose, *size)
     elevation = np.arctan2(rays[..., 2], np.hypot(rays[..., 0], rays[..., 1]))
     azimuth = np.arctan2(rays[..., 1], rays[..., 0])
     rows, columns = (0.5 - elevation / np.pi) * ROWS - 0.5, (azimuth / (2 * np.pi) + 0.5) * COLUMNS - 0.5
@@ -26,6 +28,15 @@ def slow_lookup(sky: SkyMap, pose: NDArray[np.float64]) -> NDArray[np.float32]:
     return np.asarray(top * (1 - fy) + bottom * fy, np.float32)
 
 
+def finished(
+    sky: SkyMap, pose: NDArray[np.float64], threads: int = 1, k: NDArray[np.float64] = K, size: tuple[int, int] = SIZE
+) -> NDArray[np.float32]:
+    """The sky before nothing."""
+    rgb, alpha = np.zeros((*size[::-1], 3), np.float32), np.zeros(size[::-1], np.float32)
+    sky.finish(rgb, alpha, np.eye(3, 4), k, pose, threads)
+    return rgb
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_the_sky_is_what_numpy_looks_up(seed: int) -> None:
     """Cameras turned any way, the poles and the seam behind included."""
@@ -33,18 +44,34 @@ def test_the_sky_is_what_numpy_looks_up(seed: int) -> None:
     pose = np.eye(4)
     pose[:3, :3] = turn
     sky = SkyMap(RNG.random((ROWS, COLUMNS, 3)).astype(np.float32))
-    seen = sky.seen_by(K, pose, *SIZE)
-    np.testing.assert_allclose(seen, slow_lookup(sky, pose), atol=1e-6)
-    np.testing.assert_array_equal(seen, sky.seen_by(K, pose, *SIZE, threads=3))
+    seen, looked_up = finished(sky, pose), look_up_sky(sky.cells, sky_cells(K, pose, *SIZE))
+    for found in (seen, looked_up):
+        np.testing.assert_allclose(found, slow_lookup(sky, pose), atol=1e-5)
+    np.testing.assert_array_equal(seen, finished(sky, pose, threads=3))
+    fine = np.array([[1300.0, 0.0, 300.0], [0.0, 1300.0, 170.0], [0.0, 0.0, 1.0]])  # angles of squares of 13 pixels
+    wide = pose, 3, fine, (601, 340)
+    np.testing.assert_allclose(finished(sky, *wide), slow_lookup(sky, pose, *wide[2:]), atol=0.02)  # of any two cells
+
+
+def test_a_picture_is_finished_in_its_camera_s_colours() -> None:
+    """What shines through of the sky, the camera's gain and offset, and nothing beyond black and white."""
+    sky = SkyMap(RNG.random((ROWS, COLUMNS, 3)).astype(np.float32))
+    behind, alpha = slow_lookup(sky, np.eye(4)), RNG.random(SIZE[::-1]).astype(np.float32)
+    light = RNG.random((*SIZE[::-1], 3)).astype(np.float32)
+    affine = np.array([[1.6, 0.1, 0.0, -0.9], [-0.1, 1.2, 0.2, -0.5], [0.0, 0.3, 0.8, 0.1]], np.float32)
+    expected = (light + (1.0 - alpha[..., None]) * behind) @ affine[:, :3].T + affine[:, 3]
+    sky.finish(light, alpha, affine, K, np.eye(4))
+    np.testing.assert_allclose(light, np.clip(expected, 0.0, 1.0), atol=0.5 / 255.0)
+    assert (light == 0.0).any() and (light == 1.0).any()
 
 
 def test_a_sky_that_nobody_may_write_to_is_seen_all_the_same() -> None:
     rgb = RNG.random((ROWS, COLUMNS, 3)).astype(np.float32)
-    seen = SkyMap(rgb).seen_by(K, np.eye(4), *SIZE)
+    seen = finished(SkyMap(rgb), np.eye(4))
     rgb.setflags(write=False)
-    np.testing.assert_array_equal(SkyMap(rgb).seen_by(K, np.eye(4), *SIZE), seen)
+    np.testing.assert_array_equal(finished(SkyMap(rgb), np.eye(4)), seen)
 
 
 def test_a_map_of_another_size_is_refused() -> None:
     with pytest.raises(ValueError, match=rf"sky: \(8, 16, 3\), expected \({ROWS}, {COLUMNS}, 3\)"):
-        SkyMap(np.zeros((8, 16, 3), np.float32)).seen_by(K, np.eye(4), *SIZE)
+        finished(SkyMap(np.zeros((8, 16, 3), np.float32)), np.eye(4))
