@@ -109,6 +109,7 @@ KIND_OF_NAME = {kind.value.lower(): kind for kind in AgentKind}  # vehicle, pede
 LOCATION_OF_ALIAS = {"las_vegas": "us-nv-las-vegas-strip"}
 UNIT_SLACK = 1e-3  # of a quaternion's length
 FRAME_US = 500_000
+LATEST_US = 250_000  # after or before its frame a camera takes its picture, at most
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,8 @@ class FrameCamera:
     intrinsics: Array  # (3, 3) pixels, of the distorted picture
     distortion: Array  # (5,) k1, k2, p1, p2, k3
     ego_from_camera: Array  # (4, 4); OpenScene calls it sensor2lidar, its lidar frame is the ego frame
+    late_s: float = 0.0  # when it took its picture, after the frame's stamp
+    world_from_ego: Array | None = None  # (4, 4) then; None: the frame's
 
 
 @dataclass(frozen=True)
@@ -214,7 +217,36 @@ def parse_frames(value: Any, path: Path, whole: bool = True) -> LogFrames:
         near, stamp = frames[at], frames[at].timestamp_us + FRAME_US * (i - at)
         named = replace(near, token=f"unreadable-{i}", timestamp_us=stamp, unreadable=str(wrong[i]))
         frames[i] = replace(named, cameras=(), lidar_path=None, boxes=None)
-    return LogFrames(file, path.stem, tuple(frames[i] for i in sorted(frames)))
+    return LogFrames(file, path.stem, _with_late_cameras([frames[i] for i in sorted(frames)]))
+
+
+def _with_late_cameras(frames: Sequence[Frame]) -> tuple[Frame, ...]:
+    """The same, cameras that took their pictures beside the frame's stamp knowing where: the ego drives on as from the
+    frame before to the one after."""
+    if not any(camera.late_s for frame in frames for camera in frame.cameras):
+        return tuple(frames)
+    read = [frame for frame in frames if not frame.unreadable]
+    at_s = np.array([frame.timestamp_us - read[0].timestamp_us for frame in read]) / 1e6
+    place = {frame.token: k for k, frame in enumerate(read)}
+
+    def pose(k: int, late_s: float) -> Array:
+        before, after = max(k - 1, 0), min(k + 1, len(read) - 1)
+        first, second, here = (read[i].world_from_ego for i in (before, after, k))
+        share, out = late_s / (at_s[after] - at_s[before]) if after > before else 0.0, here.copy()
+        turn = Rotation.from_matrix(first[:3, :3].T @ second[:3, :3]).as_rotvec()
+        out[:3, :3] = here[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+        out[:3, 3] += share * (second[:3, 3] - first[:3, 3])
+        return out
+
+    return tuple(
+        replace(
+            frame,
+            cameras=tuple(
+                replace(c, world_from_ego=pose(place[frame.token], c.late_s)) if c.late_s else c for c in frame.cameras
+            ),
+        )
+        for frame in frames
+    )
 
 
 def _out_of_place(frames: Mapping[int, Frame], path: Path) -> Iterator[tuple[int, BadClip]]:
@@ -266,7 +298,7 @@ def parse_frame(item: Any, file: str, place: str, whole: bool = True) -> Frame:
         dynamic_state=values.numbers("ego_dynamic_state", (4,)).astype(np.float32).astype(np.float64),  # as NAVSIM does
         lights=parse_lights(values),
         ego_status=only_command(values),
-        cameras=parse_cameras(values.inner("cams")),
+        cameras=parse_cameras(values.inner("cams"), values.integer("timestamp")),
         lidar_path=None if lidar_path is None else values.text("lidar_path", may_be_empty=True) or None,
         boxes=boxes,
         repairs=repairs,
@@ -324,8 +356,12 @@ def parse_command(values: CheckedValues) -> str:
     return COMMANDS[one_hot.index(1.0)]
 
 
-def parse_cameras(cams: CheckedValues) -> tuple[FrameCamera, ...]:
-    """`cams`: all eight, by their names in any case; those without a picture are left out. Raises BadClip."""
+def parse_cameras(cams: CheckedValues, timestamp_us: int | None = None) -> tuple[FrameCamera, ...]:
+    """`cams`: all eight, by their names in any case; those without a picture are left out. Raises BadClip.
+
+    A camera may have a stamp of its own, `timestamp`: nuPlan's take their pictures up to 40 ms apart, and who converts
+    its database keeps that; OpenScene's own logs do not.
+    """
     by_name = {key.upper(): key for key in cams.items if isinstance(key, str)}
     if missing := [name for name in CAMERA_NAMES if name not in by_name]:
         raise cams.bad(missing[0], "missing; a frame names all eight cameras, with {} for one that has no picture")
@@ -338,6 +374,11 @@ def parse_cameras(cams: CheckedValues) -> tuple[FrameCamera, ...]:
         ego_from_camera = np.eye(4)
         ego_from_camera[:3, :3] = camera.numbers("sensor2lidar_rotation", (3, 3))
         ego_from_camera[:3, 3] = camera.numbers("sensor2lidar_translation", (3,))
+        late_us = 0
+        if timestamp_us is not None and camera.get("timestamp", None) is not None:
+            late_us = camera.integer("timestamp") - timestamp_us
+            if abs(late_us) > LATEST_US:
+                raise camera.bad("timestamp", f"{late_us / 1e6:.3g} s from its frame's: expected microseconds of it")
         found.append(
             FrameCamera(
                 name=name,
@@ -345,6 +386,7 @@ def parse_cameras(cams: CheckedValues) -> tuple[FrameCamera, ...]:
                 intrinsics=camera.numbers("cam_intrinsic", (3, 3)),
                 distortion=camera.numbers("distortion", (5,)),
                 ego_from_camera=ego_from_camera,
+                late_s=late_us / 1e6,
             )
         )
     return tuple(found)

@@ -321,7 +321,8 @@ FRAME_S = 0.5
 
 
 def sensor_files(frames: Sequence[Frame], folder: Path) -> tuple[tuple[SensorFile, ...], tuple[SensorFile, ...]]:
-    """The pictures and sweeps below `folder` of frames 0.5 s apart, times from the first. Raises BadClip."""
+    """The pictures and sweeps below `folder` of frames 0.5 s apart, times from the first; of cameras with stamps of
+    their own when and where these say. Raises BadClip."""
     images: list[SensorFile] = []
     sweeps: list[SensorFile] = []
     for k, frame in enumerate(frames):
@@ -330,7 +331,9 @@ def sensor_files(frames: Sequence[Frame], folder: Path) -> tuple[tuple[SensorFil
         if there and (missing := [path for name, path in files.items() if name not in there]):
             problem = f"missing, though {len(there)} of the frame's {len(files)} pictures are there"
             raise BadClip(str(missing[0]), "image", f"{problem}: restore it, or remove them all")
-        images += [SensorFile(name, str(path), FRAME_S * k, frame.world_from_ego) for name, path in there.items()]
+        for camera in (camera for camera in frame.cameras if camera.name in there):
+            pose = frame.world_from_ego if camera.world_from_ego is None else camera.world_from_ego
+            images.append(SensorFile(camera.name, str(there[camera.name]), FRAME_S * k + camera.late_s, pose))
         if frame.lidar_path is not None and is_named(sweep := _below(folder, frame.lidar_path)):
             sweeps.append(SensorFile(LIDAR, str(sweep), FRAME_S * k, frame.world_from_ego))
     return tuple(images), tuple(sweeps)

@@ -7,13 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
-from factory.datasets.navsim.log import CAMERA_NAMES
+from factory.datasets.navsim.log import CAMERA_NAMES, read_frames
 from factory.datasets.navsim.reader import NavsimReader
 from factory.readers.base import BadClip
 from factory.readers.pictures import BadPicture, jpeg_size
 from factory.stages.sensors import block_of, load_sweeps
 from tasks.world.clip import Clip
-from tests.factory.datasets.navsim.logs import NAME
+from tests.factory.datasets.navsim.geopackage_writer import ORIGIN
+from tests.factory.datasets.navsim.logs import NAME, SPEED_MPS
 from tests.factory.datasets.navsim.small import (
     FRAMES,
     HEIGHT,
@@ -70,6 +71,36 @@ def test_a_clip_has_the_cameras_photos_and_sweeps_of_its_frames(written: Path) -
     for k, sweep in enumerate(clip.sweeps):
         assert (sweep.world_from_ego[:3, 3] == frames[k]["ego2global_translation"]).all()
     assert block_of(clip).images == clip.images and len(load_sweeps(clip.sweeps)) == FRAMES
+
+
+def test_a_camera_with_a_stamp_of_its_own_took_its_photo_then_and_there(root: Path) -> None:
+    """On a curve the pose is that of the circle, to a centimetre and 0.02 degrees."""
+    frames, rate, late_s = road_frames(), 0.02, {"CAM_L1": 0.035, "CAM_R0": -0.008}
+    for k, frame in enumerate(frames):
+        frame["ego2global_translation"], frame["ego2global_rotation"] = _on_circle(0.5 * k, rate)
+        for name, late in late_s.items():
+            frame["cams"][name]["timestamp"] = frame["timestamp"] + round(1e6 * late)
+    write_log(root, frames)
+    clip = read(reader_of(root))
+    for image in clip.images:
+        late = late_s.get(image.sensor, 0.0)
+        k = round((image.time_s - late) / 0.5)
+        assert image.time_s == pytest.approx(0.5 * k + late, abs=1e-9)
+        place, (w, *_, z) = _on_circle(image.time_s, rate)
+        assert image.world_from_ego[:3, 3] == pytest.approx(place, abs=0.01)
+        turned = np.arctan2(image.world_from_ego[1, 0], image.world_from_ego[0, 0])
+        assert turned == pytest.approx(2.0 * np.arctan2(z, w), abs=3e-4)
+    frames[3]["cams"]["CAM_L1"]["timestamp"] += 500_000
+    write_log(root, frames)
+    with pytest.raises(BadClip, match=r"frames\[3\]\.cams\.CAM_L1\.timestamp: 0.535 s from its frame's"):
+        read_frames(root / "navsim_logs" / "mini" / f"{NAME}.pkl")
+
+
+def _on_circle(time_s: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Place and quaternion of an ego at SPEED_MPS that turns at `rate` rad/s."""
+    angle, radius = rate * time_s, SPEED_MPS / rate
+    place = [ORIGIN[0] + 10.0 + radius * np.sin(angle), ORIGIN[1] + radius * (1.0 - np.cos(angle)), 12.0]
+    return np.array(place), np.array([np.cos(angle / 2.0), 0.0, 0.0, np.sin(angle / 2.0)])
 
 
 def test_without_a_folder_of_sensors_a_clip_has_none(written: Path) -> None:
