@@ -81,7 +81,7 @@ def assert_same(rollout: Rollout, other: Rollout) -> None:
 
 @BOTH
 @given(seed=seeds)
-@settings(max_examples=15)
+@settings(max_examples=8)
 def test_the_traffic_equals_its_slow_twin(yields: bool, seed: int) -> None:
     for traffic, egos in stages(seed, TrafficSettings(yields=yields)):
         for ego in egos[:3]:
