@@ -289,11 +289,22 @@ def _resume(
     return int(state["step"])
 
 
+class _WithSpare(torch.nn.Module):
+    """A planner beside a parameter that nothing uses: without one every rank warns that all are used."""
+
+    def __init__(self, planner: Planner, device: torch.device) -> None:
+        super().__init__()
+        self.planner, self.spare = planner, torch.nn.Parameter(torch.zeros(1, device=device))
+
+    def forward(self, batch: Any) -> Any:
+        return self.planner(batch)
+
+
 def _wrapped(planner: Planner, process: TrainingProcess) -> torch.nn.Module:
     if process.size == 1:
         return planner
     return DistributedDataParallel(
-        planner,
+        _WithSpare(planner, process.device),
         device_ids=[process.device] if process.device.type == "cuda" else None,
         # Else gradients are dealt to buckets anew after the first step, and a sum over three or more processes, whose
         # order depends on its place in a bucket, is another after a restart.

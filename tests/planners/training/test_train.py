@@ -124,7 +124,7 @@ def test_two_processes_of_torchrun_share_the_batch_that_the_demo_s_samples_fill(
     words = [*torchrun, *documented("docs/extend.md"), "steps=2", "device=cpu", "out=runs/two"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(words, cwd=demo, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0 and "find_unused_parameters" not in done.stderr, done.stderr
     (note,), record = noted(done.stdout), read_record(demo / "runs/two")
     assert note.startswith("note: planner.training.batch_size=64 -> 2: "), note
     assert (record["step"], record["trained"]["planner.training"]["batch_size"]) == (2, 2)
