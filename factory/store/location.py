@@ -8,6 +8,7 @@ import hashlib
 import importlib
 import io
 import json
+import math
 import os
 import re
 from collections.abc import Collection, Iterator, Mapping
@@ -278,11 +279,12 @@ def raising_damaged_file(path: str) -> Iterator[None]:
 
 # Prepared clips on disk, so that a later run goes on without a perturb task, and the scenes of a benchmark.
 #
-# A file is a plain zip of arrays (npz, no pickle) plus one JSON tree that says how frozen dataclasses, tuples, dicts
-# and arrays nest. Reading it builds only dataclasses and enums of this distribution, by their fields, and nothing
-# else. A seal (tasks.caches) stands behind the zip; a damaged or foreign file counts as missing, with the reason.
+# A file is a plain zip of arrays (npz, no pickle), all of a type one behind the other: a clip has some 1,200, and a
+# member of a zip costs more than most of them. One more is a JSON tree that says how frozen dataclasses, tuples, dicts
+# and arrays nest. Reading it builds only dataclasses and enums of this distribution, by their fields, and nothing else.
+# A seal (tasks.caches) stands behind the zip; a damaged or foreign file counts as missing, with the reason.
 
-FORMAT = 1
+FORMAT = 2
 PACKAGES = ("tasks.", "factory.")  # whose dataclasses and enums a file may name
 _AGAIN = "the command that made it writes it again"
 _PLAIN = (str, int, float, bool, type(None))
@@ -300,7 +302,7 @@ def encode_tree(value: object) -> bytes:
     arrays = _Arrays()
     tree = json.dumps({"format": FORMAT, "root": _encode(value, arrays)})
     sink = io.BytesIO()
-    np.savez_compressed(sink, allow_pickle=False, tree=np.frombuffer(tree.encode(), np.uint8), **arrays.by_name)
+    np.savez_compressed(sink, allow_pickle=False, tree=np.frombuffer(tree.encode(), np.uint8), **arrays.by_type())
     return sink.getvalue()
 
 
@@ -311,7 +313,7 @@ def decode_tree(data: bytes) -> Any:
             tree = json.loads(stored["tree"].tobytes())
             if tree["format"] != FORMAT:
                 raise BadCacheFile(f"format {tree['format']}, this version reads {FORMAT}")
-            return _decode(tree["root"], {name: stored[name] for name in stored.files})
+            return _decode(tree["root"], _Stored({name: stored[name] for name in stored.files}))
     except Exception as error:  # whatever a zip, an array's header or a class makes of bytes that are none of ours
         raise BadCacheFile(str(error) or type(error).__name__) from error
 
@@ -380,17 +382,39 @@ def _unsealed(data: bytes, key: str = "") -> bytes:
 
 
 class _Arrays:
-    """Names arrays; one that stands twice in the tree is stored once."""
+    """Where arrays lie: type, first element, shape. One that stands twice in the tree is stored once."""
 
     def __init__(self) -> None:
-        self.by_name: dict[str, NDArray[np.generic]] = {}
-        self._name_of: dict[int, str] = {}
+        self._parts: dict[str, list[NDArray[np.generic]]] = {}
+        self._ends: dict[str, int] = {}
+        self._known: dict[int, tuple[NDArray[np.generic], list[object]]] = {}  # by id, which is taken while it is here
 
-    def name(self, array: NDArray[np.generic]) -> str:
-        if id(array) not in self._name_of:
-            self._name_of[id(array)] = f"a{len(self.by_name)}"
-            self.by_name[self._name_of[id(array)]] = array  # also keeps its id taken
-        return self._name_of[id(array)]
+    def place(self, array: NDArray[np.generic]) -> list[object]:
+        if id(array) not in self._known:
+            kind = array.dtype.str[1:]
+            first = self._ends.get(kind, 0)
+            self._parts.setdefault(kind, []).append(array.astype(array.dtype.newbyteorder("="), copy=False).ravel())
+            self._ends[kind] = first + array.size
+            self._known[id(array)] = array, [kind, first, list(array.shape)]
+        return self._known[id(array)][1]
+
+    def by_type(self) -> dict[str, NDArray[np.generic]]:
+        return {kind: np.concatenate(parts) for kind, parts in self._parts.items()}
+
+
+class _Stored:
+    """The arrays of a file by where they lie; one that stands twice in the tree is one array."""
+
+    def __init__(self, by_type: Mapping[str, NDArray[np.generic]]) -> None:
+        self._by_type = by_type
+        self._known: dict[tuple[str, int, tuple[int, ...]], NDArray[np.generic]] = {}
+
+    def at(self, place: Any) -> NDArray[np.generic]:
+        kind, first, shape = place[0], place[1], tuple(place[2])
+        if (kind, first, shape) not in self._known:
+            flat = self._by_type[kind][first : first + math.prod(shape)]
+            self._known[kind, first, shape] = flat.reshape(shape)
+        return self._known[kind, first, shape]
 
 
 def _encode(value: Any, arrays: _Arrays) -> Any:
@@ -399,9 +423,9 @@ def _encode(value: Any, arrays: _Arrays) -> Any:
     if isinstance(value, np.ndarray):
         if value.dtype.hasobject:
             raise TypeError("an array of objects cannot be cached")
-        return {"array": arrays.name(value)}
+        return {"array": arrays.place(value)}
     if isinstance(value, np.generic):
-        return {"scalar": arrays.name(np.asarray(value))}
+        return {"scalar": arrays.place(np.asarray(value))}
     if isinstance(value, _PLAIN):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -417,13 +441,13 @@ def _encode(value: Any, arrays: _Arrays) -> Any:
     raise TypeError(f"{_name(type(value))} cannot be cached; allowed: dataclasses of {PACKAGES}, arrays, containers")
 
 
-def _decode(node: Any, arrays: Mapping[str, NDArray[np.generic]]) -> Any:
+def _decode(node: Any, arrays: _Stored) -> Any:
     if not isinstance(node, dict):
         return node
     if "array" in node:
-        return arrays[node["array"]]
+        return arrays.at(node["array"])
     if "scalar" in node:
-        return arrays[node["scalar"]][()]
+        return arrays.at(node["scalar"])[()]
     if "class" in node:
         kind = _class(node["class"])
         if not dataclasses.is_dataclass(kind):

@@ -62,13 +62,13 @@ def test_an_array_that_stands_twice_is_stored_once() -> None:
 )
 def test_a_file_cannot_name_what_is_not_a_dataclass_of_ours(name: str) -> None:
     with pytest.raises(BadCacheFile):
-        decode_tree(forged({"format": 1, "root": {"class": name, "members": {}}}))
+        decode_tree(forged({"format": 2, "root": {"class": name, "members": {}}}))
 
 
 def test_a_file_makes_nobody_import_a_module_of_others() -> None:
     """An import runs code: `this` prints a poem, others may do worse."""
     with pytest.raises(BadCacheFile, match="not a class a cache file may name"):
-        decode_tree(forged({"format": 1, "root": {"class": "this:Poem", "members": {}}}))
+        decode_tree(forged({"format": 2, "root": {"class": "this:Poem", "members": {}}}))
     assert "this" not in sys.modules
 
 
