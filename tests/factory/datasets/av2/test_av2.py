@@ -222,8 +222,22 @@ def test_frames_that_are_missing_for_half_a_second_are_filled_in(log: Path, tmp_
         assert [(r.what, r.time_s, r.now) for r in found.repairs] == [("gap", 9.9, "filled in")]  # of velocities too
 
 
-def test_longer_gaps_of_frames_are_dropped_and_counted(log: Path) -> None:
-    edit(log / "annotations.feather", without_frames(100, 101, 102, 103, 104))
+def ego_elsewhere_from_then_on(columns: dict[str, list]) -> None:
+    columns["tx_m"][1050:] = [x + 30.0 for x in columns["tx_m"][1050:]]
+
+
+@pytest.mark.parametrize(
+    ("file", "change"),
+    [
+        ("annotations.feather", without_frames(100, 101, 102, 103, 104)),
+        ("city_SE3_egovehicle.feather", ego_elsewhere_from_then_on),
+    ],
+    ids=["a longer gap of frames", "a jump of the ego"],
+)
+def test_windows_across_what_cannot_be_filled_in_are_dropped_and_counted(
+    log: Path, file: str, change: Callable[[dict[str, list]], None]
+) -> None:
+    edit(log / file, change)
     index = AV2Reader(log).index()
     assert [ref.start_ms for ref in index.refs] == [0] and index.dropped == {"broken_tracks": 2}
 
@@ -239,28 +253,6 @@ def test_a_car_that_its_frames_do_not_show_is_absent_there(log: Path) -> None:
     car = clip.agents.track_ids.index("car")
     assert np.flatnonzero(~clip.agents.valid[:, car]).tolist() == [50, 51, 52]
     assert not clip.repairs
-
-
-def test_a_car_that_lies_elsewhere_in_one_frame_is_where_its_others_say(log: Path, tmp_path: Path) -> None:
-    def jump(columns: dict[str, list]) -> None:
-        columns["tx_m"][50] += 30.0
-
-    edit(log / "annotations.feather", jump)
-    reader, whole = AV2Reader(log), AV2Reader(write_log(tmp_path / "whole" / "log-a"))
-    index = reader.index()
-    assert len(index.refs) == 3 and not index.dropped
-    found, expected = reader.read(index.refs[0]), whole.read(index.refs[0])
-    np.testing.assert_allclose(found.agents.boxes, expected.agents.boxes, atol=1e-9)
-    assert [(r.what, r.thing, r.time_s) for r in found.repairs] == [("jump", "car", 5.0), ("gap", "car", 5.0)]
-
-
-def test_a_log_whose_ego_jumps_and_goes_on_there_has_no_window_across_the_jump(log: Path) -> None:
-    def jump(columns: dict[str, list]) -> None:
-        columns["tx_m"][1050:] = [x + 30.0 for x in columns["tx_m"][1050:]]
-
-    edit(log / "city_SE3_egovehicle.feather", jump)
-    index = AV2Reader(log).index()
-    assert [ref.start_ms for ref in index.refs] == [0] and index.dropped == {"broken_tracks": 2}
 
 
 def test_a_log_without_annotations_is_skipped_with_its_reason(log: Path) -> None:

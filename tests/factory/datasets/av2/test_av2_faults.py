@@ -12,11 +12,18 @@ from factory.readers.base import BadClip, ClipRef
 from tests.factory.datasets.av2.test_av2 import START_NS, edit, edit_map, the_map, write_log, write_table
 
 
-def set_value(column: str, row: int, value: object) -> Callable[[dict[str, list]], None]:
+def set_value(column: str, row: int, value: object, **others: object) -> Callable[[dict[str, list]], None]:
+    """others: of further columns of the row."""
+
     def change(columns: dict[str, list]) -> None:
-        columns[column][row] = value
+        for name, here in {column: value, **others}.items():
+            columns[name][row] = here
 
     return change
+
+
+def moved_by_30_m(columns: dict[str, list]) -> None:
+    columns["tx_m"][50] += 30.0
 
 
 def cut_short(path: Path) -> None:
@@ -94,6 +101,12 @@ BROKEN = {
         ),
         "lane_segments: the map has no VEHICLE or BUS lane",
     ),
+    "lanes of no point": (
+        lambda log: edit_map(
+            log, lambda content: [x.update(left_lane_boundary=[]) for x in content["lane_segments"].values()]
+        ),
+        "no VEHICLE or BUS lane; left out: 1 (no point in its left boundary)",
+    ),
     "map of somewhere else": (
         lambda log: edit_map(log, lambda content: move(content["lane_segments"].values())),
         "lane_segments: the ego is never within",
@@ -132,18 +145,6 @@ def test_a_broken_log_names_its_file_and_field_and_hurts_no_other(tmp_path: Path
     assert named, "a broken log may be found when it is indexed or when it is read, but never vanishes"
     assert all(ref.start_ms == 0 for ref in index.broken)
     reader.read(ClipRef("av2", "log-b", 1000))
-
-
-def set_values(row: int, **values: object) -> Callable[[dict[str, list]], None]:
-    def change(columns: dict[str, list]) -> None:
-        for column, value in values.items():
-            columns[column][row] = value
-
-    return change
-
-
-def turn_round(columns: dict[str, list]) -> None:
-    set_values(5, qw=0.0, qz=1.0)(columns)
 
 
 def swap(columns: dict[str, list]) -> None:
@@ -187,7 +188,8 @@ REPAIRED = {
     "flat box": (BOXES, set_value("width_m", 5, 0.0), [("impossible", "car", 0.5), ("gap", "car", 0.5)]),
     "box at infinity": (BOXES, set_value("tx_m", 5, -float("inf")), [("impossible", "car", 0.5), ("gap", "car", 0.5)]),
     "box without rotation": (BOXES, set_value("qw", 5, 0.0), [("impossible", "car", 0.5), ("gap", "car", 0.5)]),
-    "box turned round": (BOXES, turn_round, [("heading", "car", 0.5)]),
+    "box turned round": (BOXES, set_value("qw", 5, 0.0, qz=1.0), [("heading", "car", 0.5)]),
+    "box elsewhere": (BOXES, moved_by_30_m, [("jump", "car", 5.0), ("gap", "car", 5.0)]),
     "car listed twice": (BOXES, beside_it, [("twice", "double", 0.0)]),
     "ego among the boxes": (BOXES, the_ego, [("ego", "me", 0.0)]),
 }
