@@ -122,13 +122,23 @@ def test_keep_never_continues_a_walk_on_another_candidate_list(tmp_path: Path, b
 
 
 @pytest.mark.slow
-def test_redo_replaces_every_row_and_is_the_same_as_a_fresh_run(tmp_path: Path, begun: Callable[..., Path]) -> None:
-    begun(rounds=3)
-    changed = ToyWork(threshold=0.3, prepare_digest="perturb-2", trouble={"log0:0": "standing"})
-    assert run(tmp_path / "out", changed, rounds=2, on_change="redo").exit_code == COMPLETE
-    run(tmp_path / "fresh", changed, rounds=2)
+@pytest.mark.parametrize(
+    ("rounds", "changed"),
+    [
+        (3, ToyWork(threshold=0.3, prepare_digest="perturb-2", trouble={"log0:0": "standing"})),
+        (2, ToyWork(threshold=0.3, content="other")),
+    ],
+    ids=["fewer rounds of other candidates", "a changed log, which is read anew in spite of the cache"],
+)
+def test_redo_replaces_every_row_and_is_the_same_as_a_fresh_run(
+    tmp_path: Path, begun: Callable[..., Path], rounds: int, changed: ToyWork
+) -> None:
+    begun(rounds=rounds)
+    assert run(tmp_path / "out", changed, on_change="redo").exit_code == COMPLETE
+    run(tmp_path / "fresh", changed)
     assert_same_tables(tmp_path / "out", tmp_path / "fresh")
-    assert run(tmp_path / "out", changed, rounds=2, on_change="redo").executed.attempts == 0
+    assert run(tmp_path / "out", changed, on_change="redo").executed.attempts == 0
+    assert run(tmp_path / "out", changed, rounds=3).exit_code == COMPLETE
 
 
 def test_redo_replaces_the_rows_of_an_expert_whose_inputs_changed_and_no_others(
@@ -215,16 +225,6 @@ def test_redo_tries_again_what_a_bug_stopped_under_other_settings_and_nothing_th
     fresh = tmp_path / "fresh"
     run(fresh, fixed, n=1)
     assert_same_tables(out, fresh)
-
-
-@pytest.mark.slow
-def test_redo_reads_a_changed_log_anew_in_spite_of_the_cache(tmp_path: Path, begun: Callable[..., Path]) -> None:
-    begun(rounds=2)
-    changed = ToyWork(threshold=0.3, content="other")
-    assert run(tmp_path / "out", changed, on_change="redo").exit_code == COMPLETE
-    run(tmp_path / "fresh", changed)
-    assert_same_tables(tmp_path / "out", tmp_path / "fresh")
-    assert run(tmp_path / "out", changed, rounds=3).exit_code == COMPLETE
 
 
 def test_redo_refuses_a_changed_log_whose_rows_are_to_stay(tmp_path: Path, begun: Callable[..., Path]) -> None:
