@@ -65,11 +65,7 @@ BREAKS = {
     "metadata.ts: no frame for 9,988 s": stamped(1e4, 120),
     "metadata.ts: frames further apart": with_value(np.arange(121.0), "metadata", "ts"),
     r"tracks\[ego\].state.position: missing": without("tracks", "ego", "state", "position"),
-}
-BREAKS |= {
-    r"tracks\[sdc\].state: most of 121 poses of the ego are NaN": lambda s: at("ego", "position", slice(0, 70), np.nan)(
-        s
-    ),
+    r"tracks\[sdc\].state: most of 121 poses of the ego are NaN": at("ego", "position", slice(0, 70), np.nan),
     r"tracks\[lead\].type: unknown class 'TRAM'": lambda s: [
         track.update(type="TRAM") for name, track in s["tracks"].items() if name != "ego"
     ],
