@@ -21,8 +21,8 @@ def rows(request: pytest.FixtureRequest, shared_root: Path, tmp_path_factory: py
     out = tmp_path_factory.mktemp(request.param)
     human = shared_root / "data" / "vocabulary" / "human_8192x40x3.npy"
     words = [f"clips={request.param}", f"clips.root={shared_root.joinpath('data', *LOGS[request.param])}"]
-    words += [f"vocabulary.file={human}", "experts=[pdm_closed,recovery,human]", "rounds=1", "reward.labels=none", "limit=30"]
-    assert main([*words, "render=none", "executor=local", f"out={out}"]) == 0
+    words += [f"vocabulary.file={human}", "experts=[pdm_closed,recovery,human]", "rounds=1", "reward.labels=none"]
+    assert main([*words, "limit=30", "render=none", "executor=local", f"out={out}"]) == 0
     found = rows_of(str(out))
     assert {row["expert"] for row in found} == {"human", "pdm_closed", "recovery"} and len(found) > 30
     return found
