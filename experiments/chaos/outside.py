@@ -161,8 +161,8 @@ ROWS: Mapping[str, Row] = {
     ),
     "ascii": Same("with LANG=C and an output of ASCII alone", trouble.started_with(**ASCII), EVERY),
     "files": Same("with 64 open files", trouble.started_with("prlimit", "--nofile=64"), EVERY, BAD, "files"),
-    # Where it is refused, Rust ends by SIGABRT, other native code by SIGSEGV, glibc by 127, OpenBLAS by exit code 1, both
-    # with a line of their own, or without threads by raise(SIGINT).
+    # Where it is refused, Rust ends by SIGABRT, other native code by SIGSEGV, glibc by 127 and OpenBLAS by 1, each with
+    # a line of its own, the latter without threads by raise(SIGINT).
     "memory": Same(
         "with 512 MB less memory than it takes",
         trouble.short_of_memory,
