@@ -4,9 +4,9 @@
 
 The rows are written straight to the tables, as a run that made a third of them samples would leave them: clips of two
 experts and five rounds, in `commits` commits of a file a round and expert. An `out` that is there is taken as it is.
-Every step is a process of its own; seconds are of its CPU, over what its imports take, and memory is its peak. Two are
-asked for by name alone, as `step=compact`, for they change the table: `compact`, and `go on`, one more round for two
-minutes on a Ray of two workers.
+Every step is a process of its own; seconds are of its CPU, over what its imports take, and memory is its peak.
+`compact` is asked for by name alone, as `step=compact`, for it changes the table. A table that the run's own driver
+makes is `bench_scale`'s.
 """
 
 import math
@@ -26,8 +26,6 @@ import numpy as np
 import pyarrow as pa
 
 from factory.config.arguments import run_request_command
-from factory.exits import COMPLETE, INTERRUPTED
-from factory.graph.execute import Execution, execute
 from factory.graph.plan import make_plan, retry_policy
 from factory.readers.base import ClipRef
 from factory.store.location import Shard, write_shard
@@ -39,7 +37,7 @@ from tests.factory.toy import ToyWork, row_of, stream
 EXPERTS = ("pdm_closed", "recovery")
 ROUNDS, TRIES = 5, 15  # of a walk: every third attempt is accepted
 WORK = ToyWork(n_candidates=40)
-CHANGING = ("compact", "go on")
+CHANGING = ("compact",)
 Step = Callable[[Path], object]
 
 
@@ -74,10 +72,9 @@ def measured(step: Step, out: Path) -> str:
     """CPU seconds, seconds, peak memory of one step."""
     began, before = time.perf_counter(), _cpu_s()
     with redirect_stdout(StringIO()):
-        told = step(out)
+        step(out)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    more = f"  {told}" if isinstance(told, str) else ""
-    return f"{_cpu_s() - before:8.1f}{time.perf_counter() - began:8.1f}{peak:7.0f}{more}"
+    return f"{_cpu_s() - before:8.1f}{time.perf_counter() - began:8.1f}{peak:7.0f}"
 
 
 def clips(n: int) -> list[ClipRef]:
@@ -202,20 +199,6 @@ def plan(out: Path, rounds: int = ROUNDS) -> object:
     return made
 
 
-def go_on(out: Path, minutes: float = 2.0) -> str:
-    """A run of one more round, which two minutes do not end: what its driver holds, and how many it hands out."""
-    store = Store(out)
-    refs, before = clips(sum(file.n_rows for file in store.candidates.file_facts().values())), _attempts(store)
-    ended = execute(WORK, refs, EXPERTS, ROUNDS + 1, store, Execution("ray", 2, minutes=minutes), say=str)
-    if ended.exit_code not in (COMPLETE, INTERRUPTED):
-        raise RuntimeError(f"exit code {ended.exit_code}: {ended.message}")
-    return f"{_attempts(Store(out)) - before} attempts more"
-
-
-def _attempts(store: Store) -> int:
-    return len(store.samples) + len(store.outcomes)
-
-
 def command(*words: str) -> Step:
     from factory.commands.table import COMMANDS
 
@@ -256,7 +239,6 @@ STEPS: dict[str, Step] = {
     "failed": command("failed"),
     "verify": command("verify"),
     "compact": command("compact"),
-    "go on": go_on,
 }
 
 
