@@ -39,7 +39,7 @@ from tasks.render.gate import (
     likeness_to_photo,
 )
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import agents_at_time
+from tasks.render.scene.movers import agents_at_time
 from tasks.render.scene.sensed import Photo
 from tasks.render.seen import PhotoSights, photo_sights
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings

@@ -31,7 +31,8 @@ from factory.views.pictures import (
 from factory.views.status import rows_where
 from tasks.caches import user_cache
 from tasks.render.scene.asset import RenderAsset, psnr
-from tasks.render.scene.engine import agents_at_time, render
+from tasks.render.scene.engine import render
+from tasks.render.scene.movers import agents_at_time
 from tasks.render.settings import ImageSource
 from tasks.render.views import VISIBLE_M, render_views
 from tasks.world.arrays import Array, Image

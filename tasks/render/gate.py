@@ -15,13 +15,13 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 from tasks.render.scene.asset import OwnBody, RenderAsset, camera_psnr_db, compose_gaussians, mean_psnr_db
-from tasks.render.scene.engine import Backend, PlacedAgents, agents_at_time, render
-from tasks.render.scene.movers import BEYOND_M, behind_boxes, boxes_at, world_from_boxes
+from tasks.render.scene.engine import render
+from tasks.render.scene.movers import BEYOND_M, PlacedAgents, agents_at_time, behind_boxes, boxes_at, world_from_boxes
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky import pixel_directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.seen import PhotoSights, guessed_pixels
-from tasks.render.settings import GateSettings, RenderSettings
+from tasks.render.settings import Backend, GateSettings, RenderSettings
 from tasks.render.splatting.gaussians import Gaussians, rotations_of
 from tasks.render.splatting.raster import View
 from tasks.stages import Rejected

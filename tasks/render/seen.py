@@ -21,9 +21,10 @@ import numpy as np
 
 from tasks.kernels.compiled import kernel
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import Backend, render
+from tasks.render.scene.engine import render
 from tasks.render.scene.movers import behind_boxes
 from tasks.render.scene.sky import pixel_directions
+from tasks.render.settings import Backend
 from tasks.world.arrays import F32, Array, Bools
 from tasks.world.clip import Camera, Pinhole, SensorFile
 

@@ -7,8 +7,10 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import Backend, agents_at_time, render
+from tasks.render.scene.asset import Instant, RenderAsset
+from tasks.render.scene.engine import render_pictures
+from tasks.render.scene.movers import agents_at_time
+from tasks.render.settings import Backend
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Camera, Fisheye, Pinhole
 from tasks.world.frames import box_corners
@@ -35,17 +37,13 @@ def render_views(
     the scene's 0 (`RenderAsset.since`), and before it what it sees of the car that carries it.
     Raises BackendMissing where the backend cannot work on this machine.
     """
-    out = np.empty((len(steps), len(cameras), height, width, 3), np.uint8)
-    rig = [camera.resized(width, height) for camera in cameras]
-    for f, step in enumerate(steps):
+    rig, instants = [camera.resized(width, height) for camera in cameras], []
+    for pose, step in zip(world_from_ego, steps, strict=True):
         affines = [asset.affine_of(camera.name, step * STEP_S) for camera in cameras]
-        there = agents_at_time(agents, step * STEP_S, world_from_ego[f, :2, 3], VISIBLE_M)
-        eyes = [Pinhole(c.intrinsics, world_from_ego[f] @ c.ego_from_camera, width, height) for c in rig]
-        for c, view in enumerate(render(asset, eyes, there, backend, affines=affines)):
-            cv2.convertScaleAbs(view.rgb, out[f, c], 255.0)
-            if (body := asset.own_body(cameras[c].name)) is not None:
-                out[f, c] = body.drawn_on(out[f, c])
-    return out
+        there = agents_at_time(agents, step * STEP_S, pose[:2, 3], VISIBLE_M)
+        eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, width, height) for c in rig]
+        instants.append(Instant(eyes, there, affines))
+    return render_pictures(asset, instants, [asset.own_body(camera.name) for camera in cameras], backend)
 
 
 def undistorted(image: Bytes, camera: Camera) -> Bytes:

@@ -26,7 +26,8 @@ from factory.setup.settings import assemble
 from factory.stages.assets import load_or_build_scene
 from factory.stages.sensors import block_of, choose_cameras, load_photos
 from tasks.render.scene.asset import RenderAsset, camera_psnr_db
-from tasks.render.scene.engine import agents_at_time, render
+from tasks.render.scene.engine import render
+from tasks.render.scene.movers import agents_at_time
 from tasks.render.settings import RenderSettings
 from tasks.world.clip import Camera, Clip, PhotoDrive, Pinhole, front_camera
 from tests.bench.bench_guess import FRONT, TOWN

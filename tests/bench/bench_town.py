@@ -28,7 +28,7 @@ from tasks.render.fit.reconstruct import LEAST_PIXELS as LEAST_OF_CLASS
 from tasks.render.fit.reconstruct import finish_scene, run_iterations
 from tasks.render.fit.start import prepare_fit
 from tasks.render.scene.build import held_out_rows
-from tasks.render.scene.engine import agents_at_time
+from tasks.render.scene.movers import agents_at_time
 from tasks.render.scene.sensed import Photo
 from tasks.render.settings import FitSettings
 from tasks.world.clip import Camera, Pinhole

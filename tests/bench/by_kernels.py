@@ -6,9 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gradient import backward
-from tasks.render.splatting.project import DEPTH
+from tasks.render.splatting.project import DEPTH, NEAR_M, ScreenFilter
 from tasks.render.splatting.raster import ForwardPass, forward
 from tasks.render.splatting.tensors import Eye, SceneTensors, Splatted
 
@@ -44,3 +45,33 @@ class _Blended(torch.autograd.Function):
             everyone[by.index] = part
         tensors = [torch.from_numpy(part) for part in (*whole, by.camera.astype(np.float32), by.screen)]
         return None, None, None, *tensors
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float,
+    eps2d: float,
+    rasterize_mode: str,
+    sh_degree: int | None,
+    packed: bool,
+    render_mode: str,
+) -> tuple[Tensor, Tensor, None]:
+    """What stands for `gsplat.rasterization` on the CPU: its arguments drawn by `raster.forward`."""
+    assert near_plane == NEAR_M and render_mode == "RGB+ED"
+    colours, rest = colors, torch.zeros(len(means), 0, 3)
+    if sh_degree is not None:
+        colours, rest = colors[:, 0] * sh.C0 + 0.5, colors[:, 1:]
+    scene = Gaussians(*(part.numpy() for part in (means, quats, scales.log(), opacities, colours, rest)))
+    screen = ScreenFilter(eps2d, rasterize_mode == "antialiased")
+    eyes = zip(Ks.double().numpy(), torch.inverse(viewmats.double()).numpy())
+    seen = [forward(scene, k, pose, width, height, np.zeros(3, np.float32), 1, screen).view for k, pose in eyes]
+    drawn = torch.from_numpy(np.stack([np.dstack([view.rgb, view.depth]) for view in seen]))
+    return drawn, torch.from_numpy(np.stack([view.alpha for view in seen]))[..., None], None

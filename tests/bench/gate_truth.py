@@ -32,7 +32,8 @@ from tasks.render.gate import (
     to_box_frame,
 )
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import PlacedAgents, agents_at_time, render
+from tasks.render.scene.engine import render
+from tasks.render.scene.movers import PlacedAgents, agents_at_time
 from tasks.render.views import VISIBLE_M
 from tasks.world.arrays import F32, Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentKind, AgentTracks, Camera, Clip, Pinhole

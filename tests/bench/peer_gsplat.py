@@ -24,8 +24,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tasks.render.scene.on_device import Device, gaussians_on, rasterized
 from tasks.render.splatting.gaussians import Gaussians
-from tasks.render.splatting.gsplat_backend import arguments, view_of
+from tasks.render.splatting.project import FITTED
 from tasks.render.splatting.raster import View, forward
 from tasks.render.splatting.tensors import Draw, Eye, SceneTensors, splatted
 from tasks.world.clip import Pinhole
@@ -198,6 +199,13 @@ def answers(draw: Draw, scene: Gaussians, intrinsics: Any, dtype: torch.dtype, d
     return {name: tensor.detach().cpu().numpy() for name, tensor in out.items()}
 
 
+def drawn_on(device: Device, scene: Gaussians, intrinsics: Any) -> View:
+    """What a device makes of a scene, before black."""
+    eye = Pinhole(np.array(intrinsics), pose(), WIDTH, HEIGHT)
+    found = rasterized(device, gaussians_on(device, scene), [eye], FITTED)
+    return View(*(device.fetch(picture[0]) for picture in found))
+
+
 def pictures_of(view: View, index: NDArray[Any]) -> Arrays:
     """As of `answers`, without derivatives."""
     return {"rgb": view.rgb, "depth": view.depth, "alpha": view.alpha, "index": index}
@@ -206,11 +214,15 @@ def pictures_of(view: View, index: NDArray[Any]) -> Arrays:
 def of_gsplat(scene: Gaussians, intrinsics: Any) -> Arrays:
     """What gsplat says, in float64; pictures alone where light depends on the side, which no fit learns."""
     if scene.sh_rest.shape[1]:
-        given = arguments(scene, [Pinhole(np.array(intrinsics), pose(), WIDTH, HEIGHT)])
-        tensors = {k: torch.as_tensor(v).double() if isinstance(v, np.ndarray) else v for k, v in given.items()}
-        drawn, alpha, meta = rasterization(**tensors)
-        view = view_of(drawn[0].numpy(), alpha[0].numpy())
-        return pictures_of(view, meta["gaussian_ids"].numpy())
+        index: list[NDArray[Any]] = []
+
+        def exact(**given: Any) -> Any:
+            drawn = rasterization(**{k: v.double() if isinstance(v, Tensor) else v for k, v in given.items()})
+            index.append(drawn[-1]["gaussian_ids"].numpy())
+            return drawn
+
+        view = drawn_on(Device("cpu", exact), scene, intrinsics)
+        return pictures_of(view, index[0])
     return answers(lambda tensors, eye: splatted(rasterization, tensors, eye), scene, intrinsics, torch.float64)
 
 

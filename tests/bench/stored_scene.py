@@ -12,7 +12,8 @@ import numpy as np
 
 from factory.stages.scene_file import read_scene, write_scene
 from tasks.render.scene.asset import RenderAsset, psnr
-from tasks.render.scene.engine import NOBODY, PlacedAgents, render
+from tasks.render.scene.engine import render
+from tasks.render.scene.movers import NOBODY, PlacedAgents
 from tasks.render.settings import RenderSettings, SceneDtype
 from tasks.world.arrays import F32, Bytes
 from tasks.world.clip import Pinhole

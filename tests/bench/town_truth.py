@@ -10,8 +10,8 @@ from tasks.render.fit.losses import photo_target, ssim
 from tasks.render.fit.reconstruct import pixel_classes
 from tasks.render.fit.state import Road
 from tasks.render.scene.asset import RenderAsset, psnr
-from tasks.render.scene.engine import PlacedAgents, agents_at_time, render
-from tasks.render.scene.movers import behind_boxes
+from tasks.render.scene.engine import render
+from tasks.render.scene.movers import PlacedAgents, agents_at_time, behind_boxes
 from tasks.render.scene.sensed import Photo, shift_pose
 from tasks.render.scene.sky import pixel_directions
 from tasks.render.scene.stereo import FAR_M

@@ -34,6 +34,7 @@ UNSEEN = {  # declared without an import statement of ours
 RAY_ONLY = {"factory/graph/on_ray/graph.py"}  # loaded by executor=ray alone
 GPU_ONLY = {  # by render.backend=gsplat alone
     "tasks/render/fit/on_torch.py",
+    "tasks/render/scene/on_device.py",
     "tasks/render/splatting/tensors.py",
 }
 GPU = re.compile(r"torch|triton|nvidia|cuda|cudnn|nccl|gsplat")

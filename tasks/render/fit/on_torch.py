@@ -35,7 +35,8 @@ from tasks.render.fit.state import (
     Road,
 )
 from tasks.render.scene.movers import SHIFT_SIZE
-from tasks.render.scene.sky import COLUMNS, ROWS
+from tasks.render.scene.on_device import sky_places
+from tasks.render.scene.sky import COLUMNS
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gradient import Gradients
 from tasks.render.splatting.tensors import Draw, Eye, SceneTensors, moved
@@ -123,20 +124,10 @@ def composite_sky(
 
     As `sky.look_up_sky` has it, and `backend.backdrop_gradient`: what hides more than HIDDEN asks nothing.
     """
-    height, width = alpha.shape
-    v, u = torch.meshgrid(
-        torch.arange(height, device=alpha.device).double() + 0.5,
-        torch.arange(width, device=alpha.device).double() + 0.5,
-        indexing="ij",
-    )
-    across, down = (u - intrinsics[0, 2]) / intrinsics[0, 0], (v - intrinsics[1, 2]) / intrinsics[1, 1]
-    x, y, z = (float(t[0]) * across + float(t[1]) * down + float(t[2]) for t in scene_from_camera[:3, :3])
-    row = (0.5 - torch.atan2(z, torch.hypot(x, y)) / math.pi) * ROWS - 0.5
-    column = (torch.atan2(y, x) / (2.0 * math.pi) + 0.5) * COLUMNS - 0.5
-    top, left = row.floor().clamp(0, ROWS - 2), column.floor()
-    below, right = (row - top).clamp(0.0, 1.0)[..., None].float(), (column - left)[..., None].float()
-    corner = (top * COLUMNS).long()
-    at_left, at_right = corner + left.long() % COLUMNS, corner + (left.long() + 1) % COLUMNS
+    lens, turn = (torch.as_tensor(of[None, :3, :3], device=alpha.device) for of in (intrinsics, scene_from_camera))
+    (tops, lefts), rights, belows = sky_places(lens, turn, *alpha.shape)
+    left, right, below = lefts[0], rights[0, ..., None].float(), belows[0, ..., None].float()
+    at_left, at_right = tops[0] * COLUMNS + left, tops[0] * COLUMNS + (left + 1) % COLUMNS
 
     behind = torch.zeros_like(rgb)
     open_to_it = alpha.detach() <= HIDDEN

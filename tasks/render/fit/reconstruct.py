@@ -22,10 +22,11 @@ from tasks.render.fit.start import FitPhoto, FitProblem
 from tasks.render.fit.state import BACKGROUND, FitState, Road, height_above_road, opacities_of, relocate_and_grow
 from tasks.render.scene.asset import ClassQuality, Exposure, RenderAsset, ViewQuality, mean_psnr_db, psnr
 from tasks.render.scene.body import BEFORE_M, bodies_near, nearest_box_along_rays
-from tasks.render.scene.engine import PlacedAgents, render
+from tasks.render.scene.engine import render
 from tasks.render.scene.movers import (
     SHIFT_SIZE,
     BoxShifts,
+    PlacedAgents,
     behind_boxes,
     interpolate_knots,
     knots_at,

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.scene.movers import NO_SHIFTS, BoxShifts, lift_tracks, world_from_boxes
+from tasks.render.scene.movers import NO_SHIFTS, BoxShifts, PlacedAgents, lift_tracks, world_from_boxes
 from tasks.render.scene.sky import SkyMap
 from tasks.render.scene.surfels import box_gaussians
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.render.splatting.project import FITTED, ScreenFilter
 from tasks.world.arrays import F32, Array, Bools, Bytes
-from tasks.world.clip import AgentKind, AgentTracks, Camera, SensorFile
+from tasks.world.clip import AgentKind, AgentTracks, Camera, Pinhole, SensorFile
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,15 @@ class OwnBody:
         over = cv2.resize(self.rgba, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         share = over[..., 3:] / 255.0
         return np.rint(over[..., :3] * share + picture * (1.0 - share)).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Instant:
+    """What is to be drawn of a scene at one time."""
+
+    cameras: Sequence[Pinhole]
+    vehicles: PlacedAgents
+    affines: Sequence[F32]  # (3, 4) a camera: what it makes of the scene's light
 
 
 @dataclass(frozen=True)

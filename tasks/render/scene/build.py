@@ -14,9 +14,9 @@ import numpy as np
 from tasks.render.scene.asset import RenderAsset, ViewQuality, compose_gaussians, mean_psnr_db, psnr
 from tasks.render.scene.body import with_body_depths
 from tasks.render.scene.depth import SHALLOW, PhotoDepth, estimate_photo_depth, label_confirmed
-from tasks.render.scene.engine import PlacedAgents, render
+from tasks.render.scene.engine import render
 from tasks.render.scene.features import NOTHING_KNOWN, KnownPoints, SurfacePoints, points_without_lidar
-from tasks.render.scene.movers import box_of_points, world_from_boxes
+from tasks.render.scene.movers import PlacedAgents, box_of_points, world_from_boxes
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse_sweeps, shift_pose
 from tasks.render.scene.sky import SkyMap, look_up_sky, pixel_directions, sky_cells, sky_of_views
 from tasks.render.scene.stereo import FAR_M

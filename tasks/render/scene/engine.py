@@ -1,4 +1,4 @@
-"""The one function that draws a scene: `render(asset, cameras, vehicles, backend) -> rgb, depth, alpha` per camera.
+"""The functions that draw a scene: `render` gives views of one instant, `render_pictures` 8-bit pictures of several.
 
 Backends with one face. `cpu` is the compiled tile rasteriser of this package: the same input gives the same bytes.
 `gsplat` draws the same Gaussians with CUDA, equal up to the last bits of 8-bit colours, all cameras of a size in one
@@ -6,45 +6,26 @@ call (`gsplat_dense` without packing what they see). All draw ideal pinholes: a 
 photos before they enter a scene (`views.undistorted`), so that images at new poses need none.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from types import MappingProxyType
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
-from tasks.render.scene.asset import RenderAsset, compose_gaussians
-from tasks.render.scene.movers import boxes_at
+from tasks.render.scene.asset import Instant, OwnBody, RenderAsset, compose_gaussians
+from tasks.render.scene.movers import NOBODY, PlacedAgents
 from tasks.render.scene.sensed import shift_pose
 from tasks.render.settings import Backend
-from tasks.render.splatting.gaussians import Gaussians
-from tasks.render.splatting.project import ScreenFilter
 from tasks.render.splatting.raster import View, forward
-from tasks.world.arrays import F32, Array
-from tasks.world.clip import AgentKind, AgentTracks, Pinhole
+from tasks.world.arrays import F32, Bytes
+from tasks.world.clip import Pinhole
 
+if TYPE_CHECKING:
+    from tasks.render.scene.on_device import Device
 
-@dataclass(frozen=True)
-class PlacedAgents:
-    """Who is in the scene, and where: vehicles, pedestrians and bicycles."""
-
-    track_ids: tuple[str, ...]
-    kinds: tuple[AgentKind, ...]
-    boxes: Array  # (N, 7) x, y, z of the centre, heading, length, width, height; world [m, rad]
-
-
-NOBODY = PlacedAgents((), (), np.zeros((0, 7)))
-
-
-def agents_at_time(
-    agents: AgentTracks, time_s: float, around: Array | None = None, reach_m: float = np.inf
-) -> PlacedAgents:
-    """The tracks that are there at a time since their first step; given a place `around` (2,), those within reach."""
-    boxes, valid = boxes_at(agents, time_s)
-    if around is not None:
-        valid = valid & (np.hypot(*(boxes[:, :2] - around).T) < reach_m)
-    rows = np.flatnonzero(valid)
-    return PlacedAgents(tuple(agents.track_ids[j] for j in rows), tuple(agents.kinds[j] for j in rows), boxes[rows])
+BLACK = np.zeros(3, np.float32)
+SCENE_S_OWN = np.eye(3, 4, dtype=np.float32)  # colours
 
 
 def render(
@@ -64,19 +45,58 @@ def render(
     never a black one. `threads` are the CPU backend's and change no byte. Raises BackendMissing where the backend
     cannot work on this machine.
     """
-    scene = compose_gaussians(asset, vehicles.track_ids, vehicles.kinds, vehicles.boxes)
-    local = [
-        replace(camera, world_from_camera=shift_pose(camera.world_from_camera, -asset.origin)) for camera in cameras
-    ]
-    views = RASTERISERS[backend](scene, local, threads, asset.screen)
-    for view, camera, affine in zip(
-        views, local, [SCENE_S_OWN] * len(views) if affines is None else affines, strict=True
-    ):
-        asset.sky.finish(view.rgb, view.alpha, affine, camera.intrinsics, camera.world_from_camera, threads)
-    return views
+    instant = Instant(cameras, vehicles, [SCENE_S_OWN] * len(cameras) if affines is None else affines)
+    if not backend.on_gpu:
+        return _render_on_cpu(asset, instant, threads)
+    from tasks.render.scene import on_device  # torch is loaded only where it is asked for
+
+    return on_device.views(gpu(backend), asset, _in_scene(asset, instant))
 
 
-SCENE_S_OWN = np.eye(3, 4, dtype=np.float32)  # colours
+def render_pictures(
+    asset: RenderAsset,
+    instants: Sequence[Instant],
+    bodies: Sequence[OwnBody | None],
+    backend: Backend = Backend.CPU,
+) -> Bytes:
+    """Pictures (F, C, H, W, 3) of F instants, whose cameras are of one size, with the `bodies` that these see of their
+    own car; from a GPU nothing else comes back. Raises BackendMissing where the backend cannot work on this machine."""
+    if backend.on_gpu:
+        from tasks.render.scene import on_device  # torch is loaded only where it is asked for
+
+        return on_device.pictures(gpu(backend), asset, [_in_scene(asset, instant) for instant in instants], bodies)
+    first = instants[0].cameras[0]
+    out = np.empty((len(instants), len(bodies), first.height, first.width, 3), np.uint8)
+    for row, instant in zip(out, instants, strict=True):
+        for picture, view, body in zip(row, _render_on_cpu(asset, instant, 1), bodies, strict=True):
+            cv2.convertScaleAbs(view.rgb, picture, 255.0)
+            if body is not None:
+                picture[:] = body.drawn_on(picture)
+    return out
+
+
+def _render_on_cpu(asset: RenderAsset, instant: Instant, threads: int) -> list[View]:
+    agents, seen = instant.vehicles, []
+    scene = compose_gaussians(asset, agents.track_ids, agents.kinds, agents.boxes)
+    for eye, affine in zip(_in_scene(asset, instant).cameras, instant.affines, strict=True):
+        k, pose = eye.intrinsics, eye.world_from_camera
+        view = forward(scene, k, pose, eye.width, eye.height, BLACK, threads, asset.screen).view
+        asset.sky.finish(view.rgb, view.alpha, affine, k, pose, threads)
+        seen.append(view)
+    return seen
+
+
+def _in_scene(asset: RenderAsset, instant: Instant) -> Instant:
+    """The instant with its cameras in the scene's own frame."""
+    local = [replace(c, world_from_camera=shift_pose(c.world_from_camera, -asset.origin)) for c in instant.cameras]
+    return replace(instant, cameras=local)
+
+
+def gpu(backend: Backend) -> "Device":
+    """Where a backend that is not the CPU draws. Raises BackendMissing."""
+    from tasks.render.scene.on_device import cuda  # torch is loaded only where it is asked for
+
+    return cuda(packed=backend is Backend.GSPLAT)
 
 
 def require_backend(backend: Backend) -> None:
@@ -85,31 +105,3 @@ def require_backend(backend: Backend) -> None:
         from tasks.render.splatting.gsplat_backend import require
 
         require()
-
-
-Rasteriser = Callable[[Gaussians, Sequence[Pinhole], int, ScreenFilter], list[View]]
-"""Gaussians and cameras in one frame, threads, what all is drawn through -> views before black, contiguous; colours
-may leave [0, 1]."""
-
-
-def _on_cpu(scene: Gaussians, cameras: Sequence[Pinhole], threads: int, screen: ScreenFilter) -> list[View]:
-    return [
-        forward(scene, c.intrinsics, c.world_from_camera, c.width, c.height, BLACK, threads, screen).view
-        for c in cameras
-    ]
-
-
-BLACK = np.zeros(3, np.float32)
-
-
-def _with_gsplat(
-    scene: Gaussians, cameras: Sequence[Pinhole], threads: int, screen: ScreenFilter, packed: bool = True
-) -> list[View]:
-    from tasks.render.splatting.gsplat_backend import rasterize_all  # torch is loaded only where it is asked for
-
-    return rasterize_all(scene, cameras, screen, packed)
-
-
-RASTERISERS: Mapping[Backend, Rasteriser] = MappingProxyType(
-    {Backend.CPU: _on_cpu, Backend.GSPLAT: _with_gsplat, Backend.GSPLAT_DENSE: partial(_with_gsplat, packed=False)}
-)

@@ -8,7 +8,7 @@ import numpy as np
 
 from tasks.kernels.compiled import kernel
 from tasks.world.arrays import F32, Array, Bools, FloatArray
-from tasks.world.clip import STEP_S, AgentTracks
+from tasks.world.clip import STEP_S, AgentKind, AgentTracks
 from tasks.world.frames import planar_matrices, wrap_angle
 
 MARGIN_M = 0.15  # boxes are drawn tightly; mirrors and noise stick out
@@ -117,6 +117,29 @@ def world_from_boxes(boxes: Array) -> Array:
     poses = planar_matrices(boxes[:, [0, 1, 3]])
     poses[:, 2, 3] = boxes[:, 2]
     return poses
+
+
+@dataclass(frozen=True)
+class PlacedAgents:
+    """Who is in the scene, and where: vehicles, pedestrians and bicycles."""
+
+    track_ids: tuple[str, ...]
+    kinds: tuple[AgentKind, ...]
+    boxes: Array  # (N, 7) x, y, z of the centre, heading, length, width, height; world [m, rad]
+
+
+NOBODY = PlacedAgents((), (), np.zeros((0, 7)))
+
+
+def agents_at_time(
+    agents: AgentTracks, time_s: float, around: Array | None = None, reach_m: float = np.inf
+) -> PlacedAgents:
+    """The tracks that are there at a time since their first step; given a place `around` (2,), those within reach."""
+    boxes, valid = boxes_at(agents, time_s)
+    if around is not None:
+        valid = valid & (np.hypot(*(boxes[:, :2] - around).T) < reach_m)
+    rows = np.flatnonzero(valid)
+    return PlacedAgents(tuple(agents.track_ids[j] for j in rows), tuple(agents.kinds[j] for j in rows), boxes[rows])
 
 
 def ever_moves(agents: AgentTracks) -> Bools:

@@ -72,10 +72,16 @@ def rotate_coefficients(sh_rest: F32, matrix: Array) -> F32:
     count = sh_rest.shape[1]
     if count == 0 or np.array_equal(matrix, np.eye(3)):
         return sh_rest
-    # The turned light f(matrix^T d) is again a sum of basis functions, so it is read off exactly from more directions
-    # than there are coefficients.
-    turn = np.linalg.pinv(basis(_DIRECTIONS, count)) @ basis(_DIRECTIONS @ matrix, count)
-    return np.einsum("ab,nbc->nac", turn, sh_rest).astype(np.float32)
+    return np.einsum("ab,nbc->nac", coefficient_turn(count, matrix), sh_rest).astype(np.float32)
+
+
+def coefficient_turn(count: int, matrix: Array) -> Array:
+    """(count, count) what makes of coefficients those of the same light in a frame turned by `matrix` (3, 3).
+
+    The turned light f(matrix^T d) is again a sum of basis functions, so it is read off exactly from more directions
+    than there are coefficients.
+    """
+    return np.asarray(np.linalg.pinv(basis(_DIRECTIONS, count)) @ basis(_DIRECTIONS @ matrix, count))
 
 
 def _spread(n: int) -> Array:

@@ -24,7 +24,8 @@ from tasks.experts.recovery import RecoveryExpert, RecoveryTable
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
 from tasks.render.gate import compose_near, likeness_to_photo, measure_rendered_views
 from tasks.render.scene.build import AssetSettings, build_asset
-from tasks.render.scene.engine import NOBODY, render
+from tasks.render.scene.engine import render
+from tasks.render.scene.movers import NOBODY
 from tasks.render.views import draw_map_views, pinhole, render_views
 from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.reward.label_bytes import VocabularyLabels

@@ -14,8 +14,8 @@ from factory.stages.scene_file import read_scene, write_scene
 from factory.store.samples import ClipCandidates, Store
 from factory.views.scene_files import logged_vehicles
 from tasks.render.scene.asset import BlockRange, PhotoPose, RenderAsset
-from tasks.render.scene.engine import PlacedAgents, agents_at_time, render
-from tasks.render.scene.movers import boxes_at, world_from_boxes
+from tasks.render.scene.engine import render
+from tasks.render.scene.movers import PlacedAgents, agents_at_time, boxes_at, world_from_boxes
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.project import ANTIALIASED
 from tasks.world.clip import CLIP_STEPS, Clip, Pinhole

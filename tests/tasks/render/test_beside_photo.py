@@ -21,7 +21,7 @@ from tasks.render.gate import (
     to_box_frame,
     vehicle_fault,
 )
-from tasks.render.scene.engine import PlacedAgents
+from tasks.render.scene.movers import PlacedAgents
 from tasks.render.scene.sensed import Photo
 from tasks.render.splatting.raster import View
 from tasks.world.clip import AgentKind, Pinhole

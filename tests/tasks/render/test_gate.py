@@ -19,7 +19,8 @@ from tasks.render.gate import (
     picture_fault,
 )
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import NOBODY, render
+from tasks.render.scene.engine import render
+from tasks.render.scene.movers import NOBODY
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import EMPTY, Gaussians, concatenate
 from tasks.render.splatting.raster import View

@@ -25,8 +25,8 @@ from tasks.render.gate import (
     to_box_frame,
 )
 from tasks.render.scene.asset import Exposure, RenderAsset
-from tasks.render.scene.engine import PlacedAgents, agents_at_time, render
-from tasks.render.scene.movers import BEYOND_M
+from tasks.render.scene.engine import render
+from tasks.render.scene.movers import BEYOND_M, PlacedAgents, agents_at_time
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.raster import View
 from tasks.stages import Rejected

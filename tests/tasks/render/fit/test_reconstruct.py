@@ -19,7 +19,8 @@ from tasks.render.fit.reconstruct import (
 from tasks.render.fit.start import FitProblem, prepare_fit
 from tasks.render.fit.state import BETA1, SHAPES, SLACK_M, FitState, height_above_road
 from tasks.render.scene.asset import psnr
-from tasks.render.scene.engine import PlacedAgents, render
+from tasks.render.scene.engine import render
+from tasks.render.scene.movers import PlacedAgents
 from tasks.render.scene.sensed import Photo, Sweep, Tracks
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import moved, turned_quats

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import street
 
-from tasks.render.scene import engine
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import NOBODY, agents_at_time, render
+from tasks.render.scene.engine import render
+from tasks.render.scene.movers import NOBODY, agents_at_time
 from tasks.render.scene.sky import look_up_sky, sky_cells
 from tasks.render.splatting.gaussians import EMPTY
-from tasks.render.splatting.raster import View
 from tasks.render.views import render_views
 from tasks.world.clip import Camera, Pinhole
 
@@ -36,21 +35,6 @@ def test_the_pipeline_s_frames_are_the_same_function_s(street_asset: RenderAsset
     frames = render_views(street_asset, rig, street.ego_pose(3.0)[None], street.tracks(), [8], *size)
     drawn = render(street_asset, [FRONT], agents_at_time(street.tracks(), 0.8))[0].rgb
     np.testing.assert_array_equal(frames[0, 0], np.rint(drawn * 255.0).astype(np.uint8))
-
-
-def test_a_backend_is_one_function_in_the_table_and_draws_the_pipeline_s_frames(
-    street_asset: RenderAsset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def sky_alone(scene, cameras, threads, screen):  # type: ignore[no-untyped-def]
-        empty = np.zeros((street.HEIGHT, street.WIDTH), np.float32)
-        return [View(np.zeros((*empty.shape, 3), np.float32), empty, empty) for _ in cameras]
-
-    monkeypatch.setattr(engine, "RASTERISERS", {**engine.RASTERISERS, "sky": sky_alone})
-    rig = [Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), street.EGO_FROM_CAMERA)]
-    size = (street.WIDTH, street.HEIGHT)
-    frames = render_views(street_asset, rig, street.ego_pose(3.0)[None], street.tracks(), [8], *size, "sky")
-    sky = look_up_sky(street_asset.sky.cells, sky_cells(street.INTRINSICS, FRONT.world_from_camera, *size))
-    np.testing.assert_allclose(frames[0, 0], sky * 255.0, atol=1.0)
 
 
 def test_several_cameras_are_drawn_as_each_alone(street_asset: RenderAsset) -> None:

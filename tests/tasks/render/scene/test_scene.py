@@ -8,7 +8,8 @@ from factory.stages.warm import compile_render_kernels
 from tasks.render.scene import depth, movers, stereo, surfels
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.build import AssetSettings, build_asset
-from tasks.render.scene.engine import NOBODY, PlacedAgents, render
+from tasks.render.scene.engine import render
+from tasks.render.scene.movers import NOBODY, PlacedAgents
 from tasks.render.scene.sensed import Photo
 from tasks.render.splatting import project, raster
 from tasks.world.clip import AgentKind, Pinhole

@@ -6,13 +6,14 @@ them, with the signature of its `rasterization`; written by `python -m tests.ben
 
 import inspect
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from packaging.requirements import Requirement
 
-from tasks.render.splatting.gsplat_backend import arguments
+from tasks.render.scene.on_device import Device, arguments, gaussians_on
 from tasks.render.splatting.tensors import Eye, SceneTensors, learned_arguments
 from tasks.world.clip import Pinhole
 from tests.bench.peer_gsplat import (
@@ -20,11 +21,11 @@ from tests.bench.peer_gsplat import (
     HEIGHT,
     SCENES,
     WIDTH,
-    Arrays,
     apart,
     of_gsplat,
     of_kernels,
     pose,
+    rasterization,
     read,
     signature,
 )
@@ -53,20 +54,21 @@ def test_what_is_recorded_is_what_the_installed_gsplat_says(name: str) -> None:
     assert max(apart(found, expected).values()) < 1e-6
 
 
-def given(packed: bool = True) -> tuple[Arrays, Arrays]:
+def given(packed: bool = True) -> tuple[dict[str, Any], dict[str, Any]]:
     """What the drawing and what the fit call gsplat with, of one scene and camera."""
     scene, intrinsics = SCENES["colours below zero"]
-    drawing = arguments(scene, [Pinhole(np.array(intrinsics), pose(), WIDTH, HEIGHT)], packed=packed)
+    device, eye = Device("cpu", rasterization, packed), Pinhole(np.array(intrinsics), pose(), WIDTH, HEIGHT)
+    drawing = arguments(device, gaussians_on(device, scene), [eye])
     logits = torch.logit(torch.tensor(scene.opacities))
     tensors = (scene.means, scene.quats, scene.log_scales, logits, scene.colours)
-    eye = Eye(np.array(CENTRED), pose(), WIDTH, HEIGHT, torch.zeros(6))
-    return drawing, learned_arguments(SceneTensors(*map(torch.as_tensor, tensors)), eye)
+    learned = SceneTensors(*map(torch.as_tensor, tensors))
+    return drawing, learned_arguments(learned, Eye(np.array(CENTRED), pose(), WIDTH, HEIGHT, torch.zeros(6)))
 
 
 def test_the_fit_calls_gsplat_as_the_drawing_does() -> None:
     drawing, fitting = given()
     assert drawing.keys() == fitting.keys()
-    plain = {name: value for name, value in drawing.items() if not isinstance(value, np.ndarray)}
+    plain = {name: value for name, value in drawing.items() if not isinstance(value, torch.Tensor)}
     assert plain == {name: fitting[name] for name in plain} and len(plain) == 8
     for name in drawing.keys() - plain.keys():
         np.testing.assert_allclose(fitting[name], drawing[name], rtol=1e-5, atol=1e-6, err_msg=name)

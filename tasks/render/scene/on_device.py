@@ -1,0 +1,275 @@
+"""Scenes that lie on a device of torch's and are drawn and finished there: boxes go there, pictures come back.
+
+The same Gaussians, sky and colours as the kernels draw, within a step of 8 bits, by `gsplat.rasterization` (gsplat
+1.5.3), all cameras of a size at once. Its conventions are those of the CPU rasteriser: quaternions w first,
+world-to-camera matrices with z forward, the centre of pixel (0, 0) at (0.5, 0.5), contributions cut off at 1/255 and
+capped at 0.999 (later versions cap at 0.99). What differs is passed on (near plane, the screen's filter) or below 8
+bits (no more than 1e-4 of the light is dropped instead of 1e-3). Pictures and derivatives are held against gsplat's own
+reference by tests.bench.peer_gsplat. Nothing but render.backend=gsplat loads torch.
+"""
+
+import weakref
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from math import pi
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tasks.render.scene.asset import Instant, OwnBody, RenderAsset
+from tasks.render.scene.movers import PlacedAgents, world_from_boxes
+from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
+from tasks.render.scene.surfels import box_gaussians
+from tasks.render.splatting import sh
+from tasks.render.splatting.gaussians import Gaussians, quats_of
+from tasks.render.splatting.gsplat_backend import plain_arguments, require
+from tasks.render.splatting.project import FITTED, ScreenFilter
+from tasks.render.splatting.raster import View
+from tasks.world.arrays import F32, Array, Bytes
+from tasks.world.clip import Pinhole
+
+
+def fetched(tensor: Tensor) -> NDArray[Any]:
+    """A tensor as an array of this machine's memory."""
+    return np.asarray(tensor.cpu().numpy())
+
+
+@dataclass(frozen=True)
+class Device:
+    """Where scenes are drawn."""
+
+    name: str  # torch's
+    rasterization: Callable[..., tuple[Tensor, Tensor, Any]]  # gsplat's, or what stands for it
+    packed: bool = True  # memory follows what is seen, not cameras x Gaussians
+    fetch: Callable[[Tensor], NDArray[Any]] = fetched
+
+    def sent(self, array: Any) -> Tensor:
+        """An array on the device, float32."""
+        return torch.as_tensor(np.ascontiguousarray(array, np.float32), device=self.name)
+
+
+def cuda(packed: bool) -> Device:
+    """The GPU. Raises BackendMissing."""
+    _, gsplat = require()
+    return Device("cuda", gsplat.rasterization, packed)
+
+
+@torch.inference_mode()
+def views(device: Device, asset: RenderAsset, instant: Instant) -> list[View]:
+    """One finished view a camera, of one instant."""
+    by_size: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for i, camera in enumerate(instant.cameras):
+        by_size[camera.width, camera.height].append(i)
+    found: dict[int, View] = {}
+    scene = _composed(device, asset, instant.vehicles)
+    for rows in by_size.values():
+        mine, affines = [instant.cameras[i] for i in rows], [instant.affines[i] for i in rows]
+        rgb, depth, alpha = rasterized(device, scene, mine, asset.screen)
+        lit = finished(rgb, alpha, _sky_cells(device, asset.sky), *_cameras(device, mine, affines))
+        for i, *view in zip(rows, *map(device.fetch, (lit, depth, alpha)), strict=True):
+            found[i] = View(*view)
+    return [found[i] for i in range(len(instant.cameras))]
+
+
+@torch.inference_mode()
+def pictures(
+    device: Device, asset: RenderAsset, instants: Sequence[Instant], bodies: Sequence[OwnBody | None]
+) -> Bytes:
+    """(F, C, H, W, 3) of F instants, whose cameras are of one size, with what each camera sees of its own car.
+
+    Nothing is waited for before the last one was asked for: the device is not idle between instants.
+    """
+    drawn = []
+    for instant in instants:
+        rgb, _, alpha = rasterized(device, _composed(device, asset, instant.vehicles), instant.cameras, asset.screen)
+        lit = finished(rgb, alpha, _sky_cells(device, asset.sky), *_cameras(device, instant.cameras, instant.affines))
+        rounded = (lit * 255.0).round_()
+        for picture, body in zip(rounded, bodies, strict=True):
+            if body is not None:
+                over, share = _body(device, body, picture.shape[1], picture.shape[0])
+                picture.mul_(1.0 - share).add_(over * share).round_()
+        drawn.append(rounded.to(torch.uint8))
+    return np.asarray(device.fetch(torch.stack(drawn)))
+
+
+# What lies there stays as long as the objects that it was made of, which nobody changes.
+
+_HELD: dict[tuple[object, ...], Any] = {}
+
+
+def _held(device: Device, owner: object, make: Callable[[], Any], *of: object) -> Any:
+    key = (id(owner), device.name, *of)
+    if key not in _HELD:
+        _HELD[key] = make()
+        weakref.finalize(owner, _HELD.pop, key, None)
+    return _HELD[key]
+
+
+@dataclass(frozen=True)
+class GaussianTensors:
+    """Gaussians, as `tasks.render.splatting.gaussians` has them."""
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    opacities: Tensor
+    colours: Tensor
+    sh_rest: Tensor
+
+
+def gaussians_on(device: Device, part: Gaussians) -> GaussianTensors:
+    made: GaussianTensors = _held(
+        device, part, lambda: GaussianTensors(*(device.sent(getattr(part, each.name)) for each in fields(Gaussians)))
+    )
+    return made
+
+
+def _sky_cells(device: Device, sky: SkyMap) -> Tensor:
+    made: Tensor = _held(device, sky, lambda: device.sent(sky.cells))
+    return made
+
+
+def _body(device: Device, body: OwnBody, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Colours (H, W, 3) from 0 to 255 of what a picture of this size shows of the car, and how much (H, W, 1) it hides
+    of what is behind."""
+
+    def make() -> tuple[Tensor, Tensor]:
+        over = device.sent(cv2.resize(body.rgba, (width, height), interpolation=cv2.INTER_AREA))
+        return over[..., :3], over[..., 3:] / 255.0
+
+    made: tuple[Tensor, Tensor] = _held(device, body, make, width, height)
+    return made
+
+
+def _composed(device: Device, asset: RenderAsset, vehicles: PlacedAgents) -> GaussianTensors:
+    """As `tasks.render.scene.asset.compose_gaussians` has it."""
+    background = gaussians_on(device, asset.background)
+    if not len(vehicles.track_ids):
+        return background
+    nodes = [
+        asset.nodes.get(track_id) or box_gaussians(vehicles.boxes[j, 4:7], vehicles.kinds[j])
+        for j, track_id in enumerate(vehicles.track_ids)
+    ]
+    poses = world_from_boxes(vehicles.boxes - np.concatenate([asset.origin, np.zeros(4)]))
+    return _joined([background, *_moved(device, nodes, poses)])
+
+
+def _moved(device: Device, nodes: Sequence[Gaussians], poses: Array) -> list[GaussianTensors]:
+    """Nodes at poses (V, 4, 4), as `gaussians.moved` has it; all are turned at once."""
+    parts = [gaussians_on(device, node) for node in nodes]
+    lengths = [len(node) for node in nodes]
+    of = torch.as_tensor(np.repeat(np.arange(len(nodes)), lengths), device=device.name)
+    where = torch.as_tensor(np.column_stack([poses[:, :3].reshape(-1, 12), quats_of(poses[:, :3, :3])]))
+    mine = where.to(device.name)[of]
+    turn, shift, quats = mine[:, :12].view(-1, 3, 4)[..., :3], mine[:, 3:12:4], mine[:, 12:]
+    means = (turn * torch.cat([part.means for part in parts])[:, None]).sum(-1) + shift
+    lw, lx, ly, lz = quats.unbind(1)
+    rw, rx, ry, rz = torch.cat([part.quats for part in parts]).unbind(1)
+    turned = torch.stack(
+        [
+            lw * rw - lx * rx - ly * ry - lz * rz,
+            lw * rx + lx * rw + ly * rz - lz * ry,
+            lw * ry - lx * rz + ly * rw + lz * rx,
+            lw * rz + lx * ry - ly * rx + lz * rw,
+        ],
+        dim=1,
+    )
+    at = zip(parts, poses, means.float().split(lengths), turned.float().split(lengths))
+    return [
+        GaussianTensors(mean, quat, part.log_scales, part.opacities, part.colours, _turned_light(device, part, pose))
+        for part, pose, mean, quat in at
+    ]
+
+
+def _turned_light(device: Device, part: GaussianTensors, pose: Array) -> Tensor:
+    count = part.sh_rest.shape[1]
+    if not count:
+        return part.sh_rest
+    turn = device.sent(sh.coefficient_turn(count, pose[:3, :3]))
+    return (turn[None, :, :, None] * part.sh_rest[:, None]).sum(2)
+
+
+def _joined(parts: Sequence[GaussianTensors]) -> GaussianTensors:
+    """As `gaussians.concatenate` has it."""
+    most = max(part.sh_rest.shape[1] for part in parts)
+    light = [torch.nn.functional.pad(part.sh_rest, (0, 0, 0, most - part.sh_rest.shape[1])) for part in parts]
+    names = [each.name for each in fields(GaussianTensors) if each.name != "sh_rest"]
+    joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    return GaussianTensors(**joined, sh_rest=torch.cat(light))
+
+
+def rasterized(
+    device: Device, scene: GaussianTensors, cameras: Sequence[Pinhole], screen: ScreenFilter
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Colours (C, H, W, 3) before black, which may leave [0, 1], depth (C, H, W) [m], 0 where nothing is, and alpha."""
+    width, height = cameras[0].width, cameras[0].height
+    if not len(scene.means):
+        nothing = torch.zeros(len(cameras), height, width, 3, device=device.name)
+        return nothing, nothing[..., 0], nothing[..., 0]
+    seen, covered, _ = device.rasterization(**arguments(device, scene, cameras, screen))
+    alpha = covered[..., 0]
+    return seen[..., :3], torch.where(alpha > 0.0, seen[..., 3], 0.0), alpha
+
+
+def arguments(
+    device: Device, scene: GaussianTensors, cameras: Sequence[Pinhole], screen: ScreenFilter = FITTED
+) -> dict[str, Any]:
+    """What `gsplat.rasterization` is called with: tensors float32 by its names, and plain settings.
+
+    means (N, 3), quats (N, 4), scales (N, 3), opacities (N,), colors (N, 3) or, with sh_degree, coefficients (N, K, 3),
+    viewmats (C, 4, 4) camera from scene, Ks (C, 3, 3). All cameras are of one size.
+    """
+    count = scene.sh_rest.shape[1]
+    colours = scene.colours.clamp(min=0.0)  # as the kernels do; gsplat does it for higher degrees alone
+    if count:  # gsplat adds the half again
+        colours = torch.cat([((scene.colours - 0.5) / sh.C0)[:, None], scene.sh_rest], dim=1)
+    return {
+        "means": scene.means,
+        "quats": scene.quats,
+        "scales": scene.log_scales.exp(),
+        "opacities": scene.opacities,
+        "colors": colours,
+        "viewmats": device.sent(np.stack([np.linalg.inv(camera.world_from_camera) for camera in cameras])),
+        "Ks": device.sent(np.stack([camera.intrinsics for camera in cameras])),
+    } | plain_arguments(cameras[0].width, cameras[0].height, count, screen, device.packed)
+
+
+def _cameras(device: Device, cameras: Sequence[Pinhole], affines: Sequence[F32]) -> tuple[Tensor, Tensor, Tensor]:
+    """Lenses (C, 3, 3), scene from camera (C, 3, 3) and colours (C, 3, 4)."""
+    turns = [camera.world_from_camera[:3, :3] for camera in cameras]
+    lenses = [camera.intrinsics for camera in cameras]
+    return device.sent(np.stack(lenses)), device.sent(np.stack(turns)), device.sent(np.stack(affines))
+
+
+def finished(rgb: Tensor, alpha: Tensor, cells: Tensor, lenses: Tensor, turns: Tensor, affines: Tensor) -> Tensor:
+    """Pictures (C, H, W, 3) of a scene's own light with the sky behind them where `alpha` (C, H, W) lets it through,
+    in the colours of cameras with `affines` (C, 3, 4), from 0 to 1: `SkyMap.finish`."""
+    top_left, right, below = sky_places(lenses, turns, *alpha.shape[1:])
+    top, left = top_left
+    here, beside = top * COLUMNS + left, top * COLUMNS + (left + 1) % COLUMNS
+    high = torch.lerp(cells[here], cells[beside], right[..., None])
+    low = torch.lerp(cells[here + COLUMNS], cells[beside + COLUMNS], right[..., None])
+    lit = rgb + (1.0 - alpha)[..., None] * torch.lerp(high, low, below[..., None])
+    shown = affines[:, None, None, :, 3]
+    for channel in range(3):
+        shown = shown + lit[..., channel, None] * affines[:, None, None, :, channel]
+    return shown.clamp(0.0, 1.0)
+
+
+def sky_places(lenses: Tensor, turns: Tensor, height: int, width: int) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
+    """Where pixels (C, H, W) of cameras look in the sky: row and column of the cell above and left of it, and how far
+    it lies to the right and below of that; `sky.sky_cells`, of the tensors' own precision."""
+    fx, fy, cx, cy = (lenses[:, i, j, None, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    across = (torch.arange(width, device=lenses.device).to(lenses.dtype) + 0.5 - cx) / fx
+    down = (torch.arange(height, device=lenses.device).to(lenses.dtype)[:, None] + 0.5 - cy) / fy
+    x, y, z = (turns[:, i, 0, None, None] * across + turns[:, i, 1, None, None] * down + turns[:, i, 2, None, None]
+               for i in range(3))  # fmt: skip
+    row = (0.5 - torch.atan2(z, torch.hypot(x, y)) / pi) * ROWS - 0.5
+    column = (torch.atan2(y, x) / (2.0 * pi) + 0.5) * COLUMNS - 0.5
+    top, left = row.floor().clamp(0, ROWS - 2), column.floor()
+    return (top.long(), left.long() % COLUMNS), column - left, (row - top).clamp(0.0, 1.0)

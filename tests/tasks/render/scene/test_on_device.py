@@ -1,0 +1,155 @@
+"""What is drawn and finished on a device of torch's is what the kernels draw, here with the kernels as rasteriser."""
+
+import gc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import street
+import torch
+
+from tasks.render.scene import on_device
+from tasks.render.scene.asset import Exposure, OwnBody, RenderAsset
+from tasks.render.scene.engine import render
+from tasks.render.scene.movers import PlacedAgents, agents_at_time
+from tasks.render.scene.on_device import Device, finished
+from tasks.render.scene.sky import SkyMap
+from tasks.render.settings import Backend
+from tasks.render.splatting.gaussians import EMPTY, Gaussians
+from tasks.render.views import render_views
+from tasks.world.arrays import F32
+from tasks.world.clip import AgentKind, Camera, Pinhole
+from tests.bench.by_kernels import rasterization
+
+STEP = 1.0 / 255.0
+
+
+@pytest.fixture(autouse=True)
+def gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU that is this CPU."""
+    monkeypatch.setattr(on_device, "cuda", lambda packed: Device("cpu", rasterization, packed))
+
+
+@pytest.fixture
+def rich(street_asset: RenderAsset) -> RenderAsset:
+    """The street with a sky of noise, colours of cameras that change, light that depends on the side, an own body."""
+    rng = np.random.default_rng(0)
+
+    def lit(part: Gaussians, count: int) -> Gaussians:
+        return replace(part, sh_rest=rng.normal(0.0, 0.05, (len(part), count, 3)).astype(np.float32))
+
+    sky = SkyMap(rng.uniform(0.0, 1.2, street_asset.sky.rgb.shape).astype(np.float32))
+    affines = [(np.eye(3, 4) + rng.normal(0.0, 0.08, (3, 4))).astype(np.float32) for _ in range(4)]
+    exposures = tuple(Exposure(n, t, a) for (n, t), a in zip([("a", 0.0), ("a", 2.0), ("b", 0.0), ("b", 2.0)], affines))
+    body = np.zeros((36, 64, 4), np.uint8)
+    body[24:] = rng.integers(0, 255, (12, 64, 4))
+    nodes = {name: lit(node, 3) for name, node in street_asset.nodes.items()}
+    assert nodes
+    scene = {"background": lit(street_asset.background, 15), "nodes": nodes, "sky": sky}
+    return replace(street_asset, **scene, exposures=exposures, bodies=(OwnBody("b", body),))
+
+
+def turned(degrees: float) -> np.ndarray:
+    """A mount that looks to the left by this, and up a little."""
+    a = np.radians(degrees)
+    turn = np.array([[np.cos(a), -np.sin(a), 0.0], [np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]])
+    mount = street.EGO_FROM_CAMERA.copy()
+    up = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(0.3), -np.sin(0.3)], [0.0, np.sin(0.3), np.cos(0.3)]])
+    mount[:3, :3] = turn @ mount[:3, :3] @ up
+    return mount
+
+
+def test_samples_pictures_are_the_kernels_to_a_step_of_8_bits(rich: RenderAsset) -> None:
+    """Two cameras at two instants, one of which sees its own car; a vehicle with Gaussians of its own drives along."""
+    rig = [
+        Camera(n, street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), turned(k))
+        for n, k in (("a", 0.0), ("b", 170.0))
+    ]
+    poses = np.stack([street.ego_pose(1.5, 0.6), street.ego_pose(2.5, 0.6)])
+    drawn = [
+        render_views(rich, rig, poses, street.tracks(), [4, 9.5], 96, 54, by) for by in (Backend.CPU, Backend.GSPLAT)
+    ]
+    assert drawn[0].shape == drawn[1].shape == (2, 2, 54, 96, 3)
+    apart = np.abs(drawn[0].astype(int) - drawn[1])
+    assert apart.max() <= 1 and (apart > 0).mean() < 0.01
+    assert (np.abs(drawn[0][:, 1].astype(int) - drawn[0][:, 0]) > 30).mean() > 0.2, "both look at something else"
+
+
+def test_views_of_cameras_of_any_size_in_their_order(rich: RenderAsset) -> None:
+    """Turned vehicles, one of them plain, by colours, depth and alpha."""
+    pose = street.ego_pose(3.0, 0.4)
+    eyes = [
+        Pinhole(street.INTRINSICS, pose @ turned(0.0), 128, 72),
+        Pinhole(street.INTRINSICS * [[0.5], [0.5], [1.0]], pose @ turned(40.0), 64, 36),
+        Pinhole(street.INTRINSICS, pose @ turned(-90.0), 128, 72),
+    ]
+    boxes = np.stack([street.car_box(0.4), street.car_box(1.5)])
+    boxes[:, 3] = 0.7, -2.0
+    there = PlacedAgents(("car", "nobody knows it"), (AgentKind.VEHICLE, AgentKind.PEDESTRIAN), boxes)
+    for by in (Backend.GSPLAT, Backend.GSPLAT_DENSE):
+        for slow, fast in zip(render(rich, eyes, there), render(rich, eyes, there, by), strict=True):
+            assert slow.rgb.shape == fast.rgb.shape and np.abs(slow.rgb - fast.rgb).max() < STEP
+            np.testing.assert_allclose(fast.alpha, slow.alpha, atol=1e-3)
+            solid = slow.alpha > 0.5
+            np.testing.assert_allclose(fast.depth[solid], slow.depth[solid], rtol=1e-3)
+
+
+def test_an_empty_scene_is_the_sky(rich: RenderAsset) -> None:
+    bare = replace(rich, background=EMPTY)
+    eye = Pinhole(street.INTRINSICS, street.ego_pose(0.0) @ turned(10.0), 64, 36)
+    (slow,), (fast,) = render(bare, [eye]), render(bare, [eye], backend=Backend.GSPLAT)
+    assert not fast.alpha.any() and not fast.depth.any() and np.abs(slow.rgb - fast.rgb).max() < STEP
+
+
+@pytest.mark.parametrize("pitch", [-1.5, -0.4, 0.0, 0.9, 1.57])
+def test_the_sky_behind_a_picture_is_the_kernel_s_wherever_it_looks(pitch: float) -> None:
+    """A smooth sky, at the poles and at the seam, with a wide lens, through every alpha and a camera's own colours."""
+    rng = np.random.default_rng(1)
+    small = rng.uniform(0.0, 1.0, (16, 64, 3)).astype(np.float32)
+    sky = SkyMap(np.ascontiguousarray(np.repeat(np.repeat(small, 16, axis=0), 16, axis=1)))
+    k = np.array([[60.0, 0.0, 48.0], [0.0, 60.0, 32.0], [0.0, 0.0, 1.0]])
+    c, s = np.cos(pitch), np.sin(pitch)
+    for yaw in (0.0, 3.1, -1.0):
+        pose = np.eye(4)
+        ahead = np.array([c * np.cos(yaw), c * np.sin(yaw), s])
+        right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
+        pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+        rgb, alpha = (
+            rng.uniform(-0.1, 1.0, (64, 96, 3)).astype(np.float32),
+            rng.uniform(0, 1, (64, 96)).astype(np.float32),
+        )
+        affine = (np.eye(3, 4) + rng.normal(0.0, 0.1, (3, 4))).astype(np.float32)
+        expected: F32 = rgb.copy()
+        sky.finish(expected, alpha, affine, k, pose)
+        tensors = [torch.as_tensor(a.astype(np.float32))[None] for a in (k, pose[:3, :3], affine)]
+        found = finished(torch.as_tensor(rgb)[None], torch.as_tensor(alpha)[None], torch.as_tensor(sky.cells), *tensors)
+        off = np.abs(found[0].numpy() - expected)
+        assert off.max() < 8 * STEP and (off > STEP).mean() < 0.003, "blocks of noise end within a pixel"
+
+
+def test_what_lies_on_the_device_is_sent_once_and_goes_with_its_scene(
+    rich: RenderAsset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent: list[int] = []
+    whole = Device.sent
+
+    def counted(self: Device, array: object) -> torch.Tensor:
+        tensor = whole(self, array)
+        sent.append(tensor.numel())
+        return tensor
+
+    monkeypatch.setattr(Device, "sent", counted)
+    gc.collect()
+    before = len(on_device._HELD)
+    mine = replace(rich, background=rich.background.take(slice(0, 500)), nodes={}, sky=SkyMap(rich.sky.rgb.copy()))
+    eye = [Pinhole(street.INTRINSICS, street.ego_pose(0.0) @ turned(10.0), 64, 36)]
+    render(mine, eye, backend=Backend.GSPLAT)
+    assert max(sent) == mine.sky.rgb.size and len(on_device._HELD) == before + 2
+    sent.clear()
+    render(replace(mine, exposures=()), eye, agents_at_time(street.tracks(), 0.4), Backend.GSPLAT)
+    render(mine, eye, backend=Backend.GSPLAT)
+    of_box = sum(n for n in sent if n > 16)
+    assert of_box < 40_000, "the plain box alone"
+    del mine
+    gc.collect()
+    assert len(on_device._HELD) <= before + 1
