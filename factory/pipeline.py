@@ -14,7 +14,6 @@ import numpy as np
 from factory.graph.steps import (
     AcceptedDrive,
     BlockReport,
-    NotReady,
     PreparedClip,
     RejectedAttempt,
     SampleColumns,
@@ -41,9 +40,7 @@ from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Expert, Human, drives_once_per_clip
 from tasks.hard_scenes import BEFORE_STEPS, BenchmarkClip, drive_follow_up, frame_digest, seen_half_a_second_earlier
 from tasks.perturb import NO_STARTS, Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
-from tasks.render.scene.engine import require_backend
 from tasks.render.settings import RenderMode, RenderSettings
-from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.rollout.simulate import TrafficSettings, check_same_policy
 from tasks.stages import FOLLOW_UP_BEFORE, HUMAN_BEFORE, Rejected
 from tasks.subscores import OF_ONE_PLAN
@@ -329,12 +326,8 @@ class FactoryWork:
         """This run's kernels, and no others, into the on-disk cache. Raises NotReady."""
         from factory.stages.warm import compile_kernels, kernel_parts
 
-        if draws and self.render.mode is RenderMode.AUTO:
-            try:
-                require_backend(self.render.backend)
-            except BackendMissing as error:
-                raise NotReady(str(error)) from error
-        compile_kernels(kernel_parts(self._simulates, self.traffic.mode, self.render, self.photos_alone))
+        parts = kernel_parts(self._simulates, self.traffic.mode, self.render, self.photos_alone)
+        compile_kernels([part for part in parts if draws or part != "gpu"])
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -6,10 +6,11 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from threading import Event, Lock, Thread
 
@@ -18,6 +19,7 @@ import numpy as np
 from factory.exits import ignore_terminal_signals, terminal_signals_blocked
 from factory.files import locked
 from factory.graph.steps import NotReady
+from factory.wording import one_line
 from tasks.attempt import drive_and_judge, hit_after_s, vocabulary_labels
 from tasks.caches import Damaged, with_checksum, without_checksum
 from tasks.experts.pdm_closed import forecast, proposals
@@ -26,11 +28,16 @@ from tasks.kernels.compiled import USED, cache_dir, cache_write_error, make_cach
 from tasks.render.fit.reconstruct import finish_scene, run_iterations
 from tasks.render.fit.start import prepare_fit
 from tasks.render.rig.adjust import N_CAMERA, AdjustedRig, CornerTracks, bundle_adjust, initial_rig
-from tasks.render.scene.build import AssetSettings, RenderAsset, build_asset
+from tasks.render.scene.asset import Instant, RenderAsset
+from tasks.render.scene.build import AssetSettings, build_asset
 from tasks.render.scene.depth import confirm_depths
+from tasks.render.scene.movers import NOBODY
 from tasks.render.scene.sensed import Photo, Sweep
+from tasks.render.scene.sky import plain_sky
 from tasks.render.scene.stereo import choose_partners, wide_baseline_depth
 from tasks.render.settings import FitSettings, RenderMode, RenderSettings, SceneFrom
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.gsplat_backend import BackendMissing, require
 from tasks.render.splatting.sh import rotate_coefficients
 from tasks.reward.epdms import INDEX_FROM_ROWS, prepare_scene, score
 from tasks.rollout.simulate import SeenTraffic, TrafficSettings, prepare_traffic, simulate
@@ -44,6 +51,7 @@ from tasks.world.clip import (
     AgentTracks,
     Camera,
     Clip,
+    Pinhole,
     Scene,
     SensorFile,
     scene_of_clip,
@@ -72,6 +80,8 @@ def kernel_parts(simulates: bool, traffic: str, render: RenderSettings, photos_a
         parts.append("fit" if render.scene is SceneFrom.FIT else "render")
         if render.rig.may_correct(photos_alone):
             parts.append("rig")
+        if render.backend.on_gpu:
+            parts.append("gpu")
     return parts
 
 
@@ -98,9 +108,14 @@ def compile_kernels(parts: Sequence[str], enough: Event | None = None) -> None:
     """Compiles what is not in the cache yet, each part in a process of its own, as many at once as there are cores.
 
     Of processes that want the same at once, one compiles and the others wait for it.
-    Raises NotReady where the cache cannot be written, and RuntimeError with a part's last words where it fails or is
-    given up because there is `enough`.
+    Raises NotReady where the cache cannot be written or gsplat cannot work, and RuntimeError with a part's last words
+    where it fails or is given up because there is `enough`.
     """
+    if "gpu" in parts:
+        try:
+            require()
+        except BackendMissing as error:
+            raise NotReady(str(error)) from error
     if all(map(_is_compiled, parts)):
         return
     try:
@@ -129,7 +144,8 @@ def _code_digest() -> str:
 
 def part_marker(name: str) -> Path:
     """The file that lists what a part has in the cache."""
-    return cache_dir() / f"compiled-{_code_digest()}-{name}"
+    built_for = f"-{version('torch')}-{version('gsplat')}" if name == "gpu" else ""
+    return cache_dir() / f"compiled-{_code_digest()}-{name}{built_for}"
 
 
 def _is_compiled(name: str) -> bool:
@@ -164,6 +180,8 @@ def _compile_part(name: str, enough: Event) -> None:
                     part.terminate()
     if part.returncode == DISK_FULL:
         raise OSError(said.strip().splitlines()[-1])
+    if part.returncode == NOT_HERE:
+        raise NotReady(said.strip().splitlines()[-1])
     if part.returncode != 0:
         raise RuntimeError(f"compiling the kernels of {name} failed: {said[-2000:]}")
 
@@ -172,8 +190,12 @@ def _compile_and_mark(name: str) -> int:
     """One part, in this process; the exit code."""
     ignore_terminal_signals()
     gc.disable()  # a process that ends soon: some 220 MB more for a sixth of its time
-    PARTS[name]()
-    listed = "\n".join(sorted(path.relative_to(cache_dir()).as_posix() for path in USED))
+    try:
+        PARTS[name]()
+    except BackendMissing as error:
+        print(error, file=sys.stderr)
+        return NOT_HERE
+    listed = "\n".join(sorted([*(path.relative_to(cache_dir()).as_posix() for path in USED), *_gsplat_files()]))
     try:
         for part in (name, *INCLUDED.get(name, ())):
             write_whole(part_marker(part), with_checksum(listed.encode(), part_marker(part).name))
@@ -289,7 +311,38 @@ def _compile_fit() -> None:
     finish_scene(problem, state)
 
 
-PARTS = {
+def _compile_gpu() -> None:
+    """gsplat's CUDA sources, which its first call builds: of several at once each would delete the others' build.
+
+    Raises BackendMissing where it cannot draw.
+    """
+    from tasks.render.scene import on_device  # torch is loaded only where it is asked for
+
+    one = Gaussians(*(np.ones(shape, np.float32) for shape in ((1, 3), (1, 4), (1, 3), (1,), (1, 3))))
+    scene = RenderAsset(np.zeros(3), one, {}, plain_sky(), float("nan"))
+    eye = Pinhole(np.array([[20.0, 0.0, 16.0], [0.0, 20.0, 16.0], [0.0, 0.0, 1.0]]), np.eye(4), 32, 32)
+    instant = Instant([eye], NOBODY, [np.eye(3, 4, dtype=np.float32)])
+    try:
+        on_device.pictures(on_device.cuda(packed=True), scene, [instant], [None])
+    except (
+        RuntimeError,
+        OSError,
+        AttributeError,
+        ImportError,
+    ) as error:  # as a failed build, or one that is None, ends
+        raise BackendMissing(
+            f"gsplat does not draw here ({one_line(error)}): its CUDA sources need the nvcc of torch's CUDA and a C++ "
+            "compiler, docs/gpu.md; or draw with render.backend=cpu"
+        ) from error
+
+
+def _gsplat_files() -> list[str]:
+    """What it was built to, where this process has loaded it."""
+    loaded = [getattr(module, "__file__", None) or "" for name, module in sys.modules.items() if "gsplat" in name]
+    return [path for path in loaded if path.endswith(".so")]
+
+
+PARTS: dict[str, Callable[[], object]] = {
     "judge": _compile_judge,
     "plan": _compile_plan,
     "drive": _compile_drive,
@@ -297,9 +350,10 @@ PARTS = {
     "render": compile_render_kernels,
     "fit": _compile_fit,
     "rig": compile_rig_kernels,
+    "gpu": _compile_gpu,
 }
 INCLUDED = {"judge": ("plan",), "fit": ("render",)}
-DISK_FULL = 5  # exit code of a part whose files could not be kept
+DISK_FULL, NOT_HERE = 5, 6  # exit codes of a part whose files could not be kept, and that this machine cannot enter
 
 
 def _tiny_scene() -> tuple[Scene, Array]:

@@ -9,10 +9,14 @@ from pathlib import Path
 import pytest
 
 from factory.config.run import load_config, photos_alone
-from factory.stages.warm import compile_kernels, kernel_parts, part_marker
+from factory.graph.steps import NotReady
+from factory.stages import warm
+from factory.stages.warm import NOT_HERE, compile_kernels, kernel_parts, part_marker
 from tasks.caches import without_checksum
 from tasks.kernels.compiled import cache_dir
-from tasks.render.settings import Adjust, RenderMode, RenderSettings, RigSettings
+from tasks.render.scene import on_device
+from tasks.render.settings import Adjust, Backend, RenderMode, RenderSettings, RigSettings
+from tests.bench.by_kernels import rasterization
 
 pytestmark = pytest.mark.slow
 
@@ -140,3 +144,44 @@ def test_a_run_without_images_needs_no_renderer_and_arrays_out_of_ray_s_store_no
     before, after = run_with_these(["judge", "plan", "drive"], tmp_path, *TOWN, *BLIND, towns, "workers=1")
     assert after == before
     assert not any(name.startswith("tasks/render/") for name in after)
+
+
+def test_gsplat_is_built_before_any_task_where_a_run_draws_with_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """On a GPU that is this CPU: its part draws once, by both settings that ask for it, and is marked as done."""
+    for backend, wanted in ((Backend.CPU, False), (Backend.GSPLAT, True), (Backend.GSPLAT_DENSE, True)):
+        assert ("gpu" in kernel_parts(True, "idm", RenderSettings(backend=backend), False)) is wanted
+    drawn: list[int] = []
+
+    def draws(**given: object) -> object:
+        drawn.append(len(given["means"]))  # type: ignore[arg-type]
+        return rasterization(**given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(warm, "version", lambda name: "1")
+    monkeypatch.setattr(on_device, "cuda", lambda packed: on_device.Device("cpu", draws, packed))
+    monkeypatch.setattr(warm, "cache_dir", lambda: tmp_path)
+    monkeypatch.setattr(warm, "USED", set())
+    monkeypatch.setattr(warm, "ignore_terminal_signals", lambda: None)
+    monkeypatch.setattr(warm.gc, "disable", lambda: None)
+    assert warm._compile_and_mark("gpu") == 0 and drawn == [1]
+    assert warm._is_compiled("gpu")
+    monkeypatch.setattr(warm, "version", lambda name: "2")
+    assert not warm._is_compiled("gpu"), "another torch or gsplat is built anew"
+
+
+def test_a_gsplat_that_cannot_be_built_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails(**given: object) -> object:
+        raise RuntimeError("Error building extension 'gsplat_cuda': nvcc: not found")
+
+    monkeypatch.setattr(on_device, "cuda", lambda packed: on_device.Device("cpu", fails, packed))
+    monkeypatch.setattr(warm, "ignore_terminal_signals", lambda: None)
+    monkeypatch.setattr(warm.gc, "disable", lambda: None)
+    assert warm._compile_and_mark("gpu") == NOT_HERE
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "nvcc: not found" in said and "render.backend=cpu" in said
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(NotReady, match="needs torch and gsplat"):
+        compile_kernels(["gpu"])
