@@ -67,7 +67,10 @@ PROBE_SECONDS = 120.0
 OWN_BYTES = 2**20  # of files of a cluster of our own, before it does anything: less, and another will not begin either
 GPU_WAIT_S = 900.0  # for the first node with one to come
 RAYLET_DIED = "Ray's raylet on this machine died; run the same command again once Ray is up"
-WORKER_ENV = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+WORKER_ENV = {
+    **dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"),
+    "RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES": "1",  # tasks.render.splatting.gsplat_backend.own_place
+}
 FORWARDED_ENV = ("NUMBA_CACHE_DIR",)
 
 

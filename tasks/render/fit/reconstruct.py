@@ -38,7 +38,7 @@ from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap, pixel_directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import Backend, FitSettings
 from tasks.render.splatting.gaussians import moved
-from tasks.render.splatting.gsplat_backend import require
+from tasks.render.splatting.gsplat_backend import take_gpu
 from tasks.world.arrays import F32, Array, Bools, Ints
 from tasks.world.clip import AgentKind, Pinhole
 
@@ -296,7 +296,7 @@ def fit_backend(backend: Backend, threads: int) -> FitBackend:
     """Who draws for the fit. Raises BackendMissing where it cannot work on this machine."""
     if not backend.on_gpu:
         return CpuBackend(threads)
-    require()
+    take_gpu()
     from tasks.render.fit.on_torch import TorchBackend  # torch is loaded only where it is asked for
     from tasks.render.splatting.tensors import by_gsplat
 

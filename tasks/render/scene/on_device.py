@@ -27,7 +27,7 @@ from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.scene.surfels import box_gaussians
 from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import Gaussians, quats_of
-from tasks.render.splatting.gsplat_backend import plain_arguments, require
+from tasks.render.splatting.gsplat_backend import plain_arguments, take_gpu
 from tasks.render.splatting.project import FITTED, ScreenFilter
 from tasks.render.splatting.raster import View
 from tasks.world.arrays import F32, Array, Bytes
@@ -54,8 +54,10 @@ class Device:
 
 
 def cuda(packed: bool) -> Device:
-    """The GPU. Raises BackendMissing."""
-    _, gsplat = require()
+    """This process's GPU. Raises BackendMissing."""
+    take_gpu()
+    import gsplat
+
     return Device("cuda", gsplat.rasterization, packed)
 
 

@@ -3,8 +3,14 @@
 They are loaded by the first call, nowhere else; gsplat compiles its CUDA sources then, once per machine.
 """
 
+import fcntl
 import importlib
-from typing import Any
+import os
+import tempfile
+from functools import cache
+from itertools import count
+from pathlib import Path
+from typing import Any, TextIO
 
 from tasks.render.splatting import sh
 from tasks.render.splatting.project import FITTED, NEAR_M, ScreenFilter
@@ -31,6 +37,34 @@ def require() -> tuple[Any, Any]:
             "run where there is one, or draw with render.backend=cpu"
         )
     return torch, gsplat
+
+
+def take_gpu() -> None:
+    """This process draws on its own of the machine's GPUs from here on. Raises BackendMissing."""
+    torch, _ = require()
+    torch.cuda.set_device(own_place() % torch.cuda.device_count())
+
+
+@cache
+def own_place() -> int:
+    """The first number that no other process of this user holds here, for as long as this one lives: so GPUs are shared
+    evenly. Ray deals shares out one GPU after the other, and a process each task another, where CUDA stays with the
+    first."""
+    folder = Path(tempfile.gettempdir()) / f"driving-data-factory-gpu-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    for place in count():
+        held = (folder / str(place)).open("w")
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            held.close()
+            continue
+        _PLACES.append(held)
+        return place
+    raise AssertionError("numbers do not end")
+
+
+_PLACES: list[TextIO] = []  # open until the process ends
 
 
 def plain_arguments(
