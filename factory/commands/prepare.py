@@ -21,8 +21,8 @@ def plan(argv: Sequence[str]) -> int:
 
         python -m factory plan clips=av2 clips.root=<logs> rounds=5 out=runs/next
 
-    Clips, attempts, samples, core-hours, GPU-hours and GB, from a calibration on three clips. Takes the settings of
-    `python -m factory run`.
+    Clips, attempts, samples, hours, GB and what holds it up, from three clips and the blocks that these lie in. Takes
+    the settings of `python -m factory run`.
     Exit codes: 0 told, 2 bad settings or no clip.
     """
     return factory.run.run(parse_command_line(argv), only_plan=True)

@@ -4,19 +4,22 @@ And in what its set-up differs from the paper's, to which conf/preset/paper.yaml
 """
 
 import os
+import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, cast
 
 from factory.config.run import RunConfig, load_config
 from factory.graph.plan import candidate_order
 from factory.graph.steps import SampleColumns, run_attempt
 from factory.readers.base import ClipRef
 from factory.setup.settings import Run
+from factory.store.location import encode_tree
 from factory.store.schema import BOOKKEEPING, sample_rows_to_table
 from tasks.experts.recovery import RecoveryExpert
-from tasks.render.settings import RenderMode
+from tasks.render.settings import ImageSource, RenderMode, SceneFrom
+from tasks.render.splatting.gsplat_backend import require
 from tasks.stages import TASKS, Rejected
 from tasks.world.vocabulary import Vocabulary
 
@@ -79,7 +82,10 @@ class Calibration:
     attempts: int = 0
     accepted: int = 0
     row_bytes: int = 0
+    cache_bytes: int = 0  # of prepared clips
+    pictures: int = 0  # in samples, drawn
     seconds: Counter[str] = field(default_factory=Counter)
+    fits: dict[str, float] = field(default_factory=dict)  # seconds by block that was not in the cache
     notes: list[str] = field(default_factory=list)
 
 
@@ -93,12 +99,16 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
         if ref in run.index.broken:
             sums.notes.append(f"{ref.log_id}: {run.index.broken[ref]}")
             continue
+        block, began = run.work.block(ref), time.perf_counter()
+        if block is not None and not run.work.reconstruct(ref, 1).from_cache:
+            sums.fits[block] = time.perf_counter() - began
         prepared = run.work.prepare(ref)
         sums.clips += 1
         if isinstance(prepared, Rejected):
             sums.notes.append(f"{ref.clip_id}: rejected by {prepared.stage}: {prepared.reason}")
             continue
         sums.candidates += len(prepared.candidates)
+        sums.cache_bytes += len(encode_tree(prepared))
         sums.seconds.update(prepared.seconds)
         for expert in run.config.experts:
             once = run.work.once(expert)
@@ -109,6 +119,8 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
                 sums.seconds.update(result.seconds)
                 if isinstance(result, SampleColumns):
                     sums.accepted += 1
+                    if result.row.get("image_source") == ImageSource.RENDER:
+                        sums.pictures += len(cast(Sequence[object], result.row["images"]))
                     blank: dict[str, object] = dict.fromkeys(BOOKKEEPING, "") | {"round": 0, "candidate_index": 0}
                     sums.row_bytes += int(sample_rows_to_table([{**blank, **result.row}]).nbytes)
                     wanted -= 1
@@ -118,31 +130,61 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
 
 
 def estimate_run_size(run: Run, refs: Sequence[ClipRef]) -> str:
-    """The expected size of the whole run as a text."""
+    """The expected size of the whole run as a text: what its clips take is extrapolated by clips, what their blocks
+    take by blocks."""
     sums = measure(run, refs)
     if sums.clips == 0:
         return "\n".join(["nothing could be measured:", *sums.notes])
-    factor = len(refs) / sums.clips
-    core_hours = sum(sums.seconds.values()) * factor / 3600.0
-    cores = run.config.workers or os.cpu_count() or 1
-    total = f"{core_hours:.2f} core-hours ({core_hours / cores:.2f} h on {cores} cores)"
-    if run.work.draws_on_gpu:  # a task that draws holds its share of a GPU
-        tasks = [task for task in TASKS if task.per == "attempt" and task.may_draw]
-        spent = sum(sums.seconds[stage] for task in tasks for stage in task.stages)
-        total += f", {spent * run.config.gpu_share * factor / 3600.0:.2f} GPU-hours"
+    factor, settings = len(refs) / sums.clips, run.config.render
+    hours = {stage: seconds * factor / 3600.0 for stage, seconds in sums.seconds.items()}
+    each = {stage: f"{seconds / sums.clips:.2f} a clip" for stage, seconds in sums.seconds.items()}
+    blocks = {run.work.block(ref) for ref in refs} - {None}
+    if sums.fits:
+        fit_s = sum(sums.fits.values()) / len(sums.fits)
+        hours = {"reconstruct": fit_s * len(blocks) / 3600.0} | hours
+        each["reconstruct"] = f"{fit_s:.1f} a block"
+    elif blocks:
+        sums.notes.append("what blocks take is not counted: those that were looked at are in the cache")
+    gb = f"{sums.row_bytes * factor / 1e9:.3f} GB before compression, {sums.cache_bytes * factor / 1e9:.3f} GB of cache"
+    of = f"{len(refs)} clips" + (f" of {len(blocks)} blocks" if blocks else "")
+    made = f"{sums.attempts * factor:.0f} attempts, {sums.accepted * factor:.0f} samples"
     lines = [
         f"measured on {sums.clips} clips: {sums.candidates / sums.clips:.1f} candidates a clip, "
         f"{sums.accepted} of {sums.attempts} attempts accepted",
-        f"  {'stage':<12}{'s a clip':>10}{'core-hours':>12}",
-        *(
-            f"  {stage:<12}{seconds / sums.clips:>10.2f}{seconds * factor / 3600.0:>12.2f}"
-            for stage, seconds in sums.seconds.items()
-        ),
-        f"expected for {len(refs)} clips: {sums.attempts * factor:.0f} attempts, {sums.accepted * factor:.0f} samples, "
-        f"{sums.row_bytes * factor / 1e9:.3f} GB before compression, {total}",
-        *sums.notes,
+        f"  {'stage':<12}{'seconds':>16}{'core-hours':>12}",
+        *(f"  {stage:<12}{each[stage]:>16}{spent:>12.2f}" for stage, spent in hours.items()),
+        f"expected for {of}: {made}, {gb}, {sum(hours.values()):.2f} core-hours",
+        _time_line(run, hours),
     ]
-    return "\n".join(lines)
+    if sums.pictures and not run.work.draws_on_gpu and settings.mode is RenderMode.AUTO:
+        drawn = f"{sums.pictures * factor:,.0f} pictures of {settings.width}x{settings.height}"
+        if settings.scene is SceneFrom.FIT:
+            drawn += f" and {len(blocks)} fits of {settings.fit.iterations:,} iterations"
+        lines.append(f"for a GPU: {drawn}; what it does a second, make gpu-check says (docs/gpu.md)")
+    return "\n".join([*lines, *sums.notes])
+
+
+def _time_line(run: Run, hours: Mapping[str, float]) -> str:
+    """How long that takes on what there is, what holds it up, and what memory it wants."""
+    cores = run.config.workers or os.cpu_count() or 1
+    most = max(hours, key=lambda stage: hours[stage])
+    spent, bound = sum(hours.values()) / cores, f"{most}, {hours[most] / max(sum(hours.values()), 1e-9):.0%} of it"
+    told = f"{spent:.2f} h on {cores} cores"
+    if run.work.draws_on_gpu:
+        claimed = {stage for task in TASKS if task.may_draw for stage in task.stages}
+        of_gpus = run.config.gpu_share * sum(hours.get(stage, 0.0) for stage in claimed)
+        gpus = _gpus()
+        told += f"; {of_gpus:.2f} GPU-hours, {of_gpus / gpus:.2f} h on {gpus} GPUs"
+        if of_gpus / gpus > spent:
+            bound = "the GPUs"
+    claim = max(task.memory_gb for task in TASKS)
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return f"{told}, most in {bound}; at most {claim:g} GB a worker, {claim * cores:g} of {there:.0f} GB here"
+
+
+def _gpus() -> int:
+    """Of this machine, which draws with some."""
+    return int(require()[0].cuda.device_count())
 
 
 def paper_deviations_line(config: RunConfig, vocabulary: Vocabulary, tables: Mapping[str, int]) -> str:
