@@ -24,6 +24,7 @@ from factory.files import DamagedFile, why_no_hard_links
 from factory.store.commit_copies import COPIES, LOG, CommitCopies, DamagedPart
 from factory.store.episodes import EPISODES_FOLDER, check_episode, episode_name
 from factory.store.location import (
+    CLIP_SUFFIX,
     BadCacheFile,
     BadLocation,
     Location,
@@ -193,7 +194,7 @@ def _damaged_kept(out: Location) -> list[DamagedPart]:
     found = []
     prepared, scenes = out.child(PREPARED), out.child(SCENES)
     checks: dict[str, Callable[[str], object]] = {
-        PREPARED: lambda key: check_prepared_clip(prepared.read(f"{key}.npz") or b"", key),
+        PREPARED: lambda key: check_prepared_clip(prepared.read(f"{key}{CLIP_SUFFIX}") or b"", key),
         SCENES: SceneFiles(scenes).load,
     }
     for folder, check in checks.items():
@@ -201,7 +202,7 @@ def _damaged_kept(out: Location) -> list[DamagedPart]:
             if DRAFT.fullmatch(name):
                 continue
             try:
-                check(name.removesuffix(".npz"))
+                check(name.removesuffix(CLIP_SUFFIX))
             except (BadCacheFile, FileNotFoundError) as error:  # the latter: a file of another kind of name
                 problem = str(error).removeprefix(f"{out.child(folder).uri}/{name}").removeprefix(": ").strip()
                 found.append(DamagedPart(f"{folder}/{name}", problem))

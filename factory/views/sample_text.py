@@ -217,8 +217,9 @@ def _run_facts(store: "Store", record: Row, number: int, row: Row) -> list[tuple
 
 def _clip_facts(store: "Store", row: Row, clip: Row) -> list[tuple[str, object]]:
     from factory.graph.steps import cache_key
+    from factory.store.location import CLIP_SUFFIX
 
-    cached = f"cache/prepared/{cache_key(row['clip_id'], clip['prepare_digest'])}.npz" if clip else ""
+    cached = f"cache/prepared/{cache_key(row['clip_id'], clip['prepare_digest'])}{CLIP_SUFFIX}" if clip else ""
     start = row.get("clip_start_s")
     return [
         ("clip", row["clip_id"]),

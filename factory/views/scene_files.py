@@ -17,7 +17,7 @@ from factory.graph.steps import cache_key
 from factory.pipeline import logged_clip
 from factory.readers.pickles import load_tensors
 from factory.stages.scene_file import BadScene, read_dtype, read_scene, scene_header
-from factory.store.location import BadCacheFile
+from factory.store.location import CLIP_SUFFIX, BadCacheFile
 from factory.wording import one_line
 from tasks.render.scene.asset import BlockRange, RenderAsset, ViewQuality
 from tasks.render.scene.movers import world_from_boxes
@@ -88,7 +88,8 @@ def _prepared_clips_of_block(store: "Store", block: BlockRange) -> Iterator[Clip
         try:
             clip = logged_clip(store.cache.load(key))
         except BadCacheFile as error:
-            raise BadScene(f"{store.cache.location.uri}/{key}.npz: {error}; the next run makes it again") from error
+            path = f"{store.cache.location.uri}/{key}{CLIP_SUFFIX}"
+            raise BadScene(f"{path}: {error}; the next run makes it again") from error
         if clip is None:
             continue
         if clip.start_s < block.end_s and clip.start_s + clip.agents.n_steps * STEP_S > block.start_s:

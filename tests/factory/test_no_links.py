@@ -42,7 +42,7 @@ def command(mount: Path, tmp_path_factory: pytest.TempPathFactory) -> Command:
 def made(mount: Path) -> Path:
     """A run that was made on a better file system and copied there; one of the files that it keeps is damaged."""
     run(mount / "made")
-    next((mount / "made" / "cache").rglob("*.npz")).write_bytes(b"")
+    next((mount / "made" / "cache").rglob("*.clip")).write_bytes(b"")
     return mount / "made"
 
 

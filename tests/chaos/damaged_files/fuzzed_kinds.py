@@ -65,7 +65,7 @@ def write_all(folder: Path) -> None:
     (folder / "filter.yaml").write_text(FILTER)
     save_vocabulary(folder / "vocabulary.npy", Vocabulary(kinematic_trajectories(9, 0)), {})
     save_recovery_table(folder / "table.npz", RecoveryTable(kinematic_trajectories(9, 0)), {})
-    (folder / "clip.npz").write_bytes(encode_tree(replace(tiny_clip())))
+    (folder / "kept.clip").write_bytes(encode_tree(replace(tiny_clip())))
     write_scene(folder / "scene.safetensors", scene())
     for suffix in (".ply", ".spz"):
         (folder / f"splats{suffix}").write_bytes(background_bytes(scene().background, suffix, np.zeros(3), CLASSIC))
@@ -145,7 +145,7 @@ def _table(folder: Path) -> Readable:
 
 
 def _kept_clip(folder: Path) -> Readable:
-    path = folder / "clip.npz"
+    path = folder / "kept.clip"
     golden = pickle.dumps(encode_tree(decode_tree(path.read_bytes())))
     same = lambda value: pickle.dumps(encode_tree(value)) == golden  # noqa: E731
     return Readable(path, lambda: decode_tree(path.read_bytes()), (BadCacheFile,), is_sound=same, named=False)
@@ -194,7 +194,7 @@ KINDS: Mapping[str, Callable[[Path], Readable]] = {
     "pcd, a sweep": lambda folder: _sweep(folder / "sweep.pcd"),
     "npy, a vocabulary": _vocabulary,
     "npz, a recovery table": _table,
-    "npz, a kept clip unsealed": _kept_clip,
+    "a kept clip unsealed": _kept_clip,
     "safetensors": _scene,
     "ply": partial(_splats, ".ply"),
     "spz": partial(_splats, ".spz"),

@@ -153,7 +153,7 @@ def test_a_resumed_benchmark_is_the_same_and_its_scenes_come_back(
     store: Store, work: FactoryWork, refs: Sequence[ClipRef], tmp_path: Path
 ) -> None:
     made(work, refs[1:2], tmp_path, 1)
-    scene_file = tmp_path / "scenes" / f"{refs[1].clip_id}.npz"
+    scene_file = tmp_path / "scenes" / f"{refs[1].clip_id}.clip"
     first = scene_file.read_bytes()
     scene_file.unlink()
     resumed = made(work, refs[1:2], tmp_path, 3)
@@ -181,7 +181,7 @@ def test_missing_and_foreign_scenes_are_named(tmp_path: Path) -> None:
     files = SceneFiles(Location(str(tmp_path)))
     with pytest.raises(FileNotFoundError, match="abc"):
         files.load("abc")
-    (tmp_path / "abc.npz").write_bytes(b"no zip")
+    (tmp_path / "abc.clip").write_bytes(b"no zip")
     with pytest.raises(BadCacheFile):
         files.load("abc")
 

@@ -58,7 +58,7 @@ def test_a_prepared_clip(tmp_path: Path) -> None:
     (ref,), work, out = refs(1), ToyWork(), Location(str(tmp_path))
     golden = encode_tree(prepare(work, out, ref)[1])
     key = cache_key(ref.clip_id, work.identity.prepare_digest)
-    path = tmp_path / "cache" / "prepared" / f"{key}.npz"
+    path = tmp_path / "cache" / "prepared" / f"{key}.clip"
     whole = path.read_bytes()
     for content in [*damaged(whole), whole[:-SEAL_BYTES]]:
         path.write_bytes(content)
@@ -71,7 +71,7 @@ def test_a_prepared_clip(tmp_path: Path) -> None:
 
 
 def test_a_clip_s_scenes_are_named(tmp_path: Path) -> None:
-    files, path = SceneFiles(Location(str(tmp_path))), tmp_path / "warm.npz"
+    files, path = SceneFiles(Location(str(tmp_path))), tmp_path / "warm.clip"
     files.store(OneStageClip(tiny_clip()))
     whole = path.read_bytes()
     for content in [*damaged(whole), whole[:-SEAL_BYTES]]:
@@ -135,8 +135,8 @@ def test_a_recovery_table_is_made_again_in_the_cache(
     golden = _recovery_table(run, [str(tmp_path / "v.npy")]).digest  # type: ignore[arg-type]
     (path,) = (tmp_path / "cache").rglob("recovery-*.npz")
     whole = path.read_bytes()
-    save_recovery_table(tmp_path / "x.npz", RecoveryTable(np.zeros((3, 40, 3))), {}, "recovery-0.npz")
-    another = (tmp_path / "x.npz").read_bytes()
+    save_recovery_table(tmp_path / "x.clip", RecoveryTable(np.zeros((3, 40, 3))), {}, "recovery-0.npz")
+    another = (tmp_path / "x.clip").read_bytes()
     for content in (whole[:9000] + bytes([whole[9000] ^ 1]) + whole[9001:], whole[:100], b"", another):
         path.write_bytes(content)
         assert _recovery_table(run, [str(tmp_path / "v.npy")]).digest == golden  # type: ignore[arg-type]
@@ -197,7 +197,9 @@ Kept = tuple[list[Path], Callable[[int], object]]  # two files of a cache, and w
 def prepared_clips(folder: Path) -> Kept:
     work, out, both = ToyWork(), Location(str(folder)), refs(2)
     keys = [cache_key(ref.clip_id, work.identity.prepare_digest) for ref in both]
-    return [folder / f"cache/prepared/{key}.npz" for key in keys], lambda i: encode_tree(prepare(work, out, both[i])[1])
+    return [folder / f"cache/prepared/{key}.clip" for key in keys], lambda i: encode_tree(
+        prepare(work, out, both[i])[1]
+    )
 
 
 def city_tables(folder: Path) -> Kept:
@@ -269,8 +271,8 @@ def test_what_is_half_done_and_a_list_of_kernels_are_not_another_s(
 def test_scenes_of_another_clip_are_refused_by_name(tmp_path: Path) -> None:
     files = SceneFiles(Location(str(tmp_path)))
     files.store(OneStageClip(tiny_clip()))
-    (tmp_path / "warm.npz").rename(tmp_path / "cold.npz")
-    with pytest.raises(BadCacheFile, match=rf"{tmp_path}/cold\.npz holds clip warm; remove it"):
+    (tmp_path / "warm.clip").rename(tmp_path / "cold.clip")
+    with pytest.raises(BadCacheFile, match=rf"{tmp_path}/cold\.clip holds clip warm; remove it"):
         files.load("cold")
 
 

@@ -205,7 +205,7 @@ def test_a_damaged_file_of_a_table_is_taken_out_and_made_again(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", ["episodes/*.mcap", "cache/prepared/*.npz", "run.json", "current_run.json"])
+@pytest.mark.parametrize("part", ["episodes/*.mcap", "cache/prepared/*.clip", "run.json", "current_run.json"])
 def test_damage_beside_the_tables_is_named_and_taken_out(
     out: Path, golden: Path, part: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -313,7 +313,7 @@ def test_nothing_behind_a_link_is_cleaned_away_and_companions_are_no_damage(
 def test_leftovers_go_once_they_are_old(out: Path, golden: Path, capsys: pytest.CaptureFixture[str]) -> None:
     clean = COMMANDS["clean"].load()
     shard = files(out, "samples/*/*/*.parquet")[0]
-    left = [shard.with_name(f"part-{'0' * 32}.parquet"), out / "cache/.x.npz.12345678.tmp", out / "episodes/x.mcap"]
+    left = [shard.with_name(f"part-{'0' * 32}.parquet"), out / "cache/.x.clip.12345678.tmp", out / "episodes/x.mcap"]
     for path in left:
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(b"x")
@@ -379,7 +379,7 @@ def test_drafts_that_a_killed_writer_left_are_no_damage(tmp_path: Path) -> None:
     (copy.parent / f".{2:020}.json.0123abcd.tmp").write_bytes(copy.read_bytes())
     for folder in ("cache/prepared", "scenes"):
         (tmp_path / folder).mkdir(parents=True)
-        (tmp_path / folder / ".clip.npz.0123abcd.tmp").write_bytes(b"half")
+        (tmp_path / folder / ".x.clip.0123abcd.tmp").write_bytes(b"half")
     assert verify(Store(tmp_path)).damage == ()
 
 

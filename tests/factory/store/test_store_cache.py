@@ -8,9 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
-from factory.store.location import BadCacheFile, ClipCache, Location, decode_tree, encode_tree
+from factory.store.location import FORMAT, BadCacheFile, ClipCache, Location, decode_tree, encode_tree
 from factory.store.samples import CandidateRow
 from tasks.stages import Rejected
 from tasks.world.clip import AgentKind, AgentTracks
@@ -19,7 +20,7 @@ from tasks.world.clip import AgentKind, AgentTracks
 def forged(tree: object) -> bytes:
     sink = io.BytesIO()
     np.savez(sink, tree=np.frombuffer(json.dumps(tree).encode(), np.uint8))
-    return sink.getvalue()
+    return len(sink.getvalue()).to_bytes(8, "little") + pa.compress(sink.getvalue(), codec="zstd", asbytes=True)
 
 
 def tracks() -> AgentTracks:
@@ -62,14 +63,22 @@ def test_an_array_that_stands_twice_is_stored_once() -> None:
 )
 def test_a_file_cannot_name_what_is_not_a_dataclass_of_ours(name: str) -> None:
     with pytest.raises(BadCacheFile):
-        decode_tree(forged({"format": 2, "root": {"class": name, "members": {}}}))
+        decode_tree(forged({"format": FORMAT, "root": {"class": name, "members": {}}}))
 
 
 def test_a_file_makes_nobody_import_a_module_of_others() -> None:
     """An import runs code: `this` prints a poem, others may do worse."""
     with pytest.raises(BadCacheFile, match="not a class a cache file may name"):
-        decode_tree(forged({"format": 2, "root": {"class": "this:Poem", "members": {}}}))
+        decode_tree(forged({"format": FORMAT, "root": {"class": "this:Poem", "members": {}}}))
     assert "this" not in sys.modules
+
+
+@pytest.mark.parametrize("size", [2**63, 2**30 + 1, 2**29, 0])
+def test_a_file_that_says_another_size_than_it_has_is_refused_unread(size: int) -> None:
+    """2 MB of zeros in a few bytes: nothing is made of them before their size is known."""
+    packed = pa.compress(bytes(2**21), codec="zstd", asbytes=True)
+    with pytest.raises(BadCacheFile):
+        decode_tree(size.to_bytes(8, "little") + packed)
 
 
 def test_what_cannot_be_stored_is_refused_when_written() -> None:
@@ -87,12 +96,12 @@ def test_damage_is_found_and_absence_is_none(tmp_path: Path) -> None:
         Rejected("clip", "ego_standing"),
         CandidateRow(0, 1, 0.0, 0.0, 0.0, 0.0, (0, 1), 1.0, 1.0),
     )
-    path = tmp_path / "x.npz"
+    path = tmp_path / "x.clip"
     for damage in (path.read_bytes()[:-100], b"", b"PK"):
         path.write_bytes(damage)
         with pytest.raises(BadCacheFile):
             cache.load("x")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["x.npz"]  # no drafts left
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["x.clip"]  # no drafts left
 
 
 # Listing a folder in which other processes make and remove folders.

@@ -86,11 +86,11 @@ def test_what_is_missing_is_named_at_once(tmp_path: Path) -> None:
     (tmp_path / "benchmark.json").write_text("{")
     refused("cannot be read")
     rewritten()
-    data = (tmp_path / "scenes" / "a.npz").read_bytes()
-    (tmp_path / "scenes" / "a.npz").write_bytes(data[: len(data) // 2])
+    data = (tmp_path / "scenes" / "a.clip").read_bytes()
+    (tmp_path / "scenes" / "a.clip").write_bytes(data[: len(data) // 2])
     with pytest.raises(ConfigError, match="scenes of clip a"):
         BenchmarkFolder(str(tmp_path)).scenes("a")
-    (tmp_path / "scenes" / "a.npz").unlink()
+    (tmp_path / "scenes" / "a.clip").unlink()
     refused("no scenes of 1 clips, such as a")
 
 
