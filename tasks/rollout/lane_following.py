@@ -56,6 +56,7 @@ class LaneIndex:
     steps: Array  # (Q - 1,) from each point to the next [m]
     known_lengths: dict[int, float] = field(default_factory=dict)  # of the lanes asked for
     known_successors: dict[int, list[int]] = field(default_factory=dict)  # of the lanes asked for
+    known_paths: dict[tuple[bytes, bytes, float], "LanePath | None"] = field(default_factory=dict)  # the newest found
 
     def length(self, lane: int) -> float:
         """[m]"""
@@ -198,11 +199,24 @@ class LanePath:
     lane_entries: tuple[tuple[str, float], ...]  # (lane id, path length of its start, < 0 behind it), as driven
 
 
+KNOWN_PATHS = 1024  # kept, of some 15 kB
+
+
 def find_path(index: LaneIndex, pose: Array, log_poses: Array, ahead_m: float) -> LanePath | None:
     """The path of the vehicle at `pose` (3,), `ahead_m` long ahead of it; None where it is on no lane.
 
-    log_poses (K, 3): where its log is over the whole clip, before and after.
+    log_poses (K, 3): where its log is over the whole clip, before and after. The attempts of a clip begin among the
+    same traffic and ask the same again; what is found once is handed out again, to be read only.
     """
+    key = pose.tobytes(), log_poses.tobytes(), ahead_m
+    if key not in index.known_paths:
+        if len(index.known_paths) >= KNOWN_PATHS:
+            index.known_paths.clear()
+        index.known_paths[key] = _find_path(index, pose, log_poses, ahead_m)
+    return index.known_paths[key]
+
+
+def _find_path(index: LaneIndex, pose: Array, log_poses: Array, ahead_m: float) -> LanePath | None:
     distance, difference = lane_distances_and_turns(index, pose[None])
     starts: list[int] = np.flatnonzero(on_a_lane(distance[0], difference[0])).tolist()
     if not starts:
