@@ -60,7 +60,7 @@ PLANNERS: Mapping[str, Command] = {
     "import": Command("a released checkpoint of the public code as ours", "planners.published.import_planner"),
     "evaluate": Command("EPDMS of planners on held-out clips", "planners.evaluation.evaluate"),
     "compare": Command("how two planners differ, with intervals", "planners.study.compare"),
-    "serve": Command("plans for NAVSIM's own evaluation, whose agent asks", "planners.navsim.serve"),
+    "serve": Command("plans for NAVSIM's evaluation, or a driver of AlpaSim", "planners.serve"),
     "submit": Command("plans of a NAVSIM split as its leaderboard takes them", "planners.navsim.submit"),
     "drive": Command("planners in closed loop, until something ends the drive", "planners.drive.drive"),
     "replay": Command("a planner on one clip as a film", "planners.evaluation.replay"),

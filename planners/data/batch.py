@@ -10,6 +10,7 @@ import numpy as np
 
 from tasks.settings import constant
 from tasks.world.arrays import F32, FloatArray
+from tasks.world.commands import CommandRule
 
 if TYPE_CHECKING:  # PyTorch is imported where something is computed: settings are read without it
     import torch
@@ -68,6 +69,7 @@ class Needs:
     n_agents: int = 0  # the nearest that many agents inside `bev`, as boxes
     labels: str | None = None  # digest of the vocabulary whose scores are wanted
     normalise: Literal["pairs", "batch", "masked"] = "masked"  # of the labels' EP, see tasks.reward.label_bytes
+    command: CommandRule = "navsim"  # the rows' own; another is made of their route
 
 
 @dataclass(frozen=True)

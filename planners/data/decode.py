@@ -20,6 +20,7 @@ from planners.data.index import AGENT_COLUMNS, BEV_COLUMNS
 from tasks.reward.label_bytes import CRC_BYTES
 from tasks.subscores import LABELLED
 from tasks.world.arrays import Bools, Bytes
+from tasks.world.commands import command_of_points, route_points
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -107,7 +108,11 @@ class BatchBuffer:
     def fill(self, i: int, stored: StoredRows, row: int) -> None:
         """Decode a row as sample i. Raises ValueError for what cannot be decoded."""
         arrays, needs = self._arrays, self._needs
-        arrays["status"][i, : len(COMMANDS)] = one_hot_command(stored.value("command", row))
+        if needs.command == "navsim":
+            command = stored.value("command", row)
+        else:
+            command = command_of_points(route_points(stored.value("route_centerline", row)), needs.command)
+        arrays["status"][i, : len(COMMANDS)] = one_hot_command(command)
         arrays["status"][i, len(COMMANDS) :] = stored.value("ego_status", row)
         arrays["history"][i] = stored.value("ego_history_2hz", row)
         arrays["plan_2hz"][i] = stored.value("label_2hz", row)

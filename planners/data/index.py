@@ -323,6 +323,8 @@ def make_feed(dataset: Dataset, needs: Needs) -> Feed:
         columns += IMAGE_COLUMNS
     if needs.bev is not None:
         columns += BEV_COLUMNS
+    if needs.command != "navsim" and "route_centerline" not in columns:
+        columns += ("route_centerline",)
     if needs.labels is not None:
         columns += LABEL_COLUMNS
     numbers = np.unique(dataset.rows.file)

@@ -66,7 +66,8 @@ def columns_to_read(needs: Needs | None) -> list[str]:
     if needs is None:
         return [name for name in SCHEMA.names if not name.startswith(SCORES)]
     bev = BEV_COLUMNS if needs.bev is not None else ()
-    return [*EGO_COLUMNS, *bev, *(("cameras", "images") if needs.image is not None else ())]
+    route = () if needs.command == "navsim" or "route_centerline" in bev else ("route_centerline",)
+    return [*EGO_COLUMNS, *bev, *route, *(("cameras", "images") if needs.image is not None else ())]
 
 
 class _StoredSample(StoredRows):

@@ -52,7 +52,7 @@ class EgoMlp(Planner):
 
     @property
     def needs(self) -> Needs:
-        return Needs()
+        return Needs(command=self.settings.command)
 
     def features(self, batch: Batch) -> Tensor:
         """(B, 8 + seen) that the layers take."""
@@ -88,7 +88,7 @@ class EgoMlpBev(EgoMlp):
 
     @property
     def needs(self) -> Needs:
-        return Needs(bev=self.settings.bev)
+        return Needs(bev=self.settings.bev, command=self.settings.command)
 
     def features(self, batch: Batch) -> Tensor:
         assert batch.bev is not None

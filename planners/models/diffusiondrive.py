@@ -346,11 +346,12 @@ class DiffusionDrive(Planner):
 
     @property
     def needs(self) -> Needs:
-        return Needs(self.settings.picture, self.settings.bev, self.settings.network.agents)
+        s = self.settings
+        return Needs(s.picture, s.bev, s.network.agents, command=s.command)
 
     @property
     def needs_to_plan(self) -> Needs:
-        return Needs(image=self.settings.picture)
+        return Needs(image=self.settings.picture, command=self.settings.command)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """`confidence` and `regression` of all refinements, `agent_class`, `agent_box`, `bev`.

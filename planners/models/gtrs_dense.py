@@ -193,7 +193,7 @@ class GtrsDense(Planner):
 
     @property
     def needs(self) -> Needs:
-        return Needs(image=self.settings.picture, labels=self.label_digest)
+        return Needs(image=self.settings.picture, labels=self.label_digest, command=self.settings.command)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """`imitation`: cross-entropy with softmax(-d^2 / sigma^2) of the poses at 2 Hz; one binary one per sub-score.
@@ -327,15 +327,15 @@ class Ensemble(nn.Module):
                     f"{name} chooses from vocabulary {member.choice_digest} and {first_name} from "
                     f"{first.choice_digest}: scores of different trajectories have no mean"
                 )
-            if member.needs.image != first.needs.image:
-                raise ValueError(f"{name} sees {member.needs.image} and {first_name} sees {first.needs.image}")
+            if member.needs_to_plan != first.needs_to_plan:
+                raise ValueError(f"{name} sees {member.needs_to_plan} and {first_name} sees {first.needs_to_plan}")
         self.models = [member for _, member in members]
         self.members = nn.ModuleList(self.models)  # for .to() and .eval()
 
     @property
     def needs(self) -> Needs:
-        """The members' picture; an ensemble is not trained and reads no labels."""
-        return Needs(image=self.models[0].needs.image)
+        """The members' picture and command; an ensemble is not trained and reads no labels."""
+        return self.models[0].needs_to_plan
 
     def scores(self, batch: Batch) -> dict[str, Tensor]:
         """Mean probabilities (B, K) by name."""

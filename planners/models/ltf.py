@@ -44,11 +44,12 @@ class Ltf(Planner):
 
     @property
     def needs(self) -> Needs:
-        return Needs(self.settings.picture, self.settings.bev, self.settings.network.agents)
+        s = self.settings
+        return Needs(s.picture, s.bev, s.network.agents, command=s.command)
 
     @property
     def needs_to_plan(self) -> Needs:
-        return Needs(image=self.settings.picture)
+        return Needs(image=self.settings.picture, command=self.settings.command)
 
     def decoded(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
         """Plans (B, 8, 3), queries of agents (B, N, width), features from above (B, C, rows, columns)."""

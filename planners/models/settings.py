@@ -14,6 +14,7 @@ from factory.config.words import did_you_mean
 from planners.data.batch import BevLayout, ImageLayout
 from tasks.settings import constant
 from tasks.subscores import LABELLED
+from tasks.world.commands import CommandRule
 
 STRIDES = (4, 8, 16, 32)
 Status = Literal["all", "speed"]  # what of the ego's status is seen; speed: command and velocity, no acceleration
@@ -76,6 +77,7 @@ class NetworkSettings:
     image: ImageLayout = field(default_factory=ImageLayout)
     variant: Variant = "paper"  # public: as the public code, whose checkpoints it takes; small: for two cores
     pretrained: str | None = None  # the picture's backbone: .safetensors, .pth or .pt, published names; null: random
+    command: CommandRule = "navsim"  # by which it is told where to go; curvature: as AlpaSim's routes show it
     sizes: Sizes | None = constant(None)  # in the place of the variant's
     SIZES: ClassVar[Mapping[str, Sizes]] = {"paper": Sizes(), "public": Sizes()}  # by variant
 
@@ -122,6 +124,7 @@ class EgoMlpSettings:
 
     hidden: tuple[int, ...] = (512, 512, 512)  # widths of the hidden layers
     plan_from: PlanFrom = "zero"  # what the regressed poses are added to
+    command: CommandRule = "navsim"  # as of NetworkSettings
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,15 @@
-"""`python -m planners serve planner=<training>`: plans for NAVSIM's own evaluation, whose agent starts this.
+"""A planner before NAVSIM's cameras, and its process (`python -m planners serve`), which NAVSIM's agent starts.
 
 planners.navsim.agent.FactoryAgent asks on standard input and reads the plans on standard output.
-Nobody starts it by hand; what it prints goes to standard error.
+What else the process prints goes to standard error.
 """
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,26 @@ class AgentObservation:
             raise ValueError(f"driving_command {self.status[: len(COMMANDS)]}: one of {', '.join(COMMANDS)} must be 1")
 
 
+def load_for_agent(planner: str, device: str, shown_by: str) -> tuple[Any, Needs]:
+    """A planner that plans from cameras, status and command alone, on its device, and what it needs to plan.
+
+    Raises ConfigError for one that wants more than `shown_by` shows an agent.
+    """
+    from torch import nn
+
+    who = find_planner(planner)
+    if who.load is None:
+        raise ConfigError(f"planner={planner} plans from the log itself, which {shown_by} shows no agent")
+    made = who.load()
+    asked = needs_of(made)
+    if asked is None:
+        raise ConfigError(f"planner={planner} takes samples; for {shown_by} it must take batches (plan(batch), needs)")
+    needs: Needs = replace(getattr(made, "needs_to_plan", asked), labels=None)
+    if needs.bev is not None or needs.n_agents:
+        raise ConfigError(f"planner={planner} looks at a raster of map and agents, which {shown_by} shows no agent")
+    return made.to(device) if isinstance(made, nn.Module) else made, needs
+
+
 class AgentPlanner:
     """Someone who plans from what NAVSIM shows."""
 
@@ -69,20 +90,10 @@ class AgentPlanner:
 
         Raises ConfigError for a planner that wants what NAVSIM shows no agent, and for cameras that it has not.
         """
-        from torch import nn
-
-        who = find_planner(planner)
-        if who.load is None:
-            raise ConfigError(f"planner={planner} plans from the log itself, which NAVSIM shows no agent")
-        made = who.load()
-        asked = needs_of(made)
-        if asked is None:
-            raise ConfigError(f"planner={planner} takes samples; for NAVSIM it must take batches (plan(batch), needs)")
-        needs: Needs = replace(getattr(made, "needs_to_plan", asked), labels=None)
-        if needs.bev is not None or needs.n_agents:
-            raise ConfigError(f"planner={planner} looks at a raster of map and agents, which NAVSIM shows no agent")
-        self._made = made.to(device) if isinstance(made, nn.Module) else made
-        self._needs, self._undistort, self._device = needs, undistort, device
+        made, needs = load_for_agent(planner, device, "NAVSIM")
+        if needs.command != "navsim":
+            raise ConfigError(f"planner={planner} was trained on commands by {needs.command}, and NAVSIM gives its own")
+        self._made, self._needs, self._undistort, self._device = made, needs, undistort, device
         self._by_direction = needs.image is not None and not (cameras or needs.image.cameras)
         self.cameras = agent_cameras(needs.image, cameras)
 
@@ -106,7 +117,7 @@ class AgentPlanner:
                 raise ValueError(f"{', '.join(FRONT)} do not look left, ahead and right: name others by cameras=")
         images = [undistorted(view.image, view.camera) if self._undistort else view.image for view in views]
         buffer = BatchBuffer(1, self._needs, 0)
-        buffer.fill(0, _ObservationRow(seen, images), 0)
+        buffer.fill(0, ObservationRow(seen, partial(stitch_pixels, images)), 0)
         nobody = np.zeros(1, bool)
         return buffer.batch(["navsim"], nobody, nobody)
 
@@ -146,12 +157,13 @@ def observation_of(arrays: Mapping[str, Any], cameras: Sequence[str]) -> AgentOb
     return AgentObservation(arrays["history"], arrays["status"], tuple(views))
 
 
-class _ObservationRow(StoredRows):
+class ObservationRow(StoredRows):
     """What was seen, as the loader's rows are read; zeros for the plans, which nobody knows."""
 
-    def __init__(self, seen: AgentObservation, images: Sequence[Bytes]) -> None:
+    def __init__(self, seen: AgentObservation, draw: Callable[[ImageLayout, Bytes], None]) -> None:
+        """draw: writes the wide picture of a layout into (layout.height, layout.width, 3)."""
         status = seen.status
-        self._images = images
+        self._draw = draw
         self._seen = {
             "command": COMMANDS[int(np.argmax(status[: len(COMMANDS)]))],
             "ego_status": status[len(COMMANDS) :],
@@ -162,17 +174,7 @@ class _ObservationRow(StoredRows):
         return 0.0 if column.startswith("label_") else self._seen[column]
 
     def picture(self, row: int, layout: ImageLayout, out: Bytes, keep: bool = False) -> None:
-        stitch_pixels(self._images, layout, out)
-
-
-@dataclass(frozen=True)
-class Request:
-    """The command line."""
-
-    planner: str  # a training's folder, a+b, constant_velocity, or my.module:MyPlanner; it reads pictures, status alone
-    device: str = "cpu"  # or cuda
-    cameras: tuple[str, ...] = ()  # NAVSIM's in the places of those it was trained on, left to right: [cam_l0,cam_f0]
-    undistort: bool = False  # for a planner that was trained on pinhole pictures
+        self._draw(layout, out)
 
 
 def _next_question() -> dict[str, Any] | None:
@@ -183,13 +185,13 @@ def _next_question() -> dict[str, Any] | None:
         raise Refused(f"standard input: {error}; start planners serve again") from error
 
 
-def main(request: Request) -> None:
+def answer_agent(planner: str, device: str, cameras: Sequence[str], undistort: bool) -> None:
     """Answer until nobody asks any more. Raises Refused for a planner that cannot plan there, and half a question."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever prints must not come between the answers
     with suppress(BrokenPipeError):  # who asked has gone
         try:
-            pilot = AgentPlanner(request.planner, request.cameras, request.undistort, request.device)
+            pilot = AgentPlanner(planner, cameras, undistort, device)
         except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: a device that is not there
             send(answers, {"error": str(error)})
             raise Refused(str(error)) from error

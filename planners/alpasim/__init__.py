@@ -1,0 +1,1 @@
+"""A planner as a driver of the closed-loop simulator AlpaSim."""

@@ -1,0 +1,442 @@
+"""A planner behind AlpaSim's `egodriver.EgodriverService`: bytes of a request in, bytes of the answer out.
+
+`Driver.answer` is the whole service without a socket; `serve` puts gRPC in front of it. The messages' classes are
+those of `carla-driver-interface`, which vendors NVlabs/alpasim 6870924 unchanged. Nothing that comes in is unpickled:
+`renderer_data` is not looked at, and `debug_info` stays empty.
+"""
+
+import logging
+import signal
+import threading
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from queue import Empty, Queue
+from typing import Any
+
+import numpy as np
+
+from factory import __version__
+from factory.config.arguments import Refused
+from factory.config.compose import ConfigError
+from planners.alpasim.session import (
+    SECOND_US,
+    Moment,
+    NotReady,
+    Session,
+    Unseen,
+    drawer,
+    local_poses,
+    moment_of,
+    straight_on,
+)
+from planners.data.batch import COMMANDS, ImageLayout, Needs
+from planners.data.decode import BatchBuffer
+from planners.data.images import chosen_cameras
+from planners.evaluation.planner_names import find_planner
+from planners.evaluation.planning import check_plan, plan_batch
+from planners.navsim.serve import AgentObservation, ObservationRow, load_for_agent
+from tasks.world.arrays import Array
+from tasks.world.commands import CommandRule
+
+SERVICE = "egodriver.EgodriverService"
+MESSAGE_BYTES = 32 << 20  # of a request; a PNG of 3840 x 2160 has up to 25 MB
+MOST = 10_000  # poses or waypoints of a message
+LARGEST = 1e7  # m, m/s and so on: beyond it a number is none of a rollout
+LAST_US = 1 << 62
+QUERY_US = 60 * SECOND_US  # how far ahead a trajectory may be asked for
+SESSIONS = 64  # at a time
+PATIENCE_S = 600.0  # of a question for its plan
+# carla-driver-interface turns the cameras of a peer that does not name this revision of the contract (its contract.py).
+CONTRACT = (("carla-driver-interface-contract", "2"),)
+log = logging.getLogger(__name__)
+
+
+class Fault(Exception):
+    """The request is answered by a gRPC status of this name."""
+
+    def __init__(self, status: str, problem: str) -> None:
+        super().__init__(problem)
+        self.status = status
+
+
+# Fields of requests. What is wrong with one is a ValueError that names it.
+
+
+def _stamp(name: str, value: int) -> int:
+    if value > LAST_US:
+        raise ValueError(f"{name}={value}: microseconds, at most {LAST_US}")
+    return int(value)
+
+
+def _vector(name: str, vector: Any) -> list[float]:
+    found = [vector.x, vector.y, vector.z]
+    if not all(abs(number) <= LARGEST for number in found):  # false of NaN
+        raise ValueError(f"{name}={found}: finite numbers up to {LARGEST:g} are expected")
+    return found
+
+
+def _rotation(name: str, quat: Any) -> Array:
+    """(3, 3)."""
+    q = np.array([quat.w, quat.x, quat.y, quat.z], np.float64)
+    if not abs(np.linalg.norm(q) - 1.0) <= 0.01:
+        raise ValueError(f"{name}={q.tolist()}: not a unit quaternion w, x, y, z")
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _bounded(name: str, repeated: Sequence[Any]) -> Sequence[Any]:
+    if len(repeated) > MOST:
+        raise ValueError(f"{name}: {len(repeated)} of them, at most {MOST} in a message")
+    return repeated
+
+
+def states_of(message: Any) -> dict[int, Array]:
+    """Stamp -> state (9,) of a RolloutEgoTrajectory. Raises ValueError."""
+    poses, dynamics = _bounded("trajectory.poses", message.trajectory.poses), message.dynamic_states
+    if len(dynamics) != len(poses):
+        raise ValueError(f"dynamic_states: {len(dynamics)}, one for each of the {len(poses)} trajectory.poses expected")
+    states = {}
+    for i, (at, dynamic) in enumerate(zip(poses, dynamics)):
+        x, y, z = _vector(f"trajectory.poses[{i}].pose.vec", at.pose.vec)
+        turned = _rotation(f"trajectory.poses[{i}].pose.quat", at.pose.quat)
+        name = f"dynamic_states[{i}]."
+        vx, vy, _ = _vector(f"{name}linear_velocity", dynamic.linear_velocity)
+        ax, ay, _ = _vector(f"{name}linear_acceleration", dynamic.linear_acceleration)
+        yaw_rate = _vector(f"{name}angular_velocity", dynamic.angular_velocity)[2]
+        heading = np.arctan2(turned[1, 0], turned[0, 0])
+        stamp = _stamp(f"trajectory.poses[{i}].timestamp_us", at.timestamp_us)
+        states[stamp] = np.array([x, y, heading, z, vx, vy, ax, ay, yaw_rate])
+    return states
+
+
+def route_of(route: Any) -> Array:
+    """(N, 2) of a Route; NaN where there is no point. Raises ValueError for what is neither."""
+    points = np.array([(p.x, p.y) for p in _bounded("route.waypoints", route.waypoints)], np.float64).reshape(-1, 2)
+    wrong = np.flatnonzero((np.abs(points) > LARGEST).any(axis=1))
+    if len(wrong):
+        raise ValueError(f"route.waypoints[{wrong[0]}]: beyond {LARGEST:g} m; NaN says that there is none")
+    return points
+
+
+def session_cameras(declared: Sequence[Any], layout: ImageLayout | None, given: Sequence[str]) -> tuple[str, ...]:
+    """Whose pictures a planner looks at, left to right: those given, else of its names, else by direction.
+
+    declared: AvailableCameras; names in lower case. Raises ValueError.
+    """
+    field_name = "rollout_spec.vehicle.available_cameras"
+    names = [camera.logical_id.lower() for camera in _bounded(field_name, declared)]
+    if len(set(names)) < len(names):
+        raise ValueError(f"{field_name}: a logical_id stands there twice: {', '.join(names)}")
+    if layout is None:
+        return ()
+    wanted = tuple(name.lower() for name in given or layout.cameras)
+    if not wanted:
+        quats = ((f"{field_name}[{i}].rig_to_camera.quat", c.rig_to_camera.quat) for i, c in enumerate(declared))
+        axes = np.array([_rotation(*quat)[:2, 2] for quat in quats])  # the optical frame looks along z
+        wanted = chosen_cameras(names, axes.reshape(-1, 2), layout)
+    if missing := [name for name in wanted if name not in names]:
+        there = ", ".join(names) or "none"
+        raise ValueError(f"{field_name}: no {', '.join(missing)}, which the planner looks at; sent: {there}")
+    return wanted
+
+
+# Plans, by one thread, of all sessions that ask at a time.
+
+
+class BatchedPlanner:
+    """A planner that is asked from many threads and plans batches of one size, so that no plan depends on another."""
+
+    def __init__(self, made: Any, needs: Needs, device: str, size: int, wait_s: float) -> None:
+        """size: of every batch, repeated rows where fewer ask; wait_s: for others, once one has asked."""
+        self._made, self._needs, self._device, self._size, self._wait_s = made, needs, device, size, wait_s
+        self._asked: Queue[tuple[ObservationRow, Future[Array]] | None] = Queue()
+        self._thread = threading.Thread(target=self._work, name="planner", daemon=True)
+        self._thread.start()
+
+    def plan(self, row: ObservationRow) -> Array:
+        """(8 or 40, 3), not checked. Raises what the planner raises for this row alone."""
+        future: Future[Array] = Future()
+        self._asked.put((row, future))
+        return future.result(PATIENCE_S)
+
+    def close(self) -> None:
+        """End the thread, after what is asked."""
+        self._asked.put(None)
+        self._thread.join()
+
+    def _work(self) -> None:
+        while (first := self._asked.get()) is not None:
+            asked = [first]
+            while len(asked) < self._size:
+                try:
+                    following = self._asked.get(timeout=self._wait_s)
+                except Empty:
+                    break
+                if following is None:
+                    self._asked.put(None)
+                    break
+                asked.append(following)
+            self._answer(asked)
+
+    def _answer(self, asked: Sequence[tuple[ObservationRow, Future[Array]]]) -> None:
+        try:
+            plans = self._planned([row for row, _ in asked])
+        except Exception as error:  # handed to who asked; where several did, each is asked about alone
+            if len(asked) == 1:
+                asked[0][1].set_exception(error)
+            else:
+                for one in asked:
+                    self._answer([one])
+            return
+        for plan, (_, future) in zip(plans, asked):
+            future.set_result(plan)
+
+    def _planned(self, rows: Sequence[ObservationRow]) -> Array:
+        import torch
+
+        buffer = BatchBuffer(self._size, self._needs, 0)
+        for i in range(self._size):
+            buffer.fill(i, rows[i % len(rows)], 0)
+        nobody = np.zeros(self._size, bool)
+        torch.manual_seed(0)  # of a planner that draws, as the public DiffusionDrive does
+        return plan_batch(self._made, buffer.batch(["alpasim"] * self._size, nobody, nobody).to(self._device))
+
+
+# The service.
+
+
+@dataclass
+class _Rollout:
+    """A session, who may touch it, and what came of its questions."""
+
+    session: Session
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    counts: Counter[str] = field(default_factory=Counter)
+
+
+class Driver:
+    """Every RPC of the service."""
+
+    def __init__(
+        self,
+        planner: str,
+        device: str = "cpu",
+        cameras: Sequence[str] = (),
+        command: CommandRule | None = None,
+        batch: int = 1,
+        wait_s: float = 0.002,
+    ) -> None:
+        """Loads the planner and plans once. The arguments: planners.serve.Request.
+
+        Raises ConfigError for a planner that wants more than AlpaSim sends, and without the messages' package.
+        """
+        try:
+            from carla_driver_interface import protocol
+        except ModuleNotFoundError as error:
+            raise ConfigError(f'protocol=alpasim: {error}; pip install "driving-data-factory[alpasim]"') from error
+        self._proto, self._given = protocol, cameras
+        made, self._needs = load_for_agent(planner, device, "AlpaSim")
+        layout = self._needs.image
+        places = () if layout is None else layout.cameras or cameras
+        if len(cameras) not in (0, len(places)):
+            raise ConfigError(f"cameras: {len(cameras)}, in the places of {len(places)}: {', '.join(places) or 'none'}")
+        self._rule: CommandRule = command or self._needs.command
+        who = find_planner(planner)
+        self._version = f"driving-data-factory {__version__} {who.label} {who.digest}"
+        self.counts: Counter[str] = Counter()
+        self._rollouts: dict[str, _Rollout] = {}
+        self._lock = threading.Lock()
+        self._planner = BatchedPlanner(made, self._needs, device, batch, wait_s)
+        self._requests: Mapping[str, tuple[Callable[[Any], Any], Any]] = {
+            "get_version": (self._get_version, protocol.Empty),
+            "start_session": (self._start_session, protocol.DriveSessionRequest),
+            "close_session": (self._close_session, protocol.DriveSessionCloseRequest),
+            "submit_image_observation": (self._submit_image, protocol.RolloutCameraImage),
+            "submit_egomotion_observation": (self._submit_egomotion, protocol.RolloutEgoTrajectory),
+            "submit_route": (self._submit_route, protocol.RouteRequest),
+            "submit_recording_ground_truth": (self._ignore, protocol.GroundTruthRequest),
+            "drive": (self._drive, protocol.DriveRequest),
+            "shut_down": (lambda _: protocol.Empty(), protocol.Empty),  # of old versions; a signal ends the server
+        }
+        seen = AgentObservation(np.zeros((4, 3)), np.eye(8)[COMMANDS.index("straight")])
+        try:
+            self._plan_of(seen, None if layout is None else np.zeros((layout.height, layout.width, 3), np.uint8))
+        except Unseen as error:
+            raise ConfigError(f"planner={planner}: at rest, on a black picture: {error}") from error
+
+    @property
+    def methods(self) -> Sequence[str]:
+        """The names of the RPCs."""
+        return list(self._requests)
+
+    def answer(self, method: str, request: bytes) -> bytes:
+        """Of one RPC. Raises Fault; another exception is the planner's own."""
+        from google.protobuf.message import DecodeError
+
+        does, kind = self._requests[method]
+        try:
+            message = kind.FromString(request)
+        except (DecodeError, UnicodeDecodeError) as error:
+            raise Fault("INVALID_ARGUMENT", f"{method}: the bytes are no {kind.DESCRIPTOR.name}: {error}") from error
+        try:
+            return bytes(does(message).SerializeToString())
+        except NotReady as error:
+            raise Fault("FAILED_PRECONDITION", f"{method}: {error}") from error
+        except ValueError as error:
+            raise Fault("INVALID_ARGUMENT", f"{method}: {error}") from error
+
+    def close(self) -> None:
+        """Say what came of all questions, and end the planner's thread."""
+        log.warning("all sessions: %s", _told(self.counts))
+        self._planner.close()
+
+    def _rollout(self, uuid: str) -> _Rollout:
+        with self._lock:
+            rollout = self._rollouts.get(uuid)
+        if rollout is None:
+            raise Fault("NOT_FOUND", f"session_uuid={uuid[:64]!r}: no such session; start_session opens one")
+        return rollout
+
+    def _get_version(self, _: Any) -> Any:
+        return self._proto.VersionId(version_id=self._version, grpc_api_version=self._proto.ALPASIM_API_VERSION)
+
+    def _start_session(self, message: Any) -> Any:
+        uuid = message.session_uuid
+        if not 0 < len(uuid) <= 128:
+            raise ValueError(f"session_uuid: 1 to 128 characters, not {len(uuid)}")
+        declared = message.rollout_spec.vehicle.available_cameras
+        cameras = session_cameras(declared, self._needs.image, self._given)
+        session = Session(cameras, frozenset(camera.logical_id.lower() for camera in declared))
+        with self._lock:
+            if uuid in self._rollouts:
+                raise Fault("ALREADY_EXISTS", f"session_uuid={uuid!r} is open")
+            if len(self._rollouts) >= SESSIONS:
+                raise Fault("RESOURCE_EXHAUSTED", f"{SESSIONS} sessions are open: close_session ends one")
+            self._rollouts[uuid] = _Rollout(session)
+        return self._proto.SessionRequestStatus()
+
+    def _close_session(self, message: Any) -> Any:
+        rollout = self._rollout(message.session_uuid)
+        with self._lock:
+            self._rollouts.pop(message.session_uuid, None)
+        log.warning("session %s: %s", message.session_uuid, _told(rollout.counts))
+        return self._proto.Empty()
+
+    def _submit_image(self, message: Any) -> Any:
+        rollout, image = self._rollout(message.session_uuid), message.camera_image
+        stamp = _stamp("camera_image.frame_end_us", image.frame_end_us)
+        with rollout.lock:
+            rollout.session.keep_frame(image.logical_id.lower(), stamp, image.image_bytes)
+        return self._proto.Empty()
+
+    def _submit_egomotion(self, message: Any) -> Any:
+        rollout, states = self._rollout(message.session_uuid), states_of(message)
+        with rollout.lock:
+            rollout.session.keep_states(states)
+        return self._proto.Empty()
+
+    def _submit_route(self, message: Any) -> Any:
+        rollout, points = self._rollout(message.session_uuid), route_of(message.route)
+        stamp = _stamp("route.timestamp_us", message.route.timestamp_us)
+        with rollout.lock:
+            rollout.session.keep_route(stamp, points)
+        return self._proto.Empty()
+
+    def _ignore(self, message: Any) -> Any:
+        self._rollout(message.session_uuid)
+        return self._proto.Empty()
+
+    def _drive(self, message: Any) -> Any:
+        rollout = self._rollout(message.session_uuid)
+        now, query = (_stamp(name, getattr(message, name)) for name in ("time_now_us", "time_query_us"))
+        if not now <= query <= now + QUERY_US:
+            raise ValueError(f"time_query_us={query}: from time_now_us={now} to {QUERY_US} us later")
+        with rollout.lock:
+            plan, state, begin = self._planned_now(rollout, now, message.session_uuid)
+        answer = self._proto.DriveResponse()
+        for stamp, (x, y, heading) in local_poses(plan, state, begin, now, query).items():
+            at = answer.trajectory.poses.add(timestamp_us=stamp)
+            at.pose.vec.x, at.pose.vec.y, at.pose.vec.z = x, y, state[3]
+            at.pose.quat.w, at.pose.quat.z = np.cos(heading / 2.0), np.sin(heading / 2.0)
+        return answer
+
+    def _planned_now(self, rollout: _Rollout, now: int, uuid: str) -> tuple[Array, Array, int]:
+        """A plan, the state and the stamp that it begins at; the fallback where the planner has none."""
+        try:
+            moment = moment_of(rollout.session, now)
+            seen, layout = moment.observed(self._rule), self._needs.image
+            plan = self._plan_of(seen, None if layout is None else moment.draw(layout))
+            what = "plans"
+        except Unseen as error:
+            moment = Moment(rollout.session, now)
+            plan, what = straight_on(moment.state), "fallbacks"
+            log.warning("session %s at %d us: straight on at the ego's speed: %s", uuid, now, error)
+        with self._lock:
+            rollout.counts[what] += 1
+            self.counts[what] += 1
+        return plan, moment.state, moment.stamp_us
+
+    def _plan_of(self, seen: AgentObservation, picture: Any) -> Array:
+        """Raises Unseen for what is no plan."""
+        try:
+            plan = self._planner.plan(ObservationRow(seen, drawer(picture)))
+            check_plan(plan, "the planner")
+        except ValueError as error:
+            raise Unseen(str(error)) from error
+        return plan
+
+
+def _told(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{counts[what]} {what}" for what in ("plans", "fallbacks"))
+
+
+def start_server(driver: Driver, host: str, port: int) -> tuple[Any, int]:
+    """A started gRPC server and its port; 0 asks for a free one. Raises Refused where the port is not to be had."""
+    import grpc
+
+    def handler(method: str) -> Any:
+        def answer(request: bytes, context: Any) -> bytes:
+            if method == "get_version":
+                context.send_initial_metadata(CONTRACT)
+            try:
+                return driver.answer(method, request)
+            except Fault as fault:
+                context.abort(grpc.StatusCode[fault.status], str(fault))
+                raise  # abort has raised
+
+        return grpc.unary_unary_rpc_method_handler(answer)  # bytes as they are: what is no message is ours to refuse
+
+    options = [
+        ("grpc.max_receive_message_length", MESSAGE_BYTES),
+        ("grpc.max_send_message_length", MESSAGE_BYTES),
+        ("grpc.so_reuseport", 0),  # a second server on a port is refused, not given every other question
+    ]
+    pool = ThreadPoolExecutor(SESSIONS, "rpc")
+    server = grpc.server(pool, options=options, maximum_concurrent_rpcs=4 * SESSIONS)
+    handlers = {method: handler(method) for method in driver.methods}
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, handlers),))
+    try:
+        bound = server.add_insecure_port(f"{host}:{port}")
+    except RuntimeError as error:
+        raise Refused(f"host={host} port={port}: {error}; give another port=, or 0 for a free one") from error
+    server.start()
+    return server, bound
+
+
+def serve(driver: Driver, host: str, port: int) -> None:
+    """Answer until SIGTERM. Raises Refused where the port is not to be had."""
+    server, bound = start_server(driver, host, port)
+    signal.signal(signal.SIGTERM, lambda number, frame: server.stop(5.0))
+    print(f"answers at {host}:{bound}", flush=True)
+    try:
+        server.wait_for_termination()
+    finally:
+        driver.close()
