@@ -22,8 +22,8 @@ class Request:
     host: str = "127.0.0.1"  # this and what follows: of alpasim; 0.0.0.0 lets other machines in
     port: int = 6789  # 0 for a free one
     command: Literal["trained", "curvature", "simscale"] = "trained"  # by which rule it is told where the route goes
-    batch: int = 1  # plans at a time; a rollout alone waits for batch_wait_ms, and costs as much as that many
-    batch_wait_ms: int = 2
+    batch: int = 1  # plans at a time, of several sessions; above 1 rounding depends on who else asks
+    batch_wait_ms: int = 2  # for others, of larger batches
 
     def __post_init__(self) -> None:
         """Raises ValueError for numbers that cannot be, and undistort without a lens to know."""

@@ -152,10 +152,14 @@ def session_cameras(declared: Sequence[Any], layout: ImageLayout | None, given: 
 
 
 class BatchedPlanner:
-    """A planner that is asked from many threads and plans batches of one size, so that no plan depends on another."""
+    """A planner that is asked from many threads, by one of its own.
+
+    In batches of one a plan depends on its row alone, to the last bit. In larger ones its rounding depends on how many
+    are planned with it, and at which place.
+    """
 
     def __init__(self, made: Any, needs: Needs, device: str, size: int, wait_s: float) -> None:
-        """size: of every batch, repeated rows where fewer ask; wait_s: for others, once one has asked."""
+        """size: of a batch at most; wait_s: for others, once one has asked."""
         self._made, self._needs, self._device, self._size, self._wait_s = made, needs, device, size, wait_s
         self._asked: Queue[tuple[ObservationRow, Future[Array]] | None] = Queue()
         self._thread = threading.Thread(target=self._work, name="planner", daemon=True)
@@ -202,12 +206,12 @@ class BatchedPlanner:
     def _planned(self, rows: Sequence[ObservationRow]) -> Array:
         import torch
 
-        buffer = BatchBuffer(self._size, self._needs, 0)
-        for i in range(self._size):
-            buffer.fill(i, rows[i % len(rows)], 0)
-        nobody = np.zeros(self._size, bool)
+        buffer = BatchBuffer(len(rows), self._needs, 0)
+        for i, row in enumerate(rows):
+            buffer.fill(i, row, 0)
+        nobody = np.zeros(len(rows), bool)
         torch.manual_seed(0)  # of a planner that draws, as the public DiffusionDrive does
-        return plan_batch(self._made, buffer.batch(["alpasim"] * self._size, nobody, nobody).to(self._device))
+        return plan_batch(self._made, buffer.batch(["alpasim"] * len(rows), nobody, nobody).to(self._device))
 
 
 # The service.
