@@ -139,7 +139,7 @@ COMPILE = build/tools/bin/uv pip compile -q --universal --generate-hashes --no-a
 locks: build/tools/.installed
 	$(COMPILE) --group build -o locks/build.lock
 	$(COMPILE) --group tools -c locks/build.lock -o locks/tools.lock
-	$(COMPILE) pyproject.toml --extra planners --extra gpu -c locks/build.lock -o locks/planners.lock
+	$(COMPILE) pyproject.toml --extra planners --extra gpu --extra alpasim -c locks/build.lock -o locks/planners.lock
 	$(COMPILE) pyproject.toml --extra run -c locks/planners.lock -o locks/run.lock
 	$(COMPILE) pyproject.toml --extra dev -c locks/planners.lock -o locks/dev.lock
 	awk '/^[^ ]/ {kept = !/^(torch|triton|cuda-|nvidia-)/} kept' locks/dev.lock >build/dev.lock

@@ -23,7 +23,7 @@ from factory.config.compose import ConfigError
 from planners.alpasim.session import (
     SECOND_US,
     Moment,
-    NotReady,
+    PoseUnknown,
     Session,
     Unseen,
     drawer,
@@ -292,7 +292,7 @@ class Driver:
             raise Fault("INVALID_ARGUMENT", f"{method}: the bytes are no {kind.DESCRIPTOR.name}: {error}") from error
         try:
             return bytes(does(message).SerializeToString())
-        except NotReady as error:
+        except PoseUnknown as error:
             raise Fault("FAILED_PRECONDITION", f"{method}: {error}") from error
         except ValueError as error:
             raise Fault("INVALID_ARGUMENT", f"{method}: {error}") from error

@@ -34,7 +34,7 @@ X, Y, HEADING, Z, VX, VY, AX, AY, YAW_RATE = range(9)  # of a state: local [m], 
 T = TypeVar("T")
 
 
-class NotReady(ValueError):
+class PoseUnknown(ValueError):
     """A question before what it is about was sent."""
 
 
@@ -127,12 +127,12 @@ class Moment:
 def moment_of(session: Session, now_us: int) -> Moment:
     """The moment of the newest pictures by now; now itself where the planner looks at none.
 
-    Raises NotReady where the ego's pose is not known now, Unseen where a camera has no picture of it.
+    Raises PoseUnknown where the ego's pose is not known now, Unseen where a camera has no picture of it.
     """
     newest = max(session.states, default=None)
     if newest is None or now_us - newest > STALE_US or now_us < min(session.states):
         known = "none" if newest is None else f"{min(session.states)} to {newest} us"
-        raise NotReady(f"time_now_us={now_us}: send the ego's poses up to it before drive; known: {known}")
+        raise PoseUnknown(f"time_now_us={now_us}: send the ego's poses up to it before drive; known: {known}")
     if not session.cameras:
         return Moment(session, now_us)
     stamps = {camera: newest_by(session.frames.get(camera, {}), now_us) for camera in session.cameras}

@@ -72,7 +72,7 @@ def _modules(node: ast.AST, at_import: bool) -> Iterator[str]:
     [
         ("tasks", ("run", "gpu")),
         ("factory", ("run", "gpu", "navsim")),
-        ("planners", ("planners",)),
+        ("planners", ("planners", "alpasim")),
     ],
 )
 def test_every_import_is_declared_where_it_belongs(package: str, extras: tuple[str, ...]) -> None:
