@@ -35,6 +35,7 @@ from planners.evaluation.evaluate import settings_of as evaluate_settings
 from planners.evaluation.replay import settings_of as replay_settings
 from planners.models.settings import settings_of
 from planners.published.import_planner import config_of as import_config
+from planners.serve import Request as ServeRequest
 from planners.training.train import TrainConfig
 from tasks.caches import user_cache
 from tasks.kernels.compiled import cache_dir
@@ -190,6 +191,8 @@ def test_every_command_is_one_its_program_takes(
             replay_settings(arguments)
         case ["python", "-m", "planners", "drive", *arguments]:
             drive_settings(arguments)
+        case ["python", "-m", "planners", "serve", *arguments]:
+            parse(ServeRequest, arguments)  # it would serve until it is stopped
         case ["python", "-m", "tests.bench.bench_scenes", *arguments]:
             assert set(pairs(given(arguments))) <= {"openscene", "front", "kitti", "town", "out", "iterations"}
         case ["python", "-m", "tests.bench.bench_kitti", _, *arguments]:

@@ -245,7 +245,9 @@ class Driver:
         try:
             from carla_driver_interface import protocol
         except ModuleNotFoundError as error:
-            raise ConfigError(f'protocol=alpasim: {error}; pip install "driving-data-factory[alpasim]"') from error
+            raise ConfigError(
+                f'protocol=alpasim: {error}; pip install "driving-data-factory[planners,alpasim]"'
+            ) from error
         self._proto, self._given = protocol, cameras
         made, self._needs = load_for_agent(planner, device, "AlpaSim")
         layout = self._needs.image

@@ -23,6 +23,7 @@ DISTRIBUTIONS = {  # of modules whose distribution has another name
     "cv2": "opencv-python-headless",
     "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
     "google": "protobuf",
+    "grpc": "grpcio",
     "hydra": "hydra-core",
     "mcap_protobuf": "mcap-protobuf-support",
     "yaml": "pyyaml",
