@@ -405,6 +405,18 @@ def close_all_but(driver: Driver, kept: str) -> None:
         driver.answer("close_session", protocol.DriveSessionCloseRequest(session_uuid=uuid).SerializeToString())
 
 
+def extremes(rng: random.Random) -> list[tuple[str, Any]]:
+    """What a session may hold and no rollout would: cut pictures, poses as far and as fast as they are taken."""
+    stamps = (0, 17_000, 500_000, rng.choice([600_000, 2**31 - 1, 2**62]))
+    far = [sent.pose_at(stamp, rng.choice([-1e7, 0.0, 1e7]), 1e7, rng.uniform(-9, 9)) for stamp in stamps]
+    motion = sent.egomotion("open", far, rng.choice([-1e7, 0.0, 1e7]), rng.choice([-1e7, 0.1, 1e7]))
+    cut = [sent.picture("open", name, 17_000) for name in sent.YAWS]
+    for message in cut:
+        message.camera_image.image_bytes = message.camera_image.image_bytes[: rng.choice([700, 900, 5000])]
+    pictures = [("submit_image_observation", message) for message in cut]
+    return [("submit_egomotion_observation", motion), ("submit_route", sent.route_request("open", 0, 1.0)), *pictures]
+
+
 @pytest.mark.parametrize("method", REQUESTS)
 def test_no_message_ends_the_driver_or_hurts_another_session(served: tuple[Driver, Any], method: str) -> None:
     driver, stub = served
@@ -417,6 +429,8 @@ def test_no_message_ends_the_driver_or_hurts_another_session(served: tuple[Drive
         if i % 10 == 0:
             close_all_but(driver, "other")
             driver.answer("start_session", sent.start("open").SerializeToString())
+            for request in extremes(rng):
+                getattr(InProcess(driver), request[0])(request[1])
         damaged = bytearray(valid)
         damaged[rng.randrange(40)] = rng.randrange(256)
         for request in (scrambled(REQUESTS[method](), rng).SerializeToString(), rng.randbytes(i), bytes(damaged)):
