@@ -56,3 +56,7 @@ def test_a_turn_that_has_begun_is_one_though_the_sent_points_are_straight_again(
     after = np.column_stack([np.full(100, 20.0), 12.0 + np.arange(0.5, 50.5, 0.5), np.full(100, np.pi / 2)])
     route = np.concatenate([ahead, bend, after])
     assert driving_command(route, np.zeros(3)) == command_of_points(route_points(route), "curvature") == "left"
+
+
+def test_an_ego_beside_its_straight_route_is_told_straight_where_the_route_begins_at_it() -> None:
+    assert command_of_points(np.column_stack([SENT_M, np.ones(len(SENT_M))]), "curvature") == "straight"
