@@ -11,7 +11,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from queue import Empty, Queue
 from typing import Any
 
@@ -249,12 +249,13 @@ class Driver:
                 f'protocol=alpasim: {error}; pip install "driving-data-factory[planners,alpasim]"'
             ) from error
         self._proto, self._given = protocol, cameras
-        made, self._needs = load_for_agent(planner, device, "AlpaSim")
-        layout = self._needs.image
+        made, needs = load_for_agent(planner, device, "AlpaSim")
+        self._rule: CommandRule = command or needs.command
+        self._needs = replace(needs, command="navsim")  # the rows have one already, by the rule
+        layout = needs.image
         places = () if layout is None else layout.cameras or cameras
         if len(cameras) not in (0, len(places)):
             raise ConfigError(f"cameras: {len(cameras)}, in the places of {len(places)}: {', '.join(places) or 'none'}")
-        self._rule: CommandRule = command or self._needs.command
         who = find_planner(planner)
         self._version = f"driving-data-factory {__version__} {who.label} {who.digest}"
         self.counts: Counter[str] = Counter()

@@ -16,10 +16,10 @@ from tests.planners import scenes
 FAMILIES = ("ego_mlp_small", "ltf_small", "diffusiondrive_small", "gtrs_dense_small")
 
 
-def made(name: str, **image: object) -> Planner:
+def made(name: str, command: str = "navsim", **image: object) -> Planner:
     """The planner of conf/planner/<name>.yaml with random weights, so that no two inputs are planned alike."""
     content = yaml.safe_load((conf_dir() / "planner" / f"{name}.yaml").read_text())
-    settings = content.get("settings", {})
+    settings = content.get("settings", {}) | ({} if command == "navsim" else {"command": command})
     if image:
         settings["image"] = settings["image"] | image
     trajectories = scenes.vocabulary(64)
