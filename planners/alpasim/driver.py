@@ -26,7 +26,6 @@ from planners.alpasim.session import (
     PoseUnknown,
     Session,
     Unseen,
-    drawer,
     local_poses,
     moment_of,
     straight_on,
@@ -394,7 +393,7 @@ class Driver:
     def _plan_of(self, seen: AgentObservation, picture: Any) -> Array:
         """Raises Unseen for what is no plan."""
         try:
-            plan = self._planner.plan(ObservationRow(seen, drawer(picture)))
+            plan = self._planner.plan(ObservationRow(seen, lambda layout, out: np.copyto(out, picture)))
             check_plan(plan, "the planner")
         except ValueError as error:
             raise Unseen(str(error)) from error
@@ -433,7 +432,9 @@ def start_server(driver: Driver, host: str, port: int) -> tuple[Any, int]:
     try:
         bound = server.add_insecure_port(f"{host}:{port}")
     except RuntimeError as error:
-        raise Refused(f"host={host} port={port}: {error}; give another port=, or 0 for a free one") from error
+        raise Refused(
+            f"host={host} port={port}: {str(error).rstrip('.')}; give another port=, or 0 for a free one"
+        ) from error
     server.start()
     return server, bound
 

@@ -5,9 +5,8 @@ Frames: `local` is the rollout's fixed one, `rig` the ego's: x ahead, y left, z 
 axle.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -201,12 +200,3 @@ def local_poses(plan: Array, state: Array, begin_us: int, now_us: int, query_us:
     beyond = np.maximum(after_us - knots_us[-1], 0)[:, None] / STEP_US
     poses[:, :HEADING] += beyond * (knots[-1] - knots[-2])[:HEADING]
     return dict(zip(stamps, to_world(state[: HEADING + 1], poses)))
-
-
-def drawer(picture: Bytes) -> Callable[[ImageLayout, Bytes], None]:
-    """What writes a picture that is drawn already."""
-    return partial(_copy, picture)
-
-
-def _copy(picture: Bytes, layout: ImageLayout, out: Bytes) -> None:
-    out[:] = picture

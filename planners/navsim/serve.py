@@ -16,6 +16,7 @@ import numpy as np
 
 from factory.config.arguments import Refused
 from factory.config.compose import ConfigError
+from factory.wording import one_line
 from planners.data.batch import COMMANDS, Batch, ImageLayout, Needs
 from planners.data.decode import BatchBuffer, StoredRows
 from planners.data.images import chosen_cameras, stitch_pixels
@@ -65,10 +66,15 @@ class AgentObservation:
 def load_for_agent(planner: str, device: str, shown_by: str) -> tuple[Any, Needs]:
     """A planner that plans from cameras, status and command alone, on its device, and what it needs to plan.
 
-    Raises ConfigError for one that wants more than `shown_by` shows an agent.
+    Raises ConfigError for one that wants more than `shown_by` shows an agent, and for a device that is not there.
     """
+    import torch
     from torch import nn
 
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # the latter of a PyTorch without CUDA
+        raise ConfigError(f"device={device}: {one_line(error)}") from error
     who = find_planner(planner)
     if who.load is None:
         raise ConfigError(f"planner={planner} plans from the log itself, which {shown_by} shows no agent")
@@ -192,7 +198,7 @@ def answer_agent(planner: str, device: str, cameras: Sequence[str], undistort: b
     with suppress(BrokenPipeError):  # who asked has gone
         try:
             pilot = AgentPlanner(planner, cameras, undistort, device)
-        except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: a device that is not there
+        except (ValueError, OSError) as error:
             send(answers, {"error": str(error)})
             raise Refused(str(error)) from error
         send(answers, {"cameras": np.array(pilot.cameras, dtype=str)})

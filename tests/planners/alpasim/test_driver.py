@@ -281,6 +281,8 @@ def test_planners_that_want_more_than_is_sent_are_refused_in_one_line(tmp_path: 
             Driver(planner)
     with pytest.raises(ConfigError, match="cameras: 1, in the places of 0: none"):
         Driver(BLIND, cameras=["CAM_F0"])
+    with pytest.raises(ConfigError, match="device=nowhere: "):
+        Driver(BLIND, device="nowhere")
     driver = Driver(looking, cameras=["CAM_R0", "CAM_F0", "CAM_L0"])
     driver.answer("start_session", sent.start("other order").SerializeToString())
     assert "INVALID_ARGUMENT start_session: rollout_spec.vehicle.available_cameras: no cam_r0" in refused(
