@@ -12,6 +12,7 @@ import weakref
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 from math import pi
 from typing import Any
 
@@ -53,6 +54,7 @@ class Device:
         return torch.as_tensor(np.ascontiguousarray(array, np.float32), device=self.name)
 
 
+@cache
 def cuda(packed: bool) -> Device:
     """This process's GPU. Raises BackendMissing."""
     take_gpu()

@@ -23,8 +23,8 @@ from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
 from tests.factory.toy import COLD, ColdWork, DyingWork, ToyWork, executed, refs
 
 LARGE = "64m"
-TOWN = ["clips.n_clips=3", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none"]
-TOWN += ["vocabulary.k=128", "rounds=2", "executor=local", "shard_seconds=0.001"]  # 6 MB, the pages 0.5 of them
+TOWN = ["clips.n_clips=5", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none"]
+TOWN += ["vocabulary.k=128", "rounds=2", "executor=local", "shard_seconds=0.001"]  # 8 MB, the pages 0.5 of them
 FULL = r"the disk is full: [\d,]+ bytes are needed, [\d,]+ are free; free disk space and run the same"
 ONE_LINE = rf"(?:error: )?{{out}}/\S+: {FULL}"
 
