@@ -4,6 +4,7 @@
 """
 
 import gc
+import os
 import signal
 from pathlib import Path
 
@@ -14,6 +15,9 @@ UNTIMED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow]) 
 settings.register_profile("search", UNTIMED)
 settings.register_profile("repeatable", UNTIMED, derandomize=True)
 settings.load_profile("repeatable")
+
+# Read when gRPC is first used: its handlers of fork() hold up what Ray forks, where a test of this process has used it.
+os.environ["GRPC_ENABLE_FORK_SUPPORT"] = "0"
 
 # Commands that tests start heed these, also where a shell or nohup has begun the suite itself with them ignored.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
