@@ -13,7 +13,8 @@ from tasks.world.arrays import Array
 from tasks.world.road_map import LATERAL_M, LOOKAHEAD_M, SPACING_M, arc_lengths
 
 # navsim: where the route lies 20 m ahead. curvature: where the arc from the ego through its first points lies there, on
-# arcs the same. simscale: which side its first point from 5 m on lies to (SimScale's AlpaSim samples 1f8272a).
+# arcs the same. simscale: which side its first point from 5 m on lies to, as SimScale's AlpaSim samples have it
+# (NVlabs/alpasim a2a98a2, command_from_route), to whom a route of NaN alone is straight.
 CommandRule = Literal["navsim", "curvature", "simscale"]
 FITTED = 3  # points: the first ones from LOOKAHEAD_M on
 SIMSCALE_FROM_M = 5.0
@@ -22,24 +23,26 @@ SENT_FROM_M = 40.0
 
 
 def command_of_points(points: Array, rule: CommandRule) -> str:
-    """left, straight, right, or unknown where no point lies far enough ahead.
+    """left, straight, right, or unknown where no point lies far enough ahead; by simscale, where nothing was sent.
 
     points: (N, 2) x, y [m] in the ego frame at now, in the order of the route; NaN where there is none.
     navsim is curvature here: these points do not begin at the ego. The arc leaves the ego straight ahead, y = k d^2 / 2
     at the distance d; k by least squares. It lies 2 sin^2(10 k) / k to a side 20 m along it.
     """
-    points = points[np.isfinite(points).all(axis=1)]
+    sent, points = len(points) > 0, points[np.isfinite(points).all(axis=1)]
     distance = np.hypot(*points.T)
     if rule == "simscale":
         ahead = points[distance >= SIMSCALE_FROM_M]
-        side = float(ahead[0, 1]) if len(ahead) else None
-    else:
-        ahead = points[distance >= LOOKAHEAD_M][:FITTED]
-        square = (ahead**2).sum(axis=1)
-        bend = 2.0 * (ahead[:, 1] @ square) / (square @ square) if len(ahead) else 0.0  # 1/m
-        side = bend * LOOKAHEAD_M**2 / 2.0 * np.sinc(bend * LOOKAHEAD_M / (2.0 * np.pi)) ** 2 if len(ahead) else None
-    if side is None:
+        if not len(ahead):
+            return "straight" if sent else "unknown"
+        side = float(ahead[0, 1])
+        return "left" if side > LATERAL_M else "right" if side < -LATERAL_M else "straight"
+    ahead = points[distance >= LOOKAHEAD_M][:FITTED]
+    if not len(ahead):
         return "unknown"
+    square = (ahead**2).sum(axis=1)
+    bend = 2.0 * (ahead[:, 1] @ square) / (square @ square)  # 1/m
+    side = bend * LOOKAHEAD_M**2 / 2.0 * np.sinc(bend * LOOKAHEAD_M / (2.0 * np.pi)) ** 2
     return "left" if side >= LATERAL_M else "right" if side <= -LATERAL_M else "straight"
 
 

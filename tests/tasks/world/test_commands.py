@@ -36,10 +36,28 @@ def test_a_route_s_points_are_those_that_alpasim_sends(rule: str) -> None:
     assert np.isnan(points[:10]).all() and np.isnan(points[17:]).all(), "before 40 m, and beyond its end"
     np.testing.assert_allclose(points[10:17], np.column_stack([SENT_M[10:17], np.full(7, 0.4)]), atol=1e-9)
     assert command_of_points(points, rule) == "straight"  # type: ignore[arg-type]
-    assert command_of_points(points[:10], rule) == "unknown"  # type: ignore[arg-type]
+    nothing_ahead = "straight" if rule == "simscale" else "unknown"
+    assert command_of_points(points[:10], rule) == nothing_ahead  # type: ignore[arg-type]
     assert command_of_points(points[:0], rule) == "unknown"  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"route_centerline is empty.*command=navsim"):
         route_points(route[:0])
+
+
+@pytest.mark.parametrize(
+    ("points", "theirs"),
+    [
+        ([], "unknown"),
+        ([(np.nan, np.nan)] * 20, "straight"),
+        ([(4.0, 2.9), (-1.0, 0.0)], "straight"),
+        ([(4.0, 2.9), (np.nan, 9.0), (4.0, 3.1)], "left"),
+        ([(6.0, 2.0)], "straight"),
+        ([(6.0, -2.0)], "straight"),
+        ([(6.0, -2.25), (40.0, 30.0)], "right"),
+    ],
+)
+def test_simscale_s_rule_is_its_own_code_s(points: list[tuple[float, float]], theirs: str) -> None:
+    """As `command_from_route` of NVlabs/alpasim a2a98a2 answers (e2e_challenge/sample_submission_simscale_*)."""
+    assert command_of_points(np.array(points, float).reshape(-1, 2), "simscale") == theirs
 
 
 def test_a_heading_that_flips_simscale_s_rule_on_a_straight_road_does_not_flip_ours() -> None:
