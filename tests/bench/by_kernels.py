@@ -47,31 +47,17 @@ class _Blended(torch.autograd.Function):
         return None, None, None, *tensors
 
 
-def rasterization(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    near_plane: float,
-    eps2d: float,
-    rasterize_mode: str,
-    sh_degree: int | None,
-    packed: bool,
-    render_mode: str,
-) -> tuple[Tensor, Tensor, None]:
+def rasterization(**given: Any) -> tuple[Tensor, Tensor, None]:
     """What stands for `gsplat.rasterization` on the CPU: its arguments drawn by `raster.forward`."""
-    assert near_plane == NEAR_M and render_mode == "RGB+ED"
-    colours, rest = colors, torch.zeros(len(means), 0, 3)
-    if sh_degree is not None:
-        colours, rest = colors[:, 0] * sh.C0 + 0.5, colors[:, 1:]
-    scene = Gaussians(*(part.numpy() for part in (means, quats, scales.log(), opacities, colours, rest)))
-    screen = ScreenFilter(eps2d, rasterize_mode == "antialiased")
-    eyes = zip(Ks.double().numpy(), torch.inverse(viewmats.double()).numpy())
-    seen = [forward(scene, k, pose, width, height, np.zeros(3, np.float32), 1, screen).view for k, pose in eyes]
+    assert given["near_plane"] == NEAR_M and given["render_mode"] == "RGB+ED"
+    colours, rest = given["colors"], torch.zeros(len(given["means"]), 0, 3)
+    if given["sh_degree"] is not None:
+        colours, rest = colours[:, 0] * sh.C0 + 0.5, colours[:, 1:]
+    shapes = given["means"], given["quats"], given["scales"].log(), given["opacities"]
+    scene = Gaussians(*(part.numpy() for part in (*shapes, colours, rest)))
+    screen = ScreenFilter(given["eps2d"], given["rasterize_mode"] == "antialiased")
+    size, black = (given["width"], given["height"]), np.zeros(3, np.float32)
+    eyes = zip(given["Ks"].double().numpy(), torch.inverse(given["viewmats"].double()).numpy())
+    seen = [forward(scene, k, pose, *size, black, 1, screen).view for k, pose in eyes]
     drawn = torch.from_numpy(np.stack([np.dstack([view.rgb, view.depth]) for view in seen]))
     return drawn, torch.from_numpy(np.stack([view.alpha for view in seen]))[..., None], None

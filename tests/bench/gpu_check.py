@@ -294,7 +294,7 @@ def _shifted(x: float) -> NDArray[np.float64]:
     return pose
 
 
-class Both(io.TextIOBase):
+class Tee(io.TextIOBase):
     """Writes to the screen and to a page."""
 
     def __init__(self, *places: TextIO) -> None:
@@ -311,7 +311,7 @@ class Both(io.TextIOBase):
 def main(options: dict[str, str]) -> int:
     """The exit code; what is printed is written to a page as well."""
     page = Path(options.get("page", "gpu-check.txt"))
-    with page.open("w") as kept, redirect_stdout(Both(sys.stdout, kept)):
+    with page.open("w") as kept, redirect_stdout(Tee(sys.stdout, kept)):
         code = checked(options)
     if code == 2:
         page.unlink()

@@ -39,7 +39,7 @@ from tasks.render.scene.on_device import sky_places
 from tasks.render.scene.sky import COLUMNS
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gradient import Gradients
-from tasks.render.splatting.tensors import Draw, Eye, SceneTensors, moved
+from tasks.render.splatting.tensors import Draw, Eye, SceneTensors, hamilton, moved
 from tasks.world.arrays import F32, Array, Ints, ShortInts
 
 # What the fit does to pictures and Gaussians, once more for tensors: each the twin of the numba or numpy function
@@ -178,16 +178,7 @@ def _upright(quats: Tensor, slope_x: Tensor, slope_y: Tensor) -> Tensor:
     normal = normal / normal.norm(dim=1, keepdim=True)
     normal = torch.where(((axis * normal).sum(1) < 0.0)[:, None], -normal, normal)  # the other face of the disc
     turn = torch.cat([1.0 + (axis * normal).sum(1, keepdim=True), torch.linalg.cross(axis, normal)], dim=1)
-    tw, tx, ty, tz = (turn / turn.norm(dim=1, keepdim=True)).unbind(1)
-    return torch.stack(
-        [
-            tw * w - tx * x - ty * y - tz * s,
-            tw * x + tx * w + ty * s - tz * y,
-            tw * y - tx * s + ty * w + tz * x,
-            tw * s + tx * y - ty * x + tz * w,
-        ],
-        dim=1,
-    )
+    return hamilton(turn / turn.norm(dim=1, keepdim=True), torch.stack([w, x, y, s], dim=1))
 
 
 DEVICE_SIDE = (*SHAPES, "sky")

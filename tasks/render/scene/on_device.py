@@ -31,6 +31,7 @@ from tasks.render.splatting.gaussians import Gaussians, quats_of
 from tasks.render.splatting.gsplat_backend import plain_arguments, take_gpu
 from tasks.render.splatting.project import FITTED, ScreenFilter
 from tasks.render.splatting.raster import View
+from tasks.render.splatting.tensors import hamilton
 from tasks.world.arrays import F32, Array, Bytes
 from tasks.world.clip import Pinhole
 
@@ -172,17 +173,7 @@ def _moved(device: Device, nodes: Sequence[Gaussians], poses: Array) -> list[Gau
     mine = where.to(device.name)[of]
     turn, shift, quats = mine[:, :12].view(-1, 3, 4)[..., :3], mine[:, 3:12:4], mine[:, 12:]
     means = (turn * torch.cat([part.means for part in parts])[:, None]).sum(-1) + shift
-    lw, lx, ly, lz = quats.unbind(1)
-    rw, rx, ry, rz = torch.cat([part.quats for part in parts]).unbind(1)
-    turned = torch.stack(
-        [
-            lw * rw - lx * rx - ly * ry - lz * rz,
-            lw * rx + lx * rw + ly * rz - lz * ry,
-            lw * ry - lx * rz + ly * rw + lz * rx,
-            lw * rz + lx * ry - ly * rx + lz * rw,
-        ],
-        dim=1,
-    )
+    turned = hamilton(quats, torch.cat([part.quats for part in parts]))
     at = zip(parts, poses, means.float().split(lengths), turned.float().split(lengths))
     return [
         GaussianTensors(mean, quat, part.log_scales, part.opacities, part.colours, _turned_light(device, part, pose))

@@ -52,19 +52,22 @@ def own_place() -> int:
     first."""
     folder = Path(tempfile.gettempdir()) / f"driving-data-factory-gpu-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    for place in count():
-        held = (folder / str(place)).open("w")
-        try:
-            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            held.close()
-            continue
-        _PLACES.append(held)
-        return place
-    raise AssertionError("numbers do not end")
+    return next(place for place in count() if _hold(folder / str(place)))
 
 
-_PLACES: list[TextIO] = []  # open until the process ends
+def _hold(path: Path) -> bool:
+    """Whether the file is this process's from now on, until it ends."""
+    file = path.open("w")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        return False
+    _HELD.append(file)  # its lock ends with it
+    return True
+
+
+_HELD: list[TextIO] = []
 
 
 def plain_arguments(

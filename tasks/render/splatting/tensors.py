@@ -1,7 +1,7 @@
 """A scene as tensors, drawn by gsplat on CUDA so that torch knows the derivatives.
 
-It takes what is learned (log-scales, logits), keeps to one camera, and leaves the background to whoever calls. torch is
-imported here and in `tasks.render.fit.on_torch` alone; nothing but render.backend=gsplat loads either.
+It takes what is learned (log-scales, logits), keeps to one camera, and leaves the background to whoever calls. Nothing
+but render.backend=gsplat loads it, `tasks.render.fit.on_torch` and `tasks.render.scene.on_device`, and torch with them.
 """
 
 from collections.abc import Callable
@@ -61,10 +61,24 @@ Draw = Callable[[SceneTensors, Eye], Splatted]
 def moved(scene: SceneTensors, target_from_source: Array) -> SceneTensors:
     """As `gaussians.moved`."""
     rotation, like = target_from_source[:3, :3], scene.means
-    w, x, y, z = quats_of(rotation[None])[0]
-    product = _tensor(np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]), like)
     means = scene.means @ _tensor(rotation.T, like) + _tensor(target_from_source[:3, 3], like)
-    return SceneTensors(means, scene.quats @ product.T, scene.log_scales, scene.logits, scene.colours)
+    quats = hamilton(_tensor(quats_of(rotation[None]), like), scene.quats)
+    return SceneTensors(means, quats, scene.log_scales, scene.logits, scene.colours)
+
+
+def hamilton(left: Tensor, right: Tensor) -> Tensor:
+    """Products left * right (N, 4) of quaternions w, x, y, z: who is turned by `right` and then by `left`."""
+    lw, lx, ly, lz = left.unbind(1)
+    rw, rx, ry, rz = right.unbind(1)
+    return torch.stack(
+        [
+            lw * rw - lx * rx - ly * ry - lz * rz,
+            lw * rx + lx * rw + ly * rz - lz * ry,
+            lw * ry - lx * rz + ly * rw + lz * rx,
+            lw * rz + lx * ry - ly * rx + lz * rw,
+        ],
+        dim=1,
+    )
 
 
 def _tensor(array: Any, like: Tensor) -> Tensor:
