@@ -246,18 +246,23 @@ def with_partition_columns(stored: pa.Table, schema: pa.Schema, partition: Mappi
 
 def open_parquet(location: Location, path: str) -> pq.ParquetFile:
     """One file. Only where reading costs round trips are a read's columns fetched together, before they are decoded."""
+    return _open_parquet(location, path)[0]
+
+
+def _open_parquet(location: Location, path: str) -> tuple[pq.ParquetFile, int]:
+    """The same, and its size in bytes. What the footer says of a column is not asked: Arrow ends the process where that
+    is damaged (ColumnChunkMetaData of pyarrow 26 is made outside of any `except`)."""
     filesystem, base = location.filesystem()
-    options: dict[str, Any] = {"filesystem": filesystem, "page_checksum_verification": True}
-    return pq.ParquetFile(f"{base}/{path}", pre_buffer=not location.is_local, **options)
+    source = filesystem.open_input_file(f"{base}/{path}")
+    options: dict[str, Any] = {"page_checksum_verification": True, "pre_buffer": not location.is_local}
+    return pq.ParquetFile(source, **options), source.size()
 
 
 def read_parquet(location: Location, path: str, schema: pa.Schema, without: Collection[str] = ()) -> pa.Table:
     """The columns of `schema` that stand in a file. Raises DamagedFile for a damaged page."""
     names = [name for name in schema.names if name not in without]
     with raising_damaged_file(f"{location.uri}/{path}"):
-        file = open_parquet(location, path)
-        groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
-        n_bytes = sum(group.column(i).total_compressed_size for group in groups for i in range(group.num_columns))
+        file, n_bytes = _open_parquet(location, path)
         if file.metadata.num_rows > n_bytes:  # keys that are all different take more
             raise OSError(f"{file.metadata.num_rows:,} rows in {n_bytes:,} bytes")
         return file.read(columns=names, use_threads=not location.is_local)  # threads cost more than small columns do
