@@ -237,11 +237,24 @@ def _leaf_paths(path: str, kind: pa.DataType) -> list[str]:
 
 
 def with_partition_columns(stored: pa.Table, schema: pa.Schema, partition: Mapping[str, object]) -> pa.Table:
-    """The columns of `schema` from what a file holds and what the log says of it."""
+    """The columns of `schema` from what a file holds and what the log says of it. Raises ValueError for a column whose
+    members have other names: a cast would take them for absent, and make null of what they hold."""
     n = stored.num_rows
+    for name, kind in zip(schema.names, schema.types):
+        if name not in partition and _members(stored[name].type) != _members(kind):
+            raise ValueError(f"column {name} is {stored[name].type}, expected {kind}")
     arrays = [pa.repeat(pa.scalar(partition[f.name]), n) if f.name in partition else stored[f.name] for f in schema]
     same = [array if array.type == f.type else array.cast(f.type) for array, f in zip(arrays, schema)]
     return pa.table(same, schema=schema)
+
+
+def _members(kind: pa.DataType) -> Any:
+    """The names within a type, as they nest."""
+    if pa.types.is_struct(kind):
+        return {member.name: _members(member.type) for member in kind}
+    if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+        return _members(kind.value_type)
+    return None
 
 
 def open_parquet(location: Location, path: str) -> pq.ParquetFile:

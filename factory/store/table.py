@@ -35,7 +35,14 @@ from numpy.typing import NDArray
 
 from factory.files import DamagedFile, machine_fault_of, naming_disk_errors
 from factory.store.commit_copies import COPIES, LOG, CommitCopies
-from factory.store.location import Location, Shard, read_parquet, with_partition_columns, write_shard
+from factory.store.location import (
+    Location,
+    Shard,
+    raising_damaged_file,
+    read_parquet,
+    with_partition_columns,
+    write_shard,
+)
 from factory.store.schema import TableSpec
 from factory.wording import one_line, shown
 
@@ -442,7 +449,8 @@ class KeyedTable:
     def read_file(self, path: str, partition: Mapping[str, str], columns: Sequence[str] | None = None) -> pa.Table:
         """One file's rows in the table's schema, page checksums verified."""
         schema = self.schema_of(columns)
-        return with_partition_columns(read_parquet(self.location, path, schema, partition), schema, partition)
+        with raising_damaged_file(f"{self.location.uri}/{path}"):
+            return with_partition_columns(read_parquet(self.location, path, schema, partition), schema, partition)
 
     def read(self, columns: Sequence[str] | None = None, encoded: bool = False) -> pa.Table:
         """All rows.

@@ -19,7 +19,7 @@ from factory.graph.driver import EpisodeSettings
 from factory.graph.execute import Execution, execute
 from factory.store.commit_copies import CommitCopies
 from factory.store.episodes import Message, episode_bytes
-from factory.store.location import Location, write_shard
+from factory.store.location import DamagedFile, Location, write_shard
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.schema import SAMPLES
@@ -458,3 +458,17 @@ def test_a_bit_flipped_in_a_shard_s_footer_never_ends_who_reads_it(tmp_path: Pat
     done = subprocess.run(command, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stderr[-500:]
     assert 0 < int(done.stdout) < 600
+
+
+def test_a_member_that_a_flipped_bit_renames_is_damage_and_not_null(tmp_path: Path) -> None:
+    """A cast to the table's own type takes what has another name for absent."""
+    out = Store(tmp_path / "out")
+    executed(ToyWork(), refs(1), ["recovery"], 1, out)
+    shard = next((tmp_path / "out" / "samples").rglob("*.parquet"))
+    whole = shard.read_bytes()
+    changed = whole.replace(b"why", b"whx")
+    assert changed != whole and list(SampleTable(tmp_path / "out"))
+    shard.write_bytes(changed)
+    for read in (lambda: list(SampleTable(tmp_path / "out")), lambda: Store(tmp_path / "out").samples.read()):
+        with pytest.raises(DamagedFile, match=rf"{shard.name}: cannot be read: column cameras_left_out is .*whx"):
+            read()
