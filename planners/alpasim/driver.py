@@ -440,9 +440,10 @@ def start_server(driver: Driver, host: str, port: int) -> tuple[Any, int]:
 
 
 def serve(driver: Driver, host: str, port: int) -> None:
-    """Answer until SIGTERM. Raises Refused where the port is not to be had."""
+    """Answer until SIGTERM, or until its terminal closes. Raises Refused where the port is not to be had."""
     server, bound = start_server(driver, host, port)
-    signal.signal(signal.SIGTERM, lambda number, frame: server.stop(5.0))
+    for ending in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(ending, lambda number, frame: server.stop(5.0))
     print(f"answers at {host}:{bound}", flush=True)
     try:
         server.wait_for_termination()
