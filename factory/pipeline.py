@@ -24,8 +24,9 @@ from factory.readers.base import BadClip, ClipReader, ClipRef, Unreadable, paint
 from factory.stages.assets import running_fits
 from factory.stages.imaging import Imaging, scene_cache_counts
 from factory.stages.rows import label_columns, sample_row
+from factory.store.remake import EarlierRows
 from factory.store.samples import CAMERA_LEFT_OUT, MOST_RECORDS, CandidateRow
-from factory.store.schema import UNLISTED, RunIdentity
+from factory.store.schema import UNLISTED, RunIdentity, attempt_id
 from tasks.attempt import (
     ExpertGate,
     Judged,
@@ -88,6 +89,9 @@ class WholeClip:
         return () if isinstance(self.found, Rejected) else self.found.candidates
 
 
+TAKEN_OVER = "taken over"  # among the seconds of a remake: to look for what holds of earlier rows
+
+
 class BrokenLog(BadClip):
     """A log that the index could not read; its message is the index's, which names file and field itself."""
 
@@ -112,6 +116,8 @@ class Drive:
     shared: tuple[int, ...] = ()  # steps at which samples of this drive have their now, where there are several
     row_overrides: Mapping[str, object] = field(default_factory=dict)  # columns that the row has in place of its own
     sampled_instead: Judged | None = None  # as the sample tells it, where that is not `judged`
+    pictures: Mapping[str, object] | None = None  # of an earlier sample of this drive, which hold; None: to be drawn
+    labels: Mapping[str, object] | None = None  # likewise
 
     @property
     def sampled(self) -> Judged:
@@ -155,6 +161,7 @@ class FactoryWork:
     cache_dir: str  # of reconstructed blocks
     photos_alone: bool  # clips may have photos and no lidar
     starts: Mapping[str, Array] = field(default_factory=dict, kw_only=True)  # clip_id -> (S, 40, 3) of its own
+    earlier: EarlierRows | None = field(default=None, kw_only=True)  # of which a remake takes over what still holds
 
     # A clip is read, and perturbed into candidates.
 
@@ -233,10 +240,26 @@ class FactoryWork:
 
     def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
         """Rollout, expert, rollout and reward; candidate -1 with experts that are tried once."""
-        watch = Stopwatch()
+        watch, key, earlier, known = Stopwatch(), "", self.earlier, None
+        if earlier is not None and not earlier.is_of(prepared.clip_id, prepared.content_digest):
+            earlier = None
+        if earlier is not None:
+            vocabulary, digest = self.identity.vocabulary_digest, self.expert_digest(expert)
+            key = attempt_id(prepared.clip_id, candidate, vocabulary, expert, digest)
+            with watch.timing(TAKEN_OVER):
+                known = earlier.rejection(key)
+            if known is not None and earlier.is_settled(known[0], driven=False):
+                return RejectedAttempt(*known, watch.seconds)
         drive = self.trace(prepared, candidate, expert, watch.timing)
         if drive.rejected is not None:
             return RejectedAttempt(drive.rejected, _subscores(drive), watch.seconds)
+        if earlier is not None:
+            has_one_plan = not hasattr(self.experts.get(expert), "plans")  # so this is the drive that was rejected
+            if known is not None and has_one_plan and earlier.is_settled(known[0], driven=True):
+                return RejectedAttempt(*known, watch.seconds)
+            with watch.timing(TAKEN_OVER):
+                pictures, labels = earlier.kept_columns(key, _driven_row(drive))
+            drive = replace(drive, pictures=pictures, labels=labels)
         return AcceptedDrive(drive, watch.seconds)
 
     def trace(self, prepared: PreparedClip, candidate: int, expert: str, timed: Timed = nullcontext) -> Drive:
@@ -258,6 +281,8 @@ class FactoryWork:
     def draw(self, driven: AcceptedDrive) -> SampleColumns | RejectedAttempt:
         """The pictures; RejectedAttempt where they are no sample's. Raises BadClip."""
         watch, drive, before = Stopwatch(), drive_of(driven), scene_cache_counts()
+        if drive.pictures is not None:
+            return SampleColumns(drive.pictures)
         with watch.timing("render"):
             sensed = drive.sampled.scene.clip
             if self.render.mode is RenderMode.AUTO:
@@ -284,13 +309,12 @@ class FactoryWork:
         """All but the pictures, the vocabulary labels among it."""
         watch, drive = Stopwatch(), drive_of(driven)
         judged = drive.sampled
-        labels: dict[str, object] = {}
-        if self.labels_of is not None:
+        labels = dict(drive.labels or {})
+        if self.labels_of is not None and drive.labels is None:
             with watch.timing("labels"):
                 labelled = vocabulary_labels(self.labels_of, judged.scene, judged.prepared, judged.reference)
                 labels = label_columns(labelled)
-        row = sample_row(judged.scene.clip, drive.candidate, judged)
-        return SampleColumns({**row, **drive.row_overrides, **labels}, watch.seconds)
+        return SampleColumns({**_driven_row(drive), **labels}, watch.seconds)
 
     # The block that a clip's pictures are drawn from is built before.
 
@@ -402,6 +426,12 @@ def _candidate_row(index: int, candidate: Candidate) -> CandidateRow:
         score=candidate.score,
         reactive_score=candidate.reactive_score,
     )
+
+
+def _driven_row(drive: Drive) -> dict[str, object]:
+    """All but pictures and labels."""
+    judged = drive.sampled
+    return {**sample_row(judged.scene.clip, drive.candidate, judged), **drive.row_overrides}
 
 
 def _subscores(drive: Drive) -> dict[str, float]:

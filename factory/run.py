@@ -30,7 +30,10 @@ from factory.files import why_unusable
 from tasks.render.settings import RenderMode
 
 if TYPE_CHECKING:
+    from factory.pipeline import FactoryWork
     from factory.readers.base import ClipRef
+    from factory.store.remake import Remake
+    from factory.store.samples import Store
 
 
 @command("run", RunConfig, refused=(), resumes=True)
@@ -151,10 +154,12 @@ def _run(
         if only_plan:
             print(estimate_run_size(assembled, refs))
             return 0
+        remake = _planned_remake(config, assembled.work, store, refs) if config.remake else None
+        work = assembled.work if remake is None else replace(assembled.work, earlier=remake.earlier)
         since = time.monotonic() if began is None else began
         summary = rerun_on_new_clusters(
             lambda: execute(
-                assembled.work,
+                work,
                 refs,
                 config.experts,
                 config.rounds,
@@ -165,7 +170,8 @@ def _run(
                     claims=Claims(config.gpu_share if assembled.work.draws_on_gpu else 0.0, config.graph.memory_gb),
                     isolated=needs_own_process(config),
                     limits=Limits(config.graph.limit_s, config.graph.limit_gb),
-                    on_change=config.on_change,
+                    on_change=config.on_change if remake is None else "redo",
+                    remade=None if remake is None else remake.record,
                     retry=config.retry_failed,
                     shard_seconds=config.shard_seconds,
                     minutes=config.minutes and max(0.0, config.minutes - (time.monotonic() - since) / 60.0),
@@ -203,6 +209,27 @@ def _run(
     if summary.exit_code == COMPLETE_WITH_FAILURES:
         print(failure_summary(store))
     return summary.exit_code
+
+
+def _planned_remake(
+    config: RunConfig, work: "FactoryWork", store: "Store", refs: Sequence["ClipRef"]
+) -> "Remake | None":
+    """What `remake` makes again, told; None where nothing is. Raises ConfigError where it cannot."""
+    from factory.store.location import BadLocation
+    from factory.store.remake import plan_remake, remade_text
+    from factory.store.samples import ChangedRun
+    from factory.store.table import AnotherWriter
+    from factory.store.verify import RunInProgress
+
+    digests = {expert: work.expert_digest(expert) for expert in config.experts}
+    wanted = {expert: 1 if work.once(expert) else config.rounds for expert in config.experts}
+    try:
+        remake = plan_remake(store, work.identity, digests, config.remake, wanted, [ref.clip_id for ref in refs])
+    except (ChangedRun, RunInProgress, AnotherWriter, BadLocation) as error:
+        raise ConfigError(f"remake: {error}") from error
+    told = "every row is of these settings already" if remake is None else remade_text(remake.record)
+    print(f"remake: {told}", flush=True)
+    return remake
 
 
 # What a run names outside its settings, looked up before anything heavy is imported and any clip is read.

@@ -8,10 +8,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from factory.commands.look import FolderRequest
 from factory.config.arguments import GIVEN_ALONE, POSITIONAL, RUN_SETTINGS, Refused
+from factory.config.run import RemadeStage
 from factory.exits import COMPLETE, DAMAGED
 from factory.views.status import IMPORT_AGAIN, failed_lines, location_of_out, open_store
 from factory.wording import MOST_SAID, printable
@@ -43,7 +44,6 @@ def retry(request: RetryRequest) -> int:
     the word of a table: give those settings again. A table that `import` wrote is no run: the same import again
     tries what failed. Exit codes: those of the run; 0 where nothing failed.
     """
-    from factory.run import main as run
     from factory.store.samples import imported_from
 
     store = open_store(request.out)
@@ -52,13 +52,55 @@ def retry(request: RetryRequest) -> int:
         return COMPLETE
     if source := imported_from(store.runs()):
         raise Refused(f"{store.location.uri} is no run, its rows were imported: {IMPORT_AGAIN.format(source)}")
-    folder, recorded = recorded_command(store, request.settings)
-    command = [*recorded, *request.settings, f"out={store.location.uri}", "retry_failed=true"]
+    return _run_again(store, request.settings, "retry_failed=true")
+
+
+@dataclass(frozen=True)
+class RemakeRequest:
+    """The command line."""
+
+    out: str
+    stages: tuple[RemadeStage, ...] = field(metadata=POSITIONAL)  # one or more
+    settings: tuple[str, ...] = field(default=(), metadata=RUN_SETTINGS | GIVEN_ALONE)
+
+    def __post_init__(self) -> None:
+        if unknown := sorted(set(self.stages) - set(get_args(RemadeStage))):
+            raise ValueError(f"{unknown[0]}: the stages are {', '.join(get_args(RemadeStage))}")
+
+
+def remake(request: RemakeRequest) -> int:
+    """`python -m factory remake <stage> out=<folder or URL>`: a stage of a finished run again, under new settings.
+
+        python -m factory remake render out=runs/big render.width=1024 render.height=576    cameras, sizes, their gate
+        python -m factory remake label out=runs/big reward.label_vocabulary=other.npy       the vocabulary labels
+        python -m factory remake gate out=runs/big reward.progress_above=0.6                what the reward asks
+        python -m factory remake render label out=runs/big ...                              both
+
+    The run's recorded settings with the given ones in their place; at its end the table is as if the run had been made
+    so. What the stage leaves as it was is taken over: rejections, and the pictures and labels of samples whose drive,
+    made again, is the same in every bit. A changed setting of another stage is refused. A walk's rows are replaced in
+    one transaction; what was killed goes on by the same command. The rows as they were stay readable, at the versions
+    that run.json and `python -m factory lineage` name, until `python -m factory clean replaced=true`.
+    Exit codes: those of the run.
+    """
+    return _run_again(open_store(request.out), request.settings, f"remake=[{','.join(request.stages)}]")
+
+
+def _run_again(store: "Store", settings: Sequence[str], word: str) -> int:
+    """The newest start's command where it was given, with further settings and a word of its own."""
+    from factory.run import main as run
+
+    folder, recorded = recorded_command(store, settings)
+    command = [*recorded, *settings, f"out={store.location.uri}", word]
     there = Path(folder).is_dir()
     where = folder if there else f"this folder, as {folder} is not on this machine"
     print(f"\nin {where}: python -m factory run {shlex.join(command)}", flush=True)
     with contextlib.chdir(folder if there else "."):  # paths among the settings are relative to where it was started
         return run(command)
+
+
+def _key_of(word: str) -> str:
+    return word.lstrip("+").partition("=")[0]
 
 
 def recorded_command(store: "Store", given: Sequence[str] = ()) -> tuple[str, list[str]]:
@@ -73,9 +115,8 @@ def recorded_command(store: "Store", given: Sequence[str] = ()) -> tuple[str, li
     where = f"{store.location.uri}/{CURRENT_RUN}"
     if document.get("command") is None:
         raise Refused(f"{where} records no settings: run the same command with retry_failed=true")
-    mine = ("out=", "retry_failed=")
-    words = [str(word) for word in document["command"]]
-    words = [word for word in words if not word.startswith(mine) and word not in given]
+    mine = {"out", "retry_failed", "remake", *given, *(_key_of(word) for word in given if not word.startswith("-"))}
+    words = [word for word in map(str, document["command"]) if mine.isdisjoint((word, _key_of(word)))]
     code = [word for word in words if "_target_" in word or word.startswith("-")]
     if code:
         raise Refused(f"{where} names code to be called: if you trust it, give it yourself: {shlex.join(code)}")
@@ -185,6 +226,7 @@ class CleanRequest:
     out: str
     older_than: str = "1d"  # days, hours or minutes, as 7d, 12h, 30min: what is younger stays
     say: bool = False  # and remove nothing
+    replaced: bool = False  # the rows that remakes replaced, too
 
     def __post_init__(self) -> None:
         _ = self.older_s
@@ -206,19 +248,22 @@ def clean(request: CleanRequest) -> None:
         python -m factory clean out=runs/demo                     what was last written a day ago or earlier
         python -m factory clean out=runs/demo older_than=2h       days, hours or minutes: 7d, 12h, 30min
         python -m factory clean out=runs/demo say=true            name them and remove nothing
+        python -m factory clean out=runs/demo replaced=true       and the rows that remakes replaced
 
     These are temporary files, files in the tables' folders that no commit names, and episodes of rows that were
     replaced. A reader that was opened before rows were replaced or shards merged still reads what they stood in:
     leave it its time. While a run writes here the command is refused.
     """
     from factory.store.location import BadLocation
+    from factory.store.remake import kept_files
     from factory.store.table import AnotherWriter
     from factory.store.verify import RunInProgress, claim_for_upkeep, old_leftovers, refuse_while_running
 
     store = open_store(request.out)
     try:
         (refuse_while_running if request.say else claim_for_upkeep)(store)
-        found = old_leftovers(store, request.older_s, time.time())
+        kept = set() if request.replaced else set(kept_files(store))
+        found = [name for name in old_leftovers(store, request.older_s, time.time()) if name not in kept]
     except (RunInProgress, AnotherWriter, BadLocation, OSError) as error:
         raise Refused(str(error)) from error
     for name in found:

@@ -38,6 +38,7 @@ COMMANDS: Mapping[str, Command] = {
     "status": Command("what a run holds, its acceptance funnel, how it ended", LOOK, "status"),
     "failed": Command("failed attempts: file, field, message, how to retry", LOOK, "failed"),
     "retry": Command("try failed attempts again, with the run's own settings", KEEP, "retry"),
+    "remake": Command("a stage of a finished run again, under new settings", KEEP, "remake"),
     "lineage": Command("where a sample comes from: clip, candidate, attempt, files", LOOK, "lineage"),
     "show": Command("one sample: numbers, a picture, a film", LOOK, "show"),
     "dashboard": Command("a live page of a run in the browser", LOOK, "dashboard"),

@@ -21,6 +21,7 @@ from tasks.stages import FRAMES, HUMAN, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
 Repairs = Literal["make", "refuse"]
+RemadeStage = Literal["render", "label", "gate"]
 RECOVERY = "factory.setup.settings.recovery_expert"
 FIRST_LOOK = ("clips.n_clips=3", "clips.settings.width=256", "clips.settings.height=144", "render=town")
 
@@ -131,6 +132,7 @@ class RunConfig:
     seed: int = 0  # of every random draw
     repairs: Repairs = "make"  # refuse: a clip of which anything had to be repaired or left out fails
     on_change: Literal["stop", "keep", "redo"] = "stop"  # when settings or stage versions differ from the table's
+    remake: tuple[RemadeStage, ...] = ()  # stages of a finished run to be made again: python -m factory remake
     retry_failed: bool = False  # run attempts again that failed on their input or by a bug
     minutes: float | None = None  # after which nothing new is begun (exit code 4); the same command goes on
     shard_seconds: float = 30.0  # between commits, if no partition reaches 128 MB before; longer: larger files

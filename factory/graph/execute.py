@@ -8,10 +8,10 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from deltalake.exceptions import DeltaError
 
@@ -44,7 +44,7 @@ from factory.graph.steps import NotReady, Work
 from factory.readers.base import ClipRef
 from factory.store.funnel import Funnel, funnel_of
 from factory.store.location import BadLocation
-from factory.store.samples import CURRENT_RUN, LAST_RUN, ChangedRun, History, Kind, OnChange, Store
+from factory.store.samples import CURRENT_RUN, LAST_RUN, REMADE, ChangedRun, History, Kind, OnChange, Store
 from factory.store.table import AnotherWriter
 from factory.wording import one_line
 from tasks.caches import json_with_checksum
@@ -84,6 +84,7 @@ class Execution:
     minutes: float | None = None  # after which nothing new is begun, as after an interruption
     episodes: EpisodeSettings | None = None  # MCAP files to be written beside the samples
     command: Sequence[str] | None = None  # the settings as they were given, kept for `retry`
+    remade: Mapping[str, Any] | None = None  # of a remake, which is a redo: what run.json says of it
 
 
 def execute(
@@ -133,6 +134,8 @@ class _Run:
         try:
             names = {ref.dataset for ref in self._refs}
             self._records = self._store.checked_records(self._identity, self._digests, self._how.on_change, names)
+            if self._how.remade is not None:
+                self._records[-1][REMADE] = dict(self._how.remade)
             kept = self._how.on_change == "stop" and self._records[-1]["on_change"] == "keep"
             self._on_change: OnChange = "keep" if kept else self._how.on_change
             plan = self._planned(not self._store.starts_over(self._records))

@@ -48,9 +48,18 @@ def sample_table(path: str | os.PathLike[str], storage_options: Mapping[str, str
 class SampleTable:
     """The samples of one store, read-only."""
 
-    def __init__(self, path: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None) -> None:
-        """path: the run's `out`, or its folder `samples`. Raises what `sample_table` does."""
-        self._table = sample_table(path, storage_options)
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        storage_options: Mapping[str, str] | None = None,
+        version: int | None = None,
+    ) -> None:
+        """path: the run's `out`, or its folder `samples`; version: of the table, None the newest.
+
+        Raises what `sample_table` does, and DamagedLog where the log has no such version.
+        """
+        newest = sample_table(path, storage_options)
+        self._table = newest if version is None else newest.at(version)
         self._partitions = self._table.live_files()
         files = [(path, fixed_bytes(rows["attempt_id"])) for path, rows in self._table.files(["attempt_id"])]
         counts = [len(keys) for _, keys in files]

@@ -365,6 +365,7 @@ RUN_COPY = "samples/_commits/run.json"  # the same once more: nothing else of a 
 CURRENT_RUN = "current_run.json"  # what the newest run set out to do; over once last_run.json has its began_ms
 LAST_RUN = "last_run.json"
 FACTS = "report.json"  # what only the newest run knows: its facts, and what its reader left out
+REMADE = "remade"  # of a record in run.json: which stages its run made again of earlier rows, and where these are
 IMPORTED = "import.source"  # a setting that tables of others' rows have, and no run
 WAYS_OUT = "Go on with on_change=keep, replace with on_change=redo, or choose another out"
 SHOWN = 3  # changed settings that a message names
@@ -496,6 +497,7 @@ class Store:
             if on_change == "stop":
                 record["on_change"] = records[-1]["on_change"]
             if not changes:
+                record |= {name: value for name, value in records[-1].items() if name == REMADE}
                 records = records[:-1]
         return [*records, record]
 

@@ -339,6 +339,13 @@ class KeyedTable:
         with self._log_naming():
             self._delta = None if version is None else retry_broken_listing(partial(self._opened, version))
 
+    def at(self, version: int) -> "KeyedTable":
+        """The table as it was at one of its versions, to be read. Raises DamagedLog where its log has that no more."""
+        then = KeyedTable.__new__(KeyedTable)
+        then.__setstate__({**self.__dict__, "_facts": (-1, {}), "_delta": version})
+        then.__dict__.pop("_index", None)
+        return then
+
     def _opened(self, version: int | None = None) -> DeltaTable | None:
         """version: None: the newest."""
         options = dict(self.location.options)
