@@ -255,15 +255,16 @@ def clean(request: CleanRequest) -> None:
     leave it its time. While a run writes here the command is refused.
     """
     from factory.store.location import BadLocation
-    from factory.store.remake import kept_files
+    from factory.store.remake import is_interrupted_remake
     from factory.store.table import AnotherWriter
     from factory.store.verify import RunInProgress, claim_for_upkeep, old_leftovers, refuse_while_running
 
     store = open_store(request.out)
     try:
         (refuse_while_running if request.say else claim_for_upkeep)(store)
-        kept = set() if request.replaced else set(kept_files(store))
-        found = [name for name in old_leftovers(store, request.older_s, time.time()) if name not in kept]
+        if request.replaced and is_interrupted_remake(store):
+            raise Refused(f"{store.location.uri}: its remake, which takes these rows over, is not finished")
+        found = old_leftovers(store, request.older_s, time.time(), request.replaced)
     except (RunInProgress, AnotherWriter, BadLocation, OSError) as error:
         raise Refused(str(error)) from error
     for name in found:

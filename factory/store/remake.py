@@ -4,7 +4,7 @@ A remake is a redo (factory.graph.plan) whose attempts take over what their stag
 pictures, the labels. The rows that it replaces stay in their files, and run.json names the versions they are read at.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -129,11 +129,10 @@ def plan_remake(
     if not records or imported_from(records):
         raise ChangedRun(f"{store.location.uri} holds no run: nothing can be made again")
     changes = record_differences(records[-1], store.checked_records(identity, digests, "redo")[-1])
-    rows = _made_under(store)
     if changes:
         _refuse_other_stages(changes, asked)
         refuse_while_running(store)
-        _refuse_unfinished(store, rows, wanted, clip_ids)
+        _refuse_unfinished(store, wanted, clip_ids)
         claim_for_upkeep(store)
         for table in store.tables:
             if table.properties.get(KEPT_LOG[0]) != KEPT_LOG[1]:
@@ -141,12 +140,18 @@ def plan_remake(
         stages = sorted({str(stage_of_change(change)) for change in changes})
         versions = {table.spec.name: table.version for table in store.tables}
         record = {"stages": stages, "settings_hash": records[-1]["settings_hash"], "versions": versions}
-    elif REMADE in records[-1] and _key_of(records[-2]) in rows:  # it was interrupted
+    elif is_interrupted_remake(store):
         record = records[-1][REMADE]
         _refuse_other_stages(record_differences(records[-2], records[-1]), asked)
     else:
         return None
     return Remake(record, EarlierRows(store, record["versions"], record["stages"]))
+
+
+def is_interrupted_remake(store: Store) -> bool:
+    """Whether the newest record is a remake's and rows that it is to replace are still there."""
+    records = store.runs()
+    return bool(records) and REMADE in records[-1] and _key_of(records[-2]) in _made_under(store)
 
 
 def _refuse_other_stages(changes: Sequence[str], asked: Sequence[str]) -> None:
@@ -169,12 +174,10 @@ def _key_of(record: Mapping[str, Any]) -> tuple[str, ...]:
     return record["settings_hash"], canonical_json(record["stage_versions"])
 
 
-def _refuse_unfinished(
-    store: Store, rows: set[tuple[str, ...]], wanted: Mapping[str, int], clip_ids: Sequence[str]
-) -> None:
+def _refuse_unfinished(store: Store, wanted: Mapping[str, int], clip_ids: Sequence[str]) -> None:
     """Raises ChangedRun where the table is not all of one finished run, or more than what this one is to make."""
     where, newest = store.location.uri, store.newest_run()
-    if rows - {_key_of(store.runs()[-1])}:
+    if _made_under(store) - {_key_of(store.runs()[-1])}:
         raise ChangedRun(f"{where} has rows of other settings: finish its redo or remake first, or choose another out")
     if newest.goes_on or newest.last.get("exit_code") == INTERRUPTED:
         raise ChangedRun(f"{where}: its run is not finished: give its own command again first")
@@ -186,10 +189,3 @@ def _refuse_unfinished(
         if gone := sorted(set(plan["clip_ids"]) - set(clip_ids)):
             asks = "put their logs back, or give the clips that it was made of"
             raise ChangedRun(f"{where}: {len(gone)} of its clips, as {gone[0]}, are not there: {asks}")
-
-
-def kept_files(store: Store) -> Iterator[str]:
-    """Files of the rows that remakes replaced, relative to `out`."""
-    for versions in (record[REMADE]["versions"] for record in store.runs() if REMADE in record):
-        for table in store.tables:
-            yield from (f"{table.spec.name}/{path}" for path in table.at(versions[table.spec.name]).live_files())

@@ -34,7 +34,7 @@ from factory.store.location import (
     raising_damaged_file,
     write_shard,
 )
-from factory.store.samples import CURRENT_RUN, FACTS, IMPORTED, LAST_RUN, QUIET_S, RUN_COPY, RUN_FILE, Store
+from factory.store.samples import CURRENT_RUN, FACTS, IMPORTED, LAST_RUN, QUIET_S, REMADE, RUN_COPY, RUN_FILE, Store
 from factory.store.table import KeyedTable, LiveFile, fixed_bytes, packed_tables, text_codes
 from tasks.caches import Damaged, parse_json_with_checksum, whole_of_two
 
@@ -121,11 +121,12 @@ def verify(store: Store) -> Verdict:
     )
 
 
-def orphaned_files(store: Store) -> list[str]:
-    """Files in the tables' folders that no log names, relative to `out`."""
-    orphans = []
+def orphaned_files(store: Store, replaced: bool = False) -> list[str]:
+    """Files in the tables' folders that no log names, relative to `out`; replaced: of the rows before a remake too."""
+    orphans, remade = [], [record[REMADE]["versions"] for record in store.runs() if REMADE in record and not replaced]
     for table in store.tables:
-        live, name = table.live_files(), table.spec.name
+        name = table.spec.name
+        live = {*table.live_files(), *(file for versions in remade for file in table.at(versions[name]).live_files())}
         files = [file for file in table.location.names() if not file.startswith((f"{LOG}/", f"{COPIES}/"))]
         orphans += [f"{name}/{file}" for file in files if file not in live]
     return orphans
@@ -334,10 +335,10 @@ def drop_damaged(store: Store, verdict: Verdict) -> None:
             store.location.remove(name)
 
 
-def old_leftovers(store: Store, older_s: float, now_s: float) -> list[str]:
-    """Temporary files and orphans that were last written so long ago, relative to `out`."""
+def old_leftovers(store: Store, older_s: float, now_s: float, replaced: bool = False) -> list[str]:
+    """Temporary files and orphans that were last written so long ago, relative to `out`; replaced: as of these."""
     ages = store.location.ages_s(now_s)
-    orphans = {*orphaned_files(store), *outdated_episodes(store)}
+    orphans = {*orphaned_files(store, replaced), *outdated_episodes(store)}
     inner = tuple(f"{name}/{folder}/" for name in TABLES for folder in (LOG, COPIES))
     return sorted(
         name

@@ -206,12 +206,16 @@ def _file_and_row(table: "KeyedTable", key: str, columns: Sequence[str]) -> tupl
 
 
 def _run_facts(store: "Store", record: Row, number: int, row: Row) -> list[tuple[str, object]]:
+    from factory.store.remake import remade_text
+    from factory.store.samples import REMADE
+
     versions = ", ".join(f"{stage} {version}" for stage, version in json.loads(row["stage_versions"]).items())
     return [
         ("settings", f"{row['settings_hash']}, record {number + 1} of {store.location.uri}/run.json"),
         ("stage versions", versions),
         ("vocabulary", record.get("vocabulary_digest")),
         ("seed", dict(record.get("settings", {})).get("seed")),
+        ("remade", remade_text(record[REMADE]) if REMADE in record else ""),
     ]
 
 
