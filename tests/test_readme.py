@@ -19,6 +19,7 @@ import pytest
 from examples.csv_logs import write_log
 from factory.__main__ import main as door_main
 from factory.commands.exchange import ExportRequest, ImportRequest, SceneRequest
+from factory.commands.keep import RemakeRequest
 from factory.commands.look import DashboardRequest, ExplainRequest
 from factory.commands.table import COMMANDS, PLANNERS
 from factory.config.arguments import parse
@@ -165,6 +166,8 @@ def test_every_command_is_one_its_program_takes(
             parse(ImportRequest, arguments)  # its folders are a user's
         case ["python", "-m", "factory", "scene", *arguments]:
             parse(SceneRequest, arguments)  # its files are a user's
+        case ["python", "-m", "factory", "remake", *arguments]:
+            load_config(parse(RemakeRequest, arguments).settings)  # it would change the others' demo
         case ["python", "-m", "factory", *arguments]:
             assert door_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "factory.run", "--help"]:
