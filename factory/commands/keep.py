@@ -90,7 +90,7 @@ def _run_again(store: "Store", settings: Sequence[str], word: str) -> int:
     """The newest start's command where it was given, with further settings and a word of its own."""
     from factory.run import main as run
 
-    folder, recorded = recorded_command(store, settings)
+    folder, recorded = recorded_command(store, [*settings, word])
     command = [*recorded, *settings, f"out={store.location.uri}", word]
     there = Path(folder).is_dir()
     where = folder if there else f"this folder, as {folder} is not on this machine"
@@ -103,7 +103,7 @@ def _key_of(word: str) -> str:
     return word.lstrip("+").partition("=")[0]
 
 
-def recorded_command(store: "Store", given: Sequence[str] = ()) -> tuple[str, list[str]]:
+def recorded_command(store: "Store", given: Sequence[str]) -> tuple[str, list[str]]:
     """The folder that the newest start was given in, and its settings less those that are `given`.
 
     Raises Refused where none is recorded, and where they name code: a table is data, whoever wrote it, and what is
@@ -114,8 +114,8 @@ def recorded_command(store: "Store", given: Sequence[str] = ()) -> tuple[str, li
     document = store.document(CURRENT_RUN)
     where = f"{store.location.uri}/{CURRENT_RUN}"
     if document.get("command") is None:
-        raise Refused(f"{where} records no settings: run the same command with retry_failed=true")
-    mine = {"out", "retry_failed", "remake", *given, *(_key_of(word) for word in given if not word.startswith("-"))}
+        raise Refused(f"{where} records no settings: run the same command with {given[-1]}")
+    mine = {"out", "retry_failed", *given, *(_key_of(word) for word in given if not word.startswith("-"))}
     words = [word for word in map(str, document["command"]) if mine.isdisjoint((word, _key_of(word)))]
     code = [word for word in words if "_target_" in word or word.startswith("-")]
     if code:

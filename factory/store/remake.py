@@ -22,7 +22,8 @@ from factory.store.verify import claim_for_upkeep, refuse_while_running
 from tasks.stages import Rejected
 
 LABEL_SETTINGS = ("reward.labels", "reward.label_vocabulary")
-KEPT_LOG = "delta.logRetentionDuration", "interval 36500 days"  # else a checkpoint tidies away what old versions are
+# Of the tables: else a checkpoint tidies the log of old versions away, and any program's VACUUM their files.
+KEPT = dict.fromkeys(("delta.logRetentionDuration", "delta.deletedFileRetentionDuration"), "interval 36500 days")
 # What drawing a sample may write; its `tags` it adds to those of the scene.
 PICTURE_COLUMNS = (
     *("cameras", "images", "image_source", "cameras_left_out", "psnr", "asset_digest"),
@@ -135,8 +136,9 @@ def plan_remake(
         _refuse_unfinished(store, wanted, clip_ids)
         claim_for_upkeep(store)
         for table in store.tables:
-            if table.properties.get(KEPT_LOG[0]) != KEPT_LOG[1]:
-                table.set_property(*KEPT_LOG)
+            for name, value in KEPT.items():
+                if table.properties.get(name) != value:
+                    table.set_property(name, value)
         stages = sorted({str(stage_of_change(change)) for change in changes})
         versions = {table.spec.name: table.version for table in store.tables}
         record = {"stages": stages, "settings_hash": records[-1]["settings_hash"], "versions": versions}

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deltalake import DeltaTable
 
 from factory.commands.table import COMMANDS
 from factory.exits import BAD_CONFIG, COMPLETE
@@ -103,6 +104,7 @@ def test_a_stage_made_again_is_as_if_the_run_had_been_made_so(
     assert ask("run", *WORDS, f"out={out}") == BAD_CONFIG
     assert ask("status", f"out={out}") == ask("show", 0, f"out={out}", f"to={out.parent}") == COMPLETE
 
+    assert not DeltaTable(str(out / "samples")).vacuum(dry_run=True)
     assert ask("clean", f"out={out}", "older_than=0min") == COMPLETE
     assert_same_rows(SampleTable(out, version=record["versions"]["samples"]).table(), before)
     assert not verify(Store(out)).damage and not verify(Store(out)).orphans
