@@ -29,5 +29,4 @@ def assert_same_tables(a: Path | Location, b: Path | Location) -> None:
     left, right = tables_of(a), tables_of(b)
     assert left[0]["attempt_id"].to_pylist() == right[0]["attempt_id"].to_pylist()
     assert_same_rows(left[0], right[0])
-    assert left[1] == right[1]
-    assert left[2] == right[2]
+    assert repr(left[1:]) == repr(right[1:])  # NaN to NaN
