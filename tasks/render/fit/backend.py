@@ -5,7 +5,7 @@ meanwhile: in place on the CPU, on a device elsewhere. Which photo, which step s
 poses are is the loop's, and the same with every backend.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -15,7 +15,7 @@ from tasks.kernels.compiled import kernel
 from tasks.render.fit.corrections import apply_exposure, apply_exposure_gradient, corrected_pose
 from tasks.render.fit.losses import opaque_loss, photo_loss
 from tasks.render.fit.start import FitProblem
-from tasks.render.fit.state import FitState, Road
+from tasks.render.fit.state import FitState
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.movers import SHIFT_SIZE, interpolate_knots, shift_boxes, world_from_boxes
 from tasks.render.scene.sensed import Photo
@@ -43,30 +43,6 @@ class Derivatives:
     depths: Any  # (M,) [m] of those
     tracks: Ints  # (B,) of which the photo may show some
     boxes: F32  # (B, SHIFT_SIZE) by what their boxes are off by at its time
-
-
-class LearnedArray(Protocol):
-    """As `AdamArray`: an array that steps against a gradient."""
-
-    @property
-    def values(self) -> Any: ...
-
-    def step(self, rows: Any, gradient: Any, rate: float, scale: Any = None) -> None: ...
-
-
-class LearnedState(Protocol):
-    """As `FitState`: all that is learned, wherever it lies; exposure, poses and boxes lie on the CPU."""
-
-    iteration: int
-
-    @property
-    def learned(self) -> Mapping[str, LearnedArray]: ...
-
-    def record_view(self, rows: Any, depths: Any, screen: Any) -> Any: ...
-
-    def lay_flat(self, rows: Any, road: Road) -> None: ...
-
-    def keep_round(self, rows: Any, background: float, boxes: float) -> None: ...
 
 
 class FitBackend(Protocol):

@@ -1,39 +1,42 @@
-"""The fit on a device of torch's: the state lies there, one photo an iteration goes there, and torch derives the loss.
+"""The fit on a device of torch's: state, road and photos lie there, and torch derives the loss.
 
-Exposure, poses and boxes, a few numbers a photo, stay on the CPU, and so does density control: it is the same code and
-the same draws, for which the state comes back. Sums on a GPU are added up in any order, so that no two fits are alike
-to the last bit.
+Exposure, poses and boxes, a few numbers a photo, stay on the CPU. Where Gaussians go is drawn there as well, by the
+same code and the same draws, for which opacities and what was wanted come back, and nothing else of the state. Sums on
+a GPU are added up in any order, so that no two fits are alike to the last bit.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import conv2d
 
 from tasks.render.fit.backend import HIDDEN, Derivatives, OwnedGaussians, box_gradient, visible_parts
 from tasks.render.fit.corrections import corrected_pose
 from tasks.render.fit.losses import C1, C2, SIGMA, WINDOW
-from tasks.render.fit.start import FitProblem
+from tasks.render.fit.start import FitPhoto, FitProblem
 from tasks.render.fit.state import (
     BACKGROUND,
     BETA1,
     BETA2,
     CELL_M,
     EPSILON,
+    JITTER,
     LONGEST_M,
     SHAPES,
     SLACK_M,
     THICKNESS_M,
     AdamArray,
+    Copies,
     FitState,
     Road,
 )
+from tasks.render.scene.body import BEFORE_M, NEAREST_M, BodyView
 from tasks.render.scene.movers import SHIFT_SIZE
 from tasks.render.scene.on_device import sky_places
 from tasks.render.scene.sky import COLUMNS
@@ -64,6 +67,15 @@ class LearnedTensor:
             size = size * scale[:, None]
         spread = (second / (1.0 - BETA2**counts)).sqrt() + EPSILON
         self.values[rows] -= (size * first / spread).float()
+
+    def take(self, rows: Tensor) -> "LearnedTensor":
+        """`AdamArray.take`."""
+        return LearnedTensor(self.values[rows], self.first[rows], self.second[rows], self.steps[rows])
+
+    def forget(self, rows: Ints) -> None:
+        """`AdamArray.forget`."""
+        for of in (self.first, self.second, self.steps):
+            of[rows] = 0
 
 
 def apply_exposure(rgb: Tensor, row: Tensor) -> Tensor:
@@ -102,14 +114,13 @@ class SelfAdjointBlur(torch.autograd.Function):
 
 
 def _blur(image: Tensor) -> Tensor:
-    """`losses._blur`, (H, W, C). Tap by tap: convolutions on a GPU keep ten bits (TF32), and variances need more."""
-    reach, taps = WINDOW // 2, cv2.getGaussianKernel(WINDOW, SIGMA, cv2.CV_32F)[:, 0]
-    for axis, beyond in enumerate(((0, 0, 0, 0, reach, reach), (0, 0, reach, reach))):
-        padded, n = pad(image, beyond), image.shape[axis]
-        image = padded.narrow(axis, 0, n) * float(taps[0])
-        for k in range(1, WINDOW):
-            image.add_(padded.narrow(axis, k, n), alpha=float(taps[k]))
-    return image
+    """`losses._blur`, (H, W, C), by one pass an axis. cuDNN would keep ten bits (TF32), and variances need more."""
+    taps = torch.as_tensor(cv2.getGaussianKernel(WINDOW, SIGMA, cv2.CV_32F), device=image.device)
+    planes, n = image.permute(2, 0, 1)[None].contiguous(), image.shape[-1]
+    with torch.backends.cudnn.flags(enabled=False):
+        for shape, padding in (((n, 1, WINDOW, 1), (WINDOW // 2, 0)), ((n, 1, 1, WINDOW), (0, WINDOW // 2))):
+            planes = conv2d(planes, taps.view(1, *shape[1:]).expand(shape), padding=padding, groups=n)
+    return planes[0].permute(1, 2, 0)
 
 
 def opaque_loss(alpha: Tensor, ground: Tensor, weight: float) -> Tensor:
@@ -144,17 +155,16 @@ def composite_sky(
     return rgb + (1.0 - alpha)[..., None] * behind, asked.nonzero()[:, 0]
 
 
-def lay_flat(means: Tensor, quats: Tensor, log_scales: Tensor, rows: Tensor, road: Road) -> None:
-    """`state.lay_flat`, in place."""
-    field = torch.tensor(np.dstack([road.heights, road.slopes]), device=means.device)
+def lay_flat(means: Tensor, quats: Tensor, log_scales: Tensor, rows: Tensor, surface: Tensor, corner: Array) -> None:
+    """`state.lay_flat`, in place; `surface` (X, Y, 3): the road's heights and slopes, from its `corner` on."""
     x, y, z = means[rows].double().unbind(1)
-    u, v = (x - float(road.corner[0])) / CELL_M, (y - float(road.corner[1])) / CELL_M
+    u, v = (x - float(corner[0])) / CELL_M, (y - float(corner[1])) / CELL_M
     i, j = u.floor().long(), v.floor().long()
-    on = (i >= 0) & (j >= 0) & (i + 1 < field.shape[0]) & (j + 1 < field.shape[1])
+    on = (i >= 0) & (j >= 0) & (i + 1 < surface.shape[0]) & (j + 1 < surface.shape[1])
     rows, x, y, z, u, v, i, j = (t[on] for t in (rows, x, y, z, u, v, i, j))
     a, b = (u - i)[:, None], (v - j)[:, None]
-    here = (1 - a) * ((1 - b) * field[i, j] + b * field[i, j + 1]) + a * (
-        (1 - b) * field[i + 1, j] + b * field[i + 1, j + 1]
+    here = (1 - a) * ((1 - b) * surface[i, j] + b * surface[i, j + 1]) + a * (
+        (1 - b) * surface[i + 1, j] + b * surface[i + 1, j + 1]
     )
     known = here[:, 0].isfinite()
     rows, z, here = rows[known], z[known], here[known]
@@ -181,7 +191,35 @@ def _upright(quats: Tensor, slope_x: Tensor, slope_y: Tensor) -> Tensor:
     return hamilton(turn / turn.norm(dim=1, keepdim=True), torch.stack([w, x, y, s], dim=1))
 
 
+def distance_before_bodies(points: Tensor, view: BodyView) -> tuple[Tensor, Tensor]:
+    """`body.distance_before_bodies`."""
+    camera_from_scene, intrinsics, eye = (
+        torch.as_tensor(of, device=points.device) for of in (view.camera_from_scene, view.intrinsics, view.eye)
+    )
+    at = points @ camera_from_scene[:3, :3].T + camera_from_scene[:3, 3]
+    u, v = (intrinsics[k, k] * at[:, k] / at[:, 2] + intrinsics[k, 2] for k in (0, 1))
+    seen = (at[:, 2] > NEAREST_M) & (u >= 0.0) & (u < view.width) & (v >= 0.0) & (v < view.height)
+    rows = seen.nonzero()[:, 0]
+    rays = points[rows] - eye
+    along, drives = torch.full_like(rays[:, 0], math.inf), torch.zeros(len(rows), dtype=torch.bool, device=rays.device)
+    for body, driving in zip(view.bodies, view.drives):
+        cosine, sine, half = math.cos(body[3]), math.sin(body[3]), torch.as_tensor(0.5 * body[4:], device=rays.device)
+        turn = torch.as_tensor(
+            np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]), device=eye.device
+        )
+        start, step = turn @ (eye - torch.as_tensor(body[:3], device=eye.device)), rays @ turn.T
+        sides = torch.stack([(-half - start) / step, (half - start) / step])
+        enter, leave = sides.amin(0).amax(1), sides.amax(0).amin(1)
+        first = (enter > 0.0) & (enter <= leave) & (enter < along)
+        along, drives = torch.where(first, enter, along), torch.where(first, bool(driving), drives)
+    before_m = torch.full_like(at[:, 2], math.nan)
+    before_m[rows] = torch.where(drives, (along - 1.0) * rays.norm(dim=1), math.nan)
+    return before_m, at[:, 2]
+
+
 DEVICE_SIDE = (*SHAPES, "sky")
+OF_GAUSSIANS = ("road", "nearest", "wanted")
+KEPT_BYTES = 4e9  # of photos on the device; 16 MB each at 1920 x 1080
 
 
 @dataclass
@@ -189,11 +227,14 @@ class StateTensors:
     """`FitState`, of which the Gaussians and the sky lie on a device."""
 
     iteration: int
-    learned: dict[str, Any]  # LearnedTensor; exposure, poses and boxes: Learned
+    learned: dict[str, Any]  # LearnedTensor; exposure, poses and boxes: AdamArray
     owner: ShortInts  # (N,) on the CPU
     road: Tensor
     nearest: Tensor
     wanted: Tensor
+    averages: dict[str, Any]  # of the kinds of `learned`
+    noted: int
+    _surface: tuple[Road, Tensor] | None = None  # the road that was last asked for, and what `lay_flat` takes of it
 
     def record_view(self, rows: Tensor, depths: Tensor, screen: Tensor) -> Tensor:
         """`FitState.record_view`."""
@@ -204,7 +245,9 @@ class StateTensors:
     def lay_flat(self, rows: Tensor, road: Road) -> None:
         """`FitState.lay_flat`."""
         means, quats, log_scales = (self.learned[name].values for name in ("means", "quats", "log_scales"))
-        lay_flat(means, quats, log_scales, rows[self.road[rows]], road)
+        if self._surface is None or self._surface[0] is not road:
+            self._surface = road, torch.tensor(np.dstack([road.heights, road.slopes]), device=means.device)
+        lay_flat(means, quats, log_scales, rows[self.road[rows]], self._surface[1], road.corner)
 
     def keep_round(self, rows: Tensor, background: float, boxes: float) -> None:
         """`FitState.keep_round`."""
@@ -213,6 +256,55 @@ class StateTensors:
             if most > 0.0:
                 log_scales[mine] = limit_stretch(log_scales[mine], most)
 
+    def to_host(self, array: Tensor) -> Any:
+        """`FitState.to_host`."""
+        return array.cpu().numpy()
+
+    def street_before_bodies(self, views: Sequence[BodyView], least_opacity: float) -> tuple[Ints, Array, F32, Array]:
+        """`FitState.street_before_bodies`."""
+        n = int(np.searchsorted(self.owner, BACKGROUND + 1))
+        loose = ~self.road[:n] & (self.learned["logits"].values[:n, 0].sigmoid() > least_opacity)
+        rows = loose.nonzero()[:, 0]
+        means = self.learned["means"].values[rows].double()
+        least_m = torch.full_like(means[:, 0], math.inf)
+        for view in views:
+            before_m, depth_m = distance_before_bodies(means, view)
+            least_m = torch.where(before_m > BEFORE_M, torch.minimum(least_m, depth_m), least_m)
+        found = least_m.isfinite()
+        colours = self.learned["colours"].values[rows[found]]
+        told = [tensor.cpu().numpy() for tensor in (rows[found], means[found], colours, least_m[found])]
+        return told[0], told[1], told[2], told[3]
+
+    def put_copies(self, copies: Copies) -> None:
+        """`FitState.put_copies`."""
+        named, targets, rows, order = (
+            torch.as_tensor(of, device=self.road.device)
+            for of in (copies.named, copies.targets, copies.rows, copies.order)
+        )
+        normals, logits, log_shrink = (
+            torch.as_tensor(of, device=self.road.device) for of in (copies.normals, copies.logits, copies.log_shrink)
+        )
+        self.learned["logits"].values[named, 0] = logits
+        self.learned["log_scales"].values[named] += log_shrink[:, None]
+        self._keep_rows(rows)
+        quats = self.learned["quats"].values[targets].double()
+        axis, w = quats[:, 1:] / quats.norm(dim=1, keepdim=True), quats[:, :1] / quats.norm(dim=1, keepdim=True)
+        local = normals * self.learned["log_scales"].values[targets].exp()
+        across = 2.0 * torch.linalg.cross(axis, local)
+        turned = local + w * across + torch.linalg.cross(axis, across)
+        self.learned["means"].values[targets] += JITTER * turned.float()
+        for name in SHAPES:
+            self.learned[name].forget(torch.cat([named, targets]))
+        self._keep_rows(order)
+        self.owner = self.owner[copies.rows][copies.order]
+
+    def _keep_rows(self, rows: Tensor) -> None:
+        """`FitState.keep_rows`, but for the owners."""
+        for name in SHAPES:
+            self.learned[name] = self.learned[name].take(rows)
+        for name in OF_GAUSSIANS:
+            setattr(self, name, getattr(self, name)[rows])
+
 
 @dataclass(frozen=True)
 class TorchBackend:
@@ -220,6 +312,7 @@ class TorchBackend:
 
     draw: Draw
     device: str
+    _photos: dict[int, tuple[FitPhoto, tuple[Tensor, Tensor, Tensor]]] = field(default_factory=dict)  # by their ids
 
     def __post_init__(self) -> None:
         # In this process: containers that set TORCH_ALLOW_TF32_CUBLAS_OVERRIDE multiply by ten bits, poses need more.
@@ -231,21 +324,23 @@ class TorchBackend:
         for name in DEVICE_SIDE:
             here = state.learned[name]
             learned[name] = LearnedTensor(*(self._sent(getattr(here, each.name)) for each in fields(AdamArray)))
-        others = (self._sent(array) for array in (state.road, state.nearest, state.wanted))
-        return StateTensors(state.iteration, learned, state.owner, *others)
+        averages = {name: self._sent(of) if name in DEVICE_SIDE else of for name, of in state.averages.items()}
+        road, nearest, wanted = (self._sent(getattr(state, name)) for name in OF_GAUSSIANS)
+        return StateTensors(state.iteration, learned, state.owner, road, nearest, wanted, averages, state.noted)
 
     def store(self, held: StateTensors, state: FitState) -> None:
         """Exposure, poses and boxes never left."""
-        state.iteration = held.iteration
+        state.iteration, state.noted, state.owner = held.iteration, held.noted, held.owner
         for name in DEVICE_SIDE:
             there = held.learned[name]
-            state.learned[name] = AdamArray(*(getattr(there, each.name).cpu().numpy() for each in fields(AdamArray)))
-        state.nearest, state.wanted = held.nearest.cpu().numpy(), held.wanted.cpu().numpy()
+            state.learned[name] = AdamArray(*(held.to_host(getattr(there, each.name)) for each in fields(AdamArray)))
+        state.averages = {name: held.to_host(of) if name in DEVICE_SIDE else of for name, of in held.averages.items()}
+        for name in OF_GAUSSIANS:
+            setattr(state, name, held.to_host(getattr(held, name)))
 
     def derivatives(self, problem: FitProblem, held: StateTensors, row: int, settings: FitSettings) -> Derivatives:
         """As `FitBackend` has it."""
         shot = problem.train[row]
-        compared = shot.compared
         leaves = [held.learned[name].values.detach().requires_grad_() for name in DEVICE_SIDE]
         exposure = self._sent(held.learned["exposure"].values[row]).requires_grad_()
         height, width = shot.photo.rgb.shape[:2]
@@ -255,10 +350,11 @@ class TorchBackend:
         seen = self.draw(_compose_scene(leaves[:-1], parts), eye)
 
         rgb, cells = composite_sky(seen.rgb, seen.alpha, leaves[-1], eye.intrinsics, camera)
-        picture, photo = apply_exposure(rgb, exposure), self._sent(shot.photo.rgb).float() / 255.0
-        loss = photo_loss(picture, photo, self._sent(compared.target.weight), settings.ssim_weight)
+        light, weight, ground = self._photo(shot)
+        picture, photo = apply_exposure(rgb, exposure), light.float() / 255.0
+        loss = photo_loss(picture, photo, weight, settings.ssim_weight)
         if settings.opaque_weight > 0.0:
-            loss = loss + opaque_loss(seen.alpha, self._sent(compared.ground), settings.opaque_weight)
+            loss = loss + opaque_loss(seen.alpha, ground, settings.opaque_weight)
 
         asked = [*leaves, exposure, eye.motion, seen.screen]
         by = torch.autograd.grad(loss, asked, materialize_grads=True)
@@ -274,6 +370,16 @@ class TorchBackend:
         score = float(-10.0 * torch.log10(error))
         shown = (cells, sky[cells], rows, Gradients(**back), seen.depths, tracks, boxes)
         return Derivatives(float(loss.detach()), score, d_exposure.cpu().numpy(), back["camera"], *shown)
+
+    def _photo(self, shot: FitPhoto) -> tuple[Tensor, Tensor, Tensor]:
+        """A photo, the weight of its pixels and which of them look at the ground; kept while there is room."""
+        if id(shot) in self._photos:
+            return self._photos[id(shot)][1]
+        compared = shot.compared
+        sent = self._sent(shot.photo.rgb), self._sent(compared.target.weight), self._sent(compared.ground)
+        if sum(tensor.nbytes for _, kept in self._photos.values() for tensor in kept) < KEPT_BYTES:
+            self._photos[id(shot)] = shot, sent
+        return sent
 
     def _sent(self, array: object) -> Tensor:
         return torch.as_tensor(array, device=self.device).clone()

@@ -2,12 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from tasks.kernels.compiled import kernel
-from tasks.render.fit.backend import CpuBackend, Derivatives, FitBackend, LearnedState
+from tasks.render.fit.backend import CpuBackend, Derivatives, FitBackend
 from tasks.render.fit.corrections import (
     apply_exposure,
     chain_exposures,
@@ -19,9 +17,17 @@ from tasks.render.fit.corrections import (
 )
 from tasks.render.fit.losses import Target, ssim
 from tasks.render.fit.start import FitPhoto, FitProblem
-from tasks.render.fit.state import BACKGROUND, FitState, Road, height_above_road, opacities_of, relocate_and_grow
+from tasks.render.fit.state import (
+    BACKGROUND,
+    FitState,
+    LearnedState,
+    Road,
+    add_to_average,
+    height_above_road,
+    relocate_and_grow,
+)
 from tasks.render.scene.asset import ClassQuality, Exposure, RenderAsset, ViewQuality, mean_psnr_db, psnr
-from tasks.render.scene.body import BEFORE_M, bodies_near, nearest_box_along_rays
+from tasks.render.scene.body import BEFORE_M, BodyView, bodies_near, distance_before_bodies, project_points
 from tasks.render.scene.engine import render
 from tasks.render.scene.movers import (
     SHIFT_SIZE,
@@ -152,94 +158,63 @@ LEAST_OPACITY = 0.02  # what hides less may stay
 ALIKE = 0.08  # of every colour channel: a photo that differs by less shows the Gaussian
 FARTHER = 2.0  # times the depth at which it hides: photos from farther off see too little of it
 SHOWN_BY = 0.5  # of the photos that look at its place: no more, and it is a floater
-NEAREST_M = 0.3  # to a camera
 GONE_LOGIT = -8.0  # of its opacity
 
 
-def fade_floaters(problem: FitProblem, state: FitState) -> int:
+def fade_floaters(problem: FitProblem, held: LearnedState) -> int:
     """Makes floaters transparent, in place, for `relocate_and_grow` to move them. Returns how many there were."""
-    rows = find_floaters(problem, state)
-    state.learned["logits"].values[rows] = GONE_LOGIT
-    state.learned["logits"].forget(rows)
-    if state.noted:
-        state.averages["logits"][rows] = GONE_LOGIT
+    rows = find_floaters(problem, held)
+    held.learned["logits"].values[rows] = GONE_LOGIT
+    held.learned["logits"].forget(rows)
+    if held.noted:
+        held.averages["logits"][rows] = GONE_LOGIT
     return len(rows)
 
 
-def find_floaters(problem: FitProblem, state: FitState) -> Ints:
+def find_floaters(problem: FitProblem, held: LearnedState) -> Ints:
     """Rows (M,) of Gaussians of the street, not of its road, that hide the body of a vehicle which drives in some photo
     by BEFORE_M or more, and that at most SHOWN_BY of the other photos which look there show in their own colour.
 
     No other photo looks there: it goes too. A photo in which such a body hides the place says nothing of it.
     """
-    n = int(np.searchsorted(state.owner, BACKGROUND + 1))
-    loose = ~state.road[:n] & (opacities_of(state.learned["logits"].values[:n, 0]) > LEAST_OPACITY)
-    rows = np.flatnonzero(loose)
-    means = state.learned["means"].values[rows].astype(np.float64)
-    least_m, silent = np.full(len(rows), np.inf), list[Ints]()
-    for i in range(len(problem.train)):
-        hiding, depths_m, hidden = _hiding_and_hidden_by_bodies(problem, state, i, means)
-        least_m[hiding] = np.minimum(least_m[hiding], depths_m)
-        silent.append(np.concatenate([hiding, hidden]))
-    found = np.flatnonzero(np.isfinite(least_m))
-    looked, shown = np.zeros(len(found), np.int64), np.zeros(len(found), np.int64)
-    colours = state.learned["colours"].values[rows[found]]
+    views = _body_views(problem, held)
+    rows, means, colours, least_m = held.street_before_bodies(list(views.values()), LEAST_OPACITY)
+    looked, shown = np.zeros(len(rows), np.int64), np.zeros(len(rows), np.int64)
     for i, shot in enumerate(problem.train):
-        pixel, depth_m = _in_photo(shot, state.learned["poses"].values[i], means[found])
-        looking = (pixel >= 0) & (depth_m < FARTHER * least_m[found]) & ~np.isin(found, silent[i])
+        camera_from_scene = np.linalg.inv(_learned_pose(shot, held, i))
+        size = shot.photo.rgb.shape[:2]
+        pixel, depth_m = project_points(means, camera_from_scene, shot.photo.intrinsics, *size)
+        looking = (pixel >= 0) & (depth_m < FARTHER * least_m)
+        if i in views:
+            before_m, _ = distance_before_bodies(means, views[i])
+            looking &= ~((before_m > BEFORE_M) | (before_m < 0.0))
         if shot.hidden is not None:
             looking &= ~shot.hidden.ravel()[pixel]
-        mine = apply_exposure(colours[looking], state.learned["exposure"].values[i])
+        mine = apply_exposure(colours[looking], held.learned["exposure"].values[i])
         theirs = shot.photo.rgb.reshape(-1, 3)[pixel[looking]] / np.float32(255.0)
         looked += looking
         shown[looking] += np.abs(np.clip(mine, 0.0, 1.0) - theirs).max(axis=1) < ALIKE
-    return rows[found[shown <= SHOWN_BY * looked]]
+    return rows[shown <= SHOWN_BY * looked]
 
 
-def _hiding_and_hidden_by_bodies(
-    problem: FitProblem, state: FitState, i: int, means: Array
-) -> tuple[Ints, Array, Ints]:
-    """Of `means` (M, 3) those that hide the body of a vehicle which drives in photo `i`, their depths in it [m], and
-    those that such a body hides."""
-    shot, tracks, nothing = problem.train[i], problem.tracks, np.zeros(0, np.int64)
-    boxes, valid = tracks.at(shot.photo.time_s)
-    off = state.learned["boxes"].values.reshape(len(boxes), tracks.n_knots, SHIFT_SIZE)
-    boxes = shift_boxes(boxes, interpolate_knots(off, shot.photo.time_s))
-    eye = corrected_pose(shot.photo.world_from_camera, state.learned["poses"].values[i])[:3, 3].copy()
-    bodies, drives = bodies_near(boxes, valid, tracks, eye)
-    if not drives.any():
-        return nothing, np.zeros(0), nothing
-    pixel, depth_m = _in_photo(shot, state.learned["poses"].values[i], means)
-    rows = np.flatnonzero(pixel >= 0)
-    along, first = nearest_box_along_rays(means[rows] - eye, eye, bodies)
-    on = (first >= 0) & drives[first]
-    rows, along = rows[on], along[on]
-    before_m = (along - 1.0) * np.linalg.norm(means[rows] - eye, axis=1)
-    hiding = rows[before_m > BEFORE_M]
-    return hiding, depth_m[hiding], rows[before_m < 0.0]
+def _body_views(problem: FitProblem, held: LearnedState) -> dict[int, BodyView]:
+    """Of those photos that are near a vehicle which drives, by their rows."""
+    tracks, views = problem.tracks, dict[int, BodyView]()
+    off = held.learned["boxes"].values.reshape(len(tracks.ids), tracks.n_knots, SHIFT_SIZE)
+    for i, shot in enumerate(problem.train):
+        boxes, valid = tracks.at(shot.photo.time_s)
+        boxes = shift_boxes(boxes, interpolate_knots(off, shot.photo.time_s))
+        pose = _learned_pose(shot, held, i)
+        bodies, drives = bodies_near(boxes, valid, tracks, pose[:3, 3])
+        if drives.any():
+            height, width = shot.photo.rgb.shape[:2]
+            views[i] = BodyView(pose, shot.photo.intrinsics, height, width, bodies, drives)
+    return views
 
 
-def _in_photo(shot: FitPhoto, pose: F32, means: Array) -> tuple[Ints, Array]:
-    """Which pixel of the photo shows each mean (M, 3), row by row, -1 where none does; and its depth [m]."""
-    camera_from_scene = np.linalg.inv(corrected_pose(shot.photo.world_from_camera, pose))
-    return project_points(means, camera_from_scene, shot.photo.intrinsics, *shot.photo.rgb.shape[:2])
-
-
-@kernel
-def project_points(means: Any, camera_from_scene: Any, k: Any, height: int, width: int) -> Any:
-    """As `_in_photo` has it, for a camera (4, 4) with intrinsics (3, 3)."""
-    pixel, depth = np.full(means.shape[0], -1, np.int64), np.zeros(means.shape[0])
-    m = camera_from_scene
-    for i in range(means.shape[0]):
-        x, y, z = means[i, 0], means[i, 1], means[i, 2]
-        depth[i] = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-        if depth[i] <= NEAREST_M:
-            continue
-        u = k[0, 0] * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth[i] + k[0, 2]
-        v = k[1, 1] * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth[i] + k[1, 2]
-        if 0.0 <= u < width and 0.0 <= v < height:
-            pixel[i] = int(v) * width + int(u)
-    return pixel, depth
+def _learned_pose(shot: FitPhoto, held: LearnedState, i: int) -> Array:
+    """Where the photo of row `i` was taken (4, 4)."""
+    return corrected_pose(shot.photo.world_from_camera, held.learned["poses"].values[i])
 
 
 REPORT_EVERY = 100
@@ -275,15 +250,11 @@ def run_iterations(
         due = at % settings.refine_every == 0 and settings.refine_from <= at < settings.iterations
         relocates = at <= REFINE_UNTIL * settings.iterations
         if due and (relocates or problem.tracks.driving.any()):
-            drawing.store(held, state)
-            fade_floaters(problem, state)
+            fade_floaters(problem, held)
             if relocates:
-                relocate_and_grow(state, settings)
-            held = drawing.load(state)
+                relocate_and_grow(held, settings)
         if not relocates and (at % max(1, round(NOTED_EVERY * settings.iterations)) == 0 or at == settings.iterations):
-            drawing.store(held, state)
-            state.add_to_average()
-            held = drawing.load(state)
+            add_to_average(held)
         if progress is not None and at % REPORT_EVERY == 0:
             progress(at, float(np.mean(losses)), float(np.mean(scores)))
             losses, scores = [], []

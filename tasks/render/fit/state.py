@@ -3,13 +3,14 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from tasks.kernels.compiled import kernel
+from tasks.render.scene.body import BEFORE_M, BodyView, distance_before_bodies
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians, rotations_of
 from tasks.world.arrays import F32, Array, Bools, FloatArray, Ints, ShortInts
@@ -237,6 +238,50 @@ def lay_flat(means: F32, quats: F32, log_scales: F32, rows: Ints, road: Road) ->
     _lay(means, quats, log_scales, rows, road.heights, road.slopes, road.corner, *np.log([THICKNESS_M, LONGEST_M]))
 
 
+class LearnedArray(Protocol):
+    """As `AdamArray`: an array that steps against a gradient."""
+
+    @property
+    def values(self) -> Any: ...
+
+    def step(self, rows: Any, gradient: Any, rate: float, scale: Any = None) -> None: ...
+
+    def forget(self, rows: Ints) -> None: ...
+
+
+class LearnedState(Protocol):
+    """As `FitState`: all that is learned, wherever it lies; owners, exposure, poses and boxes lie on the CPU."""
+
+    iteration: int
+    noted: int
+
+    @property
+    def learned(self) -> Mapping[str, LearnedArray]: ...
+
+    @property
+    def averages(self) -> dict[str, Any]: ...
+
+    @property
+    def owner(self) -> ShortInts: ...
+
+    @property
+    def wanted(self) -> Any: ...
+
+    def record_view(self, rows: Any, depths: Any, screen: Any) -> Any: ...
+
+    def lay_flat(self, rows: Any, road: Road) -> None: ...
+
+    def keep_round(self, rows: Any, background: float, boxes: float) -> None: ...
+
+    def to_host(self, array: Any) -> F32: ...
+
+    def street_before_bodies(
+        self, views: Sequence[BodyView], least_opacity: float
+    ) -> tuple[Ints, Array, F32, Array]: ...
+
+    def put_copies(self, copies: "Copies") -> None: ...
+
+
 BACKGROUND = -1
 SHAPES = ("means", "quats", "log_scales", "logits", "colours")  # learned, one row per Gaussian
 WORLD = ("sky", "exposure", "poses", "boxes")
@@ -292,15 +337,38 @@ class FitState:
             if most > 0.0 and len(mine):
                 log_scales[mine] = limit_stretch(log_scales[mine], most)
 
-    def add_to_average(self) -> None:
-        """Takes what is learned now into its average. Rows must not be moved from the first time on."""
-        self.noted += 1
-        for name, learned in self.learned.items():
-            average = self.averages.setdefault(name, np.zeros_like(learned.values))
-            values = learned.values
-            if name == "quats":  # which, negated, turn the same way
-                values = np.where((average * values).sum(axis=1, keepdims=True) < 0.0, -values, values)
-            average += (values - average) / np.float32(self.noted)
+    def to_host(self, array: F32) -> F32:
+        """An array of this state's kind, as numpy's: itself."""
+        return array
+
+    def street_before_bodies(self, views: Sequence[BodyView], least_opacity: float) -> tuple[Ints, Array, F32, Array]:
+        """Gaussians of the street, not of its road, that hide more than `least_opacity` and of which some view shows
+        that they stand by BEFORE_M or more before the body of a vehicle that drives.
+
+        Their rows (M,), means (M, 3), colours (M, C), and least depth (M,) [m] of those views.
+        """
+        n = int(np.searchsorted(self.owner, BACKGROUND + 1))
+        rows = np.flatnonzero(~self.road[:n] & (opacities_of(self.learned["logits"].values[:n, 0]) > least_opacity))
+        means, least_m = self.learned["means"].values[rows].astype(np.float64), np.full(len(rows), np.inf)
+        for view in views:
+            before_m, depth_m = distance_before_bodies(means, view)
+            least_m = np.where(before_m > BEFORE_M, np.minimum(least_m, depth_m), least_m)
+        found = np.isfinite(least_m)
+        return rows[found], means[found], self.learned["colours"].values[rows[found]], least_m[found]
+
+    def put_copies(self, copies: "Copies") -> None:
+        """As they are told."""
+        named, targets = copies.named, copies.targets
+        self.learned["logits"].values[named, 0] = copies.logits
+        self.learned["log_scales"].values[named] += copies.log_shrink[:, None]
+        self.keep_rows(copies.rows)
+        quats = self.learned["quats"].values[targets]
+        turns = rotations_of(quats / np.linalg.norm(quats, axis=1, keepdims=True))
+        local = copies.normals * np.exp(self.learned["log_scales"].values[targets])
+        self.learned["means"].values[targets] += JITTER * np.einsum("nij,nj->ni", turns, local).astype(np.float32)
+        for name in SHAPES:
+            self.learned[name].forget(np.concatenate([named, targets]))
+        self.keep_rows(copies.order)
 
     def apply_average(self, road: Road | None) -> None:
         """Puts everything where it was on average, on the road as well."""
@@ -340,6 +408,18 @@ class FitState:
             setattr(self, name, getattr(self, name)[rows])
 
 
+def add_to_average(held: LearnedState) -> None:
+    """Takes what is learned now into its average. Rows must not be moved from the first time on."""
+    held.noted += 1
+    for name, learned in held.learned.items():
+        values = learned.values * 1.0
+        average = held.averages.setdefault(name, values * 0.0)
+        if name == "quats":  # which, negated, turn the same way
+            turned = (average * values).sum(axis=1) < 0.0
+            values[turned] = -values[turned]
+        average += (values - average) / float(held.noted)
+
+
 def limit_stretch(log_scales: F32, most: float) -> F32:
     """Logarithms (M, 3) of sizes, the shorter ones raised to the longest over `most`."""
     return np.maximum(log_scales, log_scales.max(axis=1, keepdims=True) - np.float32(np.log(most)))
@@ -366,41 +446,49 @@ DEAD_OPACITY = 0.01  # below which a Gaussian is moved elsewhere
 JITTER = 0.5  # how far from its source a copy is put, in standard deviations of it
 
 
-def relocate_and_grow(state: FitState, settings: FitSettings) -> None:
+@dataclass(frozen=True)
+class Copies:
+    """Which Gaussians are copied where; M copies of K Gaussians."""
+
+    named: Ints  # (K,) the rows that are copied
+    logits: F32  # (K,) of their opacities from then on
+    log_shrink: F32  # (K,) that their logarithmic scales gain
+    rows: Ints  # (N',) which row each row is then a copy of; those beyond the last are new
+    targets: Ints  # (M,) the rows that copies are put at
+    normals: Array  # (M, 3) how far from their sources, in standard deviations over JITTER
+    order: Ints  # (N',) of the rows afterwards
+
+
+def relocate_and_grow(held: LearnedState, settings: FitSettings) -> None:
     """Relocates and grows, in place; a function of seed and iteration alone."""
-    rng = np.random.Generator(np.random.Philox(key=[settings.seed, 2**32 + state.iteration]))
-    opacities = opacities_of(state.learned["logits"].values[:, 0]).astype(np.float64)
+    rng, n = np.random.Generator(np.random.Philox(key=[settings.seed, 2**32 + held.iteration])), len(held.owner)
+    opacities = opacities_of(held.to_host(held.learned["logits"].values[:, 0])).astype(np.float64)
     dead = opacities < DEAD_OPACITY
-    weight = np.where(dead, 0.0, opacities * state.wanted)
+    weight = np.where(dead, 0.0, opacities * held.to_host(held.wanted))
     if weight.sum() > 0.0:
         free = np.flatnonzero(dead)
-        target = min(settings.most_gaussians, int(len(state) * (1.0 + settings.growth)))
-        n_new = max(target - len(state), 0)
-        sources = rng.choice(len(state), len(free) + n_new, p=weight / weight.sum())
-        _copy_gaussians(state, np.concatenate([free, np.arange(len(state), len(state) + n_new)]), sources, rng)
-    state.wanted = np.zeros(len(state), np.float32)
+        n_new = max(min(settings.most_gaussians, int(n * (1.0 + settings.growth))) - n, 0)
+        sources = rng.choice(n, len(free) + n_new, p=weight / weight.sum())
+        if len(sources):
+            held.put_copies(_copies(held.owner, opacities, np.concatenate([free, n + np.arange(n_new)]), sources, rng))
+    held.wanted[:] = 0.0
 
 
-def _copy_gaussians(state: FitState, targets: Ints, sources: Ints, rng: np.random.Generator) -> None:
-    """Puts copies of `sources` at the rows `targets` (M,), where rows beyond the last are new."""
-    if len(targets) == 0:
-        return
+def _copies(owner: ShortInts, opacities: Array, targets: Ints, sources: Ints, rng: np.random.Generator) -> Copies:
+    """Of `sources`, at the rows `targets` (M,)."""
     named, counts = np.unique(sources, return_counts=True)
-    logits, log_scales = state.learned["logits"].values, state.learned["log_scales"].values
-    opacities, shrink = split_opacity(opacities_of(logits[named, 0]).astype(np.float64), counts + 1)
-    logits[named, 0] = logits_of(np.maximum(opacities, LEAST_OPACITY))
-    log_scales[named] += np.log(shrink)[:, None].astype(np.float32)
-    rows = np.arange(max(len(state), int(targets.max()) + 1))
+    shared, shrink = split_opacity(opacities[named], counts + 1)
+    rows = np.arange(max(len(owner), int(targets.max()) + 1))
     rows[targets] = sources
-    state.keep_rows(rows)
-    means = state.learned["means"].values
-    quats = state.learned["quats"].values[targets]
-    turns = rotations_of(quats / np.linalg.norm(quats, axis=1, keepdims=True))
-    local = rng.standard_normal((len(targets), 3)) * np.exp(state.learned["log_scales"].values[targets])
-    means[targets] += JITTER * np.einsum("nij,nj->ni", turns, local).astype(np.float32)
-    for name in SHAPES:
-        state.learned[name].forget(np.concatenate([named, targets]))
-    state.keep_rows(np.argsort(state.owner, kind="stable"))
+    return Copies(
+        named,
+        logits_of(np.maximum(shared, LEAST_OPACITY)),
+        np.log(shrink).astype(np.float32),
+        rows,
+        targets,
+        rng.standard_normal((len(targets), 3)),
+        np.argsort(owner[rows], kind="stable"),
+    )
 
 
 @kernel

@@ -5,7 +5,7 @@ of it lies anywhere, most of it outside its box, where it would be taken for the
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -114,6 +114,66 @@ def nearest_box_along_rays(rays: Any, eye: Any, boxes: Any) -> Any:
             if 0.0 < enter <= leave and enter < along[i]:
                 along[i], which[i] = enter, j
     return along, which
+
+
+# What stands before, or behind, the body of a vehicle that drives, as a photo shows it.
+
+NEAREST_M = 0.3  # to a camera
+
+
+@dataclass(frozen=True)
+class BodyView:
+    """A photo's view of bodies, in one frame."""
+
+    scene_from_camera: Array  # (4, 4)
+    intrinsics: Array  # (3, 3)
+    height: int
+    width: int
+    bodies: Array  # (B, 7)
+    drives: Bools  # (B,) of a vehicle that does
+
+    @property
+    def eye(self) -> Array:
+        """Where the camera is (3,)."""
+        return np.ascontiguousarray(self.scene_from_camera[:3, 3])
+
+    @property
+    def camera_from_scene(self) -> Array:
+        """(4, 4)"""
+        return np.asarray(np.linalg.inv(self.scene_from_camera), np.float64)
+
+
+def distance_before_bodies(points: Array, view: BodyView) -> tuple[Array, Array]:
+    """How far [m] points (M, 3) stand before the body of a vehicle that drives, and their depths [m]; (M,) each.
+
+    Negative: behind it; NaN where the photo shows no such body in the point's place.
+    """
+    pixel, depth_m = project_points(points, view.camera_from_scene, view.intrinsics, view.height, view.width)
+    eye, rows = view.eye, np.flatnonzero(pixel >= 0)
+    rays = points[rows] - eye
+    along, first = nearest_box_along_rays(rays, eye, view.bodies)
+    on = (first >= 0) & view.drives[first]
+    before_m = np.full(len(points), np.nan)
+    before_m[rows[on]] = (along[on] - 1.0) * np.linalg.norm(rays[on], axis=1)
+    return before_m, depth_m
+
+
+@kernel
+def project_points(points: Any, camera_from_scene: Any, k: Any, height: int, width: int) -> Any:
+    """Which pixel of a camera (4, 4) with intrinsics (3, 3) shows each of `points` (M, 3), row by row, -1 where none
+    does; and their depths [m]."""
+    pixel, depth = np.full(points.shape[0], -1, np.int64), np.zeros(points.shape[0])
+    m = camera_from_scene
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        depth[i] = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+        if depth[i] <= NEAREST_M:
+            continue
+        u = k[0, 0] * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth[i] + k[0, 2]
+        v = k[1, 1] * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth[i] + k[1, 2]
+        if 0.0 <= u < width and 0.0 <= v < height:
+            pixel[i] = int(v) * width + int(u)
+    return pixel, depth
 
 
 def unseen_body_gaussians(seen: Gaussians, size: Array) -> Gaussians:

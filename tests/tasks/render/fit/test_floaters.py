@@ -15,7 +15,6 @@ from tasks.render.fit.reconstruct import (
     FARTHER,
     GONE_LOGIT,
     LEAST_OPACITY,
-    NEAREST_M,
     REFINE_UNTIL,
     SHOWN_BY,
     fade_floaters,
@@ -23,9 +22,9 @@ from tasks.render.fit.reconstruct import (
     run_iterations,
 )
 from tasks.render.fit.start import FitProblem, prepare_fit
-from tasks.render.fit.state import BACKGROUND, FitState, logits_of, opacities_of
+from tasks.render.fit.state import BACKGROUND, FitState, add_to_average, logits_of, opacities_of
 from tasks.render.gate import intersect_box
-from tasks.render.scene.body import BEFORE_M, REACH_M, body_boxes
+from tasks.render.scene.body import BEFORE_M, NEAREST_M, REACH_M, body_boxes
 from tasks.render.scene.movers import SHIFT_SIZE, interpolate_knots, shift_boxes
 from tasks.render.settings import FitSettings
 from tasks.world.arrays import Array
@@ -213,7 +212,7 @@ def test_floaters_become_transparent_and_forget_how_they_were_moved(prepared: Pr
     before = fresh(state)
     for name in ("first", "second"):
         getattr(state.learned["logits"], name)[:] = 1.0
-    state.add_to_average()
+    add_to_average(state)
     assert fade_floaters(problem, state) == 1
     logits = state.learned["logits"]
     assert state.averages["logits"][0] == GONE_LOGIT

@@ -8,11 +8,14 @@ import pytest
 import street
 import torch
 
+from tasks.render.fit import on_torch
 from tasks.render.fit.backend import CpuBackend, Derivatives
 from tasks.render.fit.on_torch import TorchBackend
 from tasks.render.fit.reconstruct import finish_scene, run_iterations
 from tasks.render.fit.start import FitProblem, prepare_fit
-from tasks.render.fit.state import FitState
+from tasks.render.fit.state import FitState, add_to_average, relocate_and_grow
+from tasks.render.scene import body
+from tasks.render.scene.body import BEFORE_M, BodyView
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gradient import Gradients
 from tasks.render.splatting.tensors import splatted
@@ -134,3 +137,68 @@ def test_what_is_taken_is_a_copy(prepared: tuple[FitProblem, FitState]) -> None:
     state = fresh(prepared[1])
     TENSORS.load(state).learned["means"].values[:] = 0.0
     assert state.learned["means"].values.any()
+
+
+def assert_same_state(one: FitState, other: FitState) -> None:
+    mine, theirs = one.arrays(), other.arrays()
+    assert mine.keys() == theirs.keys()
+    for name, array in mine.items():
+        np.testing.assert_allclose(theirs[name], array, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+def test_gaussians_are_copied_and_averaged_on_the_device_as_on_the_cpu(prepared: tuple[FitProblem, FitState]) -> None:
+    """With the same draws: the same sources, places, owners and moments."""
+    one = fresh(prepared[1])
+    run_iterations(prepared[0], one, SETTINGS, 5)
+    one.learned["logits"].values[::7] = -9.0
+    other = fresh(one)
+    held = TENSORS.load(other)
+    for state in (one, held):
+        relocate_and_grow(state, SETTINGS)
+        add_to_average(state)
+        state.learned["quats"].values[:] *= -1.0
+        state.learned["means"].values[:] += 1.0
+        add_to_average(state)
+    TENSORS.store(held, other)
+    assert len(one) == len(other) > len(prepared[1]) and one.noted == 2
+    assert_same_state(one, other)
+
+
+def test_bodies_hide_and_are_hidden_on_the_device_as_on_the_cpu() -> None:
+    """Two turned boxes, one behind the other, one of which drives, and points all around the camera."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
+    pose[:3, 3] = 1.0, -2.0, 1.5
+    bodies = np.array([[9.0, -2.0, 1.0, 0.4, 4.0, 1.8, 1.5], [16.0, -2.5, 1.2, -0.2, 6.0, 2.2, 3.0]])
+    lens = np.array([[60.0, 0.0, 40.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]])
+    points = np.random.default_rng(3).uniform([-5.0, -10.0, -1.0], [30.0, 8.0, 4.0], (40_000, 3))
+    for drives in ([True, False], [False, True], [True, True]):
+        view = BodyView(pose, lens, 48, 80, bodies, np.array(drives))
+        before_m, depth_m = body.distance_before_bodies(points, view)
+        assert (before_m > BEFORE_M).sum() > 20 and (before_m < 0.0).sum() > 20 and np.isnan(before_m).any()
+        for found, expected in zip(on_torch.distance_before_bodies(torch.tensor(points), view), (before_m, depth_m)):
+            np.testing.assert_allclose(found.numpy(), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_the_state_comes_back_once_however_often_gaussians_are_moved(
+    prepared: tuple[FitProblem, FitState], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing but opacities, what was wanted and what hides vehicles is looked at meanwhile."""
+    stored, asked = list[int](), list[int]()
+    store, to_host = TorchBackend.store, on_torch.StateTensors.to_host
+
+    def storing(backend: TorchBackend, held: on_torch.StateTensors, state: FitState) -> None:
+        stored.append(len(asked))
+        store(backend, held, state)
+
+    def asking(held: on_torch.StateTensors, array: torch.Tensor) -> np.ndarray:
+        asked.append(array.ndim)
+        return to_host(held, array)
+
+    monkeypatch.setattr(TorchBackend, "store", storing)
+    monkeypatch.setattr(on_torch.StateTensors, "to_host", asking)
+    problem, state = prepared[0], fresh(prepared[1])
+    run_iterations(problem, state, SETTINGS, SETTINGS.iterations - 1, backend=TENSORS)
+    assert len(state) > len(prepared[1]) and state.noted > 0
+    (n_before,) = stored
+    assert n_before > 2 and set(asked[:n_before]) == {1}  # a number of each Gaussian, no more

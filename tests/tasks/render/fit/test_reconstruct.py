@@ -17,7 +17,7 @@ from tasks.render.fit.reconstruct import (
     run_iterations,
 )
 from tasks.render.fit.start import FitProblem, prepare_fit
-from tasks.render.fit.state import BETA1, SHAPES, SLACK_M, FitState, height_above_road
+from tasks.render.fit.state import BETA1, SHAPES, SLACK_M, FitState, add_to_average, height_above_road
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.engine import render
 from tasks.render.scene.movers import PlacedAgents
@@ -107,16 +107,16 @@ def test_the_scene_is_the_mean_of_what_was_learned_once_nothing_is_relocated(
 def test_a_turn_and_its_negative_are_one_on_average(prepared: tuple[FitProblem, FitState]) -> None:
     state = fresh(prepared[1])
     before = state.learned["quats"].values.copy()
-    state.add_to_average()
+    add_to_average(state)
     state.learned["quats"].values[::2] *= -1.0
-    state.add_to_average()
+    add_to_average(state)
     state.apply_average(None)
     np.testing.assert_allclose(state.learned["quats"].values, before, rtol=1e-6)
 
 
 def test_what_lies_on_the_road_lies_on_it_on_average(prepared: tuple[FitProblem, FitState]) -> None:
     problem, state = prepared[0], fresh(prepared[1])
-    state.add_to_average()
+    add_to_average(state)
     state.averages["means"][state.road, 2] += 0.5
     state.apply_average(problem.road)
     assert problem.road is not None and state.road.sum() > 100
