@@ -41,6 +41,7 @@ from planners.training.train import TrainConfig
 from tasks.caches import user_cache
 from tasks.kernels.compiled import cache_dir
 from tasks.render.settings import FitSettings
+from tests.bench import bench_gpus
 from tests.factory.installs import SMALL, as_if_installed
 from tests.pages import PAGES, REPOSITORY, Command, blocks, commands, named_in_prose
 
@@ -200,6 +201,8 @@ def test_every_command_is_one_its_program_takes(
             assert set(pairs(given(arguments))) <= {"openscene", "front", "kitti", "town", "out", "iterations"}
         case ["python", "-m", "tests.bench.bench_kitti", _, *arguments]:
             assert set(pairs(given(arguments))) <= FIT | {"validate", "first", "last", "by"}
+        case ["python", "-m", "tests.bench.bench_gpus", *arguments]:
+            parse(bench_gpus.Request, arguments)
         case ["python", "-m", "tests.bench.bench_gate", *arguments]:
             assert set(pairs(arguments)) <= {"chosen", "held", "clips", "out", "drives", "every"}
         case ["python", "-m", "tests.bench.bench_guess", *arguments]:
