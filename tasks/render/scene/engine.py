@@ -68,19 +68,19 @@ def render_pictures(
     first = instants[0].cameras[0]
     out = np.empty((len(instants), len(bodies), first.height, first.width, 3), np.uint8)
     for row, instant in zip(out, instants, strict=True):
-        for picture, view, body in zip(row, _render_on_cpu(asset, instant, 1), bodies, strict=True):
+        for picture, view, body in zip(row, _render_on_cpu(asset, instant, 1, with_depth=False), bodies, strict=True):
             cv2.convertScaleAbs(view.rgb, picture, 255.0)
             if body is not None:
-                picture[:] = body.drawn_on(picture)
+                body.draw_on(picture)
     return out
 
 
-def _render_on_cpu(asset: RenderAsset, instant: Instant, threads: int) -> list[View]:
+def _render_on_cpu(asset: RenderAsset, instant: Instant, threads: int, with_depth: bool = True) -> list[View]:
     agents, seen = instant.vehicles, []
     scene = compose_gaussians(asset, agents.track_ids, agents.kinds, agents.boxes)
     for eye, affine in zip(_in_scene(asset, instant).cameras, instant.affines, strict=True):
         k, pose = eye.intrinsics, eye.world_from_camera
-        view = forward(scene, k, pose, eye.width, eye.height, BLACK, threads, asset.screen).view
+        view = forward(scene, k, pose, eye.width, eye.height, BLACK, threads, asset.screen, with_depth).view
         asset.sky.finish(view.rgb, view.alpha, affine, k, pose, threads)
         seen.append(view)
     return seen

@@ -203,9 +203,9 @@ def blend(
     last_tile: int,
 ) -> None:
     """Fills rgb (H, W, 3), depth and alpha (H, W) on some tiles, and where in `tile_splats` each was opaque. `behind`
-    (H, W, 3), or (1, 1, 3)."""
+    (H, W, 3), or (1, 1, 3); depth (0, 0): nobody asks for it."""
     height, width = alpha.shape
-    many = behind.shape[0] > 1
+    many, deep = behind.shape[0] > 1, depth.shape[0] > 0
     tiles_x = (width + TILE - 1) // TILE
     buffer = aligned_memory(TILE * 5 * TILE)  # by row: light that still passes; sums of red, green, blue, depth
     for t in range(first_tile, last_tile):
@@ -237,7 +237,8 @@ def blend(
                     store(buffer, at + np.uint64(16), fma(w, red, load(buffer, at + np.uint64(16))))
                     store(buffer, at + np.uint64(32), fma(w, green, load(buffer, at + np.uint64(32))))
                     store(buffer, at + np.uint64(48), fma(w, blue, load(buffer, at + np.uint64(48))))
-                    store(buffer, at + np.uint64(64), fma(w, z, load(buffer, at + np.uint64(64))))
+                    if deep:
+                        store(buffer, at + np.uint64(64), fma(w, z, load(buffer, at + np.uint64(64))))
                     at += np.uint64(80)
                     dy = dy + fill(ALL)
             if most_light(buffer, 5) <= OPAQUE:
@@ -253,7 +254,9 @@ def blend(
                     total = buffer[pixel + np.uint64((channel + 1) * TILE)]
                     rgb[y0 + y, x0 + x, channel] = light * behind[v, u, channel] + total
                 alpha[y0 + y, x0 + x] = covered
-                depth[y0 + y, x0 + x] = buffer[pixel + np.uint64(4 * TILE)] / covered if covered > NOTHING else NOTHING
+                if deep:
+                    total = buffer[pixel + np.uint64(4 * TILE)]
+                    depth[y0 + y, x0 + x] = total / covered if covered > NOTHING else NOTHING
 
 
 @kernel
@@ -309,7 +312,7 @@ class View:
     """What one camera sees."""
 
     rgb: F32  # (H, W, 3) in [0, 1] when colours and background are
-    depth: F32  # (H, W) [m] mean of the Gaussians' depths by weight; 0 where nothing is
+    depth: F32  # (H, W) [m] mean of the Gaussians' depths by weight; 0 where nothing is; (0, 0): not asked for
     alpha: F32  # (H, W) 1 - the part of the background that shines through
 
 
@@ -385,6 +388,7 @@ def forward(
     background: F32,
     threads: int = 1,
     screen: ScreenFilter = FITTED,
+    with_depth: bool = True,
 ) -> ForwardPass:
     """The picture of a pinhole camera, with what `tasks.render.splatting.gradient.backward` needs.
 
@@ -394,7 +398,7 @@ def forward(
     """
     splats = project_and_sort(gaussians, intrinsics, scene_from_camera, width, height, threads, screen)
     splats.projected[:, RED : BLUE + 1] = colours_seen(gaussians, scene_from_camera[:3, 3], splats.index, threads)
-    view, tile_end = _shade(splats, background, threads)
+    view, tile_end = _shade(splats, background, threads, with_depth)
     return ForwardPass(view, splats, tile_end)
 
 
@@ -414,10 +418,11 @@ def shade(splats: Splats, colours: F32, background: F32, threads: int = 1) -> Vi
     return _shade(replace(splats, projected=projected), background, threads)[0]
 
 
-def _shade(splats: Splats, background: F32, threads: int) -> tuple[View, Ints]:
+def _shade(splats: Splats, background: F32, threads: int, with_depth: bool = True) -> tuple[View, Ints]:
     height, width = splats.height, splats.width
     behind = np.ascontiguousarray(background, np.float32).reshape(-1, 1 if background.ndim == 1 else width, 3)
-    view = View(*(np.empty((height, width, *more), np.float32) for more in ((3,), (), ())))
+    sizes = (height, width, 3), (height, width) if with_depth else (0, 0), (height, width)
+    view = View(*(np.empty(size, np.float32) for size in sizes))
     dealt = (splats.projected, splats.tile_start, splats.tile_splats)
     ends = np.empty(len(splats.tile_start) - 1, np.int64)
 
