@@ -30,7 +30,7 @@ ROOMS = {
         *("exits", "wording", "files"),
         *("readers.settings", "config", "readers", "store"),
         *("graph", "datasets", "stages", "pipeline", "setup", "datasets.navsim", "views", "views.board"),
-        *("run", "commands", "__main__"),
+        *("alpasim", "run", "commands", "__main__"),
     ),
     "planners": (
         *("data", "models", "training", "published"),

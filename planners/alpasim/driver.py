@@ -1,16 +1,14 @@
 """A planner behind AlpaSim's `egodriver.EgodriverService`: bytes of a request in, bytes of the answer out.
 
-`Driver.answer` is the whole service without a socket; `serve` puts gRPC in front of it. The messages' classes are
-those of `carla-driver-interface`, which vendors NVlabs/alpasim 6870924 unchanged. Nothing that comes in is unpickled:
+`Driver.service` is all of it without a socket; `serve` puts gRPC in front of it. Nothing that comes in is unpickled:
 `renderer_data` is not looked at, and `debug_info` stays empty.
 """
 
 import logging
-import signal
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from queue import Empty, Queue
 from typing import Any
@@ -18,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from factory import __version__
-from factory.config.arguments import Refused
+from factory.alpasim import wire
+from factory.alpasim.wire import LARGEST, Fault, Service, Sessions, bounded, rotation_of, stamp_of, vector_of
 from factory.config.compose import ConfigError
 from planners.alpasim.session import (
     SECOND_US,
@@ -40,85 +39,35 @@ from tasks.world.arrays import Array
 from tasks.world.commands import CommandRule
 
 SERVICE = "egodriver.EgodriverService"
-MESSAGE_BYTES = 32 << 20  # of a request; a PNG of 3840 x 2160 has up to 25 MB
-MOST = 10_000  # poses or waypoints of a message
-LARGEST = 1e7  # m, m/s and so on: beyond it a number is none of a rollout
-LAST_US = 1 << 62
 QUERY_US = 60 * SECOND_US  # how far ahead a trajectory may be asked for
-SESSIONS = 64  # at a time
 PATIENCE_S = 600.0  # of a question for its plan
 # carla-driver-interface turns the cameras of a peer that does not name this revision of the contract (its contract.py).
 CONTRACT = (("carla-driver-interface-contract", "2"),)
 log = logging.getLogger(__name__)
 
 
-class Fault(Exception):
-    """The request is answered by a gRPC status of this name."""
-
-    def __init__(self, status: str, problem: str) -> None:
-        super().__init__(problem)
-        self.status = status
-
-
-# Fields of requests. What is wrong with one is a ValueError that names it.
-
-
-def _stamp(name: str, value: int) -> int:
-    if value > LAST_US:
-        raise ValueError(f"{name}={value}: microseconds, at most {LAST_US}")
-    return int(value)
-
-
-def _vector(name: str, vector: Any) -> list[float]:
-    found = [vector.x, vector.y, vector.z]
-    if not all(abs(number) <= LARGEST for number in found):  # false of NaN
-        raise ValueError(f"{name}={found}: finite numbers up to {LARGEST:g} are expected")
-    return found
-
-
-def _rotation(name: str, quat: Any) -> Array:
-    """(3, 3)."""
-    q = np.array([quat.w, quat.x, quat.y, quat.z], np.float64)
-    if not abs(np.linalg.norm(q) - 1.0) <= 0.01:
-        raise ValueError(f"{name}={q.tolist()}: not a unit quaternion w, x, y, z")
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def _bounded(name: str, repeated: Sequence[Any]) -> Sequence[Any]:
-    if len(repeated) > MOST:
-        raise ValueError(f"{name}: {len(repeated)} of them, at most {MOST} in a message")
-    return repeated
-
-
 def states_of(message: Any) -> dict[int, Array]:
     """Stamp -> state (9,) of a RolloutEgoTrajectory. Raises ValueError."""
-    poses, dynamics = _bounded("trajectory.poses", message.trajectory.poses), message.dynamic_states
+    poses, dynamics = bounded("trajectory.poses", message.trajectory.poses), message.dynamic_states
     if len(dynamics) != len(poses):
         raise ValueError(f"dynamic_states: {len(dynamics)}, one for each of the {len(poses)} trajectory.poses expected")
     states = {}
     for i, (at, dynamic) in enumerate(zip(poses, dynamics)):
-        x, y, z = _vector(f"trajectory.poses[{i}].pose.vec", at.pose.vec)
-        turned = _rotation(f"trajectory.poses[{i}].pose.quat", at.pose.quat)
+        x, y, z = vector_of(f"trajectory.poses[{i}].pose.vec", at.pose.vec)
+        turned = rotation_of(f"trajectory.poses[{i}].pose.quat", at.pose.quat)
         name = f"dynamic_states[{i}]."
-        vx, vy, _ = _vector(f"{name}linear_velocity", dynamic.linear_velocity)
-        ax, ay, _ = _vector(f"{name}linear_acceleration", dynamic.linear_acceleration)
-        yaw_rate = _vector(f"{name}angular_velocity", dynamic.angular_velocity)[2]
+        vx, vy, _ = vector_of(f"{name}linear_velocity", dynamic.linear_velocity)
+        ax, ay, _ = vector_of(f"{name}linear_acceleration", dynamic.linear_acceleration)
+        yaw_rate = vector_of(f"{name}angular_velocity", dynamic.angular_velocity)[2]
         heading = np.arctan2(turned[1, 0], turned[0, 0])
-        stamp = _stamp(f"trajectory.poses[{i}].timestamp_us", at.timestamp_us)
+        stamp = stamp_of(f"trajectory.poses[{i}].timestamp_us", at.timestamp_us)
         states[stamp] = np.array([x, y, heading, z, vx, vy, ax, ay, yaw_rate])
     return states
 
 
 def route_of(route: Any) -> Array:
     """(N, 2) of a Route; NaN where there is no point. Raises ValueError for what is neither."""
-    points = np.array([(p.x, p.y) for p in _bounded("route.waypoints", route.waypoints)], np.float64).reshape(-1, 2)
+    points = np.array([(p.x, p.y) for p in bounded("route.waypoints", route.waypoints)], np.float64).reshape(-1, 2)
     wrong = np.flatnonzero((np.abs(points) > LARGEST).any(axis=1))
     if len(wrong):
         raise ValueError(f"route.waypoints[{wrong[0]}]: beyond {LARGEST:g} m; NaN says that there is none")
@@ -131,7 +80,7 @@ def session_cameras(declared: Sequence[Any], layout: ImageLayout | None, given: 
     declared: AvailableCameras; names in lower case. Raises ValueError.
     """
     field_name = "rollout_spec.vehicle.available_cameras"
-    names = [camera.logical_id.lower() for camera in _bounded(field_name, declared)]
+    names = [camera.logical_id.lower() for camera in bounded(field_name, declared)]
     if len(set(names)) < len(names):
         raise ValueError(f"{field_name}: a logical_id stands there twice: {', '.join(names)}")
     if layout is None:
@@ -139,7 +88,7 @@ def session_cameras(declared: Sequence[Any], layout: ImageLayout | None, given: 
     wanted = tuple(name.lower() for name in given or layout.cameras)
     if not wanted:
         quats = ((f"{field_name}[{i}].rig_to_camera.quat", c.rig_to_camera.quat) for i, c in enumerate(declared))
-        axes = np.array([_rotation(*quat)[:2, 2] for quat in quats])  # the optical frame looks along z
+        axes = np.array([rotation_of(*quat)[:2, 2] for quat in quats])  # the optical frame looks along z
         wanted = chosen_cameras(names, axes.reshape(-1, 2), layout)
     if missing := [name for name in wanted if name not in names]:
         there = ", ".join(names) or "none"
@@ -241,13 +190,7 @@ class Driver:
 
         Raises ConfigError for a planner that wants more than AlpaSim sends, and without the messages' package.
         """
-        try:
-            from carla_driver_interface import protocol
-        except ModuleNotFoundError as error:
-            raise ConfigError(
-                f'protocol=alpasim: {error}; pip install "driving-data-factory[planners,alpasim]"'
-            ) from error
-        self._proto, self._given = protocol, cameras
+        self._proto, self._given = wire.contract("protocol=alpasim", "planners,alpasim"), cameras
         made, needs = load_for_agent(planner, device, "AlpaSim")
         self._rule: CommandRule = command or needs.command
         self._needs = replace(needs, command="navsim")  # the rows have one already, by the rule
@@ -258,10 +201,11 @@ class Driver:
         who = find_planner(planner)
         self._version = f"driving-data-factory {__version__} {who.label} {who.digest}"
         self.counts: Counter[str] = Counter()
-        self._rollouts: dict[str, _Rollout] = {}
+        self.rollouts: Sessions[_Rollout] = Sessions()
         self._lock = threading.Lock()
         self._planner = BatchedPlanner(made, self._needs, device, batch, wait_s)
-        self._requests: Mapping[str, tuple[Callable[[Any], Any], Any]] = {
+        protocol = self._proto
+        requests = {
             "get_version": (self._get_version, protocol.Empty),
             "start_session": (self._start_session, protocol.DriveSessionRequest),
             "close_session": (self._close_session, protocol.DriveSessionCloseRequest),
@@ -272,101 +216,67 @@ class Driver:
             "drive": (self._drive, protocol.DriveRequest),
             "shut_down": (lambda _: protocol.Empty(), protocol.Empty),  # of old versions; a signal ends the server
         }
+        self.service = Service(SERVICE, requests, {"get_version": CONTRACT})
         seen = AgentObservation(np.zeros((4, 3)), np.eye(8)[COMMANDS.index("straight")])
         try:
             self._plan_of(seen, None if layout is None else np.zeros((layout.height, layout.width, 3), np.uint8))
         except Unseen as error:
             raise ConfigError(f"planner={planner}: at rest, on a black picture: {error}") from error
 
-    @property
-    def methods(self) -> Sequence[str]:
-        """The names of the RPCs."""
-        return list(self._requests)
-
-    def answer(self, method: str, request: bytes) -> bytes:
-        """Of one RPC. Raises Fault; another exception is the planner's own."""
-        from google.protobuf.message import DecodeError
-
-        does, kind = self._requests[method]
-        try:
-            message = kind.FromString(request)
-        except (DecodeError, UnicodeDecodeError) as error:
-            raise Fault("INVALID_ARGUMENT", f"{method}: the bytes are no {kind.DESCRIPTOR.name}: {error}") from error
-        try:
-            return bytes(does(message).SerializeToString())
-        except PoseUnknown as error:
-            raise Fault("FAILED_PRECONDITION", f"{method}: {error}") from error
-        except ValueError as error:
-            raise Fault("INVALID_ARGUMENT", f"{method}: {error}") from error
-
     def close(self) -> None:
         """Say what came of all questions, and end the planner's thread."""
         log.warning("all sessions: %s", _told(self.counts))
         self._planner.close()
 
-    def _rollout(self, uuid: str) -> _Rollout:
-        with self._lock:
-            rollout = self._rollouts.get(uuid)
-        if rollout is None:
-            raise Fault("NOT_FOUND", f"session_uuid={uuid[:64]!r}: no such session; start_session opens one")
-        return rollout
-
     def _get_version(self, _: Any) -> Any:
         return self._proto.VersionId(version_id=self._version, grpc_api_version=self._proto.ALPASIM_API_VERSION)
 
     def _start_session(self, message: Any) -> Any:
-        uuid = message.session_uuid
-        if not 0 < len(uuid) <= 128:
-            raise ValueError(f"session_uuid: 1 to 128 characters, not {len(uuid)}")
         declared = message.rollout_spec.vehicle.available_cameras
         cameras = session_cameras(declared, self._needs.image, self._given)
         session = Session(cameras, frozenset(camera.logical_id.lower() for camera in declared))
-        with self._lock:
-            if uuid in self._rollouts:
-                raise Fault("ALREADY_EXISTS", f"session_uuid={uuid!r} is open")
-            if len(self._rollouts) >= SESSIONS:
-                raise Fault("RESOURCE_EXHAUSTED", f"{SESSIONS} sessions are open: close_session ends one")
-            self._rollouts[uuid] = _Rollout(session)
+        self.rollouts.begin(message.session_uuid, _Rollout(session))
         return self._proto.SessionRequestStatus()
 
     def _close_session(self, message: Any) -> Any:
-        rollout = self._rollout(message.session_uuid)
-        with self._lock:
-            self._rollouts.pop(message.session_uuid, None)
+        rollout = self.rollouts.end(message.session_uuid)
         log.warning("session %s: %s", message.session_uuid, _told(rollout.counts))
         return self._proto.Empty()
 
     def _submit_image(self, message: Any) -> Any:
-        rollout, image = self._rollout(message.session_uuid), message.camera_image
-        stamp = _stamp("camera_image.frame_end_us", image.frame_end_us)
+        rollout, image = self.rollouts[message.session_uuid], message.camera_image
+        stamp = stamp_of("camera_image.frame_end_us", image.frame_end_us)
         with rollout.lock:
             rollout.session.keep_frame(image.logical_id.lower(), stamp, image.image_bytes)
         return self._proto.Empty()
 
     def _submit_egomotion(self, message: Any) -> Any:
-        rollout, states = self._rollout(message.session_uuid), states_of(message)
+        rollout, states = self.rollouts[message.session_uuid], states_of(message)
         with rollout.lock:
             rollout.session.keep_states(states)
         return self._proto.Empty()
 
     def _submit_route(self, message: Any) -> Any:
-        rollout, points = self._rollout(message.session_uuid), route_of(message.route)
-        stamp = _stamp("route.timestamp_us", message.route.timestamp_us)
+        rollout, points = self.rollouts[message.session_uuid], route_of(message.route)
+        stamp = stamp_of("route.timestamp_us", message.route.timestamp_us)
         with rollout.lock:
             rollout.session.keep_route(stamp, points)
         return self._proto.Empty()
 
     def _ignore(self, message: Any) -> Any:
-        self._rollout(message.session_uuid)
+        self.rollouts[message.session_uuid]
         return self._proto.Empty()
 
     def _drive(self, message: Any) -> Any:
-        rollout = self._rollout(message.session_uuid)
-        now, query = (_stamp(name, getattr(message, name)) for name in ("time_now_us", "time_query_us"))
+        rollout = self.rollouts[message.session_uuid]
+        now, query = (stamp_of(name, getattr(message, name)) for name in ("time_now_us", "time_query_us"))
         if not now <= query <= now + QUERY_US:
             raise ValueError(f"time_query_us={query}: from time_now_us={now} to {QUERY_US} us later")
-        with rollout.lock:
-            plan, state, begin = self._planned_now(rollout, now, message.session_uuid)
+        try:
+            with rollout.lock:
+                plan, state, begin = self._planned_now(rollout, now, message.session_uuid)
+        except PoseUnknown as error:
+            raise Fault("FAILED_PRECONDITION", f"drive: {error}") from error
         answer = self._proto.DriveResponse()
         for stamp, (x, y, heading) in local_poses(plan, state, begin, now, query).items():
             at = answer.trajectory.poses.add(timestamp_us=stamp)
@@ -404,48 +314,9 @@ def _told(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{counts[what]} {what}" for what in ("plans", "fallbacks"))
 
 
-def start_server(driver: Driver, host: str, port: int) -> tuple[Any, int]:
-    """A started gRPC server and its port; 0 asks for a free one. Raises Refused where the port is not to be had."""
-    import grpc
-
-    def handler(method: str) -> Any:
-        def answer(request: bytes, context: Any) -> bytes:
-            if method == "get_version":
-                context.send_initial_metadata(CONTRACT)
-            try:
-                return driver.answer(method, request)
-            except Fault as fault:
-                context.abort(grpc.StatusCode[fault.status], str(fault))
-                raise  # abort has raised
-
-        return grpc.unary_unary_rpc_method_handler(answer)  # bytes as they are: what is no message is ours to refuse
-
-    options = [
-        ("grpc.max_receive_message_length", MESSAGE_BYTES),
-        ("grpc.max_send_message_length", MESSAGE_BYTES),
-        ("grpc.so_reuseport", 0),  # a second server on a port is refused, not given every other question
-    ]
-    pool = ThreadPoolExecutor(SESSIONS, "rpc")
-    server = grpc.server(pool, options=options, maximum_concurrent_rpcs=4 * SESSIONS)
-    handlers = {method: handler(method) for method in driver.methods}
-    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, handlers),))
-    try:
-        bound = server.add_insecure_port(f"{host}:{port}")
-    except RuntimeError as error:
-        raise Refused(
-            f"host={host} port={port}: {str(error).rstrip('.')}; give another port=, or 0 for a free one"
-        ) from error
-    server.start()
-    return server, bound
-
-
 def serve(driver: Driver, host: str, port: int) -> None:
     """Answer until SIGTERM, or until its terminal closes. Raises Refused where the port is not to be had."""
-    server, bound = start_server(driver, host, port)
-    for ending in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(ending, lambda number, frame: server.stop(5.0))
-    print(f"answers at {host}:{bound}", flush=True)
     try:
-        server.wait_for_termination()
+        wire.serve([driver.service], host, port)
     finally:
         driver.close()

@@ -20,12 +20,14 @@ from carla_driver_interface import protocol
 from carla_driver_interface.testing import FakeCamera, FakeLoop
 from google.protobuf.descriptor import FieldDescriptor
 
+from factory.alpasim import wire
+from factory.alpasim.wire import Fault, start_server
 from factory.config.arguments import Refused
 from factory.config.compose import ConfigError
 from factory.exits import COMPLETE
 from factory.store.location import Location
 from planners.alpasim import driver as driver_module
-from planners.alpasim.driver import Driver, Fault, start_server
+from planners.alpasim.driver import Driver
 from planners.alpasim.session import HEADING, Moment, Session, driven_on, local_poses, state_at
 from planners.drive.drive import main as drive_main
 from planners.drive.work import open_drives
@@ -52,7 +54,7 @@ class InProcess:
             "start_session": protocol.SessionRequestStatus,
         }
         kind = answers.get(method, protocol.Empty)
-        return lambda request: kind.FromString(self._driver.answer(method, request.SerializeToString()))
+        return lambda request: kind.FromString(self._driver.service.answer(method, request.SerializeToString()))
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +67,7 @@ def looking(tmp_path_factory: pytest.TempPathFactory) -> str:
 def served(looking: str) -> Iterator[tuple[Driver, Any]]:
     """A driver that looks, and a stub over the wire."""
     driver = Driver(looking)
-    server, port = start_server(driver, "127.0.0.1", 0)
+    server, port = start_server([driver.service], "127.0.0.1", 0)
     with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
         yield driver, protocol.EgodriverServiceStub(channel)
     server.stop(0)
@@ -96,7 +98,7 @@ def poses(answer: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def refused(driver: Driver, method: str, request: Any) -> str:
     with pytest.raises(Fault) as caught:
-        driver.answer(method, request if isinstance(request, bytes) else request.SerializeToString())
+        driver.service.answer(method, request if isinstance(request, bytes) else request.SerializeToString())
     return f"{caught.value.status} {caught.value}"
 
 
@@ -284,7 +286,7 @@ def test_planners_that_want_more_than_is_sent_are_refused_in_one_line(tmp_path: 
     with pytest.raises(ConfigError, match="device=nowhere: "):
         Driver(BLIND, device="nowhere")
     driver = Driver(looking, cameras=["CAM_R0", "CAM_F0", "CAM_L0"])
-    driver.answer("start_session", sent.start("other order").SerializeToString())
+    driver.service.answer("start_session", sent.start("other order").SerializeToString())
     assert "INVALID_ARGUMENT start_session: rollout_spec.vehicle.available_cameras: no cam_r0" in refused(
         driver, "start_session", sent.start("two", ("CAM_F0", "CAM_L0"))
     )
@@ -339,12 +341,12 @@ def test_png_and_a_route_of_few_points_or_none_are_driven(served: tuple[Driver, 
 
 
 def test_sessions_and_what_they_hold_are_bounded(blind: Driver, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(driver_module, "SESSIONS", 2)
+    monkeypatch.setattr(wire, "SESSIONS", 2)
     for uuid in ("a", "b"):
-        blind.answer("start_session", sent.start(uuid, ()).SerializeToString())
+        blind.service.answer("start_session", sent.start(uuid, ()).SerializeToString())
     assert "RESOURCE_EXHAUSTED 2 sessions are open" in refused(blind, "start_session", sent.start("c", ()))
     for uuid in ("a", "b"):
-        blind.answer("close_session", protocol.DriveSessionCloseRequest(session_uuid=uuid).SerializeToString())
+        blind.service.answer("close_session", protocol.DriveSessionCloseRequest(session_uuid=uuid).SerializeToString())
     session = Session(("front",), frozenset({"front"}))
     for stamp in random.Random(0).sample(range(20), 20):
         session.keep_frame("front", stamp, sent.photo(0))
@@ -407,8 +409,8 @@ def scrambled(message: Any, rng: random.Random, depth: int = 0) -> Any:
 
 
 def close_all_but(driver: Driver, kept: str) -> None:
-    for uuid in set(driver._rollouts) - {kept}:
-        driver.answer("close_session", protocol.DriveSessionCloseRequest(session_uuid=uuid).SerializeToString())
+    for uuid in set(driver.rollouts) - {kept}:
+        driver.service.answer("close_session", protocol.DriveSessionCloseRequest(session_uuid=uuid).SerializeToString())
 
 
 def extremes(rng: random.Random) -> list[tuple[str, Any]]:
@@ -434,14 +436,14 @@ def test_no_message_ends_the_driver_or_hurts_another_session(served: tuple[Drive
     for i in range(150):
         if i % 10 == 0:
             close_all_but(driver, "other")
-            driver.answer("start_session", sent.start("open").SerializeToString())
+            driver.service.answer("start_session", sent.start("open").SerializeToString())
             for request in extremes(rng):
                 getattr(InProcess(driver), request[0])(request[1])
         damaged = bytearray(valid)
         damaged[rng.randrange(40)] = rng.randrange(256)
         for request in (scrambled(REQUESTS[method](), rng).SerializeToString(), rng.randbytes(i), bytes(damaged)):
             try:
-                driver.answer(method, request)
+                driver.service.answer(method, request)
             except Fault as fault:
                 statuses.add(fault.status)
     assert statuses <= {"INVALID_ARGUMENT", "NOT_FOUND", "ALREADY_EXISTS", "FAILED_PRECONDITION", "RESOURCE_EXHAUSTED"}
@@ -453,7 +455,7 @@ def test_no_message_ends_the_driver_or_hurts_another_session(served: tuple[Drive
 
 def test_bytes_that_are_no_message_or_too_many_get_a_status_over_the_wire() -> None:
     driver = Driver(BLIND)
-    server, port = start_server(driver, "127.0.0.1", 0)
+    server, port = start_server([driver.service], "127.0.0.1", 0)
     options = [("grpc.max_send_message_length", -1)]
     with grpc.insecure_channel(f"127.0.0.1:{port}", options=options) as channel:
         for method in REQUESTS:
@@ -464,7 +466,7 @@ def test_bytes_that_are_no_message_or_too_many_get_a_status_over_the_wire() -> N
                 assert caught.value.code().name == code
         assert len(driven(protocol.EgodriverServiceStub(channel), "after", cameras=())) == 3
     with pytest.raises(Refused, match=f"port={port}.*give another port="):
-        start_server(driver, "127.0.0.1", port)
+        start_server([driver.service], "127.0.0.1", port)
     server.stop(0)
     driver.close()
 

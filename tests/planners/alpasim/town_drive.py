@@ -10,7 +10,8 @@ import numpy as np
 from carla_driver_interface import protocol
 from numpy.typing import NDArray
 
-from planners.alpasim.driver import Driver, start_server
+from factory.alpasim.wire import start_server
+from planners.alpasim.driver import Driver
 from planners.evaluation.planner_names import find_planner
 from planners.evaluation.planning import plan_samples
 from tasks.world.commands import route_points
@@ -28,7 +29,7 @@ class OverTheWire:
     @cached_property
     def _asked(self) -> tuple[Any, Any, Any]:
         folder = os.environ["ALPASIM_TOWN_PLANNER"]
-        server, port = start_server(Driver(folder), "127.0.0.1", 0)
+        server, port = start_server([Driver(folder).service], "127.0.0.1", 0)
         load = find_planner(folder).load
         assert load is not None
         return load(), protocol.EgodriverServiceStub(grpc.insecure_channel(f"127.0.0.1:{port}")), server

@@ -1,0 +1,1 @@
+"""Scenes and traffic behind AlpaSim's contracts, and what every service on that wire needs."""
