@@ -317,7 +317,9 @@ SCENE_KEYS = {  # of each action
     "import": ("to", "like", "origin", "traversal", "transforms", "antialiased"),
     "build": ("to", "root", "width", "masks", "settings"),
     "film": ("to", "root", "width", "camera", "aside", "turn"),
+    "serve": ("host", "port", "root", "pinhole", "settings"),
 }
+OWN_SIZE = ("render.width", "render.height")  # of runs: width= is that of scene build
 SCENE_WIDTH, FILM_WIDTH = 480, 640  # pixels, of photos that are no narrower
 
 
@@ -325,7 +327,7 @@ SCENE_WIDTH, FILM_WIDTH = 480, 640  # pixels, of photos that are no narrower
 class SceneRequest:
     """The command line."""
 
-    action: Literal["info", "export", "import", "build", "film"] = field(metadata=POSITIONAL)
+    action: Literal["info", "export", "import", "build", "film", "serve"] = field(metadata=POSITIONAL)
     files: tuple[str, ...] = field(metadata=POSITIONAL)
     to: str | None = None
     like: str | None = None
@@ -341,20 +343,29 @@ class SceneRequest:
     camera: str | None = None
     aside: float | None = None
     turn: float | None = None
+    host: str | None = None
+    port: int | None = None
+    pinhole: bool | None = None
     settings: tuple[str, ...] = field(default=(), metadata=RUN_SETTINGS | GIVEN_ALONE)
 
     def __post_init__(self) -> None:
         if self.action == "film" and len(self.files) != 2:
             raise ValueError("scene film takes a scene and its cameras.json; see --help")
-        if self.action not in ("info", "film") and len(self.files) != 1:
+        if self.action == "serve" and len(self.files) > 2:
+            raise ValueError("scene serve takes a run's out, or a scene and its cameras.json; see --help")
+        if self.action not in ("info", "film", "serve") and len(self.files) != 1:
             raise ValueError(f"scene {self.action} takes one file; see --help")
-        if self.action != "info" and self.to is None:
+        if self.action not in ("info", "serve") and self.to is None:
             raise ValueError(f"scene {self.action} takes to=...; see --help")
         takes = SCENE_KEYS[self.action]
         for word in self.settings:
             key = word.partition("=")[0]
-            if "settings" not in takes or not key.startswith("render.") or key in ("render.width", "render.height"):
-                known = [f"{name}=" for name in (*request_keys(SceneRequest), "render.fit.iterations")]
+            if self.action == "serve":
+                fits, like = key == "render.backend" or key.partition(".")[0] == "traffic", "render.backend"
+            else:
+                fits, like = key.startswith("render.") and key not in OWN_SIZE, "render.fit.iterations"
+            if "settings" not in takes or not fits:
+                known = [f"{name}=" for name in (*request_keys(SceneRequest), like)]
                 raise ValueError(f"scene {self.action} takes no {key}=; see --help{did_you_mean(key, known)}")
         for name in [name for name in request_keys(SceneRequest) if name not in ("action", "files")]:
             if getattr(self, name) is not None and name not in takes:
@@ -365,6 +376,8 @@ class SceneRequest:
             raise ValueError("give origin= or like=: the other scene has an origin of its own")
         if self.width is not None and self.width < 16:
             raise ValueError(f"width={self.width}: must be 16 pixels or more")
+        if self.port is not None and not 0 <= self.port < 1 << 16:
+            raise ValueError(f"port={self.port}: must be from 0, for a free one, to 65535")
         if self.action == "film" and not str(self.to).endswith(".mp4"):
             raise ValueError(f"to={self.to}: must end in .mp4")
         for name, value in (("aside", self.aside), ("turn", self.turn)):
@@ -373,7 +386,7 @@ class SceneRequest:
 
 
 def scene(request: SceneRequest) -> None:
-    """`python -m factory scene info|export|import|build|film ...`: scenes of 3D Gaussians, one file each.
+    """`python -m factory scene info|export|import|build|film|serve ...`: scenes of 3D Gaussians, one file each.
 
     info SCENE...                       what is in it: Gaussians, nodes, sky, range, quality, digest
     export SCENE to=FOLDER              background.ply, one node-<track id>.ply a vehicle, sky.png, scene.json
@@ -387,6 +400,9 @@ def scene(request: SceneRequest) -> None:
                                         run; the same command goes on where it was stopped
     film SCENE cameras.json to=MP4      photo beside the scene from aside=1 m to the left of it (below 0: to the right),
                                         turned by turn=0 degrees to the left; camera=NAME: not the one that looks ahead
+    serve RUN                           its clips' scenes and traffic for AlpaSim, by gRPC (docs/alpasim.md)
+    serve SCENE cameras.json            the pictures of one that was built so; port=50051 host=127.0.0.1, pinhole=true:
+                                        cameras are told without distortion; render.backend=, traffic=, traffic.*
 
     traversal=N takes the colours of an MTGS checkpoint's N-th traversal (default: their mean), transforms=FILE
     takes back nerfstudio's dataparser_transforms.json. antialiased=true|false: how a file was made to be drawn
@@ -434,6 +450,8 @@ def scene(request: SceneRequest) -> None:
                 _build_scene(request, file, to)
             case "film":
                 _film_scene(request, read_scene(file), Path(request.files[1]), to)
+            case "serve":
+                _serve_scenes(request)
     except (BadClip, BackendMissing, ValueError, OSError) as error:
         raise Refused(str(error)) from error
 
@@ -502,9 +520,7 @@ def _film_scene(request: SceneRequest, asset: "RenderAsset", sidecar: Path, to: 
     from factory.views.rendered_again import shifted_film
     from tasks.world.clip import front_camera
 
-    drive = _read_drive(request, sidecar)
-    if asset.block is None or (asset.block.log_id, asset.block.start_s) != (drive.log_id, drive.block.start_s):
-        raise ValueError(f"{request.files[0]}: is no scene that was built of {sidecar}")
+    drive = _drive_of_scene(request, asset, sidecar)
     axes = np.array([camera.ego_from_camera[:2, 2] for camera in drive.cameras])
     ahead = front_camera([camera.name for camera in drive.cameras], axes) or drive.cameras[0].name
     (camera,) = choose_cameras(drive.cameras, [request.camera or ahead])
@@ -513,6 +529,43 @@ def _film_scene(request: SceneRequest, asset: "RenderAsset", sidecar: Path, to: 
     aside_m, width = 1.0 if request.aside is None else request.aside, request.width or min(camera.width, FILM_WIDTH)
     write_mp4(to, shifted_film(asset, drive, camera, aside_m, request.turn or 0.0, width), max(rate, 1))
     print(f"{to.resolve()}: {len(times_s)} photos of {camera.name}, {max(rate, 1)} a second")
+
+
+def _serve_scenes(request: SceneRequest) -> None:
+    """Answer until the process is asked to end. Raises ValueError, BadClip, BackendMissing, OSError and Refused."""
+    from factory.alpasim.scenes import Scenes, scene_of_drive, scenes_of_run
+    from factory.alpasim.sensors import Sensors
+    from factory.alpasim.traffic import Traffic
+    from factory.alpasim.wire import serve
+    from factory.config.compose import compose, fill
+    from factory.stages.scene_file import read_scene
+    from tasks.render.scene.engine import require_backend
+    from tasks.render.settings import RenderSettings
+    from tasks.settings import TrafficSettings
+
+    composed = compose("run", request.settings)
+    backend = fill(RenderSettings, composed["render"], "render").backend
+    traffic = fill(TrafficSettings, composed["traffic"], "traffic")
+    require_backend(backend)
+    if len(request.files) == 1:
+        scenes = scenes_of_run(open_store(request.files[0]))
+    else:
+        sidecar, asset = Path(request.files[1]), read_scene(Path(request.files[0]))
+        served = scene_of_drive(_drive_of_scene(request, asset, sidecar), asset)
+        scenes = Scenes({asset.digest: lambda: served})
+    if not scenes.ids:
+        raise ValueError(f"{request.files[0]}: no clip's scene is kept there: it has no rendered sample, or no cache")
+    services = [Sensors(scenes, backend, request.pinhole or False).service, Traffic(scenes, traffic).service]
+    print(f"{len(scenes.ids)} scenes, such as {scenes.ids[0]}", flush=True)
+    serve(services, request.host or "127.0.0.1", 50051 if request.port is None else request.port)
+
+
+def _drive_of_scene(request: SceneRequest, asset: "RenderAsset", sidecar: Path) -> "PhotoDrive":
+    """The drive that a scene was built of. Raises ValueError, BadClip."""
+    drive = _read_drive(request, sidecar)
+    if asset.block is None or (asset.block.log_id, asset.block.start_s) != (drive.log_id, drive.block.start_s):
+        raise ValueError(f"{request.files[0]}: is no scene that was built of {sidecar}")
+    return drive
 
 
 def _read_drive(request: SceneRequest, sidecar: Path) -> "PhotoDrive":

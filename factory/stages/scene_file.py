@@ -107,15 +107,21 @@ def find_scene(folder: Path, digest: str) -> RenderAsset | None:
 
     Raises BadScene for a file whose header names the digest and whose content is another.
     """
+    path = scene_files(folder).get(digest)
+    return None if path is None else read_scene(path)
+
+
+def scene_files(folder: Path) -> dict[str, Path]:
+    """The blocks' scenes in a cache folder by the digests that their headers name."""
+    found: dict[str, Path] = {}
     for path in sorted(folder.glob(f"block-*{SUFFIX}")):
         try:
             with safe_open(path, framework="numpy") as file:
-                header = json.loads((file.metadata() or {}).get(KEY, "{}"))
-        except (SafetensorError, OSError, ValueError):
+                digest = json.loads((file.metadata() or {}).get(KEY, "{}")).get("digest")
+        except (SafetensorError, OSError, ValueError, AttributeError):
             continue  # of another scene, as far as anyone can tell: whoever needs that one builds it again
-        if header.get("digest") == digest:
-            return read_scene(path)
-    return None
+        found.setdefault(digest, path)
+    return found
 
 
 def read_dtype(path: Path) -> SceneDtype:

@@ -80,11 +80,15 @@ def scene_digest_of(store: Store, row: Row) -> str | None:
     return min({other["asset_digest"] for other in others} - {None}, default=None)
 
 
+def scene_folder(store: Store) -> Path:
+    """Where the scenes of a run's blocks are."""
+    return Path(store.location.uri, "cache") if store.location.is_local else user_cache() / "assets"
+
+
 def load_scene(store: Store, digest: str) -> RenderAsset | None:
     """The block's scene of a digest; None where the cache has it no more, or has it damaged."""
-    folder = Path(store.location.uri, "cache") if store.location.is_local else user_cache() / "assets"
     try:
-        return find_scene(folder, digest)
+        return find_scene(scene_folder(store), digest)
     except BadScene:
         return None  # the next run builds it again and says so
 

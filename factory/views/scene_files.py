@@ -84,16 +84,21 @@ def _prepared_clips_of_block(store: "Store", block: BlockRange) -> Iterator[Clip
     for row in sorted(rows, key=lambda row: str(row["clip_id"])):
         if (row["dataset"], row["log_id"]) != (block.dataset, block.log_id):
             continue
-        key = cache_key(row["clip_id"], row["prepare_digest"])
-        try:
-            clip = logged_clip(store.cache.load(key))
-        except BadCacheFile as error:
-            path = f"{store.cache.location.uri}/{key}{CLIP_SUFFIX}"
-            raise BadScene(f"{path}: {error}; the next run makes it again") from error
+        clip = prepared_clip(store, row["clip_id"], row["prepare_digest"])
         if clip is None:
             continue
         if clip.start_s < block.end_s and clip.start_s + clip.agents.n_steps * STEP_S > block.start_s:
             yield clip
+
+
+def prepared_clip(store: "Store", clip_id: str, prepare_digest: str) -> Clip | None:
+    """Without its sensor files; None where the cache has it no more. Raises BadScene for a damaged file."""
+    key = cache_key(clip_id, prepare_digest)
+    try:
+        return logged_clip(store.cache.load(key))
+    except BadCacheFile as error:
+        path = f"{store.cache.location.uri}/{key}{CLIP_SUFFIX}"
+        raise BadScene(f"{path}: {error}; the next run makes it again") from error
 
 
 def _add_boxes(seen: dict[str, dict[int, Array]], clip: Clip, asset: RenderAsset, block: BlockRange) -> None:

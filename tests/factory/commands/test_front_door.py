@@ -321,7 +321,7 @@ def test_completion_knows_commands_keys_groups_and_choices() -> None:
     assert set(completions(["export"], "m")) == {"mcap", "mp4", "navsim"}
     assert {"out=", "workers="} <= set(completions(["retry"], ""))
     assert {"clip=", "clips=", "tries="} <= set(completions(["explain"], ""))
-    assert set(completions(["scene"], "")) == {"info", "export", "import", "build", "film"}
+    assert set(completions(["scene"], "")) == {"info", "export", "import", "build", "film", "serve"}
     assert not list(completions(["nothing"], ""))
 
 

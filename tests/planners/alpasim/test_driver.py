@@ -18,7 +18,6 @@ pytest.importorskip("carla_driver_interface", reason='the contract needs pip ins
 import grpc
 from carla_driver_interface import protocol
 from carla_driver_interface.testing import FakeCamera, FakeLoop
-from google.protobuf.descriptor import FieldDescriptor
 
 from factory.alpasim import wire
 from factory.alpasim.wire import Fault, start_server
@@ -33,6 +32,7 @@ from planners.drive.drive import main as drive_main
 from planners.drive.work import open_drives
 from planners.evaluation.planning import plan_samples
 from tasks.world.frames import to_local, to_world
+from tests.factory.alpasim.scrambled import scrambled_message
 from tests.planners.alpasim import rollout as sent
 from tests.planners.alpasim.rollout import NAN, Rollout
 from tests.planners.navsim.agent_inputs import HISTORY, MOTION, row
@@ -367,45 +367,13 @@ REQUESTS = {
     "drive": protocol.DriveRequest,
     "shut_down": protocol.Empty,
 }
-FLOATS = (0.0, 1.0, -1.0, NAN, float("inf"), 3e38, 1e-40)
-WHOLE = (0, 1, 17_000, 500_000, 2**31 - 1)
+STRINGS = ("", "open", "cam_f0", "CAM_F0", "é" * 200)
 
 
-def scrambled(message: Any, rng: random.Random, depth: int = 0) -> Any:
-    """The message with fields of random values; those of a session that is open among them."""
-
-    def value(field: Any) -> Any:
-        match field.cpp_type:
-            case FieldDescriptor.CPPTYPE_FLOAT | FieldDescriptor.CPPTYPE_DOUBLE:
-                return rng.choice(FLOATS)
-            case FieldDescriptor.CPPTYPE_STRING if field.type == FieldDescriptor.TYPE_BYTES:
-                return rng.choice([b"", rng.randbytes(40), sent.photo(1)[: rng.randrange(900)], sent.photo(1)])
-            case FieldDescriptor.CPPTYPE_STRING:
-                return rng.choice(["", "open", "cam_f0", "CAM_F0", "é" * 200])
-            case FieldDescriptor.CPPTYPE_BOOL:
-                return rng.random() < 0.5
-            case FieldDescriptor.CPPTYPE_ENUM:
-                return rng.choice(field.enum_type.values).number
-            case FieldDescriptor.CPPTYPE_UINT64:
-                return rng.choice([*WHOLE, 2**63, 2**64 - 1])
-            case _:
-                return rng.choice(WHOLE)
-
-    for field in message.DESCRIPTOR.fields:
-        if rng.random() < 0.15 or depth > 6:
-            continue
-        repeated = field.is_repeated
-        for _ in range(rng.choice([0, 1, 2, 30]) if repeated else 1):
-            if field.cpp_type == FieldDescriptor.CPPTYPE_MESSAGE:
-                inner = getattr(message, field.name)
-                scrambled(inner.add() if repeated else inner, rng, depth + 1)
-                if not repeated:
-                    inner.SetInParent()
-            elif repeated:
-                getattr(message, field.name).append(value(field))
-            else:
-                setattr(message, field.name, value(field))
-    return message
+def scrambled(message: Any, rng: random.Random) -> Any:
+    """Fields of random values; those of a session that is open among them."""
+    photos = lambda: rng.choice([b"", rng.randbytes(40), sent.photo(1)[: rng.randrange(900)], sent.photo(1)])  # noqa: E731
+    return scrambled_message(message, rng, STRINGS, photos)
 
 
 def close_all_but(driver: Driver, kept: str) -> None:
