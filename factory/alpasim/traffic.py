@@ -86,7 +86,7 @@ def traffic_messages(common_pb2: Any) -> SimpleNamespace:
             *how, kind = kind.split()
             if how == ["repeated"]:
                 one.label = proto.LABEL_REPEATED
-            elif how == ["optional"]:  # its presence is a oneof of its own (protobuf, implementing_proto3_presence.md)
+            elif how == ["optional"]:  # its presence is a oneof of its own
                 one.proto3_optional, one.oneof_index = True, len(message.oneof_decl)
                 message.oneof_decl.add(name=f"_{field_name}")
             if kind.startswith("."):

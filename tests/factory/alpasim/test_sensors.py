@@ -343,12 +343,14 @@ def test_the_command_serves_a_run_until_it_is_told_to_end(run: Store) -> None:
     words = [sys.executable, "-m", "factory", "scene", "serve", run.location.uri, "port=0", "traffic=replay"]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        assert process.stdout.readline() == f"1 scenes, such as {scenes_of_run(run).ids[0]}\n"
-        with grpc.insecure_channel(process.stdout.readline().split()[-1]) as channel:
-            told = channel.unary_unary(f"/{SERVICE}/get_available_scenes")(b"")
-            metadata = channel.unary_unary("/traffic.TrafficService/get_metadata")(b"")
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(60) == 0
+        first, address = process.stdout.readline(), process.stdout.readline().split()[-1]
+        try:
+            with grpc.insecure_channel(address) as channel:
+                told = channel.unary_unary(f"/{SERVICE}/get_available_scenes")(b"")
+                metadata = channel.unary_unary("/traffic.TrafficService/get_metadata")(b"")
+        finally:
+            process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0 and first == f"1 scenes, such as {scenes_of_run(run).ids[0]}\n"
     assert told[2:] in metadata and b" replay" in metadata
 
 
