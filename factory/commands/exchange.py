@@ -313,7 +313,7 @@ def _import_nuscenes_cameras(request: ImportRequest) -> int:
 
 SCENE_KEYS = {  # of each action
     "info": (),
-    "export": ("to", "format", "out"),
+    "export": ("to", "format", "out", "rasterize"),
     "import": ("to", "like", "origin", "traversal", "transforms", "antialiased"),
     "build": ("to", "root", "width", "masks", "settings"),
     "film": ("to", "root", "width", "camera", "aside", "turn"),
@@ -333,6 +333,7 @@ class SceneRequest:
     like: str | None = None
     origin: str | None = None
     format: Literal["ply", "spz", "ckpt"] | None = None
+    rasterize: Literal["classic", "antialiased"] | None = None
     traversal: int | None = None
     transforms: str | None = None
     antialiased: bool | None = None
@@ -372,6 +373,8 @@ class SceneRequest:
                 raise ValueError(f"scene {self.action} takes no {name}=; see --help")
         if self.action == "export" and self.out is not None and self.format != "ckpt":
             raise ValueError("out= brings vehicles' poses into a checkpoint: format=ckpt")
+        if self.rasterize is not None and self.out is None:
+            raise ValueError("rasterize= goes with out=: opacities depend on where the cameras drove")
         if self.like is not None and self.origin is not None:
             raise ValueError("give origin= or like=: the other scene has an origin of its own")
         if self.width is not None and self.width < 16:
@@ -391,8 +394,10 @@ def scene(request: SceneRequest) -> None:
     info SCENE...                       what is in it: Gaussians, nodes, sky, range, quality, digest
     export SCENE to=FOLDER              background.ply, one node-<track id>.ply a vehicle, sky.png, scene.json
     export SCENE to=FOLDER format=spz   the same, a tenth the size; format=ckpt: checkpoints, of the background as of
-                                        WorldEngine, of vehicles as of nerfstudio's splatfacto; with out=RUN the former
-                                        has the vehicles too, where the log had them by the run's prepared clips
+                                        WorldEngine, of vehicles as of nerfstudio's splatfacto
+    export SCENE to=FOLDER format=ckpt out=RUN   as WorldEngine and AlpaSim's MTGS server lay a scene out, with a sky
+                                        and the vehicles where the log had them by the run's prepared clips;
+                                        rasterize=classic: opacities for that mode, AlpaSim's (default: antialiased)
     import FILE to=SCENE                a .ply, .spz or checkpoint (.ckpt, .pt, .pth: splatfacto, MTGS, WorldEngine) as
                                         a scene under a plain sky; origin=x,y,z puts it into the world [m]
     import FILE to=SCENE like=OTHER     the same with the origin, nodes, sky and range of another scene
@@ -419,7 +424,15 @@ def scene(request: SceneRequest) -> None:
     """
     from factory.readers.base import BadClip
     from factory.stages.scene_file import read_scene, write_scene
-    from factory.views.scene_files import export_scene, info_text, logged_vehicles, read_splats, scene_from_splats
+    from factory.views.scene_files import (
+        classic_scene,
+        export_scene,
+        info_text,
+        logged_rig,
+        logged_vehicles,
+        read_splats,
+        scene_from_splats,
+    )
     from factory.views.status import open_store
     from tasks.render.splatting.formats import LoggedVehicle
     from tasks.render.splatting.gsplat_backend import BackendMissing
@@ -430,10 +443,14 @@ def scene(request: SceneRequest) -> None:
             case "info":
                 print("\n\n".join(info_text(path, read_scene(path)) for path in map(Path, request.files)))
             case "export":
-                asset, vehicles, unseen = read_scene(file), list[LoggedVehicle](), list[str]()
+                asset, vehicles, unseen, rig = read_scene(file), list[LoggedVehicle](), list[str](), None
                 if request.out is not None:
-                    vehicles, unseen = logged_vehicles(open_store(request.out), asset)
-                print("\n".join(map(str, export_scene(asset, to, f".{request.format or 'ply'}", vehicles))))
+                    store = open_store(request.out)
+                    vehicles, unseen = logged_vehicles(store, asset)
+                    rig = logged_rig(store, asset)
+                    if request.rasterize == "classic":
+                        asset, vehicles = classic_scene(asset, vehicles, rig)
+                print("\n".join(map(str, export_scene(asset, to, f".{request.format or 'ply'}", vehicles, rig))))
                 if unseen:
                     print(f"left out    {', '.join(unseen)}: no clip of the run shows them here")
             case "import":

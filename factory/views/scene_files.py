@@ -2,8 +2,9 @@
 
 import json
 import math
+import pickle
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,9 +21,11 @@ from factory.stages.scene_file import BadScene, read_dtype, read_scene, scene_he
 from factory.store.location import CLIP_SUFFIX, BadCacheFile
 from factory.wording import one_line
 from tasks.render.scene.asset import BlockRange, RenderAsset, ViewQuality
+from tasks.render.scene.dome import sky_gaussians
 from tasks.render.scene.movers import world_from_boxes
 from tasks.render.scene.sky import plain_sky
 from tasks.render.splatting import sh
+from tasks.render.splatting.classic import made_classic
 from tasks.render.splatting.formats import (
     LoggedVehicle,
     SplatCheckpoint,
@@ -34,10 +37,11 @@ from tasks.render.splatting.formats import (
     to_spz,
     to_worldengine,
 )
-from tasks.render.splatting.gaussians import Gaussians, moved
+from tasks.render.splatting.gaussians import Gaussians, moved, quats_of
 from tasks.render.splatting.project import ANTIALIASED, CLASSIC, ScreenFilter
 from tasks.world.arrays import Array
-from tasks.world.clip import STEP_S, Clip
+from tasks.world.clip import STEP_S, Camera, Clip, Pinhole
+from tasks.world.frames import pose_on_ground
 
 if TYPE_CHECKING:
     from factory.store.samples import Store
@@ -76,6 +80,80 @@ def logged_vehicles(store: "Store", asset: RenderAsset) -> tuple[list[LoggedVehi
         for name, token in zip(known, tokens)
     ]
     return vehicles, [name for name in seen if name not in known]
+
+
+@dataclass(frozen=True)
+class LoggedRig:
+    """The cameras of a scene's log, and where its ego was, on the scene's road."""
+
+    cameras: tuple[Camera, ...]
+    times_s: Array  # (F,) since the log's first instant
+    scene_from_ego: Array  # (F, 4, 4)
+
+    def eyes(self) -> list[tuple[int, Pinhole]]:
+        """Every camera at every EYE_STRIDE-th instant of the log, with the instant's row."""
+        rows = range(0, len(self.times_s), EYE_STRIDE)
+        poses = [(row, c, self.scene_from_ego[row] @ c.ego_from_camera) for row in rows for c in self.cameras]
+        return [(row, Pinhole(c.intrinsics, pose, c.width, c.height)) for row, c, pose in poses]
+
+
+EYE_STRIDE = 6  # of 0.1 s
+
+
+def logged_rig(store: "Store", asset: RenderAsset) -> LoggedRig:
+    """By the run's clips of the scene's stretch of its log. Raises BadScene as `logged_vehicles`."""
+    assert asset.block is not None, "logged_vehicles comes first"
+    cameras, poses = tuple[Camera, ...](), dict[int, Array]()
+    for clip in _prepared_clips_of_block(store, asset.block):
+        cameras = asset.as_corrected(clip.cameras)
+        on_road = pose_on_ground(asset.on_road(clip.world_from_ego), clip.ego_states)
+        on_road[:, :3, 3] -= asset.origin
+        poses |= {round(1e3 * (clip.start_s + k * STEP_S)): pose for k, pose in enumerate(on_road)}
+    if not cameras:
+        raise BadScene(f"{store.location.uri}: the log {asset.block.log_id} has no cameras")
+    times_ms = sorted(poses)
+    return LoggedRig(cameras, 1e-3 * np.array(times_ms), np.stack([poses[time_ms] for time_ms in times_ms]))
+
+
+def video_scene_dict(name: str, rig: LoggedRig) -> bytes:
+    """What AlpaSim's MTGS server wants beside a checkpoint (NVlabs/alpasim 9177bd0, plugins/mtgs/server): cameras as
+    they are mounted, and the ego's poses in the checkpoint's frame, from which it takes heights and tilts. Containers,
+    numbers and text alone, which any reader of pickles takes."""
+    cams = {
+        camera.name: {
+            "cam_intrinsic": camera.intrinsics.tolist(),
+            "distortion": camera.distortion.tolist(),
+            "sensor2ego_rotation": quats_of(camera.ego_from_camera[None, :3, :3])[0].tolist(),
+            "sensor2ego_translation": camera.ego_from_camera[:3, 3].tolist(),
+            "height": camera.height,
+            "width": camera.width,
+        }
+        for camera in rig.cameras
+    }
+    frames = [
+        {"cams": cams, "ego2global": pose.tolist(), "timestamp": round(1e6 * time_s)}
+        for time_s, pose in zip(rig.times_s.tolist(), rig.scene_from_ego)
+    ]
+    return pickle.dumps({name: {"frame_infos": frames}}, protocol=4)
+
+
+def classic_scene(
+    asset: RenderAsset, vehicles: Sequence[LoggedVehicle], rig: LoggedRig
+) -> tuple[RenderAsset, list[LoggedVehicle]]:
+    """The scene and its vehicles with opacities for gsplat's `classic`, as it is driven through in its log."""
+    eyes = rig.eyes()
+    street = made_classic(asset.background, asset.screen, [eye for _, eye in eyes])
+    out, made = [], {id(node): node for node in asset.nodes.values()}
+    for vehicle in vehicles:
+        near = []
+        for row, eye in eyes:
+            (there,) = np.nonzero(np.abs(vehicle.times_s - rig.times_s[row]) < SLACK_S)
+            if len(there) and np.isfinite(pose := vehicle.scene_from_box[there[0]]).all():
+                near.append(replace(eye, world_from_camera=np.linalg.inv(pose) @ eye.world_from_camera))
+        made[id(vehicle.gaussians)] = made_classic(vehicle.gaussians, asset.screen, near)
+        out.append(replace(vehicle, gaussians=made[id(vehicle.gaussians)]))
+    nodes = {name: made[id(node)] for name, node in asset.nodes.items()}
+    return replace(asset, background=street, nodes=nodes, screen=CLASSIC), out
 
 
 def _prepared_clips_of_block(store: "Store", block: BlockRange) -> Iterator[Clip]:
@@ -207,14 +285,19 @@ def read_splats(path: Path, traversal: int | None = None, transforms: Path | Non
 
 
 def background_bytes(
-    gaussians: Gaussians, suffix: str, origin: Array, screen: ScreenFilter, vehicles: Sequence[LoggedVehicle] = ()
+    gaussians: Gaussians,
+    suffix: str,
+    origin: Array,
+    screen: ScreenFilter,
+    vehicles: Sequence[LoggedVehicle] = (),
+    sky: Gaussians | None = None,
 ) -> bytes:
-    """A street's file; a checkpoint is WorldEngine's, `origin` (3,) [m] in the world, and has its `vehicles`.
+    """A street's file; a checkpoint is WorldEngine's, `origin` (3,) [m] in the world, and has its `vehicles` and sky.
 
     Raises ValueError.
     """
     if suffix in CHECKPOINTS:
-        return _checkpoint_bytes(to_worldengine(gaussians, origin, vehicles))
+        return _checkpoint_bytes(to_worldengine(gaussians, origin, vehicles, sky))
     return to_ply(gaussians) if suffix == ".ply" else to_spz(gaussians, screen.keeps_light)
 
 
@@ -323,19 +406,31 @@ def info_text(path: Path, asset: RenderAsset) -> str:
 
 
 def export_scene(
-    asset: RenderAsset, folder: Path, suffix: str = ".ply", vehicles: Sequence[LoggedVehicle] = ()
+    asset: RenderAsset,
+    folder: Path,
+    suffix: str = ".ply",
+    vehicles: Sequence[LoggedVehicle] = (),
+    rig: LoggedRig | None = None,
 ) -> list[Path]:
     """Writes the parts into a folder, Gaussians as `suffix` says; returns their paths.
 
-    vehicles: those that stand in the background's checkpoint as well, with their poses.
-    Raises BadScene where a part cannot be written so.
+    rig: of a checkpoint as WorldEngine and AlpaSim have it, `background/<folder's name>.ckpt` with its `vehicles` and a
+    sky, and AlpaSim's `video_scene_dict.pkl`. Raises BadScene where a part cannot be written so.
     """
     folder.mkdir(parents=True, exist_ok=True)
     nodes = {f"node-{re.sub(r'[^A-Za-z0-9._-]', '_', name)}{suffix}": node for name, node in asset.nodes.items()}
     if len(nodes) < len(asset.nodes):
         raise BadScene(f"track ids {', '.join(asset.nodes)}: two of them make the same file name")
     street = partial(background_bytes, asset.background, suffix, asset.origin, asset.screen, vehicles)
-    files = {f"background{suffix}": street}
+    files: dict[str, Callable[[], bytes]] = {f"background{suffix}": street}
+    if rig is not None:
+        name = folder.resolve().name
+        if name[-4:-3] == "-":
+            raise BadScene(f"to={folder}: AlpaSim cuts {name[-4:]} off a scene's name; give it another")
+        (folder / "background").mkdir(exist_ok=True)
+        sky = sky_gaussians(asset.sky, rig.scene_from_ego[:, :3, 3].mean(axis=0))
+        files = {f"background/{name}{suffix}": partial(street, sky)}
+        files["video_scene_dict.pkl"] = partial(video_scene_dict, name, rig)
     files |= {name: partial(node_bytes, node, suffix, asset.screen) for name, node in nodes.items()}
     for name, written in files.items():
         try:

@@ -255,14 +255,19 @@ def to_splatfacto(gaussians: Gaussians) -> dict[str, Any]:
     return {"step": 0, "pipeline": {f"_model.gauss_params.{name}": a for name, a in parameters_of(gaussians).items()}}
 
 
-def to_worldengine(background: Gaussians, origin: Array, vehicles: Sequence[LoggedVehicle] = ()) -> dict[str, Any]:
-    """A street as WorldEngine reads it, `origin` (3,) [m] in the world, with its vehicles.
+def to_worldengine(
+    background: Gaussians, origin: Array, vehicles: Sequence[LoggedVehicle] = (), sky: Gaussians | None = None
+) -> dict[str, Any]:
+    """A street as WorldEngine reads it, `origin` (3,) [m] in the world, with its vehicles, and a sky that is drawn.
 
     Raises ValueError for a vehicle that is nowhere in the log.
     """
     config = _config("VanillaGaussianSplattingModel", background)
     config["recon2world_translation"] = [float(value) for value in origin]
     street = {BACKGROUND: {"config": config, "state_dict": gauss_params(background)}}
+    if sky is not None:
+        config = _config("SkyboxGaussianSplattingModel", sky)
+        street[SKY] = {"config": config, "state_dict": gauss_params(sky)}
     return street | {f"{RIGID}{vehicle.token}": _vehicle_part(vehicle) for vehicle in vehicles}
 
 
