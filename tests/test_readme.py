@@ -209,6 +209,8 @@ def test_every_command_is_one_its_program_takes(
             assert set(pairs(given(arguments))) <= {"front", "rig", "town", "out"}
         case ["python", "-m", "tests.bench.bench_town", *arguments]:
             assert set(pairs(given(arguments))) <= FIT | {"log", "width", "height", "lpips"}
+        case ["python", "-m", "tests.bench.bench_alpasim", _, _, *arguments]:
+            assert set(pairs(given(arguments))) <= {"root", "width", "instants"}
         case ["python", "-m", "examples.csv_logs", folder]:
             write_log(Path(folder) / "street")  # what it does, see tests/test_extending.py
         case ["python", "-m", module] if module.startswith("tests.bench."):
