@@ -38,6 +38,7 @@ SERVICE = "nre.grpc.protos.sensorsim.SensorsimService"
 MOST_SIDE, MOST_PIXELS = 4096, 3840 * 2160  # of a picture
 MOST_PICTURES = 64  # of a request
 SAME_MOUNT = 1e-3  # m, and of a rotation's elements: a sent mount that near is the scene's own, rounded on the wire
+HIDDEN_M = 100.0  # AlpaSim lowers a track by as much that is not to be seen (its unbound_rollout.py)
 EGO_POSE = 1013  # RGBRenderRequest.ego_pose, a PosePair of newer contracts than the vendored one
 LENSES = 16  # of which the maps are kept
 
@@ -213,23 +214,24 @@ def placed_agents(name: str, objects: Sequence[Any], scene: ServedScene) -> Agen
         if j in places:
             raise ValueError(f"{name}[{i}].track_id={one.track_id!r}: stands there twice")
         pose = pose_of(f"{name}[{i}].pose_pair.end_pose", one.pose_pair.end_pose)
-        places[j] = np.array([*(pose[:2, 3] + scene.origin[:2]), heading_of(pose)])
+        places[j] = np.array([*(pose[:3, 3] + scene.origin), heading_of(pose)])
     columns, log = list(places), scene.agents
-    sent = np.stack([*places.values(), np.zeros(3)])[:-1]
+    sent = np.stack([*places.values(), np.zeros(4)])[:-1]
     off = np.linalg.norm(log.boxes[:, columns, :2] - sent[:, :2], axis=-1)
     there = log.valid[:, columns]
     if not there.any(axis=0).all():
         raise ValueError(f"{name}[{int(np.argmin(there.any(axis=0)))}].track_id: it is at no place in this scene's log")
     nearest = np.argmin(np.where(there, off, np.inf), axis=0)
-    boxes = log.boxes[nearest, columns].copy()
-    boxes[:, :3] = sent
+    boxes, center_z = log.boxes[nearest, columns].copy(), log.center_z[nearest, columns]
+    boxes[:, :3] = sent[:, [0, 1, 3]]
+    shown = np.abs(sent[:, 2] - center_z + HIDDEN_M) > HIDDEN_M / 2.0
     return AgentTracks(
         tuple(log.track_ids[j] for j in columns),
         tuple(log.kinds[j] for j in columns),
         boxes[None],
         np.zeros((1, len(columns), 2)),
-        np.ones((1, len(columns)), bool),
-        log.center_z[nearest, columns][None],
+        shown[None],
+        center_z[None],
         log.heights[columns],
     )
 

@@ -317,7 +317,7 @@ SCENE_KEYS = {  # of each action
     "import": ("to", "like", "origin", "traversal", "transforms", "antialiased"),
     "build": ("to", "root", "width", "masks", "settings"),
     "film": ("to", "root", "width", "camera", "aside", "turn"),
-    "serve": ("host", "port", "root", "pinhole", "settings"),
+    "serve": ("host", "port", "root", "pinhole", "usdz", "settings"),
 }
 OWN_SIZE = ("render.width", "render.height")  # of runs: width= is that of scene build
 SCENE_WIDTH, FILM_WIDTH = 480, 640  # pixels, of photos that are no narrower
@@ -347,6 +347,7 @@ class SceneRequest:
     host: str | None = None
     port: int | None = None
     pinhole: bool | None = None
+    usdz: str | None = None
     settings: tuple[str, ...] = field(default=(), metadata=RUN_SETTINGS | GIVEN_ALONE)
 
     def __post_init__(self) -> None:
@@ -407,7 +408,8 @@ def scene(request: SceneRequest) -> None:
                                         turned by turn=0 degrees to the left; camera=NAME: not the one that looks ahead
     serve RUN                           its clips' scenes and traffic for AlpaSim, by gRPC (docs/alpasim.md)
     serve SCENE cameras.json            the pictures of one that was built so; port=50051 host=127.0.0.1, pinhole=true:
-                                        cameras are told without distortion; render.backend=, traffic=, traffic.*
+                                        cameras are told without distortion; render.backend=, traffic=, traffic.*;
+                                        usdz=FOLDER: writes there what AlpaSim's runtime lists scenes by
 
     traversal=N takes the colours of an MTGS checkpoint's N-th traversal (default: their mean), transforms=FILE
     takes back nerfstudio's dataparser_transforms.json. antialiased=true|false: how a file was made to be drawn
@@ -550,6 +552,7 @@ def _film_scene(request: SceneRequest, asset: "RenderAsset", sidecar: Path, to: 
 
 def _serve_scenes(request: SceneRequest) -> None:
     """Answer until the process is asked to end. Raises ValueError, BadClip, BackendMissing, OSError and Refused."""
+    from factory.alpasim.artifact import write_artifacts
     from factory.alpasim.scenes import Scenes, scene_of_drive, scenes_of_run
     from factory.alpasim.sensors import Sensors
     from factory.alpasim.traffic import Traffic
@@ -574,6 +577,8 @@ def _serve_scenes(request: SceneRequest) -> None:
         raise ValueError(f"{request.files[0]}: no clip's scene is kept there: it has no rendered sample, or no cache")
     services = [Sensors(scenes, backend, request.pinhole or False).service, Traffic(scenes, traffic).service]
     print(f"{len(scenes.ids)} scenes, such as {scenes.ids[0]}", flush=True)
+    if request.usdz is not None:
+        write_artifacts(scenes, Path(request.usdz))
     serve(services, request.host or "127.0.0.1", 50051 if request.port is None else request.port)
 
 

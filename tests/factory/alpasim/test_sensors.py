@@ -106,6 +106,9 @@ def test_a_moved_object_moves_and_one_that_is_not_sent_is_not_there(service: Ser
     gone = replace(scene.agents, valid=valid)
     expected = render_views(scene.asset, scene.cameras[:1], scene.on_road[[40]], gone, [40], 96, 64)[0, 0]
     np.testing.assert_array_equal(picture(service, shot(STREET, camera, ego, 4_000_000, objects)), expected)
+    objects["ahead"] = drive(40)[1]["ahead"]
+    objects["ahead"][2, 3] -= 100.0  # as AlpaSim hides it
+    np.testing.assert_array_equal(picture(service, shot(STREET, camera, ego, 4_000_000, objects)), expected)
 
 
 def test_a_lens_s_picture_undistorted_is_the_pinhole_s(service: Service) -> None:
