@@ -90,24 +90,24 @@ class Sensors:
         return answer
 
     def _render_rgb(self, message: Any) -> Any:
-        return self._pictures([("", message)])[0]
+        return self._pictures("", [("", message)])[0]
 
     def _render_aggregated(self, message: Any) -> Any:
         if message.lidar_requests:
             raise ValueError("lidar_requests: no lidar is simulated; leave them out")
         asked = [(f"rgb_requests[{i}].", request) for i, request in enumerate(message.rgb_requests)]
-        return self._sensorsim.AggregatedRenderReturn(rgb_returns=self._pictures(asked))
+        return self._sensorsim.AggregatedRenderReturn(rgb_returns=self._pictures("rgb_requests", asked))
 
     def _batch_render_rgb(self, message: Any) -> Any:
-        found = self._pictures([(f"items[{i}].request.", item.request) for i, item in enumerate(message.items)])
+        found = self._pictures("items", [(f"items[{i}].request.", one.request) for i, one in enumerate(message.items)])
         answer = self._sensorsim.BatchRGBRenderReturn()
         for item, picture in zip(message.items, found):
             answer.items.add(camera_name=item.camera_name, result=picture, success=True)
         return answer
 
-    def _pictures(self, asked: Sequence[tuple[str, Any]]) -> list[Any]:
+    def _pictures(self, name: str, asked: Sequence[tuple[str, Any]]) -> list[Any]:
         """RGBRenderReturns of requests, each with what stands before its fields' names."""
-        bounded("rgb_requests", asked, MOST_PICTURES)
+        bounded(name, asked, MOST_PICTURES)
         return list(self._drawing.map(lambda one: self._picture(*one), asked))
 
     def _picture(self, at: str, message: Any) -> Any:

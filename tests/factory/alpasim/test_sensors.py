@@ -213,6 +213,8 @@ def test_what_is_wrong_with_a_request_is_named(service: Service) -> None:
     assert "dynamic_objects[1].track_id='ahead': stands there twice" in refused(service, "render_rgb", request)
     whole = sensorsim_pb2.AggregatedRenderRequest(rgb_requests=[shot(STREET, camera, ego, 0, {}), request])
     assert "rgb_requests[1].dynamic_objects[1]" in refused(service, "render_aggregated", whole)
+    many = sensorsim_pb2.BatchRGBRenderRequest(items=[sensorsim_pb2.BatchRGBRenderRequestItem()] * 65)
+    assert refused(service, "batch_render_rgb", many).endswith("items: 65 of them, at most 64 in a message")
     whole.lidar_requests.add()
     assert "lidar_requests: no lidar" in refused(service, "render_aggregated", whole)
     lens = request.camera_intrinsics.opencv_pinhole_param
