@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from factory import __version__
 from factory.alpasim.scenes import Scenes, ServedScene
+from factory.alpasim.wire import Fault
 from factory.files import atomic_file
 from tasks.render.scene.movers import ever_moves, world_from_boxes
 from tasks.world.arrays import Array
@@ -77,10 +78,13 @@ def usdz(scene_id: str, scene: ServedScene) -> bytes:
 
 
 def write_artifacts(scenes: Scenes, folder: Path) -> None:
-    """A file for each scene. Raises ValueError as `usdz`, Fault, OSError."""
+    """A file for each scene. Raises ValueError as `usdz`, and for a scene that cannot be read, and OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     for scene_id in scenes.ids:
-        data = usdz(scene_id, scenes.find("scene", scene_id))
+        try:
+            data = usdz(scene_id, scenes.find("scene", scene_id))
+        except Fault as error:
+            raise ValueError(str(error)) from error
         with atomic_file(folder / f"{scene_id}.usdz", len(data)) as draft:
             draft.write_bytes(data)
 

@@ -6,7 +6,7 @@ classes are those of `carla-driver-interface`, which vendors NVlabs/alpasim 6870
 
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
@@ -158,9 +158,6 @@ class Sessions(Generic[T]):
             if uuid not in self._open:
                 raise _not_open(uuid)
             return self._open.pop(uuid)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(list(self._open))
 
 
 def _not_open(uuid: str) -> Fault:

@@ -19,6 +19,7 @@ pytest.importorskip("carla_driver_interface", reason='the contract needs pip ins
 import grpc
 from carla_driver_interface.protocol import common_pb2, sensorsim_pb2
 
+from factory.alpasim.artifact import write_artifacts
 from factory.alpasim.scenes import Scenes, scenes_of_run
 from factory.alpasim.sensors import SERVICE, Sensors
 from factory.alpasim.wire import Fault, Service, start_server
@@ -359,7 +360,7 @@ def test_the_command_serves_a_run_until_it_is_told_to_end(run: Store) -> None:
     assert told[2:] in metadata and b" replay" in metadata
 
 
-def test_a_scene_whose_file_is_damaged_is_named_and_others_are_served(run: Store) -> None:
+def test_a_scene_whose_file_is_damaged_is_named_and_others_are_served(run: Store, tmp_path: Path) -> None:
     (scene_id,) = scenes_of_run(run).ids
     found = scenes_of_run(run)
     (path,) = Path(run.location.uri, "cache").glob("block-*.safetensors")
@@ -371,6 +372,8 @@ def test_a_scene_whose_file_is_damaged_is_named_and_others_are_served(run: Store
         request = sensorsim_pb2.AvailableCamerasRequest(scene_id=scene_id)
         assert refused(service, "get_available_cameras", request).startswith(f"DATA_LOSS scene_id={scene_id}: ")
         assert cameras(service, STREET)
+        with pytest.raises(ValueError, match=f"{scene_id}: .*block-"):
+            write_artifacts(mixed, tmp_path)
     finally:
         path.write_bytes(whole)
     assert cameras(Sensors(scenes_of_run(run)).service, scene_id)

@@ -377,7 +377,7 @@ def scrambled(message: Any, rng: random.Random) -> Any:
 
 
 def close_all_but(driver: Driver, kept: str) -> None:
-    for uuid in set(driver.rollouts) - {kept}:
+    for uuid in set(driver.rollouts._open) - {kept}:
         driver.service.answer("close_session", protocol.DriveSessionCloseRequest(session_uuid=uuid).SerializeToString())
 
 
