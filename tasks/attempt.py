@@ -14,9 +14,9 @@ import numpy as np
 from tasks.experts.pdm_closed import MIN_PROGRESS_M, PdmClosed, PdmPlan, PdmSettings, path_length_m, plan_for
 from tasks.experts.protocol import Expert, Plan, plans_of
 from tasks.kernels.compiled import kernel
-from tasks.reward.areas import set_area_flags
+from tasks.reward.areas import N_POINTS, empty_places, set_area_flags
 from tasks.reward.centerline import empty_body, place_body
-from tasks.reward.collisions import STOPPED_SPEED_MPS, first_collision, obstacles_of, within_reach
+from tasks.reward.collisions import STOPPED_SPEED_MPS, empty_looks, first_contacts, obstacles_of
 from tasks.reward.epdms import (
     PreparedScene,
     RuleContext,
@@ -295,16 +295,17 @@ def extrapolate(states: Array, braking_mps2: float = 0.0) -> Array:
 @kernel
 def _first_hit(context: RuleContext, boxes: Array, is_stopped: Bools, collision_score: Array, states: Array) -> float:
     """Index of the first collision at fault of states (T, 11) with boxes (T, N, 5), inf: none."""
-    body = empty_body(states.shape[0])
+    n_times, n_objects = states.shape[0], len(is_stopped)
+    body, places = empty_body(n_times), empty_places(context.map_index, N_POINTS * n_times)
     place_body(states, REAR_AXLE_TO_CENTER, body)
-    set_area_flags(context.map_index, body, HALF_LENGTH, HALF_WIDTH)
-    obstacles, ignored = obstacles_of(boxes, is_stopped, collision_score), np.empty(len(is_stopped), np.bool_)
-    return first_collision(obstacles, within_reach(obstacles, body), states, body, ignored)[1]
+    set_area_flags(context.map_index, body, HALF_LENGTH, HALF_WIDTH, places)
+    obstacles, looks = obstacles_of(boxes, is_stopped, collision_score), empty_looks(n_times, n_times, n_objects)
+    return first_contacts(obstacles, states, body, looks, 0, context.map_index, places)[1]
 
 
 # A vocabulary's labels.
 
-TRAJECTORIES_AT_ONCE = 4096  # 15 MB of states
+TRAJECTORIES_AT_ONCE = 512  # their states fill the second-level cache, 2 MB
 
 
 def vocabulary_labels(

@@ -3,8 +3,7 @@
 The map is laid out so that the regions that hold a point are found at once. A grid covers every polygon. A cell that no
 edge touches lies in the same regions everywhere, so it names one set of regions. A crossed cell names the set of its
 middle and lists its edges: on the way from the middle to a point of the cell, every edge that is passed leads into or
-out of the regions it bounds. Polygons share many edges, so that most crossed cells know just two sets, one on either
-side.
+out of the regions it bounds. Polygons share many edges, so that nearly all crossed cells know just two sets or four.
 """
 
 import math
@@ -12,9 +11,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from tasks.kernels.compiled import kernel
+from tasks.kernels.compiled import inlined, inner_kernel, kernel
 from tasks.reward.centerline import CENTER_IN_INTERSECTION, MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, Body
 from tasks.world.arrays import Array, Bools, Bytes, Ints, ShortInts
 from tasks.world.frames import LARGEST, all_within
@@ -102,6 +102,7 @@ CELL_M = 0.5
 MAX_CELLS = 1_000_000  # larger maps get larger cells
 SLACK_CELLS = 1e-6  # an edge this close to a cell touches it: far above rounding, far below a cell
 CLEAR_CELLS = 1e-9  # the line of an edge keeps this far from the middles of the edge's cells
+LEFT, WAY, THROUGH, EDGE = 1, 1, 8, 4  # of an entry: two flags; where a way of two bits and the edge begin
 SHIFTS = (math.sqrt(5.0), math.sqrt(2.0))  # in x, y: no line of rational slope holds on to cells moved by these
 
 
@@ -118,8 +119,8 @@ class Grid(NamedTuple):
 def cover_with_grid(edges: Array) -> tuple[Grid, Ints]:
     """A grid over edges (E, 4), and the pairs cell << 32 | entry of its cells and the edges that touch them.
 
-    An entry is 2 * edge, plus 1 where the cell's middle is on the left of the edge. No middle is on the line of an
-    edge of its cell. Pairs are in the order of the edges.
+    An entry is edge << EDGE, with LEFT where the cell's middle is on the left of the edge, and THROUGH where neither
+    end of the edge is in the cell. No middle is on the line of an edge of its cell. Pairs are in the order of edges.
     """
     is_clear, attempt = False, 0
     while not is_clear:  # nearly always once
@@ -146,19 +147,19 @@ def _grid(edges: Array, attempt: int) -> Grid:
     )
 
 
-@kernel
+@inlined
 def cell_middle(low: float, cell_m: float, index: int) -> float:
     """Where the middle of a row or column of cells is."""
     return low + (index + 0.5) * cell_m
 
 
-@kernel
+@inlined
 def side_of_edge(ax: float, ay: float, bx: float, by: float, x: float, y: float) -> float:
     """Where a point is as seen from a to b: > 0 on the left, < 0 on the right; twice an area [m2]."""
     return (bx - ax) * (y - ay) - (by - ay) * (x - ax)
 
 
-@kernel
+@inlined
 def line_splits_edge(
     ax: float, ay: float, bx: float, by: float, from_x: float, from_y: float, x: float, y: float
 ) -> bool:
@@ -214,9 +215,17 @@ def _touched_cells(edges: Array, grid: Grid) -> tuple[Ints, bool]:
             for column in range(start, stop):
                 side = side_of_edge(ax, ay, bx, by, cell_middle(grid.low_x, grid.cell_m, column), y)
                 is_clear &= abs(side) > near
-                found[n] = (row * grid.n_columns + column) << 32 | 2 * e + (side > 0.0)
+                inside = _is_near_cell(u, v, row, column) or _is_near_cell(u + du, v + dv, row, column)
+                entry = e << EDGE | (0 if inside else THROUGH) | (LEFT if side > 0.0 else 0)
+                found[n] = (row * grid.n_columns + column) << 32 | entry
                 n += 1
     return found[:n], is_clear
+
+
+@inlined
+def _is_near_cell(u: float, v: float, row: int, column: int) -> bool:
+    """Whether a point is in a cell or touches it; all in cells."""
+    return max(abs(u - (column + 0.5)), abs(v - (row + 0.5))) <= 0.5 + SLACK_CELLS
 
 
 @kernel
@@ -259,9 +268,8 @@ PARTS_OF_LAYER = {  # lane, drivable, intersection; lanes themselves are not dri
 }
 
 # Columns of MapIndex.crossed
-NEAR = 0  # set of the cell's middle
-FAR = 1  # set across the edges, when all of them bound the same regions, else -1
-FIRST, LAST = 2, 3  # the cell's entries; the last one is not included
+NEAR = 0  # set of the cell's middle; columns 0 .. 3 are the sets that ways lead to from there, or column 1 is -1
+FIRST, LAST = 4, 5  # the cell's entries; the last one is not included
 
 
 class MapIndex(NamedTuple):
@@ -271,8 +279,8 @@ class MapIndex(NamedTuple):
     low_y: float
     cell_m: float
     cells: ShortInts  # (rows, columns) set of a cell without edges; -1 - q for crossed cell q
-    crossed: ShortInts  # (Q, 4) NEAR, FAR, FIRST, LAST
-    entry: ShortInts  # (N,) 2 * edge, plus 1 where the cell's middle is on the left of the edge
+    crossed: ShortInts  # (Q, 6) sets, FIRST, LAST
+    entry: ShortInts  # (N,) see cover_with_grid; with the way that passing the edge is a part of
     edges: Array  # (E, 4) x, y of the start, x, y of the end [m]
     bounded: Bits  # (E, W) the regions an edge bounds
     sets: Bits  # (S, W); set 0 is empty
@@ -365,13 +373,13 @@ def _arranged(
 ) -> tuple[ShortInts, ShortInts, ShortInts, Bits]:
     """`cells` (n_cells,), `crossed`, `entry` and `sets` of the index; changes are sorted."""
     sides = np.full((bounded.shape[0], 2), -1, np.int32)  # sets last met on the two sides of each edge
-    sets = np.empty((changes.size + touched.size + 2, bounded.shape[1]), np.uint64)
+    sets = np.empty((changes.size + 2 * touched.size + 2, bounded.shape[1]), np.uint64)
     sets[0] = 0
     slots = _no_slots(sets.shape[0])
     n_sets = 1 + _row_of(sets, 0, slots)
     cells, n_sets = _cells(changes, n_cells, bounded, sides, sets, slots, n_sets)
     crossed, entry = _crossed(touched, cells)
-    n_sets = _find_far_sets(crossed, entry, bounded, sides, sets, slots, n_sets)
+    n_sets = _find_ways(crossed, entry, bounded, sides, sets, slots, n_sets)
     return cells, crossed, entry, sets[:n_sets].copy()
 
 
@@ -384,13 +392,8 @@ def _cells(
     current = 0
     for k in range(changes.size):
         edge = changes[k] & 0xFFFFFFFF
-        if current == sides[edge, 0]:
-            current = sides[edge, 1]
-        elif current == sides[edge, 1]:
-            current = sides[edge, 0]
-        else:
-            current = _across(bounded, sides, sets, slots, n_sets, current, edge)
-            n_sets = max(n_sets, current + 1)
+        current = _across(bounded, sides, sets, slots, n_sets, current, edge)
+        n_sets = max(n_sets, current + 1)
         stop = changes[k + 1] >> 32 if k + 1 < changes.size else n_cells
         cells[changes[k] >> 32 : stop] = current
     return cells, n_sets
@@ -398,8 +401,8 @@ def _cells(
 
 @kernel
 def _crossed(touched: Ints, cells: ShortInts) -> tuple[ShortInts, ShortInts]:
-    """The crossed cells (Q, 4), not yet knowing their far sets, and their entries; `cells` then name them."""
-    crossed = np.empty((touched.size, 4), np.int32)
+    """The crossed cells (Q, 6), not yet knowing any ways, and their entries; `cells` then name them."""
+    crossed = np.empty((touched.size, 6), np.int32)
     n = 0
     for pair in touched:
         cell = pair >> 32
@@ -423,31 +426,48 @@ def _crossed(touched: Ints, cells: ShortInts) -> tuple[ShortInts, ShortInts]:
 
 
 @kernel
-def _find_far_sets(
+def _find_ways(
     crossed: ShortInts, entry: ShortInts, bounded: Bits, sides: ShortInts, sets: Bits, slots: ShortInts, n_sets: int
 ) -> int:
-    """Fill in the far sets of crossed cells; returns how many sets there are."""
+    """Fill in the sets of crossed cells and the ways of their entries; returns how many sets there are.
+
+    Way 1 is to pass the first edge, way 2 one that bounds other regions; who bounds what just one of the two does is
+    both. An edge that is none of these, in one cell of twenty, leaves the cell without ways.
+    """
     for q in range(crossed.shape[0]):
-        edge, near = entry[crossed[q, FIRST]] >> 1, crossed[q, NEAR]
-        alike = True
-        for i in range(crossed[q, FIRST] + 1, crossed[q, LAST]):
-            for w in range(bounded.shape[1]):
-                alike &= bounded[entry[i] >> 1, w] == bounded[edge, w]
-        if not alike:
-            crossed[q, FAR] = -1
-        elif near == sides[edge, 0]:
-            crossed[q, FAR] = sides[edge, 1]
-        elif near == sides[edge, 1]:
-            crossed[q, FAR] = sides[edge, 0]
-        else:
-            crossed[q, FAR] = _across(bounded, sides, sets, slots, n_sets, near, edge)
-            n_sets = max(n_sets, crossed[q, FAR] + 1)
+        one, other, has_ways = entry[crossed[q, FIRST]] >> EDGE, -1, True
+        for i in range(crossed[q, FIRST], crossed[q, LAST]):
+            way = _way(bounded, entry[i] >> EDGE, one, other)
+            if way == 0 and other < 0:
+                other, way = entry[i] >> EDGE, 2
+            has_ways &= way > 0
+            entry[i] |= way << WAY
+        for way in range(1, 4 if other >= 0 else 2):
+            edge, start = (one, crossed[q, way - 1]) if way != 2 else (other, crossed[q, NEAR])
+            crossed[q, way] = _across(bounded, sides, sets, slots, n_sets, start, edge)
+            n_sets = max(n_sets, crossed[q, way] + 1)
+        if not has_ways:
+            crossed[q, 1] = -1
     return n_sets
 
 
-@kernel
+@inner_kernel
+def _way(bounded: Bits, edge: int, one: int, other: int) -> int:
+    """1 where an edge bounds what one edge does, 2 what another does, 3 what just one of them does, else 0."""
+    as_one, as_other, as_both = True, other >= 0, other >= 0
+    for w in range(bounded.shape[1]):
+        as_one &= bounded[edge, w] == bounded[one, w]
+        as_other &= bounded[edge, w] == bounded[other, w]
+        as_both &= bounded[edge, w] == bounded[one, w] ^ bounded[other, w]
+    return 1 if as_one else 2 if as_other else 3 if as_both else 0
+
+
+@inner_kernel
 def _across(bounded: Bits, sides: ShortInts, sets: Bits, slots: ShortInts, n_sets: int, start: int, edge: int) -> int:
     """The number of the set on the other side of an edge, n_sets if it is a new one."""
+    for side in range(2):
+        if start == sides[edge, side]:
+            return int(sides[edge, 1 - side])
     for w in range(sets.shape[1]):
         sets[n_sets, w] = sets[start, w] ^ bounded[edge, w]
     found = _row_of(sets, n_sets, slots)
@@ -464,7 +484,7 @@ def _no_slots(n_rows: int) -> ShortInts:
     return np.full(size, -1, np.int32)
 
 
-@kernel
+@inner_kernel
 def _row_of(rows: Bits, new: int, slots: ShortInts) -> int:
     """The earlier row that equals row `new`, else `new`, which the hash table then knows."""
     key = np.uint64(0)
@@ -489,7 +509,7 @@ def _first_crossing(edges: Array, bounded: Bits, crossed: ShortInts, entry: Shor
     for q in range(crossed.shape[0]):
         for i in range(crossed[q, FIRST], crossed[q, LAST]):
             for k in range(crossed[q, FIRST], i):
-                one, other = entry[i] >> 1, entry[k] >> 1
+                one, other = entry[i] >> EDGE, entry[k] >> EDGE
                 for w in range(bounded.shape[1]):
                     both = bounded[one, w] & bounded[other, w]
                     if both and _splits_clearly(edges, one, other) and _splits_clearly(edges, other, one):
@@ -510,69 +530,108 @@ def _splits_clearly(edges: Array, line: int, edge: int) -> bool:
     return n_left == 1
 
 
-# The flags of a body. Each step is one loop over all points of a trajectory. Calls with arrays inside of these loops
-# would cost more than the work: numba counts references to every one of them.
+# The flags of a body. What can run many points wide is a loop of its own over all points of a trajectory; one by one go
+# those in crossed cells, which are listed first: branches that nobody can foresee cost more than the work.
 
 
-class RegionsAtPoints(NamedTuple):
-    """The regions that hold each of P points."""
+N_POINTS = 5  # of a body: corners FL, RL, RR, FR and centre
 
+
+class Places(NamedTuple):
+    """Scratch for P points and the regions that hold them."""
+
+    x: Array  # (P,) [m]
+    y: Array  # (P,)
     number: ShortInts  # (P,) n >= 0: set n of the map index; else row -1 - n of `others`
     others: Bits  # (P, W) sets without a number; used up to as many as there are
     parts: Bytes  # (P,) bits of the parts that these regions play
+    listed: ShortInts  # (P,) points that are yet to be looked at
+
+
+@register_jitable
+def empty_places(index: MapIndex, n_points: int) -> Places:
+    """Scratch for that many points."""
+    number, listed = np.empty(n_points, np.int32), np.empty(n_points, np.int32)
+    others, parts = np.empty((n_points, index.sets.shape[1]), np.uint64), np.empty(n_points, np.uint8)
+    return Places(np.empty(n_points), np.empty(n_points), number, others, parts, listed)
 
 
 @kernel
-def set_area_flags(index: MapIndex, body: Body, half_length: float, half_width: float) -> None:
-    """Fill the flags of a placed body. A point on a region's boundary is outside of it, up to rounding."""
-    x, y = _points(body, half_length, half_width)
-    _set_flags(index, regions_at(index, x, y), body.flags)
+def set_area_flags(index: MapIndex, body: Body, half_length: float, half_width: float, places: Places) -> None:
+    """Fill the flags of a placed body. A point on a region's boundary is outside of it, up to rounding.
+
+    places: scratch for five times as many points as the body has instants.
+    """
+    _set_points(body, half_length, half_width, places)
+    find_regions(index, places)
+    _set_flags(index, places, body.flags)
 
 
-@kernel
-def in_intersection(index: MapIndex, x: float, y: float) -> bool:
-    """Whether a point is in an intersection."""
-    return _plays(regions_at(index, np.full(1, x), np.full(1, y)).parts[0], INTERSECTION)
+@inner_kernel
+def in_intersection(index: MapIndex, x: float, y: float, places: Places) -> bool:
+    """Whether a point is in an intersection. places: scratch."""
+    one = Places(places.x[:1], places.y[:1], places.number[:1], places.others, places.parts, places.listed)
+    one.x[0], one.y[0] = x, y
+    find_regions(index, one)
+    return _plays(one.parts[0], INTERSECTION)
 
 
-@kernel
-def regions_at(index: MapIndex, x: Array, y: Array) -> RegionsAtPoints:
-    """Which regions hold the points x, y (P,) [m]."""
-    held = RegionsAtPoints(
-        np.empty(x.size, np.int32), np.empty((x.size, index.sets.shape[1]), np.uint64), np.empty(x.size, np.uint8)
-    )
-    _look_up(index, x, y, held.number)
-    _pass_edges(index, x, y, held.number)
-    _collect_others(index, x, y, held)
-    return held
-
-
-@kernel
+@inlined
 def _plays(parts: int, part: int) -> bool:
     return parts & 1 << part != 0
 
 
-@kernel
-def _points(body: Body, half_length: float, half_width: float) -> tuple[Array, Array]:
-    """x, y (5 T,) of the corners FL, RL, RR, FR and of the centre; those of one kind follow each other."""
+@inlined
+def _set_points(body: Body, half_length: float, half_width: float, places: Places) -> None:
+    """The corners FL, RL, RR, FR and the centre (5 T,); those of one kind follow each other."""
     n = body.x.size
-    x, y = np.empty(5 * n), np.empty(5 * n)
-    for t in range(n):
-        along_x, along_y = body.cos[t] * half_length, body.sin[t] * half_length
-        across_x, across_y = body.sin[t] * half_width, body.cos[t] * half_width
-        front_x, front_y = body.x[t] + along_x, body.y[t] + along_y
-        rear_x, rear_y = body.x[t] - along_x, body.y[t] - along_y
-        x[t], y[t] = front_x - across_x, front_y + across_y
-        x[n + t], y[n + t] = rear_x - across_x, rear_y + across_y
-        x[2 * n + t], y[2 * n + t] = rear_x + across_x, rear_y - across_y
-        x[3 * n + t], y[3 * n + t] = front_x + across_x, front_y - across_y
-        x[4 * n + t], y[4 * n + t] = body.x[t], body.y[t]
-    return x, y
+    for kind, ahead, aside in ((0, 1.0, 1.0), (1, -1.0, 1.0), (2, -1.0, -1.0), (3, 1.0, -1.0), (4, 0.0, 0.0)):
+        along, across = ahead * half_length, aside * half_width
+        x, y = places.x[kind * n : (kind + 1) * n], places.y[kind * n : (kind + 1) * n]
+        for t in range(n):
+            x[t] = body.x[t] + body.cos[t] * along - body.sin[t] * across
+            y[t] = body.y[t] + body.sin[t] * along + body.cos[t] * across
 
 
-@kernel
-def _look_up(index: MapIndex, x: Array, y: Array, found: ShortInts) -> None:
+@inner_kernel
+def find_regions(index: MapIndex, places: Places) -> None:
+    """Find the regions that hold the points of `places`."""
+    low_x, low_y, cell_m = index.low_x, index.low_y, index.cell_m
+    crossed, entry, edges = index.crossed, index.entry, index.edges
+    x, y, number, parts, listed = places.x, places.y, places.number, places.parts, places.listed
+    _look_up(index, places)
+    n_listed = n_left = 0
+    for p in range(x.size):
+        listed[n_listed] = p
+        n_listed += number[p] < 0
+    for k in range(n_listed):
+        p = listed[k]
+        q = -1 - number[p]
+        way, is_left = 0, crossed[q, 1] < 0
+        for i in range(crossed[q, FIRST], crossed[q, LAST]):
+            ax, ay, bx, by = edges[entry[i] >> EDGE]
+            side = side_of_edge(ax, ay, bx, by, x[p], y[p])
+            is_left |= side == 0.0
+            is_passed = (side > 0.0) != (entry[i] & LEFT != 0)
+            if entry[i] & THROUGH == 0:
+                from_x = cell_middle(low_x, cell_m, int((x[p] - low_x) / cell_m))
+                from_y = cell_middle(low_y, cell_m, int((y[p] - low_y) / cell_m))
+                is_passed &= line_splits_edge(ax, ay, bx, by, from_x, from_y, x[p], y[p])
+            way ^= (entry[i] >> WAY & 3) * is_passed
+        listed[n_left] = p
+        n_left += is_left
+        number[p] = number[p] if is_left else crossed[q, way]
+    for k in range(n_left):
+        _find_apart(index, listed[k], k, places)
+    for p in range(x.size):
+        if number[p] >= 0:
+            parts[p] = index.parts[number[p]]
+
+
+@inlined
+def _look_up(index: MapIndex, places: Places) -> None:
     """What the index says of the points' cells; its outermost cells, which are empty, stand for all beyond."""
+    x, y, found = places.x, places.y, places.number
     low_x, low_y, cell_m = index.low_x, index.low_y, index.cell_m
     n_rows, n_columns = index.cells.shape
     for p in range(x.size):
@@ -584,88 +643,45 @@ def _look_up(index: MapIndex, x: Array, y: Array, found: ShortInts) -> None:
         found[p] = cells[found[p]]
 
 
-@kernel
-def _pass_edges(index: MapIndex, x: Array, y: Array, found: ShortInts) -> None:
-    """Turn crossed cells that know their far set into the set around the point, unless an edge's line is on it."""
-    low_x, low_y, cell_m = index.low_x, index.low_y, index.cell_m
-    crossed, entry, edges = index.crossed, index.entry, index.edges
-    for p in range(x.size):
-        q = -1 - found[p]
-        if q >= 0 and crossed[q, FAR] >= 0:
-            from_x = cell_middle(low_x, cell_m, int((x[p] - low_x) / cell_m))
-            from_y = cell_middle(low_y, cell_m, int((y[p] - low_y) / cell_m))
-            is_far = on_line = False
-            for i in range(crossed[q, FIRST], crossed[q, LAST]):
-                ax, ay, bx, by = edges[entry[i] >> 1]
-                side = side_of_edge(ax, ay, bx, by, x[p], y[p])
-                on_line |= side == 0.0
-                if (side > 0.0) != (entry[i] & 1 == 1):
-                    is_far ^= line_splits_edge(ax, ay, bx, by, from_x, from_y, x[p], y[p])
-            if not on_line:
-                found[p] = crossed[q, FAR if is_far else NEAR]
-
-
-@kernel
-def _collect_others(index: MapIndex, x: Array, y: Array, held: RegionsAtPoints) -> None:
-    """Fill in the other sets, and all parts."""
-    low_x, low_y, cell_m = index.low_x, index.low_y, index.cell_m
-    crossed, entry, edges = index.crossed, index.entry, index.edges
-    sets, bounded, parts_of_set, playing = index.sets, index.bounded, index.parts, index.playing
-    found, others, parts = held
-    n = 0
-    for p in range(x.size):
-        if found[p] >= 0:
-            parts[p] = parts_of_set[found[p]]
-            continue
-        q = -1 - found[p]
-        from_x = cell_middle(low_x, cell_m, int((x[p] - low_x) / cell_m))
-        from_y = cell_middle(low_y, cell_m, int((y[p] - low_y) / cell_m))
-        for w in range(others.shape[1]):
-            others[n, w] = sets[crossed[q, NEAR], w]
-        on_line = False
-        for i in range(crossed[q, FIRST], crossed[q, LAST]):
-            ax, ay, bx, by = edges[entry[i] >> 1]
-            side = side_of_edge(ax, ay, bx, by, x[p], y[p])
-            on_line |= side == 0.0
-            if (side > 0.0) != (entry[i] & 1 == 1) and line_splits_edge(ax, ay, bx, by, from_x, from_y, x[p], y[p]):
-                for w in range(others.shape[1]):
-                    others[n, w] ^= bounded[entry[i] >> 1, w]
-        if on_line:
-            _drop_boundary_regions(index, q, x[p], y[p], others, n)
-        parts[p] = 0
-        for w in range(others.shape[1]):
-            for part in range(playing.shape[0]):
-                parts[p] |= (others[n, w] & playing[part, w] != 0) << part
-        n += 1
-        found[p] = -n
-
-
-@kernel
-def _drop_boundary_regions(index: MapIndex, q: int, x: float, y: float, others: Bits, n: int) -> None:
-    """Take the regions on whose boundary a point of crossed cell q lies out of row n of `others`."""
+@inlined
+def _find_apart(index: MapIndex, p: int, new: int, places: Places) -> None:
+    """Find the set around a point whose crossed cell does not name it, or on an edge's line: row `new` of `others`."""
+    x, y, q, others = places.x[p], places.y[p], -1 - places.number[p], places.others
+    from_x = cell_middle(index.low_x, index.cell_m, int((x - index.low_x) / index.cell_m))
+    from_y = cell_middle(index.low_y, index.cell_m, int((y - index.low_y) / index.cell_m))
+    for w in range(others.shape[1]):
+        others[new, w] = index.sets[index.crossed[q, NEAR], w]
     for i in range(index.crossed[q, FIRST], index.crossed[q, LAST]):
-        e = index.entry[i] >> 1
-        ax, ay, bx, by = index.edges[e]
-        if (
-            side_of_edge(ax, ay, bx, by, x, y) == 0.0
-            and min(ax, bx) <= x <= max(ax, bx)
-            and min(ay, by) <= y <= max(ay, by)
-        ):
+        ax, ay, bx, by = index.edges[index.entry[i] >> EDGE]
+        is_across = (side_of_edge(ax, ay, bx, by, x, y) > 0.0) != (index.entry[i] & LEFT != 0)
+        if is_across and line_splits_edge(ax, ay, bx, by, from_x, from_y, x, y):
             for w in range(others.shape[1]):
-                others[n, w] &= ~index.bounded[e, w]
+                others[new, w] ^= index.bounded[index.entry[i] >> EDGE, w]
+    for i in range(index.crossed[q, FIRST], index.crossed[q, LAST]):  # no region holds a point on its boundary
+        ax, ay, bx, by = index.edges[index.entry[i] >> EDGE]
+        in_x, in_y = min(ax, bx) <= x <= max(ax, bx), min(ay, by) <= y <= max(ay, by)
+        if side_of_edge(ax, ay, bx, by, x, y) == 0.0 and in_x and in_y:
+            for w in range(others.shape[1]):
+                others[new, w] &= ~index.bounded[index.entry[i] >> EDGE, w]
+    parts = 0
+    for w in range(others.shape[1]):
+        for part in range(index.playing.shape[0]):
+            parts |= (others[new, w] & index.playing[part, w] != 0) << part
+    places.parts[p], places.number[p] = parts, -1 - new
 
 
-@kernel
-def _set_flags(index: MapIndex, held: RegionsAtPoints, flags: Bytes) -> None:
+@inlined
+def _set_flags(index: MapIndex, places: Places, flags: Bytes) -> None:
     sets, lanes, n_words = index.sets, index.playing[LANE], index.n_lane_words
-    number, others, parts = held
-    n = flags.size
+    number, others, parts, n = places.number, places.others, places.parts, flags.size
     for t in range(n):
         at_center = parts[4 * n + t]
         at_corners = parts[t] & parts[n + t] & parts[2 * n + t] & parts[3 * n + t]
         flag = 0 if _plays(at_center, ON_ROUTE) else ONCOMING
         flag |= CENTER_IN_INTERSECTION if _plays(at_center, INTERSECTION) else 0
         flag |= 0 if _plays(at_corners, DRIVABLE) else NON_DRIVABLE
+        flags[t] = flag
+    for t in range(n):
         fl, rl, rr, fr = number[t], number[n + t], number[2 * n + t], number[3 * n + t]
         if fl != rl or fl != rr or fl != fr:
             n_touched = 0
@@ -678,8 +694,7 @@ def _set_flags(index: MapIndex, held: RegionsAtPoints, flags: Bytes) -> None:
                 touched = (a | b | c | d) & lanes[w]
                 n_touched += (touched != 0) + (touched & (touched - np.uint64(1)) != 0)
                 holds_all |= a & b & c & d & lanes[w] != 0
-            flag |= MULTIPLE_LANES if n_touched > 1 and not holds_all else 0
-        flags[t] = flag
+            flags[t] |= MULTIPLE_LANES if n_touched > 1 and not holds_all else 0
 
 
 # Whether the ego's body is on a lane connector whose light is red (docs/reward.md 2d).

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numba.extending import register_jitable
 
-from tasks.kernels.compiled import kernel
+from tasks.kernels.compiled import inlined, kernel
 from tasks.kernels.trig import sincos
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import HORIZON_STEPS
@@ -21,14 +21,14 @@ OFF_LANE = MULTIPLE_LANES | NON_DRIVABLE  # where a lateral contact is the ego's
 
 
 class Body(NamedTuple):
-    """Scratch for one trajectory, 41 instants; world frame."""
+    """Scratch for T instants of one trajectory, or of several one after the other; world frame."""
 
-    x: Array  # (41,) centre of the body [m]
-    y: Array  # (41,)
-    cos: Array  # (41,) of the heading
-    sin: Array  # (41,)
-    speed: Array  # (41,) hypot(vx, vy) [m/s]
-    flags: Bytes  # (41,) bits above
+    x: Array  # (T,) centre of the body [m]
+    y: Array  # (T,)
+    cos: Array  # (T,) of the heading
+    sin: Array  # (T,)
+    speed: Array  # (T,) hypot(vx, vy) [m/s]
+    flags: Bytes  # (T,) bits above
 
 
 def as_states(name: str, states: Array) -> Array:
@@ -52,16 +52,26 @@ def empty_body(n_times: int) -> Body:
     )
 
 
+@inlined
+def instants_of(body: Body, start: int, stop: int) -> Body:
+    """Some of the instants."""
+    x, y, cos, sin = body.x[start:stop], body.y[start:stop], body.cos[start:stop], body.sin[start:stop]
+    return Body(x, y, cos, sin, body.speed[start:stop], body.flags[start:stop])
+
+
 @kernel
 def place_body(states: Array, rear_axle_to_center: float, body: Body) -> None:
-    """Fill everything but the flags from the states (41, 11) of one trajectory; their pose is the rear axle."""
+    """Fill everything but the flags from states (T, 11); their pose is the rear axle."""
     x, y, cos, sin, speed = body.x, body.y, body.cos, body.sin, body.speed
-    for t in range(states.shape[0]):
-        s, c = sincos(states[t, HEADING])
-        cos[t], sin[t] = c, s
-        x[t] = states[t, X] + rear_axle_to_center * c
-        y[t] = states[t, Y] + rear_axle_to_center * s
-        speed[t] = math.sqrt(states[t, VX] * states[t, VX] + states[t, VY] * states[t, VY])
+    for t in range(len(x)):
+        x[t], y[t], cos[t] = states[t, X], states[t, Y], states[t, HEADING]
+        speed[t] = states[t, VX] * states[t, VX] + states[t, VY] * states[t, VY]
+    for t in range(len(x)):
+        sin[t], cos[t] = sincos(cos[t])
+    for t in range(len(x)):
+        x[t] += rear_axle_to_center * cos[t]
+        y[t] += rear_axle_to_center * sin[t]
+        speed[t] = math.sqrt(speed[t])
 
 
 # The centreline, indexed once: where along it a point lies, whether points are off it. Both answers are GEOS' to the
@@ -101,7 +111,7 @@ def index_centerline(points: Array) -> Centerline:
     return Centerline(segments, np.column_stack([centers, radii * SLACK + SLACK_M]))
 
 
-@kernel
+@inlined
 def nearest_on_segment(segments: Array, i: int, x: float, y: float) -> tuple[float, float]:
     """Distance [m] of (x, y) to segment i, and the arc length [m] from the segment's start to the nearest place."""
     from_x, from_y = x - segments[i, 0], y - segments[i, 1]
@@ -139,9 +149,14 @@ def arc_length_at(line: Centerline, x: float, y: float) -> float:
 
 
 @kernel
-def progress_m(line: Centerline, x0: float, y0: float, x1: float, y1: float) -> float:
-    """EP raw [m]: arc length gained along the centreline from (x0, y0) to (x1, y1), at least 0."""
-    return max(0.0, arc_length_at(line, x1, y1) - arc_length_at(line, x0, y0))
+def progress_m(line: Centerline, x0: float, y0: float, x1: float, y1: float, begun: Array) -> float:
+    """EP raw [m]: arc length gained along the centreline from (x0, y0) to (x1, y1), at least 0.
+
+    begun: (3,) scratch, NaN at first: where the drive before began, x, y and arc length [m]. Most begin at one place.
+    """
+    if begun[0] != x0 or begun[1] != y0:
+        begun[0], begun[1], begun[2] = x0, y0, arc_length_at(line, x0, y0)
+    return max(0.0, arc_length_at(line, x1, y1) - begun[2])
 
 
 @kernel
@@ -193,8 +208,11 @@ def lane_keeping_failure(line: Centerline, body: Body) -> float:
 
 
 @kernel
-def driving_direction_compliance(body: Body) -> tuple[float, float]:
-    """DDC in {0, 0.5, 1}, and the first time index with 2 m or more against traffic within 1 s (inf: none)."""
+def driving_direction_compliance(body: Body, moved: Array) -> tuple[float, float]:
+    """DDC in {0, 0.5, 1}, and the first time index with 2 m or more against traffic within 1 s (inf: none).
+
+    moved: (10 + 41,) scratch.
+    """
     x, y, flags = body.x, body.y, body.flags
     n = len(x)
     any_oncoming = False
@@ -203,7 +221,7 @@ def driving_direction_compliance(body: Body) -> tuple[float, float]:
     if not any_oncoming:
         return 1.0, math.inf
     before = DDC_WINDOW - 1
-    moved = np.zeros(before + n)  # from the step before, where that is against traffic
+    moved[:] = 0.0  # from the step before, where that is against traffic
     for t in range(1, n):
         if (flags[t] & (ONCOMING | CENTER_IN_INTERSECTION)) == ONCOMING:
             moved[before + t] = math.hypot(x[t] - x[t - 1], y[t] - y[t - 1])

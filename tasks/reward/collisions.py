@@ -1,18 +1,19 @@
 """No at-fault collision and time to collision of one trajectory (docs/reward.md 2b, 2g).
 
 Both rules walk through the contacts of the ego's body in time and stop looking at an object once a contact with it was
-harmless.
+harmless. They walk together, for time to collision also looks at where the ego is.
 """
 
 import math
 from typing import NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 
-from tasks.kernels.compiled import kernel
-from tasks.reward.areas import MapIndex, in_intersection
+from tasks.kernels.compiled import inlined, kernel
+from tasks.reward.areas import MapIndex, Places, in_intersection
 from tasks.reward.centerline import OFF_LANE, Body
-from tasks.world.arrays import Array, Bools, ShortInts
+from tasks.world.arrays import Array, Bools, Bytes, ShortInts
 from tasks.world.clip import HORIZON_STEPS
 from tasks.world.frames import HALF_LENGTH, HALF_WIDTH, HEADING, X, Y
 
@@ -33,11 +34,12 @@ class Box(NamedTuple):
     width: float
 
 
-@kernel
-def apart(first: Box, second: Box) -> bool:
-    """Whether two boxes are clear of each other by more than rounding.
+@inlined
+def gap_m(first: Box, second: Box) -> float:
+    """How far two boxes are apart [m] along the axis of theirs where they are farthest, < 0 where they overlap; without
+    trigonometry.
 
-    True only where `touching` is False, and nearly always then; without trigonometry.
+    Above ROUNDING_M they are not `touching`, below -ROUNDING_M they are; in between `touching` alone can say.
     """
     dx, dy = second.x - first.x, second.y - first.y
     c = abs(first.cos * second.cos + first.sin * second.sin)
@@ -46,7 +48,7 @@ def apart(first: Box, second: Box) -> bool:
     across1 = 2.0 * abs(first.cos * dy - first.sin * dx) - (first.width + second.length * s + second.width * c)
     along2 = 2.0 * abs(second.cos * dx + second.sin * dy) - (second.length + first.length * c + first.width * s)
     across2 = 2.0 * abs(second.cos * dy - second.sin * dx) - (second.width + first.length * s + first.width * c)
-    return max(max(along1, across1), max(along2, across2)) > ROUNDING_M
+    return max(max(along1, across1), max(along2, across2))
 
 
 @kernel
@@ -180,7 +182,7 @@ def _register(box: Box, t: int, item: int, fill: bool, starts: ShortInts, items:
                     starts[cell] += 1
 
 
-@kernel
+@inlined
 def _cell(t: int, row: int, column: int) -> int:
     return (t * CELLS_PER_SIDE + (row & (CELLS_PER_SIDE - 1))) * CELLS_PER_SIDE + (column & (CELLS_PER_SIDE - 1))
 
@@ -256,15 +258,11 @@ def extents_over_time(boxes: Array) -> Array:
     return spans
 
 
-@kernel
-def within_reach(obstacles: Obstacles, body: Body) -> Cells:
-    """The index, or where none is made: who is not out of reach of a placed body all along where it looks."""
-    if len(obstacles.axes) > 0:
-        return obstacles.cells
+@inlined
+def list_within_reach(obstacles: Obstacles, body: Body, one: Cells) -> None:
+    """Fill a single cell with who is not out of reach of a placed body all along where the rules look."""
     least_x, least_y, most_x, most_y = _looked_at(body)
-    spans = obstacles.spans
-    items = np.empty(len(spans), np.int32)
-    n = 0
+    spans, n = obstacles.spans, 0
     for item in range(len(spans)):
         # as far as out_of_reach ever looks
         reach = math.sqrt(0.5 * (spans[item, 4] + LENGTH * LENGTH + WIDTH * WIDTH) + ROUNDING_M) + ROUNDING_M
@@ -274,12 +272,12 @@ def within_reach(obstacles: Obstacles, body: Body) -> Cells:
             and spans[item, 1] - reach <= most_y
             and spans[item, 3] + reach >= least_y
         ):
-            items[n] = item
+            one.items[n] = item
             n += 1
-    return Cells(np.array([0, n], np.int32), items[:n])
+    one.starts[1] = n
 
 
-@kernel
+@inlined
 def box_at(obstacles: Obstacles, t: int, item: int) -> Box:
     """Where an object is at step t; NaN when absent."""
     x, y, heading = obstacles.boxes[t, item, 0], obstacles.boxes[t, item, 1], obstacles.boxes[t, item, 2]
@@ -289,7 +287,7 @@ def box_at(obstacles: Obstacles, t: int, item: int) -> Box:
     return Box(x, y, heading, math.cos(heading), math.sin(heading), length, width)
 
 
-@kernel
+@inlined
 def out_of_reach(obstacles: Obstacles, t: int, item: int, ego: Box) -> bool:
     """Whether an object is too far away, or absent, to touch the ego at step t: nothing dearer is needed."""
     boxes = obstacles.boxes
@@ -308,67 +306,96 @@ AHEAD_RAD = math.radians(30.0)
 TTC_STEPS = (0, 3, 6, 9)  # projections 0, 0.3, 0.6, 0.9 s ahead
 
 
-@kernel
-def first_collision(
-    obstacles: Obstacles, cells: Cells, states: Array, body: Body, ignored: Bools
-) -> tuple[float, float]:
-    """NC in {0, 0.5, 1} and the time index of the first collision at fault, inf where there is none.
+class Looks(NamedTuple):
+    """Scratch for the contacts of trajectories of T instants each, P in all."""
 
-    cells: the obstacles within reach; states: (41, 11) of one trajectory; body: placed there, with its flags; ignored:
-    (N,) scratch.
+    cell: ShortInts  # (4, P) of where the ego looks at each of TTC_STEPS, times left out
+    listed: ShortInts  # (2, 4 T) see `_list_looks`
+    one: Cells  # of obstacles without an index
+    asking: Bytes  # (N,) bits below: the rules that still look at an object
+
+
+NC, TTC = 1, 2
+
+
+@register_jitable
+def empty_looks(n_instants: int, n_times: int, n_items: int) -> Looks:
+    """Room for trajectories of T instants each, P in all, among N objects."""
+    cell, listed = np.empty((len(TTC_STEPS), n_instants), np.int32), np.empty((2, len(TTC_STEPS) * n_times), np.int32)
+    one = Cells(np.zeros(2, np.int32), np.empty(n_items, np.int32))
+    return Looks(cell, listed, one, np.empty(n_items, np.uint8))
+
+
+@inlined
+def set_looks(body: Body, looks: Looks) -> None:
+    """Fill in the cells of a placed body."""
+    for k, step in enumerate(TTC_STEPS):
+        cell = looks.cell[k]
+        for t in range(len(body.x)):
+            gone = body.speed[t] * (step * 0.1)
+            row, column = (body.y[t] + body.sin[t] * gone) / CELL_M, (body.x[t] + body.cos[t] * gone) / CELL_M
+            cell[t] = _cell(0, math.floor(row), math.floor(column))
+
+
+@inlined
+def _list_looks(cells: Cells, looks: Looks, start: int, n_times: int) -> int:
+    """List looks with somebody in the cell, in time: 4 * t + place in TTC_STEPS, and the cell. How many there are."""
+    one, n = len(cells.starts) == 2, 0
+    for t in range(n_times):
+        for k in range(len(TTC_STEPS) if t < n_times - max(TTC_STEPS) else 1):
+            cell = 0 if one else _cell(t + TTC_STEPS[k], 0, 0) + looks.cell[k, start + t]
+            looks.listed[0, n], looks.listed[1, n] = len(TTC_STEPS) * t + k, cell
+            n += cells.starts[cell + 1] > cells.starts[cell]
+    return n
+
+
+@inlined
+def first_contacts(
+    obstacles: Obstacles, states: Array, body: Body, looks: Looks, start: int, map_index: MapIndex, places: Places
+) -> tuple[float, float, float]:
+    """NC in {0, 0.5, 1}, the time index of the first collision at fault, and that of the first TTC violation.
+
+    A TTC violation is where the ego, going straight on for up to 0.9 s, runs into something; the index is inf where
+    there is none. states: (T, 11) of one trajectory; body: placed there, with its flags; looks: set by `set_looks`,
+    from `start` on for this one; map_index: within its intersections contacts beside the ego count for TTC too.
     """
-    ignored[:] = False
-    nc, first = 1.0, math.inf
-    for t in range(states.shape[0]):
-        ego = Box(body.x[t], body.y[t], states[t, HEADING], body.cos[t], body.sin[t], LENGTH, WIDTH)
-        cell = cell_of(cells, t, ego.x, ego.y)
+    cells = looks.one if len(obstacles.axes) == 0 else obstacles.cells
+    one = len(cells.starts) == 2
+    if one:
+        list_within_reach(obstacles, body, looks.one)
+    nc, hit, violated, ends = 1.0, math.inf, math.inf, states.shape[0] - max(TTC_STEPS)
+    looks.asking[:] = NC | TTC
+    for i in range(_list_looks(cells, looks, start, states.shape[0])):
+        t, k, cell = looks.listed[0, i] // len(TTC_STEPS), looks.listed[0, i] % len(TTC_STEPS), looks.listed[1, i]
+        asks = NC if k == 0 and nc > 0.0 else 0
+        asks |= TTC if violated == math.inf and t < ends and body.speed[t] >= STOPPED_EGO_TTC_MPS else 0
+        if asks == 0:
+            continue
+        step, c, s = TTC_STEPS[k], body.cos[t], body.sin[t]
+        gone = body.speed[t] * (step * 0.1)
+        ego = Box(body.x[t] + c * gone, body.y[t] + s * gone, states[t, HEADING], c, s, LENGTH, WIDTH)
         for entry in range(cells.starts[cell], cells.starts[cell + 1]):
             item = cells.items[entry]
-            if ignored[item] or out_of_reach(obstacles, t, item, ego):
+            if not looks.asking[item] & asks or (one and out_of_reach(obstacles, t + step, item, ego)):
                 continue
-            other = box_at(obstacles, t, item)
-            if apart(ego, other) or not touching(ego, other):
+            other = box_at(obstacles, t + step, item)
+            gap = gap_m(ego, other)
+            if gap > ROUNDING_M or not (gap < -ROUNDING_M or touching(ego, other)):
                 continue
-            off_lane = (body.flags[t] & OFF_LANE) != 0
-            if _at_fault(ego, states[t, X], states[t, Y], body.speed[t], off_lane, other, obstacles.is_stopped[item]):
-                nc, first = min(nc, obstacles.collision_score[item]), min(first, float(t))
-            else:
-                ignored[item] = True
-        if nc == 0.0:
-            break
-    return nc, first
-
-
-@kernel
-def first_ttc_violation(
-    obstacles: Obstacles, cells: Cells, states: Array, body: Body, map_index: MapIndex, ignored: Bools
-) -> float:
-    """First time index at which the ego, going straight on for up to 0.9 s, runs into something; inf: none.
-
-    Arguments as for `first_collision`; map_index: within its intersections contacts beside the ego count too.
-    """
-    ignored[:] = False
-    for t in range(states.shape[0] - max(TTC_STEPS)):
-        if body.speed[t] < STOPPED_EGO_TTC_MPS:
-            continue
-        c, s = body.cos[t], body.sin[t]
-        for step in TTC_STEPS:
-            gone = body.speed[t] * (step * 0.1)
-            x, y = body.x[t] + c * gone, body.y[t] + s * gone
-            ego = Box(x, y, states[t, HEADING], c, s, LENGTH, WIDTH)
-            cell = cell_of(cells, t + step, x, y)
-            for entry in range(cells.starts[cell], cells.starts[cell + 1]):
-                item = cells.items[entry]
-                if ignored[item] or out_of_reach(obstacles, t + step, item, ego):
-                    continue
-                other = box_at(obstacles, t + step, item)
-                if apart(ego, other) or not touching(ego, other):
-                    continue
-                angle = _angle_to(states[t, X], states[t, Y], ego.heading, other)  # the ego as it is now
-                if angle < AHEAD_RAD or (not angle > BEHIND_RAD and _exposed(map_index, states, body, t)):
-                    return float(t)
-                ignored[item] = True
-    return math.inf
+            rear_x, rear_y = states[t, X], states[t, Y]
+            off_lane, stopped = (body.flags[t] & OFF_LANE) != 0, obstacles.is_stopped[item]
+            if looks.asking[item] & asks & NC:
+                if _at_fault(ego, rear_x, rear_y, body.speed[t], off_lane, other, stopped):
+                    nc, hit = min(nc, obstacles.collision_score[item]), min(hit, float(t))
+                else:
+                    looks.asking[item] &= ~NC
+            if looks.asking[item] & asks & TTC:
+                angle = _angle_to(rear_x, rear_y, ego.heading, other)  # the ego as it is now
+                beside = not angle > BEHIND_RAD and (off_lane or in_intersection(map_index, rear_x, rear_y, places))
+                if angle < AHEAD_RAD or beside:
+                    violated, asks = float(t), asks & NC
+                looks.asking[item] &= ~TTC
+    return nc, hit, violated
 
 
 @kernel
@@ -382,12 +409,6 @@ def _looked_at(body: Body) -> tuple[float, float, float, float]:
         least_x, least_y = min(least_x, x, ahead_x), min(least_y, y, ahead_y)
         most_x, most_y = max(most_x, x, ahead_x), max(most_y, y, ahead_y)
     return least_x, least_y, most_x, most_y
-
-
-@kernel
-def _exposed(map_index: MapIndex, states: Array, body: Body, t: int) -> bool:
-    """Whether objects beside the ego count at step t: between lanes, off the road or in an intersection."""
-    return (body.flags[t] & OFF_LANE) != 0 or in_intersection(map_index, states[t, X], states[t, Y])
 
 
 @kernel

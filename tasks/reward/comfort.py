@@ -1,7 +1,8 @@
 """History comfort and two-frame extended comfort (docs/reward.md 2i, 2j).
 
-The six limits hold on a series of 55 rows: 14 of history, then the 41 of the trajectory. It is judged one quantity at a
-time, each a contiguous row of scratch.
+The six limits hold on a series of 55 rows: 14 of history, then the 41 of the trajectory. LANES series are judged side
+by side, one quantity at a time, each a row of scratch: instant by instant what the lanes have then, so that every loop
+vectorises whatever its filter. Where there are fewer drives the last one stands in the other lanes too.
 """
 
 import math
@@ -14,7 +15,7 @@ from numba.extending import register_jitable
 from tasks.kernels.compiled import kernel
 from tasks.reward.centerline import as_states
 from tasks.world.arrays import Array, Bools
-from tasks.world.clip import HORIZON_STEPS, STEP_S
+from tasks.world.clip import STEP_S
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, REAR_AXLE_TO_CENTER, STEERING, YAW_ACCEL, YAW_RATE
 
 # Savitzky-Golay filters of the comfort rules (docs/reward.md 2i): a polynomial fitted to every window of samples.
@@ -23,7 +24,8 @@ from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, REAR_AXLE_TO_CEN
 # the first or last window, evaluated at the rows' own places. Every filter ends by rounding to 8 decimals, as the
 # public metric does: its thresholds and the jerk of a filtered acceleration see rounded values.
 
-Filter = Callable[[Array, Array], None]  # samples (T,) at 10 Hz, output (T,); T is at least the window
+LANES = 16  # of fewer LLVM makes no vectors
+Filter = Callable[[Array, Array], None]  # samples (T * LANES,) at 10 Hz, output alike; T is at least the window
 
 # Weights of the oldest to the newest sample, in scipy.signal.savgol_coeffs' own rounding. Exact fractions (-3 / 32,
 # k / 28, ..) differ in the last bits, and the jerk of accelerations rounded to 8 decimals lies half-way between two
@@ -90,21 +92,24 @@ def _filter(name: str, weights: tuple[float, ...], order: int, derivative: int) 
     head, tail = _edge_weights(window, order, derivative)
 
     def smooth(samples: Array, out: Array) -> None:
-        n = len(samples)
-        for i in range(n - window + 1):
+        newest = (window - 1) * LANES
+        for i in range(len(samples) - newest):
             # The newest sample first: the order of scipy's sum
-            total = samples[i + window - 1] * taps[window - 1]
+            total = samples[i + newest] * taps[window - 1]
             for j in range(window - 1):
-                total += samples[i + j] * taps[j]
-            out[i + before] = total
-        for i in range(half):
-            first, last = 0.0, 0.0
-            for j in range(window):
-                first += samples[j] * head[j, i]
-                last += samples[n - window + j] * tail[j, i]
-            out[i] = first
-            out[n - half + i] = last
-        for i in range(n):
+                total += samples[i + j * LANES] * taps[j]
+            out[i + before * LANES] = total
+        for weights, rows, seen in (
+            (head, out[: half * LANES], samples),
+            (tail, out[-half * LANES :], samples[-window * LANES :]),
+        ):
+            for row in range(half):
+                for lane in range(LANES):
+                    total = 0.0
+                    for j in range(window):
+                        total += seen[j * LANES + lane] * weights[j, row]
+                    rows[row * LANES + lane] = total
+        for i in range(len(samples)):
             out[i] = np.rint(out[i] * 1e8) / 1e8
 
     # A name is a cache file: closures of one name share theirs, and processes that fill it at once mix them up.
@@ -120,23 +125,22 @@ plan_yaw_accel_of = _filter("plan_yaw_accel_of", PLAN_YAW_ACCEL_WEIGHTS, order=2
 
 
 @kernel
-def unwrap(angles: Array) -> None:
-    """Add turns to angles (T,) [rad] in place until no step is longer than half a turn, as np.unwrap does."""
-    wraps = False
-    for i in range(1, len(angles)):
-        wraps |= abs(angles[i] - angles[i - 1]) >= math.pi
-    if not wraps:
-        return
-    turned, before = 0.0, angles[0]
-    for i in range(1, len(angles)):
-        step = angles[i] - before
-        before = angles[i]
-        if abs(step) >= math.pi:
-            short = (step + math.pi) % (2.0 * math.pi) - math.pi
-            if short == -math.pi and step > 0.0:
-                short = math.pi
-            turned += short - step
-        angles[i] += turned
+def unwrap(angles: Array, lanes: int) -> None:
+    """Add turns to angles (T * lanes,) [rad] in place until no step is longer than half a turn, as np.unwrap does."""
+    earlier, later, n_wraps = angles[:-lanes], angles[lanes:], 0
+    for i in range(len(later)):
+        n_wraps += abs(later[i] - earlier[i]) >= math.pi
+    for lane in range(lanes if n_wraps > 0 else 0):
+        turned, before = 0.0, angles[lane]
+        for i in range(lane + lanes, len(angles), lanes):
+            step = angles[i] - before
+            before = angles[i]
+            if abs(step) >= math.pi:
+                short = (step + math.pi) % (2.0 * math.pi) - math.pi
+                if short == -math.pi and step > 0.0:
+                    short = math.pi
+                turned += short - step
+            angles[i] += turned
 
 
 # The rules.
@@ -149,7 +153,7 @@ HISTORY_ROWS = 14  # -1.5 .. -0.2 s: the row at -0.1 s is missing in the public 
 HISTORY_START = -15  # step of the first row
 N_FLAGS = 6
 LONGEST_FILTER = len(JERK_WEIGHTS)  # samples
-_SCRATCH_ROWS = N_FLAGS + 4
+_LON, _LAT, _MAGNITUDE, _HEADING, _BEYOND, _SCRATCH_ROWS = range(N_FLAGS, N_FLAGS + 6)
 
 
 @kernel
@@ -160,7 +164,7 @@ def interpolated_history(past_states: Array) -> Array:
     """
     past = past_states.copy()
     heading = past[:, HEADING].copy()
-    unwrap(heading)
+    unwrap(heading, 1)
     for k in range(len(past)):  # element by element: numba takes seconds to compile the copy of a slice
         past[k, HEADING] = heading[k]
     past[:, STEERING + 1 :] = 0.0
@@ -174,78 +178,72 @@ def interpolated_history(past_states: Array) -> Array:
 
 
 @register_jitable
-def comfort_scratch() -> Array:
-    """Scratch (10, 55) for `first_uncomfortable_step`, one per thread."""
-    return np.empty((_SCRATCH_ROWS, HISTORY_ROWS + HORIZON_STEPS + 1))
+def comfort_scratch(n_rows: int) -> Array:
+    """Scratch for LANES series of that many rows, one per thread."""
+    return np.empty((_SCRATCH_ROWS, n_rows * LANES))
 
 
 @kernel
-def first_uncomfortable_step(
+def first_uncomfortable_steps(
     history: Array,  # (14, 11) ego states, see interpolated_history
-    states: Array,  # (41, 11) of one trajectory
-    scratch: Array,  # (10, 55), see comfort_scratch
-    flags: Bools,  # (6,) out, as in LIMITS
-) -> float:
-    """The first uncomfortable step, inf where there is none; a step of the history is negative (-15 .. -2).
+    states: Array,  # (up to LANES, 41, 11)
+    scratch: Array,  # for 55 rows, see comfort_scratch
+    flags: Bools,  # (K, 6) out, as in LIMITS
+    first: Array,  # (K,) out: the first uncomfortable step, inf where there is none
+) -> None:
+    """History comfort of some trajectories; a step of the history is negative (-15 .. -2).
 
-    History comfort is the conjunction of the flags (docs/reward.md 2i).
+    It is the conjunction of the flags (docs/reward.md 2i).
     """
-    judged, lon, lat, magnitude, heading = scratch[:N_FLAGS], scratch[6], scratch[7], scratch[8], scratch[9]
-    before = len(history)
-    _load(history, lon[:before], lat[:before], magnitude[:before], heading[:before])
-    _load(states, lon[before:], lat[before:], magnitude[before:], heading[before:])
-    _limited_quantities(lon, lat, magnitude, heading, judged)
-    comfortable = True
-    for f in range(N_FLAGS):
-        flags[f] = _all_within(judged[f], LIMITS[f, 0], LIMITS[f, 1])
-        comfortable &= flags[f]
-    if comfortable:
-        return math.inf
-    row = _first_beyond(judged)
-    return float(row + HISTORY_START) if row < before else float(row - before)
-
-
-@kernel
-def _limited_quantities(lon: Array, lat: Array, magnitude: Array, heading: Array, judged: Array) -> None:
-    """The limited quantities (6, T) of a drive that is loaded; overwrites it."""
-    unwrap(heading)
-    smooth_accel(lon, judged[0])
-    smooth_accel(lat, judged[1])
-    smooth_accel(magnitude, lat)
-    jerk_of(lat, judged[2])
-    jerk_of(judged[0], judged[3])
-    yaw_accel_of(heading, judged[4])
-    yaw_rate_of(heading, judged[5])
-
-
-@kernel
-def _load(states: Array, lon: Array, lat: Array, magnitude: Array, heading: Array) -> None:
-    for t in range(len(states)):
-        ax, ay, omega = states[t, AX], states[t, AY], states[t, YAW_RATE]
-        # At the centre, with the public signs: + d omega^2 where geometry says minus, and no lateral term
-        lon[t] = ax + REAR_AXLE_TO_CENTER * (omega * omega) + REAR_AXLE_TO_CENTER * states[t, YAW_ACCEL]
-        lat[t] = ay
-        magnitude[t] = math.sqrt(ax * ax + ay * ay)
-        heading[t] = states[t, HEADING]
-
-
-@kernel
-def _all_within(values: Array, low: float, high: float) -> bool:
-    beyond = 0
-    for value in values:
-        beyond += not ((low < value) & (value < high))
-    return beyond == 0
-
-
-@kernel
-def _first_beyond(judged: Array) -> int:
-    """First column of (6, T) at which a flag's quantity is not within its limits; there must be one."""
-    t = 0
-    while True:
+    _side_by_side(history.reshape(1, len(history), EGO_STATE_SIZE), 0, scratch)
+    _side_by_side(states, len(history), scratch)
+    _limited_quantities(scratch)
+    beyond = scratch[_BEYOND]
+    for i in range(len(beyond)):
+        which = 0
         for f in range(N_FLAGS):
-            if not (LIMITS[f, 0] < judged[f, t] and judged[f, t] < LIMITS[f, 1]):
-                return t
-        t += 1
+            value = scratch[f, i]
+            which |= (not ((LIMITS[f, 0] < value) & (value < LIMITS[f, 1]))) << f
+        beyond[i] = float(which)
+    for k in range(len(first)):
+        n_comfortable, which = 0, 0
+        for row in range(len(beyond) // LANES):
+            which |= int(beyond[row * LANES + k])
+            n_comfortable += which == 0
+        for f in range(N_FLAGS):
+            flags[k, f] = which & 1 << f == 0
+        step = n_comfortable + HISTORY_START if n_comfortable < len(history) else n_comfortable - len(history)
+        first[k] = math.inf if which == 0 else float(step)
+
+
+@kernel
+def _side_by_side(states: Array, start: int, scratch: Array) -> None:
+    """What the limited quantities are made of, from states (K, T, 11), into the rows of the series from `start` on."""
+    lon, lat, magnitude, heading = scratch[_LON], scratch[_LAT], scratch[_MAGNITUDE], scratch[_HEADING]
+    for lane in range(LANES):
+        k = min(lane, len(states) - 1)
+        for t in range(states.shape[1]):
+            i = (start + t) * LANES + lane
+            ax, ay, omega = states[k, t, AX], states[k, t, AY], states[k, t, YAW_RATE]
+            # At the centre, with the public signs: + d omega^2 where geometry says minus, and no lateral term
+            lon[i] = ax + REAR_AXLE_TO_CENTER * (omega * omega) + REAR_AXLE_TO_CENTER * states[k, t, YAW_ACCEL]
+            lat[i] = ay
+            magnitude[i] = math.sqrt(ax * ax + ay * ay)
+            heading[i] = states[k, t, HEADING]
+
+
+@kernel
+def _limited_quantities(scratch: Array) -> None:
+    """The limited quantities, the first rows of scratch, of what `_side_by_side` put into the others."""
+    lon, lat, magnitude, heading = scratch[_LON], scratch[_LAT], scratch[_MAGNITUDE], scratch[_HEADING]
+    unwrap(heading, LANES)
+    smooth_accel(lon, scratch[0])
+    smooth_accel(lat, scratch[1])
+    smooth_accel(magnitude, lat)
+    jerk_of(lat, scratch[2])
+    jerk_of(scratch[0], scratch[3])
+    yaw_accel_of(heading, scratch[4])
+    yaw_rate_of(heading, scratch[5])
 
 
 def comfortable(states: Array) -> Bools:
@@ -262,14 +260,12 @@ def comfortable(states: Array) -> Bools:
 
 @kernel
 def _within_limits(states: Array, within: Bools) -> None:
-    n = len(states)
-    scratch = np.empty((_SCRATCH_ROWS, n))
-    judged, lon, lat, magnitude, heading = scratch[:N_FLAGS], scratch[6], scratch[7], scratch[8], scratch[9]
-    _load(states, lon, lat, magnitude, heading)
-    _limited_quantities(lon, lat, magnitude, heading, judged)
-    for t in range(n):
+    scratch = comfort_scratch(len(states))
+    _side_by_side(states.reshape(1, len(states), EGO_STATE_SIZE), 0, scratch)
+    _limited_quantities(scratch)
+    for t in range(len(states)):
         for f in range(N_FLAGS):
-            within[t] &= LIMITS[f, 0] < judged[f, t] and judged[f, t] < LIMITS[f, 1]
+            within[t] &= LIMITS[f, 0] < scratch[f, t * LANES] and scratch[f, t * LANES] < LIMITS[f, 1]
 
 
 @dataclass(frozen=True)
@@ -293,28 +289,35 @@ def _motion_rms(now: Array, previous: Array, shift: int, rms: Array) -> None:
     """Root mean square (K, 4) over time of what now[k, :-shift] does otherwise than previous[k or 0, shift:]."""
     # The overlap is cut out first and filtered then, so that the filters' edges fall inside the horizon.
     n = now.shape[1] - shift
-    ours, theirs, raw = np.empty((4, n)), np.empty((4, n)), np.empty(n)
-    for k in range(len(now)):
-        _motion(now[k, :n], raw, ours)
-        if k < len(previous):
-            _motion(previous[k, shift:], raw, theirs)
-        for f in range(4):
-            total = 0.0
-            for t in range(n):
-                difference = ours[f, t] - theirs[f, t]
-                total += difference * difference
-            rms[k, f] = math.sqrt(total / n)
+    ours, theirs, raw = np.empty((4, n * LANES)), np.empty((4, n * LANES)), np.empty(n * LANES)
+    for start in range(0, len(now), LANES):
+        _motions(now, start, 0, raw, ours)
+        if start < len(previous):
+            _motions(previous, start, shift, raw, theirs)
+        for k in range(start, min(start + LANES, len(now))):
+            for f in range(4):
+                total = 0.0
+                for i in range(k - start, n * LANES, LANES):
+                    difference = ours[f, i] - theirs[f, i]
+                    total += difference * difference
+                rms[k, f] = math.sqrt(total / n)
 
 
 @kernel
-def _motion(states: Array, raw: Array, out: Array) -> None:
-    """Acceleration, jerk, yaw rate, yaw acceleration (4, T) of states (T, 11); raw: scratch (T,)."""
-    for t in range(len(states)):
-        raw[t] = math.sqrt(states[t, AX] * states[t, AX] + states[t, AY] * states[t, AY])
+def _motions(states: Array, first: int, start: int, raw: Array, out: Array) -> None:
+    """Acceleration, jerk, yaw rate, yaw acceleration (4, T * LANES) of states[first:, start : start + T]; raw: scratch.
+
+    Where there are fewer than LANES the last ones stand in for the others.
+    """
+    for t in range(len(raw) // LANES):
+        for lane in range(LANES):
+            row = states[min(first + lane, len(states) - 1), start + t]
+            raw[t * LANES + lane] = math.sqrt(row[AX] * row[AX] + row[AY] * row[AY])
     smooth_accel(raw, out[0])
     jerk_of(out[0], out[1])
-    for t in range(len(states)):  # a slice assigned to a slice compiles for 5 s more
-        raw[t] = states[t, HEADING]
-    unwrap(raw)
+    for t in range(len(raw) // LANES):
+        for lane in range(LANES):
+            raw[t * LANES + lane] = states[min(first + lane, len(states) - 1), start + t, HEADING]
+    unwrap(raw, LANES)
     yaw_rate_of(raw, out[2])
     plan_yaw_accel_of(raw, out[3])

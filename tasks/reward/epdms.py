@@ -10,9 +10,21 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from tasks.kernels.compiled import kernel, read_only
-from tasks.reward.areas import NEVER_RED, MapIndex, RedLanes, first_red, index_map, index_red_lanes, set_area_flags
+from tasks.kernels.compiled import inlined, inner_kernel, kernel, read_only
+from tasks.reward.areas import (
+    N_POINTS,
+    NEVER_RED,
+    MapIndex,
+    Places,
+    RedLanes,
+    empty_places,
+    first_red,
+    index_map,
+    index_red_lanes,
+    set_area_flags,
+)
 from tasks.reward.centerline import (
+    DDC_WINDOW,
     MULTIPLE_LANES,
     NON_DRIVABLE,
     ONCOMING,
@@ -22,20 +34,22 @@ from tasks.reward.centerline import (
     driving_direction_compliance,
     empty_body,
     index_centerline,
+    instants_of,
     lane_keeping_failure,
     place_body,
     progress_m,
 )
 from tasks.reward.collisions import (
     N_TIMES,
+    Looks,
     Obstacles,
-    first_collision,
-    first_ttc_violation,
+    empty_looks,
+    first_contacts,
     obstacles_of_tracks,
+    set_looks,
     with_index,
-    within_reach,
 )
-from tasks.reward.comfort import N_FLAGS, comfort_scratch, first_uncomfortable_step, interpolated_history
+from tasks.reward.comfort import LANES, N_FLAGS, comfort_scratch, first_uncomfortable_steps, interpolated_history
 from tasks.subscores import (
     EC_WEIGHT,
     INDEX,
@@ -231,10 +245,13 @@ class RuleContext(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Reused from trajectory to trajectory; one for each thread."""
+    """Reused from block to block; one for each thread."""
 
     body: Body
-    ignored: Bools  # (N,) objects that a rule stopped looking at
+    places: Places
+    looks: Looks
+    moved: Array  # see driving_direction_compliance
+    begun: Array  # see progress_m
     comfort: Array
 
 
@@ -245,32 +262,63 @@ def rule_context(prepared: PreparedScene, with_history: bool) -> RuleContext:
 
 
 @register_jitable
-def empty_scratch(n_objects: int) -> Scratch:
-    """Room for one trajectory among N objects."""
-    return Scratch(empty_body(N_TIMES), np.empty(n_objects, np.bool_), comfort_scratch())
+def empty_scratch(context: RuleContext, n_objects: int, n_block: int) -> Scratch:
+    """Room for that many trajectories at once among N objects."""
+    n = n_block * N_TIMES
+    places, looks = empty_places(context.map_index, N_POINTS * n), empty_looks(n, N_TIMES, n_objects)
+    comfort = comfort_scratch(len(context.history) + N_TIMES)
+    return Scratch(empty_body(n), places, looks, np.empty(DDC_WINDOW - 1 + N_TIMES), np.full(3, np.nan), comfort)
 
 
-@kernel
-def judge_one(
-    context: RuleContext, obstacles: Obstacles, states: Array, scratch: Scratch, k: int, out: Verdicts
-) -> None:
-    """All rules on one trajectory (41, 11), written to row k."""
+@inner_kernel
+def judge_block(
+    context: RuleContext, obstacles: Obstacles, states: Array, first: int, n: int, scratch: Scratch, out: Verdicts
+) -> bool:
+    """All rules on n trajectories of states (K, 41, 11), written to rows `first` on. False where a state is none."""
+    rows = states[first : first + n].reshape(n * N_TIMES, EGO_STATE_SIZE)
+    values, beyond = rows.reshape(-1), 0
+    for i in range(len(values)):
+        beyond += not abs(values[i]) <= LARGEST
+    if beyond > 0:
+        return False
     body = scratch.body
-    place_body(states, REAR_AXLE_TO_CENTER, body)
-    set_area_flags(context.map_index, body, HALF_LENGTH, HALF_WIDTH)
+    place_body(rows, REAR_AXLE_TO_CENTER, body)
+    set_area_flags(context.map_index, body, HALF_LENGTH, HALF_WIDTH, scratch.places)
+    set_looks(body, scratch.looks)
+    if len(context.history) > 0:
+        here = slice(first, first + n)
+        first_uncomfortable_steps(
+            context.history, states[here], scratch.comfort, out.comfort[here], out.fails[HC][here]
+        )
+    for k in range(first, first + n):
+        start = (k - first) * N_TIMES
+        judge_one(context, obstacles, states[k], instants_of(body, start, start + N_TIMES), start, scratch, k, out)
+    return True
+
+
+@inlined
+def judge_one(
+    context: RuleContext,
+    obstacles: Obstacles,
+    states: Array,
+    body: Body,
+    start: int,
+    scratch: Scratch,
+    k: int,
+    out: Verdicts,
+) -> None:
+    """All rules but comfort on one trajectory (41, 11) of a block, whose instants begin at `start`; to row k."""
     _spread_flags(body.flags, out.ego_areas[k])
-    cells = within_reach(obstacles, body)
-    out.scores[NC, k], out.fails[NC, k] = first_collision(obstacles, cells, states, body, scratch.ignored)
+    out.scores[NC, k], out.fails[NC, k], out.fails[TTC, k] = first_contacts(
+        obstacles, states, body, scratch.looks, start, context.map_index, scratch.places
+    )
     out.fails[DAC, k] = _first_with(body.flags, NON_DRIVABLE)
-    out.scores[DDC, k], out.fails[DDC, k] = driving_direction_compliance(body)
+    out.scores[DDC, k], out.fails[DDC, k] = driving_direction_compliance(body, scratch.moved)
     out.fails[TLC, k] = first_red(context.red_lanes, body, HALF_LENGTH, HALF_WIDTH)
-    out.fails[TTC, k] = first_ttc_violation(obstacles, cells, states, body, context.map_index, scratch.ignored)
     out.fails[LK, k] = lane_keeping_failure(context.centerline, body)
     last = states.shape[0] - 1
-    out.ep_raw_m[k] = progress_m(context.centerline, body.x[0], body.y[0], body.x[last], body.y[last])
-    if len(context.history) > 0:
-        out.fails[HC, k] = first_uncomfortable_step(context.history, states, scratch.comfort, out.comfort[k])
-    else:
+    out.ep_raw_m[k] = progress_m(context.centerline, body.x[0], body.y[0], body.x[last], body.y[last], scratch.begun)
+    if len(context.history) == 0:
         out.fails[HC, k] = math.inf
         out.comfort[k] = True
     for row in _WHOLES:
@@ -392,18 +440,15 @@ def _score_all(
 ) -> bool:
     """All rules and sums. One call: on two trajectories entering it takes as long as the rules.
 
-    False, and nothing judged, where a state is not finite or above LARGEST.
+    False where a state is not finite or above LARGEST.
     """
-    beyond = 0
-    for value in states.reshape(-1):
-        beyond += not abs(value) <= LARGEST
-    if beyond > 0:
-        return False
     table[:] = math.nan  # what no rule says
     out = Verdicts(table[:_N_SCORES], table[_N_SCORES:_EP_RAW_M], table[_EP_RAW_M], areas, comfort)
-    scratch = empty_scratch(obstacles.boxes.shape[1])
-    for k in range(states.shape[0]):
-        judge_one(context, obstacles, states[k], scratch, k, out)
+    n = min(LANES, len(states))
+    scratch = empty_scratch(context, obstacles.boxes.shape[1], n)
+    for first in range(0, len(states), n):  # the last block is a whole one too, some of it judged again
+        if not judge_block(context, obstacles, states, min(first, len(states) - n), n, scratch, out):
+            return False
     _add_up(table, in_pairs)
     return True
 

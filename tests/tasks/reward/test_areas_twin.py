@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.reward.areas import in_intersection, index_map, set_area_flags
+from tasks.reward.areas import N_POINTS, empty_places, in_intersection, index_map, set_area_flags
 from tasks.reward.centerline import (
     CENTER_IN_INTERSECTION,
     MULTIPLE_LANES,
@@ -31,7 +31,8 @@ def flags_along(polygons: list[MapPolygon], route: frozenset[str], states: np.nd
     for k, one in enumerate(states):
         body = empty_body(len(one))
         place_body(one, vehicle.rear_axle_to_center, body)
-        set_area_flags(index, body, vehicle.half_length, vehicle.half_width)
+        places = empty_places(index, N_POINTS * len(one))
+        set_area_flags(index, body, vehicle.half_length, vehicle.half_width, places)
         flags[k] = body.flags
     return flags
 
@@ -90,7 +91,7 @@ def test_the_rear_axle_is_in_the_intersections_of_the_numpy_version(polygons: li
     states = drives(np.random.default_rng(seed), 6)
     slow = ego_areas(_regions([*polygons, *crossings], frozenset()), states, ego_boxes(states, PACIFICA))
     for k, one in enumerate(states):
-        inside = [in_intersection(index, x, y) for x, y in one[:, [X, Y]]]
+        inside = [in_intersection(index, x, y, empty_places(index, 1)) for x, y in one[:, [X, Y]]]
         assert np.array_equal(inside, slow.rear_axle_in_intersection[k])
 
 

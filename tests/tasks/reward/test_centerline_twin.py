@@ -109,10 +109,10 @@ def test_the_three_rules_equal_their_slow_twins(data: st.DataObject, points: np.
         oncoming=(body.flags & ONCOMING > 0)[None],
         center_in_intersection=(body.flags & CENTER_IN_INTERSECTION > 0)[None],
     )
-    gained = progress_m(line, body.x[0], body.y[0], body.x[-1], body.y[-1])
+    gained = progress_m(line, body.x[0], body.y[0], body.x[-1], body.y[-1], np.full(3, np.nan))
     np.testing.assert_allclose(gained, slow.progress_along(shape, centers)[0], rtol=0, atol=1e-9)
     assert lane_keeping_failure(line, body) == slow.lane_keeping(shape, centers, areas)[1][0]
-    ddc, first = driving_direction_compliance(body)
+    ddc, first = driving_direction_compliance(body, np.empty(51))
     slow_ddc, slow_first = slow.driving_direction_compliance(centers, areas)
     assert (ddc, first) == (slow_ddc[0], slow_first[0])
 
@@ -128,8 +128,10 @@ def test_beyond_its_ends_a_line_goes_no_further() -> None:
     line = index_centerline(ALONG_X)
     for x, place in ((-5.0, 0.0), (-1e9, 0.0), (10.0, 10.0), (12.5, 12.5), (61.0, 60.0), (1e9, 60.0)):
         assert arc_length_at(line, x, 3.0) == place
-    assert progress_m(line, -20.0, 0.0, 80.0, 0.0) == 60.0
-    assert progress_m(line, 30.0, 0.0, 20.0, 0.0) == 0.0  # backwards is none
+    begun = np.full(3, np.nan)
+    assert progress_m(line, -20.0, 0.0, 80.0, 0.0, begun) == 60.0
+    assert progress_m(line, 30.0, 0.0, 20.0, 0.0, begun) == 0.0  # backwards is none
+    assert [progress_m(line, 30.0, y, 50.0, 0.0, begun) for y in (0.0, 1.0)] == [20.0, 20.0]
 
 
 @pytest.mark.parametrize("origin", [(0.0, 0.0), (4096.0, -2048.0)])
@@ -151,10 +153,13 @@ def test_exactly_half_a_metre_is_not_off(origin: tuple[float, float]) -> None:
 )
 def test_driving_direction_sums_eleven_steps_against_traffic(step_m: float, ddc: float, first: float) -> None:
     x = step_m * np.arange(41)
-    assert driving_direction_compliance(body_at(x, 0 * x, ONCOMING)) == (ddc, first)
-    assert driving_direction_compliance(body_at(0 * x, -x, ONCOMING | NON_DRIVABLE)) == (ddc, first)
-    assert driving_direction_compliance(body_at(x, 0 * x, ONCOMING | CENTER_IN_INTERSECTION)) == (1.0, np.inf)
-    assert driving_direction_compliance(body_at(x, 0 * x, NON_DRIVABLE)) == (1.0, np.inf)
+    assert driving_direction_compliance(body_at(x, 0 * x, ONCOMING), np.empty(51)) == (ddc, first)
+    assert driving_direction_compliance(body_at(0 * x, -x, ONCOMING | NON_DRIVABLE), np.empty(51)) == (ddc, first)
+    assert driving_direction_compliance(body_at(x, 0 * x, ONCOMING | CENTER_IN_INTERSECTION), np.empty(51)) == (
+        1.0,
+        np.inf,
+    )
+    assert driving_direction_compliance(body_at(x, 0 * x, NON_DRIVABLE), np.empty(51)) == (1.0, np.inf)
 
 
 def test_a_long_centreline_stays_exact() -> None:

@@ -8,10 +8,11 @@ from scipy.signal import savgol_coeffs, savgol_filter
 
 from tasks.reward import comfort
 from tasks.reward.comfort import (
+    LANES,
     LIMITS,
     comfort_scratch,
     extended_comfort,
-    first_uncomfortable_step,
+    first_uncomfortable_steps,
     interpolated_history,
 )
 from tasks.world.frames import AX, AY, HEADING, PACIFICA, VX, YAW_ACCEL, YAW_RATE
@@ -26,9 +27,10 @@ FILTERS = {  # window, order, derivative
 }
 
 
-def judged(history: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, float]:
-    flags = np.empty(6, dtype=bool)
-    first = first_uncomfortable_step(history, states, comfort_scratch(), flags)
+def judged(history: np.ndarray, *states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Flags (K, 6) and first steps (K,) of K drives side by side."""
+    flags, first = np.empty((len(states), 6), dtype=bool), np.empty(len(states))
+    first_uncomfortable_steps(history, np.stack(states), comfort_scratch(len(history) + len(states[0])), flags, first)
     return flags, first
 
 
@@ -60,14 +62,14 @@ def drives(draw: st.DrawFn, n_rows: int) -> np.ndarray:
 
 
 @settings(max_examples=80)
-@given(past=drives(4), states=drives(41))
-def test_flags_and_first_step_equal_the_slow_twin(past: np.ndarray, states: np.ndarray) -> None:
+@given(past=drives(4), states=st.lists(drives(41), min_size=1, max_size=3))
+def test_flags_and_first_step_equal_the_slow_twin(past: np.ndarray, states: list[np.ndarray]) -> None:
     history = interpolated_history(past)
-    flags, first = judged(history, states)
-    comfortable, slow_flags, slow_first = slow.history_comfort(history, states[None], PACIFICA)
-    assert np.array_equal(flags, slow_flags[0])
-    assert first == slow_first[0]
-    assert np.isinf(first) == flags.all() == (comfortable[0] == 1.0)
+    flags, first = judged(history, *states)
+    comfortable, slow_flags, slow_first = slow.history_comfort(history, np.stack(states), PACIFICA)
+    assert np.array_equal(flags, slow_flags)
+    assert np.array_equal(first, slow_first)
+    assert np.array_equal(np.isinf(first), comfortable == 1.0) and np.array_equal(flags.all(axis=1), comfortable == 1.0)
 
 
 @settings(max_examples=60)
@@ -87,10 +89,12 @@ def test_extended_comfort_equals_the_slow_twin(
 @pytest.mark.parametrize("n_rows", [15, 36, 55])
 def test_a_filter_equals_scipys_but_for_ties_of_the_rounding(name: str, n_rows: int) -> None:
     window, order, derivative = FILTERS[name]
-    samples = np.random.default_rng(n_rows).normal(size=(200, n_rows)).round(8)
+    samples = np.random.default_rng(n_rows).normal(size=(12 * LANES, n_rows)).round(8)
     ours = np.empty_like(samples)
-    for row, out in zip(samples, ours):
-        getattr(comfort, name)(row, out)
+    for k in range(0, len(samples), LANES):
+        side_by_side, out = samples[k : k + LANES].T.flatten(), np.empty(n_rows * LANES)
+        getattr(comfort, name)(side_by_side, out)
+        ours[k : k + LANES] = out.reshape(n_rows, LANES).T
     theirs = np.round(savgol_filter(samples, window, order, deriv=derivative, delta=0.1), 8)
     # Samples of 8 decimals put one sum in 14 half-way between two roundings. There the last bits of the weights decide,
     # which scipy solves for with other bits on other processors.
@@ -115,15 +119,15 @@ def test_the_written_weights_are_scipys() -> None:
 @given(st.lists(st.floats(-10.0, 10.0) | st.sampled_from([0.0, np.pi, -np.pi, 2 * np.pi]), min_size=1, max_size=55))
 def test_unwrapping_is_numpys(angles: list[float]) -> None:
     unwrapped = np.array(angles)
-    comfort.unwrap(unwrapped)
+    comfort.unwrap(unwrapped, 1)
     assert np.array_equal(unwrapped, np.unwrap(angles))
 
 
 @pytest.mark.parametrize(("accel", "inside"), [(2.4, False), (2.39999999, True), (-4.05, False), (-4.04999999, True)])
 def test_the_limits_themselves_are_uncomfortable_and_rounding_is_to_eight_decimals(accel: float, inside: bool) -> None:
     flags, first = judged(*series(accel=accel))
-    assert flags.tolist() == [inside] + [True] * 5
-    assert first == (np.inf if inside else -15.0)
+    assert flags.tolist() == [[inside] + [True] * 5]
+    assert first[0] == (np.inf if inside else -15.0)
     assert not judged(*series(accel=accel - np.sign(accel) * 4e-9))[0].all() or inside
 
 
@@ -133,14 +137,14 @@ def test_a_constant_turn_has_its_yaw_rate_whatever_the_wrap(start: float) -> Non
     for rate, comfortable in ((0.94, True), (0.95, False), (-0.94, True), (-0.95, False)):
         heading = (start + rate * seconds + np.pi) % (2 * np.pi) - np.pi
         flags, _ = judged(*series(heading=heading))
-        assert flags.tolist() == [True] * 5 + [comfortable]
+        assert flags.tolist() == [[True] * 5 + [comfortable]]
 
 
 def test_a_quadratic_heading_has_its_yaw_acceleration() -> None:
     seconds = 0.1 * np.arange(55)
     for accel, comfortable in ((1.92, True), (1.93, False)):
         flags, _ = judged(*series(heading=0.5 * accel * (seconds - 2.75) ** 2))
-        assert flags[4] == comfortable
+        assert flags[0, 4] == comfortable
 
 
 def test_limits_hold_the_six_rules_in_their_order() -> None:

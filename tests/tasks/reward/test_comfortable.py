@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tasks.kernels.compiled import read_only
-from tasks.reward.comfort import N_FLAGS, comfort_scratch, comfortable, first_uncomfortable_step
+from tasks.reward.comfort import N_FLAGS, comfort_scratch, comfortable, first_uncomfortable_steps
 from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, YAW_RATE
 
 
@@ -16,9 +16,10 @@ def test_it_is_history_comfort_instant_by_instant() -> None:
         states = np.zeros((55, EGO_STATE_SIZE))
         smooth = np.cumsum(rng.normal(size=(55, 4)), axis=0) * scale * 0.1
         states[:, [AX, AY, HEADING, YAW_RATE]] = smooth
-        flags = np.empty(N_FLAGS, np.bool_)
+        flags, steps = np.empty((1, N_FLAGS), np.bool_), np.empty(1)
         history, drive = states[:14].copy(), states[14:].copy()
-        first = first_uncomfortable_step(history, drive, comfort_scratch(), flags)
+        first_uncomfortable_steps(history, drive[None], comfort_scratch(55), flags, steps)
+        first = steps[0]
         within = comfortable(read_only(states))
         assert within.all() == flags.all() == np.isinf(first)
         judged.add(bool(flags.all()))

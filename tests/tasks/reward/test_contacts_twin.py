@@ -8,15 +8,18 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.reward.areas import index_map
-from tasks.reward.centerline import MULTIPLE_LANES, NON_DRIVABLE, empty_body, place_body
+from tasks.kernels.compiled import inner_kernel
+from tasks.reward.areas import MapIndex, Places, empty_places, index_map
+from tasks.reward.centerline import MULTIPLE_LANES, NON_DRIVABLE, Body, empty_body, instants_of, place_body
 from tasks.reward.collisions import (
+    Looks,
     Obstacles,
-    first_collision,
-    first_ttc_violation,
+    empty_looks,
+    first_contacts,
+    list_within_reach,
     obstacles_of,
+    set_looks,
     with_index,
-    within_reach,
 )
 from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y, box_corners, ego_boxes, to_world, touching
 from tasks.world.road_map import MapLayer, MapPolygon
@@ -44,16 +47,33 @@ def objects(world: World) -> Obstacles:
 def contacts(world: World, obstacles: Obstacles) -> np.ndarray:
     """NC, its index, TTC's index (K, 3) by the kernels."""
     found = np.empty((len(world.states), 3))
-    ignored = np.ones(obstacles.boxes.shape[1], dtype=bool)
     map_index = index_map([MapPolygon("crossing", MapLayer.INTERSECTION, world.crossing)], frozenset())
-    for k, states in enumerate(world.states):
-        body = empty_body(len(states))
-        place_body(states, PACIFICA.rear_axle_to_center, body)
-        body.flags[:] = world.flags[k]
-        cells = within_reach(obstacles, body)
-        found[k, :2] = first_collision(obstacles, cells, states, body, ignored)
-        found[k, 2] = first_ttc_violation(obstacles, cells, states, body, map_index, ignored)
+    body, looks = empty_body(world.flags.size), empty_looks(world.flags.size, 41, obstacles.boxes.shape[1])
+    place_body(world.states.reshape(-1, 11), PACIFICA.rear_axle_to_center, body)
+    body.flags[:] = world.flags.ravel()
+    _contacts(obstacles, world.states, body, looks, map_index, empty_places(map_index, 1), found)
     return found
+
+
+@inner_kernel
+def _contacts(
+    obstacles: Obstacles,
+    states: np.ndarray,
+    body: Body,
+    looks: Looks,
+    index: MapIndex,
+    places: Places,
+    found: np.ndarray,
+) -> None:
+    set_looks(body, looks)
+    for k in range(len(states)):
+        one = instants_of(body, 41 * k, 41 * k + 41)
+        found[k, 0], found[k, 1], found[k, 2] = first_contacts(obstacles, states[k], one, looks, 41 * k, index, places)
+
+
+@inner_kernel
+def _list_within_reach(obstacles: Obstacles, body: Body, looks: Looks) -> None:
+    list_within_reach(obstacles, body, looks.one)
 
 
 def slow_contacts(world: World) -> np.ndarray:
@@ -201,7 +221,8 @@ def test_objects_left_out_along_a_path_are_those_that_nothing_on_it_touches() ->
     states[:, X] = np.arange(41.0) - PACIFICA.rear_axle_to_center
     body = empty_body(41)
     place_body(states, PACIFICA.rear_axle_to_center, body)
-    kept = within_reach(obstacles_of(boxes, np.zeros(7, dtype=bool), np.zeros(7)), body)
-    assert kept.items.tolist() == [0, 1, 2, 6]
+    looks = empty_looks(41, 41, 7)
+    _list_within_reach(obstacles_of(boxes, np.zeros(7, dtype=bool), np.zeros(7)), body, looks)
+    assert looks.one.items[: looks.one.starts[1]].tolist() == [0, 1, 2, 6]
     ego = np.array([40.0, 0.0, 0.0, PACIFICA.length, PACIFICA.width])
     assert [i for i in range(7) if touching(ego, boxes[:, i]).any()] == [2, 6]  # from the path's end

@@ -6,16 +6,34 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.reward.areas import DRIVABLE, INTERSECTION, LANE, ON_ROUTE, MapIndex, index_map, regions_at
+from tasks.reward.areas import (
+    DRIVABLE,
+    INTERSECTION,
+    LANE,
+    ON_ROUTE,
+    MapIndex,
+    Places,
+    empty_places,
+    find_regions,
+    index_map,
+)
 from tasks.world.road_map import MapLayer, MapPolygon
 from tests.tasks.reward.small_maps import small_maps
 
 NOBODY: frozenset[str] = frozenset()
 
 
+def found_at(index: MapIndex, points: np.ndarray) -> Places:
+    """The regions at points (P, 2)."""
+    found = empty_places(index, len(points))
+    found.x[:], found.y[:] = np.asarray(points).T
+    find_regions(index, found)
+    return found
+
+
 def held(index: MapIndex, points: np.ndarray) -> np.ndarray:
     """Which regions hold points (P, 2): (P, R padded to whole words)."""
-    found = regions_at(index, *np.ascontiguousarray(points.T))
+    found = found_at(index, points)
     words = np.concatenate([index.sets, found.others[::-1]])[found.number]
     return np.unpackbits(words.view(np.uint8), axis=1, bitorder="little").astype(bool)
 
@@ -73,7 +91,7 @@ def test_polygons_with_the_same_rings_are_one_region_that_plays_all_parts() -> N
     ]
     index = index_map(polygons, frozenset({"c", "da"}))
     assert held(index, np.array([[1.0, 1.0], [5.0, 5.0], [9.5, 1.0]])).sum(axis=1).tolist() == [2, 1, 0]
-    parts = regions_at(index, np.array([1.0, 5.0, 9.5]), np.ones(3)).parts.tolist()
+    parts = found_at(index, np.array([[1.0, 1.0], [5.0, 1.0], [9.5, 1.0]])).parts.tolist()
     assert parts == [1 << LANE | 1 << ON_ROUTE | 1 << DRIVABLE | 1 << INTERSECTION, 1 << DRIVABLE, 0]
 
 
