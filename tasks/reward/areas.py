@@ -377,26 +377,26 @@ def _arranged(
     sets[0] = 0
     slots = _no_slots(sets.shape[0])
     n_sets = 1 + _row_of(sets, 0, slots)
-    cells, n_sets = _cells(changes, n_cells, bounded, sides, sets, slots, n_sets)
+    cells = np.zeros(n_cells, np.int32)
+    n_sets = _fill_cells(changes, cells, bounded, sides, sets, slots, n_sets)
     crossed, entry = _crossed(touched, cells)
     n_sets = _find_ways(crossed, entry, bounded, sides, sets, slots, n_sets)
     return cells, crossed, entry, sets[:n_sets].copy()
 
 
-@kernel
-def _cells(
-    changes: Ints, n_cells: int, bounded: Bits, sides: ShortInts, sets: Bits, slots: ShortInts, n_sets: int
-) -> tuple[ShortInts, int]:
-    """The set at every cell's middle (n_cells,), and how many sets there are."""
-    cells = np.zeros(n_cells, np.int32)
+@inner_kernel
+def _fill_cells(
+    changes: Ints, cells: ShortInts, bounded: Bits, sides: ShortInts, sets: Bits, slots: ShortInts, n_sets: int
+) -> int:
+    """Fill in the set at every cell's middle; returns how many sets there are."""
     current = 0
     for k in range(changes.size):
         edge = changes[k] & 0xFFFFFFFF
         current = _across(bounded, sides, sets, slots, n_sets, current, edge)
         n_sets = max(n_sets, current + 1)
-        stop = changes[k + 1] >> 32 if k + 1 < changes.size else n_cells
+        stop = changes[k + 1] >> 32 if k + 1 < changes.size else cells.size
         cells[changes[k] >> 32 : stop] = current
-    return cells, n_sets
+    return n_sets
 
 
 @kernel
@@ -425,7 +425,7 @@ def _crossed(touched: Ints, cells: ShortInts) -> tuple[ShortInts, ShortInts]:
     return crossed[:n].copy(), entry
 
 
-@kernel
+@inner_kernel
 def _find_ways(
     crossed: ShortInts, entry: ShortInts, bounded: Bits, sides: ShortInts, sets: Bits, slots: ShortInts, n_sets: int
 ) -> int:
@@ -437,7 +437,7 @@ def _find_ways(
     for q in range(crossed.shape[0]):
         one, other, has_ways = entry[crossed[q, FIRST]] >> EDGE, -1, True
         for i in range(crossed[q, FIRST], crossed[q, LAST]):
-            way = _way(bounded, entry[i] >> EDGE, one, other)
+            way = 1 if entry[i] >> EDGE == one else _way(bounded, entry[i] >> EDGE, one, other)
             if way == 0 and other < 0:
                 other, way = entry[i] >> EDGE, 2
             has_ways &= way > 0
@@ -451,7 +451,7 @@ def _find_ways(
     return n_sets
 
 
-@inner_kernel
+@inlined
 def _way(bounded: Bits, edge: int, one: int, other: int) -> int:
     """1 where an edge bounds what one edge does, 2 what another does, 3 what just one of them does, else 0."""
     as_one, as_other, as_both = True, other >= 0, other >= 0
@@ -462,7 +462,7 @@ def _way(bounded: Bits, edge: int, one: int, other: int) -> int:
     return 1 if as_one else 2 if as_other else 3 if as_both else 0
 
 
-@inner_kernel
+@inlined
 def _across(bounded: Bits, sides: ShortInts, sets: Bits, slots: ShortInts, n_sets: int, start: int, edge: int) -> int:
     """The number of the set on the other side of an edge, n_sets if it is a new one."""
     for side in range(2):
