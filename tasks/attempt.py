@@ -305,7 +305,7 @@ def _first_hit(context: RuleContext, boxes: Array, is_stopped: Bools, collision_
 
 # A vocabulary's labels.
 
-TRAJECTORIES_AT_ONCE = 512  # their states fill the second-level cache, 2 MB
+TRAJECTORIES_AT_ONCE = 512  # 2 MB of states, which stay in the caches
 
 
 def vocabulary_labels(
