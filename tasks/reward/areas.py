@@ -14,7 +14,7 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from tasks.kernels.compiled import inlined, inner_kernel, kernel
+from tasks.kernels.compiled import hidden_kernel, inlined, kernel
 from tasks.reward.centerline import CENTER_IN_INTERSECTION, MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, Body
 from tasks.world.arrays import Array, Bools, Bytes, Ints, ShortInts
 from tasks.world.frames import LARGEST, all_within
@@ -384,7 +384,7 @@ def _arranged(
     return cells, crossed, entry, sets[:n_sets].copy()
 
 
-@inner_kernel
+@hidden_kernel
 def _fill_cells(
     changes: Ints, cells: ShortInts, bounded: Bits, sides: ShortInts, sets: Bits, slots: ShortInts, n_sets: int
 ) -> int:
@@ -425,7 +425,7 @@ def _crossed(touched: Ints, cells: ShortInts) -> tuple[ShortInts, ShortInts]:
     return crossed[:n].copy(), entry
 
 
-@inner_kernel
+@hidden_kernel
 def _find_ways(
     crossed: ShortInts, entry: ShortInts, bounded: Bits, sides: ShortInts, sets: Bits, slots: ShortInts, n_sets: int
 ) -> int:
@@ -484,7 +484,7 @@ def _no_slots(n_rows: int) -> ShortInts:
     return np.full(size, -1, np.int32)
 
 
-@inner_kernel
+@hidden_kernel
 def _row_of(rows: Bits, new: int, slots: ShortInts) -> int:
     """The earlier row that equals row `new`, else `new`, which the hash table then knows."""
     key = np.uint64(0)
@@ -550,13 +550,13 @@ class Places(NamedTuple):
 
 @register_jitable
 def empty_places(index: MapIndex, n_points: int) -> Places:
-    """Scratch for that many points."""
+    """Scratch for that many points of a map."""
     number, listed = np.empty(n_points, np.int32), np.empty(n_points, np.int32)
     others, parts = np.empty((n_points, index.sets.shape[1]), np.uint64), np.empty(n_points, np.uint8)
     return Places(np.empty(n_points), np.empty(n_points), number, others, parts, listed)
 
 
-@kernel
+@hidden_kernel
 def set_area_flags(index: MapIndex, body: Body, half_length: float, half_width: float, places: Places) -> None:
     """Fill the flags of a placed body. A point on a region's boundary is outside of it, up to rounding.
 
@@ -567,7 +567,7 @@ def set_area_flags(index: MapIndex, body: Body, half_length: float, half_width: 
     _set_flags(index, places, body.flags)
 
 
-@inner_kernel
+@hidden_kernel
 def in_intersection(index: MapIndex, x: float, y: float, places: Places) -> bool:
     """Whether a point is in an intersection. places: scratch."""
     one = Places(places.x[:1], places.y[:1], places.number[:1], places.others, places.parts, places.listed)
@@ -593,7 +593,7 @@ def _set_points(body: Body, half_length: float, half_width: float, places: Place
             y[t] = body.y[t] + body.sin[t] * along + body.cos[t] * across
 
 
-@inner_kernel
+@hidden_kernel
 def find_regions(index: MapIndex, places: Places) -> None:
     """Find the regions that hold the points of `places`."""
     low_x, low_y, cell_m = index.low_x, index.low_y, index.cell_m

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numba.extending import register_jitable
 
-from tasks.kernels.compiled import inlined, kernel
+from tasks.kernels.compiled import hidden_kernel, inlined, kernel
 from tasks.reward.areas import MapIndex, Places, in_intersection
 from tasks.reward.centerline import OFF_LANE, Body
 from tasks.world.arrays import Array, Bools, Bytes, ShortInts
@@ -349,7 +349,7 @@ def _list_looks(cells: Cells, looks: Looks, start: int, n_times: int) -> int:
     return n
 
 
-@inlined
+@hidden_kernel
 def first_contacts(
     obstacles: Obstacles, states: Array, body: Body, looks: Looks, start: int, map_index: MapIndex, places: Places
 ) -> tuple[float, float, float]:

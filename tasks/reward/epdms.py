@@ -10,7 +10,7 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from tasks.kernels.compiled import inlined, inner_kernel, kernel, read_only
+from tasks.kernels.compiled import hidden_kernel, inlined, kernel, read_only
 from tasks.reward.areas import (
     N_POINTS,
     NEVER_RED,
@@ -270,7 +270,7 @@ def empty_scratch(context: RuleContext, n_objects: int, n_block: int) -> Scratch
     return Scratch(empty_body(n), places, looks, np.empty(DDC_WINDOW - 1 + N_TIMES), np.full(3, np.nan), comfort)
 
 
-@inner_kernel
+@hidden_kernel
 def judge_block(
     context: RuleContext, obstacles: Obstacles, states: Array, first: int, n: int, scratch: Scratch, out: Verdicts
 ) -> bool:

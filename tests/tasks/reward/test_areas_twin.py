@@ -6,12 +6,14 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.reward.areas import N_POINTS, empty_places, in_intersection, index_map, set_area_flags
+from tasks.kernels.compiled import kernel
+from tasks.reward.areas import N_POINTS, MapIndex, empty_places, in_intersection, index_map, set_area_flags
 from tasks.reward.centerline import (
     CENTER_IN_INTERSECTION,
     MULTIPLE_LANES,
     NON_DRIVABLE,
     ONCOMING,
+    Body,
     empty_body,
     place_body,
 )
@@ -26,15 +28,20 @@ EXACT = Vehicle(width=2.0, front_length=4.0, rear_length=1.0, rear_axle_to_cente
 
 def flags_along(polygons: list[MapPolygon], route: frozenset[str], states: np.ndarray, vehicle: Vehicle) -> np.ndarray:
     """(K, T) flags by the kernels."""
-    index = index_map(polygons, route)
-    flags = np.empty(states.shape[:2], np.uint8)
-    for k, one in enumerate(states):
-        body = empty_body(len(one))
-        place_body(one, vehicle.rear_axle_to_center, body)
-        places = empty_places(index, N_POINTS * len(one))
-        set_area_flags(index, body, vehicle.half_length, vehicle.half_width, places)
-        flags[k] = body.flags
-    return flags
+    body = empty_body(states.shape[0] * states.shape[1])
+    place_body(states.reshape(-1, states.shape[2]), vehicle.rear_axle_to_center, body)
+    _set_area_flags(index_map(polygons, route), body, vehicle.half_length, vehicle.half_width)
+    return body.flags.reshape(states.shape[:2])
+
+
+@kernel
+def _set_area_flags(index: MapIndex, body: Body, half_length: float, half_width: float) -> None:
+    set_area_flags(index, body, half_length, half_width, empty_places(index, N_POINTS * len(body.x)))
+
+
+@kernel
+def _in_intersection(index: MapIndex, x: float, y: float) -> bool:
+    return in_intersection(index, x, y, empty_places(index, 1))
 
 
 def as_flags(areas: EgoAreas) -> np.ndarray:
@@ -91,7 +98,7 @@ def test_the_rear_axle_is_in_the_intersections_of_the_numpy_version(polygons: li
     states = drives(np.random.default_rng(seed), 6)
     slow = ego_areas(_regions([*polygons, *crossings], frozenset()), states, ego_boxes(states, PACIFICA))
     for k, one in enumerate(states):
-        inside = [in_intersection(index, x, y, empty_places(index, 1)) for x, y in one[:, [X, Y]]]
+        inside = [_in_intersection(index, x, y) for x, y in one[:, [X, Y]]]
         assert np.array_equal(inside, slow.rear_axle_in_intersection[k])
 
 

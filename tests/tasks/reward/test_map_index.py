@@ -6,6 +6,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tasks.kernels.compiled import kernel
 from tasks.reward.areas import (
     DRIVABLE,
     INTERSECTION,
@@ -27,8 +28,13 @@ def found_at(index: MapIndex, points: np.ndarray) -> Places:
     """The regions at points (P, 2)."""
     found = empty_places(index, len(points))
     found.x[:], found.y[:] = np.asarray(points).T
-    find_regions(index, found)
+    _find_regions(index, found)
     return found
+
+
+@kernel
+def _find_regions(index: MapIndex, places: Places) -> None:
+    find_regions(index, places)
 
 
 def held(index: MapIndex, points: np.ndarray) -> np.ndarray:
