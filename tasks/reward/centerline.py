@@ -152,7 +152,7 @@ def arc_length_at(line: Centerline, x: float, y: float) -> float:
 def progress_m(line: Centerline, x0: float, y0: float, x1: float, y1: float, begun: Array) -> float:
     """EP raw [m]: arc length gained along the centreline from (x0, y0) to (x1, y1), at least 0.
 
-    begun: (3,) scratch, NaN at first: where the drive before began, x, y and arc length [m]. Most begin at one place.
+    begun: (3,) scratch: where the drive before began, x (NaN: none), y and arc length [m]. Most begin at one place.
     """
     if begun[0] != x0 or begun[1] != y0:
         begun[0], begun[1], begun[2] = x0, y0, arc_length_at(line, x0, y0)
@@ -221,7 +221,8 @@ def driving_direction_compliance(body: Body, moved: Array) -> tuple[float, float
     if not any_oncoming:
         return 1.0, math.inf
     before = DDC_WINDOW - 1
-    moved[:] = 0.0  # from the step before, where that is against traffic
+    for t in range(len(moved)):
+        moved[t] = 0.0  # from the step before, where that is against traffic
     for t in range(1, n):
         if (flags[t] & (ONCOMING | CENTER_IN_INTERSECTION)) == ONCOMING:
             moved[before + t] = math.hypot(x[t] - x[t - 1], y[t] - y[t - 1])

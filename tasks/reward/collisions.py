@@ -364,7 +364,8 @@ def first_contacts(
     if one:
         list_within_reach(obstacles, body, looks.one)
     nc, hit, violated, ends = 1.0, math.inf, math.inf, states.shape[0] - max(TTC_STEPS)
-    looks.asking[:] = NC | TTC
+    for item in range(len(looks.asking)):
+        looks.asking[item] = NC | TTC
     for i in range(_list_looks(cells, looks, start, states.shape[0])):
         t, k, cell = looks.listed[0, i] // len(TTC_STEPS), looks.listed[0, i] % len(TTC_STEPS), looks.listed[1, i]
         asks = NC if k == 0 and nc > 0.0 else 0

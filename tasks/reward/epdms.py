@@ -266,8 +266,9 @@ def empty_scratch(context: RuleContext, n_objects: int, n_block: int) -> Scratch
     """Room for that many trajectories at once among N objects."""
     n = n_block * N_TIMES
     places, looks = empty_places(context.map_index, N_POINTS * n), empty_looks(n, N_TIMES, n_objects)
-    comfort = comfort_scratch(len(context.history) + N_TIMES)
-    return Scratch(empty_body(n), places, looks, np.empty(DDC_WINDOW - 1 + N_TIMES), np.full(3, np.nan), comfort)
+    comfort, begun = comfort_scratch(len(context.history) + N_TIMES), np.empty(3)
+    begun[0] = math.nan  # nowhere yet
+    return Scratch(empty_body(n), places, looks, np.empty(DDC_WINDOW - 1 + N_TIMES), begun, comfort)
 
 
 @hidden_kernel
