@@ -1,0 +1,111 @@
+"""AlpaSim's MPC against closed forms, a slow twin, and what AlpaSim's own does."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from planners.drive import mpc
+from planners.drive.mpc import advanced, best_command, car_that_moves, follow, linearised
+from tasks.world.frames import VX, YAW_RATE, to_world
+
+JUDGED = json.loads((Path(__file__).parent / "alpasim_judged.json").read_text())
+TIMES = 0.1 * np.arange(1, 41)
+
+
+def moving(speed: float, pose: np.ndarray | None = None) -> np.ndarray:
+    """(8,) straight on."""
+    pose = np.zeros(3) if pose is None else pose
+    return car_that_moves(pose, to_world(pose, np.array([0.5 * speed, 0.0, 0.0])), 0.5)
+
+
+def straight(speed: float) -> np.ndarray:
+    return np.column_stack([speed * TIMES, np.zeros((40, 2))])
+
+
+@pytest.mark.parametrize("speed", [0.0, 3.0, 8.0, 25.0])
+def test_a_straight_plan_at_the_car_s_own_speed_is_followed_exactly(speed: float) -> None:
+    _, states = follow(moving(speed), straight(speed), 5)
+    np.testing.assert_allclose(
+        states[:, :4], np.column_stack([speed * TIMES[:5], *np.zeros((2, 5)), [speed] * 5]), atol=1e-9
+    )
+
+
+def test_only_what_lies_a_second_and_more_ahead_is_looked_at() -> None:
+    """Of the plan's instants 0.1 .. 0.9 s and from 2.5 s on none is, over five steps of 0.1 s."""
+    plan = straight(8.0)
+    expected = follow(moving(6.0), plan, 5)[1]
+    for instants, same in ((slice(0, 9), True), (slice(24, 40), True), (slice(9, 10), False), (slice(23, 24), False)):
+        other = plan.copy()
+        other[instants] += 1.0, 2.0, 0.5
+        assert (follow(moving(6.0), other, 5)[1].tobytes() == expected.tobytes()) == same, instants
+
+
+@pytest.mark.parametrize("case", JUDGED["followed"], ids=lambda case: f"{case['car'][3]} m/s")
+def test_it_drives_as_alpasim_s_own(case: dict[str, list[float]]) -> None:
+    """Its solver stops at 1e-4 and its poses are float32."""
+    _, states = follow(np.array(case["car"]), np.array(case["plan"]), 5)
+    np.testing.assert_allclose(states[:, :3], case["poses"], atol=2e-4)
+
+
+@pytest.mark.parametrize("speed", [2.0, 7.0])
+def test_no_other_commands_cost_less_by_the_model_stepped_one_by_one(
+    speed: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All twenty commands, found where the solver is asked, against ones beside them."""
+    rng, car = np.random.default_rng(0), moving(speed)
+    car[[mpc.VY, mpc.YAW_RATE, mpc.STEERING, mpc.ACCEL]] = 0.1, 0.05, 0.02, -0.3
+    ahead = np.column_stack([speed * TIMES[:20] + 0.3, 0.05 * TIMES[:20] ** 2, 0.01 * TIMES[:20]])
+    asked: list[np.ndarray] = []
+    solve = mpc._minimum
+    monkeypatch.setattr(mpc, "_minimum", lambda *question: asked.append(solve(*question)) or asked[-1])
+    best_command(car, ahead)
+    step, pushed = linearised(car)
+
+    def cost(commands: np.ndarray) -> float:
+        state, total = car, 1e-6 * (commands**2).sum()
+        for k, command in enumerate(commands):
+            total += 5.0 * command[0] ** 2 + command[1] ** 2
+            state = step @ state + pushed @ command
+            if k + 1 >= 10:
+                error = state[:3] - ahead[k]
+                total += 2.0 * error[0] ** 2 + error[1] ** 2 + error[2] ** 2 + 0.1 * state[mpc.ACCEL] ** 2
+        return float(total)
+
+    best = asked[0].reshape(20, 2)
+    for _ in range(50):
+        assert cost(best + rng.normal(0.0, 1e-3, best.shape)) > cost(best)
+
+
+@pytest.mark.parametrize("speed", [4.0, 12.0])
+def test_the_linear_model_is_the_car_s_own_near_straight_on(speed: float) -> None:
+    car, command = moving(speed), np.array([1e-4, 1e-3])
+    step, pushed = linearised(car)
+    np.testing.assert_allclose(step @ car + pushed @ command, advanced(car, command), rtol=5e-3, atol=2e-7)
+
+
+def test_a_car_that_is_to_stand_brakes_within_its_bounds_and_stands() -> None:
+    car = moving(12.0)
+    speeds, accelerations = [], []
+    for _ in range(12):
+        car, states = follow(car, np.repeat(car[None, :3], 40, axis=0), 5)
+        speeds += states[:, VX].tolist()
+        accelerations.append(car[mpc.ACCEL])
+    assert min(speeds) >= 0.0 and speeds[-1] < 0.01 and -8.0 - 1e-6 <= min(accelerations) < -7.9
+
+
+def test_a_drive_does_not_depend_on_where_the_world_lies() -> None:
+    origin = np.array([300.0, -80.0, 2.1])
+    plan = np.column_stack([7.0 * TIMES, 0.2 * TIMES**2, 0.05 * TIMES])
+    here, there = follow(moving(8.0), plan, 5)[1], follow(moving(8.0, origin), to_world(origin, plan), 5)[1]
+    np.testing.assert_allclose(to_world(origin, here[:, :3]), there[:, :3], atol=1e-9)
+    np.testing.assert_allclose(here[:, 3:], there[:, 3:], atol=1e-9)
+
+
+def test_on_an_arc_the_first_state_has_the_arc_s_yaw_rate() -> None:
+    """A chord of 4 m that turns by 0.2 rad in 0.5 s: 2 sin(0.1) / 0.5, as AlpaSim takes it from the quaternion."""
+    car = car_that_moves(np.zeros(3), np.array([4.0, 0.4, 0.2]), 0.5)
+    assert car[mpc.YAW_RATE] == pytest.approx(4.0 * np.sin(0.1))
+    assert car[mpc.VY] == pytest.approx(0.8 + mpc.REAR_TO_CG * car[mpc.YAW_RATE])
+    assert mpc.ego_state(car, np.zeros(2))[YAW_RATE] == car[mpc.YAW_RATE]
