@@ -74,6 +74,14 @@ def route_of(route: Any) -> Array:
     return points
 
 
+def add_poses(trajectory: Any, poses: Mapping[int, Array], z: float = 0.0) -> None:
+    """Add poses (3,) x, y, heading by their stamps to a Trajectory."""
+    for stamp, (x, y, heading) in poses.items():
+        at = trajectory.poses.add(timestamp_us=stamp)
+        at.pose.vec.x, at.pose.vec.y, at.pose.vec.z = x, y, z
+        at.pose.quat.w, at.pose.quat.z = np.cos(heading / 2.0), np.sin(heading / 2.0)
+
+
 def session_cameras(declared: Sequence[Any], layout: ImageLayout | None, given: Sequence[str]) -> tuple[str, ...]:
     """Whose pictures a planner looks at, left to right: those given, else of its names, else by direction.
 
@@ -185,13 +193,14 @@ class Driver:
         command: CommandRule | None = None,
         batch: int = 1,
         wait_s: float = 0.002,
+        changed: Mapping[str, Any] | None = None,
     ) -> None:
-        """Loads the planner and plans once. The arguments: planners.serve.Request.
+        """Loads the planner and plans once. The arguments: planners.serve.Request; changed: settings of a trained one.
 
         Raises ConfigError for a planner that wants more than AlpaSim sends, and without the messages' package.
         """
         self._proto, self._given = wire.contract("protocol=alpasim", "planners,alpasim"), cameras
-        made, needs = load_for_agent(planner, device, "AlpaSim")
+        made, needs = load_for_agent(planner, device, "AlpaSim", changed)
         self._rule: CommandRule = command or needs.command
         self._needs = replace(needs, command="navsim")  # the rows have one already, by the rule
         layout = needs.image
@@ -278,10 +287,7 @@ class Driver:
         except PoseUnknown as error:
             raise Fault("FAILED_PRECONDITION", f"drive: {error}") from error
         answer = self._proto.DriveResponse()
-        for stamp, (x, y, heading) in local_poses(plan, state, begin, now, query).items():
-            at = answer.trajectory.poses.add(timestamp_us=stamp)
-            at.pose.vec.x, at.pose.vec.y, at.pose.vec.z = x, y, state[3]
-            at.pose.quat.w, at.pose.quat.z = np.cos(heading / 2.0), np.sin(heading / 2.0)
+        add_poses(answer.trajectory, local_poses(plan, state, begin, now, query), state[3])
         return answer
 
     def _planned_now(self, rollout: _Rollout, now: int, uuid: str) -> tuple[Array, Array, int]:

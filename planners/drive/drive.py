@@ -10,6 +10,8 @@ the log's sensors were, after `seconds`, and the human's own with its log. docs/
 
     out/drives          a Delta table, one row a drive; what stands there is not driven again
     out/summary.csv     all planners of this command, with intervals
+    out/alpasim         a Delta table of loop=alpasim: AlpaSim's columns and scene scores of its drives
+    out/results-summary.json   the same in AlpaSim's form
     out/differences.csv what the engine's pictures change, of planners that drove with both
     out/films           MP4 files, as many as films= says
 
@@ -34,21 +36,24 @@ from factory.graph.steps import TaskStopped
 from factory.readers.base import ClipRef, painter_of
 from factory.store.location import Location
 from factory.store.table import AnotherWriter, KeyedTable
+from planners.drive.alpasim_score import AlpasimColumns, SummaryEntry, results_summary
+from planners.drive.contract import WIRE, planner_over_the_wire
 from planners.drive.drivers import make_driver
 from planners.drive.settings import DriveSettings, Pictures, settings_of
 from planners.drive.starts import LOGGED
 from planners.drive.summary import Row, picture_source_effects, summarise_drives, summary_text, write_summary
 from planners.drive.work import (
     FACTS,
+    AlpasimRow,
     DriveItem,
-    DriveRow,
     DriveWork,
     DrivingPlanner,
     FailedDrive,
     RowCommitter,
+    open_alpasim,
     open_drives,
 )
-from planners.evaluation.planner_names import find_planners
+from planners.evaluation.planner_names import EvaluatedPlanner, find_planners
 from tasks.render.scene import engine
 from tasks.render.splatting.gsplat_backend import BackendMissing
 
@@ -65,8 +70,11 @@ class RequestedDrives:
     planners: Sequence[str]  # labels, in order
 
     def rows(self, table: KeyedTable) -> list[Row]:
-        """Those of the table, by planner and clip, under the labels of now."""
+        """Those of the table, by planner and clip, under the labels of now; of loop=alpasim with AlpaSim's columns."""
         found = {row["drive_id"]: row for row in table.read(FACTS).to_pylist()}
+        if self.work.settings.loop == "alpasim":
+            told = {row.pop("drive_id"): row for row in open_alpasim(self.work.out).read().to_pylist()}
+            found = {drive_id: row | {"alpasim": told.get(drive_id)} for drive_id, row in found.items()}
         asked = [(who.label, found.get(key.drive_id)) for item in self.items for who, key in item.keys]
         rows = [row | {"planner": label} for label, row in asked if row is not None]
         return sorted(rows, key=lambda row: self.planners.index(row["planner"]))
@@ -108,8 +116,8 @@ def _requested_drives(settings: DriveSettings) -> RequestedDrives:
     from factory.setup.settings import choose_vocabulary, open_reader  # half a second that no refusal waits for
 
     planners: list[tuple[DrivingPlanner, tuple[Pictures, ...]]] = []  # and which pictures each is shown
-    for one in find_planners(settings.planner, settings.planners, settings.bounds, settings.settings):
-        looks = make_driver(one, settings.pdm).needs_pictures
+    for one in _asked(settings):
+        looks = one.spec.startswith(WIRE) or make_driver(one, settings.pdm).needs_pictures
         planners.append((DrivingPlanner(one.label, one.spec, one.digest), settings.pictures if looks else ("none",)))
     reader, index = open_reader(settings.clips)
     if any("truth" in kinds for _, kinds in planners) and painter_of(reader) is None:
@@ -123,6 +131,15 @@ def _requested_drives(settings: DriveSettings) -> RequestedDrives:
     work = DriveWork(reader, choose_vocabulary(settings.vocabulary), settings, out)
     items = list(_items(work, index.refs[: settings.limit], planners))
     return RequestedDrives(work, items, index.broken, [who.label for who, _ in planners])
+
+
+def _asked(settings: DriveSettings) -> list[EvaluatedPlanner]:
+    """Who drives. Raises ConfigError."""
+    if settings.driver is None:
+        return find_planners(settings.planner, settings.planners, settings.bounds, settings.settings)
+    if settings.planner is not None or settings.planners is not None:
+        raise ConfigError("driver= stands in the place of planner= and planners=: give one of them")
+    return [planner_over_the_wire(settings.driver)]
 
 
 def _items(
@@ -145,7 +162,10 @@ def _drive(work: DriveWork, items: Sequence[DriveItem], table: KeyedTable) -> li
     waiting = [replace(item, keys=left) for item in items if (left := item.missing(done))]
     total = sum(len(item.keys) for item in items)
     failed: list[FailedDrive] = []
-    settings, rows = work.settings, RowCommitter(table)
+    settings, alpasim = work.settings, open_alpasim(work.out) if work.settings.loop == "alpasim" else None
+    if alpasim is not None:
+        alpasim.claim()
+    rows = RowCommitter(table, alpasim)
     n_done = total - sum(len(item.keys) for item in waiting)
     try:
         with (
@@ -153,9 +173,9 @@ def _drive(work: DriveWork, items: Sequence[DriveItem], table: KeyedTable) -> li
             closing(parallel_map(work, waiting, settings.executor, settings.workers, work.out)) as results,
         ):
             for made in results:
-                rows.add(row for row in made if isinstance(row, DriveRow))
+                rows.add(row for row in made if not isinstance(row, FailedDrive))
                 failed += [row for row in made if isinstance(row, FailedDrive)]
-                n_done += len(made)
+                n_done += sum(not isinstance(row, AlpasimRow) for row in made)
                 progress.show(n_done)
     finally:
         rows.close()
@@ -183,9 +203,24 @@ def _drive_and_print(settings: DriveSettings) -> None:
     if rows:
         lines, apart = summarise_drives(rows, settings.confidence), picture_source_effects(rows, settings.confidence)
         print(summary_text(lines, apart, settings.confidence))
+        if settings.loop == "alpasim":
+            Location.parse(settings.out).write("results-summary.json", _results_summary(rows, failed).encode())
         if (place := Location.parse(settings.out)).is_local:  # on an object store the table of drives says all
             write_summary(Path(place.uri), lines, apart)
             print(f"look at {place.uri}")
     if failed:
-        shown = "; ".join(f"clip {one.clip_id}: {one.why}" for one in failed[:SHOWN_FAILURES])
+        shown = "; ".join(f"clip {one.clip_id}: {one}" for one in failed[:SHOWN_FAILURES])
         raise Failed(f"{len(failed)} drives or clips could not be driven: {shown}")
+
+
+def _results_summary(rows: Sequence[Row], failed: Sequence[FailedDrive]) -> str:
+    entries = []
+    for row in rows:
+        columns = AlpasimColumns(**row["alpasim"]) if row["alpasim"] else None
+        why = None if columns else "no step was driven"
+        entries.append(SummaryEntry(row["planner"], row["clip_id"], row["drive_id"], columns, why))
+    labels = dict.fromkeys(row["planner"] for row in rows)
+    for one in failed:
+        who = [one.planner] if one.planner else labels
+        entries += [SummaryEntry(label, one.clip_id, "failed", None, one.why) for label in who]
+    return results_summary(entries)

@@ -7,19 +7,21 @@ body with a corner in no drivable area (docs/reward.md 2a, 2b).
 """
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from planners.drive.cameras import DriveCameras, Images, NoCameras, Observer
 from planners.drive.drivers import DriveEnd, Driver
+from planners.drive.mpc import car_that_moves, follow
 from planners.drive.starts import DriveStart
 from tasks.reward.comfort import comfortable
 from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.world.arrays import Array, Bools, Ints
-from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentTracks, Rollout
-from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y, ego_boxes, touching
+from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentTracks, Rollout, Scene
+from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y, ego_boxes, to_local, to_world, touching
 from tasks.world.road_map import CenterlineFinder, arc_lengths
 
 # The road ahead of a drive: how far along it a place lies, and where it ends.
@@ -79,8 +81,10 @@ def distance_m(places: Array, known: Array) -> Array:
     return nearest
 
 
+LoopRule = Literal["own", "alpasim"]
 DRIVE_VERSION = 1  # raised by hand whenever the same start is driven otherwise
 PLAN_STEPS = 5  # of 0.1 s between two plans: 2 Hz
+FIRST_QUESTION_S = 0.017  # after the first pose of AlpaSim's recording: a picture's exposure
 NON_DRIVABLE = 1  # column of Scores.ego_areas
 
 
@@ -91,6 +95,7 @@ class LoopSettings:
     seconds: float = 20.0  # after which a drive ends
     bound_m: float = 30.0  # from the nearest place that the log's sensors were at
     traffic: TrafficSettings = field(default_factory=TrafficSettings)
+    rule: LoopRule = "own"
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.seconds <= 600.0:
@@ -100,8 +105,10 @@ class LoopSettings:
 
     @property
     def n_steps(self) -> int:
-        """Of 0.1 s, of the longest drive."""
-        return round(self.seconds / STEP_S)
+        """Of 0.1 s, of the longest drive; by AlpaSim, those of whole plans that fit into a recording so long."""
+        if self.rule == "own":
+            return round(self.seconds / STEP_S)
+        return PLAN_STEPS * int((self.seconds - FIRST_QUESTION_S) / (PLAN_STEPS * STEP_S) + 1e-9)
 
     def clip_steps(self, start_step: int) -> int:
         """That a clip must have for drives from this step of it: a horizon is looked at beyond the last."""
@@ -151,6 +158,7 @@ def drive(
     if scene.clip.agents.n_steps < settings.clip_steps(scene.step):
         raise ValueError(f"the clip must have {settings.clip_steps(scene.step)} steps, not {scene.clip.agents.n_steps}")
     finder = CenterlineFinder(scene.clip.road_map, scene.clip.route)
+    tracker = _AlpasimTracker() if settings.rule == "alpasim" else _tracked
     course, observer = _DriveSoFar(start, settings), Observer(seen)
     plans: list[Array] = []
     images: list[Images] = []
@@ -162,7 +170,7 @@ def drive(
             break
         plans.append(plan)
         images.append(seen_now)
-        tracked = track(scene.ego_state, plan[None])[0]
+        tracked = tracker(scene, plan)
         rollout = roll_out(prepare_traffic(scene, settings.traffic), tracked, PLAN_STEPS)
         steps = course.follow(rollout, score(prepare_scene(scene, rollout.agents), tracked[None]))
         ahead = finder.centerline_from(tracked[steps, : HEADING + 1])
@@ -182,12 +190,52 @@ def drive(
     )
 
 
+def _tracked(scene: Scene, plan: Array) -> Array:
+    """(41, 11) as every plan is followed here."""
+    return track(scene.ego_state, plan[None])[0]
+
+
+class _AlpasimTracker:
+    """As AlpaSim follows plans: by its MPC, and by the log up to the second one."""
+
+    def __init__(self) -> None:
+        self._car: Array | None = None
+
+    def __call__(self, scene: Scene, plan: Array) -> Array:
+        """(41, 11) of which PLAN_STEPS are driven; the last of those holds after them, and nobody looks at it."""
+        if self._car is None:
+            log = scene.clip.ego_states[scene.step : scene.step + HORIZON_STEPS + 1]
+            poses = log[:, : HEADING + 1]
+            self._car, _ = follow(
+                car_that_moves(poses[0], poses[PLAN_STEPS], PLAN_STEPS * STEP_S), poses[1:], PLAN_STEPS
+            )
+            driven = log[1 : PLAN_STEPS + 1]
+        else:
+            car = np.concatenate([scene.ego_state[: HEADING + 1], self._car[HEADING + 1 :]])
+            self._car, driven = follow(car, plan, PLAN_STEPS)
+        held = np.repeat(driven[-1:], HORIZON_STEPS - PLAN_STEPS, axis=0)
+        return np.concatenate([scene.ego_state[None], driven, held])
+
+
+def first_pose(scene: Scene) -> Array:
+    """(3,) where the ego was when AlpaSim's recording began, whose first question this scene is."""
+    before, now = scene.ego_history[-2:, : HEADING + 1]
+    there: Array = to_world(now, FIRST_QUESTION_S / STEP_S * to_local(now, before))
+    return there
+
+
 class _DriveSoFar:
     """A drive as far as it has come."""
 
     def __init__(self, start: DriveStart, settings: LoopSettings) -> None:
         scene = start.scene
         self.start, self.settings = start, settings
+        log_steps = len(scene.clip.ego_states) - 1 - scene.step
+        self._n_steps = settings.n_steps
+        if settings.rule == "alpasim":
+            self._n_steps = min(self._n_steps, log_steps // PLAN_STEPS * PLAN_STEPS)
+            if self._n_steps < PLAN_STEPS:
+                raise ValueError(f"the log goes on for {log_steps * STEP_S:.1f} s: AlpaSim drives 0.5 s of it or more")
         self.road = route_ahead(scene.centerline, scene.ego_state[: HEADING + 1], start.known, settings.bound_m)
         self.states, self.along_m, self.off_road = [scene.ego_state], [self.road.start_m], list[bool]()
         self.ended: DriveEnd | None = None
@@ -204,7 +252,7 @@ class _DriveSoFar:
             self.states.append(state)
             self.along_m.append(self.road.place_m(state[[X, Y]], self.along_m[-1]))
             touched = _touching_agents(state, rollout.agents, step)
-            self.hit = _collision_at(rollout, scores, step, np.setdiff1d(touched, self._excused))
+            self.hit = self.hit or _collision_at(rollout, scores, step, np.setdiff1d(touched, self._excused))
             self._excused = np.intersect1d(touched, self._excused)
             self.ended = self._end(state)
             self.off_road.append(bool(flags[step]) and self.ended is not DriveEnd.ROAD_END)  # it has arrived
@@ -213,13 +261,15 @@ class _DriveSoFar:
         return PLAN_STEPS
 
     def _end(self, state: Array) -> DriveEnd | None:
+        if self.settings.rule == "alpasim":  # which cuts off afterwards what came after an incident
+            return DriveEnd.TIME if len(self.states) > self._n_steps else None
         if self.hit is not None:
             return DriveEnd.COLLISION
         if self.along_m[-1] >= self.road.end_m:
             return DriveEnd.ROAD_END
         if distance_m(state[None, [X, Y]], self.start.known)[0] > self.settings.bound_m:
             return DriveEnd.SCENE_END
-        return DriveEnd.TIME if len(self.states) > self.settings.n_steps else None
+        return DriveEnd.TIME if len(self.states) > self._n_steps else None
 
 
 def _touching_agents(state: Array, agents: AgentTracks, step: int) -> Ints:
@@ -250,7 +300,7 @@ class DriveMeasures:
     progress_m: float  # gained along the route, 0 or more
     route_m: float  # from the start to where the road, or what is known of it, ends
     route_completed: float  # progress over route, 0 .. 1; 1 where there was no route to complete
-    collision: bool  # with anything, whoever is to blame; it ends the drive
+    collision: bool  # with anything, whoever is to blame
     at_fault_collision: bool
     off_road_s: float  # some corner of the body in no drivable area
     off_road_m: float  # driven meanwhile
@@ -277,7 +327,7 @@ def measure_drive(drive: ClosedLoopDrive) -> DriveMeasures:
         progress_m=progress_m,
         route_m=route_m,
         route_completed=min(1.0, progress_m / route_m) if route_m > 0.0 else 1.0,
-        collision=drive.ended is DriveEnd.COLLISION,
+        collision=drive.hit is not None,
         at_fault_collision=drive.hit is not None and drive.hit.at_fault,
         off_road_s=float(off[1:].sum() * STEP_S),
         off_road_m=float(steps_m[off[1:]].sum()),

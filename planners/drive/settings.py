@@ -8,7 +8,7 @@ from factory.config.compose import fill, refuse_unknown
 from factory.config.datasets import reader_settings
 from factory.config.run import VocabularyChoice, own_settings, refuse_missing_root
 from factory.config.shapes import deep_merge, defaults_of
-from planners.drive.loop import LoopSettings
+from planners.drive.loop import LoopRule, LoopSettings
 from planners.evaluation.planner_names import compose_with_planner
 from tasks.render.settings import RenderSettings
 from tasks.settings import PdmSettings, PerturbSettings, TrafficSettings
@@ -23,11 +23,13 @@ class DriveSettings:
     clips: dict[str, Any]  # the reader, and which clips of its data
     planner: str | None = None  # a training's folder, human, pdm_closed, constant_velocity, or my.module:MyPlanner
     planners: list[str] | dict[str, str] | None = None  # several: a list, or {label: planner, ...}
+    driver: str | None = None  # host:port of a driver of AlpaSim's, in their place; with loop=alpasim
     bounds: bool = True  # human, pdm_closed and constant_velocity too
     settings: dict[str, Any] = field(default_factory=dict)  # of planning, changed in all trained planners
     pictures: tuple[Pictures, ...] = ("truth",)  # of planners that look: truth: the town's painter; engine: scenes
     logged: bool = True  # drive from the log at T
     perturbed: int = 0  # drive from so many candidates of each clip too, at T+H
+    loop: LoopRule = "own"  # alpasim: as AlpaSim's nuPlan track drives and scores, docs/driving.md
     seconds: float = 20.0  # after which a drive ends
     bound_m: float = 30.0  # from the nearest place that the log's sensors were at, beyond which a drive ends
     films: int | Literal["none", "all"] = "none"  # or n for one drive in n: MP4 files under out/films
@@ -47,12 +49,16 @@ class DriveSettings:
 
     def __post_init__(self) -> None:
         """Raises ValueError for what cannot be driven."""
-        self.loop  # noqa: B018 - raises ValueError for bounds of a drive that cannot be
+        self.rules  # noqa: B018 - raises ValueError for bounds of a drive that cannot be
         for name in ("workers", "limit"):
             if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: must be positive, or null for no bound")
         if self.perturbed < 0 or not (self.logged or self.perturbed):
             raise ValueError(f"perturbed={self.perturbed}, logged={self.logged}: there is nothing to drive from")
+        if self.loop == "alpasim" and (self.perturbed or not self.logged):
+            raise ValueError("loop=alpasim begins on the log: perturbed=0 logged=true")
+        if self.driver is not None and self.loop != "alpasim":
+            raise ValueError(f"driver={self.driver}: is asked by loop=alpasim")
         if self.films == 0 or self.one_film_in < 0:
             raise ValueError(f"films={self.films}: must be none, all, or n for one drive in n")
         if len(set(self.pictures)) < len(self.pictures) or not self.pictures:
@@ -61,9 +67,9 @@ class DriveSettings:
             raise ValueError(f"confidence={self.confidence}: must lie between 0 and 1")
 
     @property
-    def loop(self) -> LoopSettings:
+    def rules(self) -> LoopSettings:
         """What every drive depends on."""
-        return LoopSettings(self.seconds, self.bound_m, self.traffic)
+        return LoopSettings(self.seconds, self.bound_m, self.traffic, self.loop)
 
     @property
     def one_film_in(self) -> int:

@@ -23,6 +23,17 @@ SHARES: Mapping[str, Callable[[Row], float]] = {  # of each drive, 0 .. 1
 }
 
 
+ALPASIM_SHARES: Mapping[str, Callable[[Row], float]] = {
+    "scene_score": lambda row: row["alpasim"]["score"] if row["alpasim"] else 0.0,
+    "scene_score_july": lambda row: row["alpasim"]["score_july"] if row["alpasim"] else 0.0,
+}
+
+
+def shares_of(rows: Sequence[Row]) -> Mapping[str, Callable[[Row], float]]:
+    """What drives of one command are told by."""
+    return {**SHARES, **(ALPASIM_SHARES if "alpasim" in rows[0] else {})}
+
+
 @dataclass(frozen=True)
 class DriveLine:
     """All drives of one planner that saw the same, from starts of one kind."""
@@ -33,7 +44,7 @@ class DriveLine:
     drives: int
     clips: int
     level: str  # of LEVELS, that the intervals are over: the highest of which there are two
-    shares: Mapping[str, Interval]  # of SHARES: mean (`b`), low, high
+    shares: Mapping[str, Interval]  # of `shares_of`: mean (`b`), low, high
     km: float
     failures: int
     failures_per_km: Interval
@@ -75,7 +86,7 @@ def _line(planner: str, pictures: str, start: str, rows: Sequence[Row], confiden
         drives=len(rows),
         clips=len({row["clip_id"] for row in rows}),
         level=level,
-        shares={name: interval(np.array([share(row) for row in rows])) for name, share in SHARES.items()},
+        shares={name: interval(np.array([share(row) for row in rows])) for name, share in shares_of(rows).items()},
         km=float(km.sum()),
         failures=int(failed.sum()),
         failures_per_km=interval(failed / km, km),
@@ -131,7 +142,7 @@ def picture_source_effects(rows: Sequence[Row], confidence: float = 0.95) -> lis
                 clusters=clusters,
                 confidence=confidence,
             )
-            for name, share in SHARES.items()
+            for name, share in shares_of(rows).items()
         }
         found.append(PictureSourceEffect(planner, start, len(twice), level, shares))
     return found
@@ -139,7 +150,16 @@ def picture_source_effects(rows: Sequence[Row], confidence: float = 0.95) -> lis
 
 def summary_text(lines: Sequence[DriveLine], differences: Sequence[PictureSourceEffect], confidence: float) -> str:
     """Tables to be printed, in percent."""
-    head = ["planner", "pictures", "start", "drives", *(f"{name} %" for name in SHARES), "km", "failures", "m between"]
+    head = [
+        "planner",
+        "pictures",
+        "start",
+        "drives",
+        *(f"{name} %" for name in lines[0].shares),
+        "km",
+        "failures",
+        "m between",
+    ]
     rows = [head]
     for line in lines:
         shares = [_bounded(one.b, one, 100.0) for one in line.shares.values()]
@@ -150,7 +170,7 @@ def summary_text(lines: Sequence[DriveLine], differences: Sequence[PictureSource
         rows.append([*facts, *shares, f"{line.km:.2f}", str(line.failures), between])
     told = _table(rows)
     if differences:
-        rows = [["engine - truth", "start", "pairs", *(f"{name} %" for name in SHARES)]]
+        rows = [["engine - truth", "start", "pairs", *(f"{name} %" for name in differences[0].shares)]]
         for one in differences:
             shares = [_bounded(share.difference, share, 100.0, "+") for share in one.shares.values()]
             rows.append([one.planner, one.start, str(one.drives), *shares])

@@ -5,6 +5,7 @@ import json
 import math
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
 from typing import Any
@@ -15,17 +16,18 @@ from factory.readers.base import BadClip, ClipReader, ClipRef, painter_of, read_
 from factory.store.location import Location, write_shard
 from factory.store.schema import TableSpec, canonical_json, schema_of
 from factory.store.table import KeyedTable
+from planners.drive.alpasim_score import AlpasimColumns, logged_rollout, score_drive
 from planners.drive.cameras import DriveCameras, NoCameras, PaintedCameras, RenderedCameras, open_rendered_cameras
 from planners.drive.drivers import Driver, make_driver
 from planners.drive.films import write_film
 from planners.drive.loop import DRIVE_VERSION, ClosedLoopDrive, DriveMeasures, drive, measure_drive
 from planners.drive.settings import DriveSettings, Pictures
 from planners.drive.starts import LOGGED, DriveStart, extend_clip, logged_start, perturbed_starts
-from planners.evaluation.planner_names import find_planner
+from planners.evaluation.planner_names import EvaluatedPlanner, find_planner
 from tasks.perturb import Perturbation, perturb
 from tasks.rollout.simulate import traffic_record
 from tasks.stages import stage_versions
-from tasks.world.clip import HORIZON_STEPS, NOW, Clip, random_stream
+from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Scene, random_stream
 from tasks.world.vocabulary import Vocabulary
 
 # The table `drives` under `out`: one row a drive, committed as they end, so that no drive is made twice.
@@ -77,8 +79,16 @@ class DriveRow(DriveMeasures):
     plans: tuple[tuple[float, ...], ...]  # (P, 120) x, y, heading at 0.1 .. 4.0 s of the plans at 2 Hz, world
 
 
+@dataclass(frozen=True)
+class AlpasimRow(AlpasimColumns):
+    """What AlpaSim tells of a drive of loop=alpasim, in a table of its own."""
+
+    drive_id: str
+
+
 SCHEMA = schema_of(DriveRow)
 DRIVES = TableSpec("drives", SCHEMA, "drive_id")
+ALPASIM = TableSpec("alpasim", schema_of(AlpasimRow), "drive_id")
 FACTS = [field.name for field in fields(DriveRow) if field.name not in ("ego_states", "plans")]
 
 
@@ -87,28 +97,39 @@ def open_drives(out: Location) -> KeyedTable:
     return KeyedTable(out.child("drives"), DRIVES)
 
 
-def write_rows(table: KeyedTable, rows: Sequence[DriveRow]) -> None:
+def open_alpasim(out: Location) -> KeyedTable:
+    """What AlpaSim tells of the drives of loop=alpasim; the table need not be there yet."""
+    return KeyedTable(out.child("alpasim"), ALPASIM)
+
+
+def write_rows(table: KeyedTable, rows: Sequence[DriveRow] | Sequence[AlpasimRow]) -> None:
     """One commit. Raises DuplicateKey, and AnotherWriter where a later command has taken the table over."""
-    columns = [pa.array([getattr(row, field.name) for row in rows], field.type) for field in SCHEMA]
-    table.commit([write_shard(table.location, DRIVES, pa.Table.from_arrays(columns, schema=SCHEMA))])
+    spec = table.spec
+    columns = [pa.array([getattr(row, field.name) for row in rows], field.type) for field in spec.schema]
+    table.commit([write_shard(table.location, spec, pa.Table.from_arrays(columns, schema=spec.schema))])
 
 
 class RowCommitter:
     """Gathers rows and writes them, a commit each time, every COMMIT_EVERY_S and when it is closed."""
 
-    def __init__(self, table: KeyedTable) -> None:
-        self._table, self._rows, self._last = table, list[DriveRow](), time.monotonic()
+    def __init__(self, table: KeyedTable, alpasim: KeyedTable | None = None) -> None:
+        self._table, self._alpasim = table, alpasim
+        self._rows, self._last = list[DriveRow | AlpasimRow](), time.monotonic()
 
-    def add(self, rows: Iterable[DriveRow]) -> None:
+    def add(self, rows: Iterable[DriveRow | AlpasimRow]) -> None:
         """Rows to be committed."""
         self._rows += rows
         if time.monotonic() - self._last > COMMIT_EVERY_S:
             self.close()
 
     def close(self) -> None:
-        """Commit what is gathered."""
-        if self._rows:
-            write_rows(self._table, self._rows)
+        """Commit what is gathered; a drive that is there has its columns, which those of a killed command may have."""
+        if self._alpasim is not None:
+            told = [row for row in self._rows if isinstance(row, AlpasimRow) and row.drive_id not in self._alpasim]
+            if told:
+                write_rows(self._alpasim, told)
+        if driven := [row for row in self._rows if isinstance(row, DriveRow)]:
+            write_rows(self._table, driven)
         self._rows, self._last = [], time.monotonic()
 
 
@@ -144,6 +165,10 @@ class FailedDrive:
 
     clip_id: str
     why: str
+    planner: str | None = None  # None: nobody could drive there
+
+    def __str__(self) -> str:
+        return self.why if self.planner is None else f"{self.planner}: {self.why}"
 
 
 @dataclass(frozen=True)
@@ -167,7 +192,7 @@ class DriveWork:
         found: dict[str, Any] = {
             "drive": DRIVE_VERSION,
             "stages": stage_versions(),
-            "loop": {"seconds": s.seconds, "bound_m": s.bound_m},
+            "loop": {"seconds": s.seconds, "bound_m": s.bound_m} | ({} if s.loop == "own" else {"rule": s.loop}),
             "traffic": traffic_record(s.traffic),
         }
         if start != LOGGED:
@@ -178,14 +203,14 @@ class DriveWork:
             found["render"] = asdict(s.render)
         return found
 
-    def __call__(self, item: DriveItem) -> list[DriveRow | FailedDrive]:
+    def __call__(self, item: DriveItem) -> list[DriveRow | AlpasimRow | FailedDrive]:
         """Drive all of it. What is wrong with a clip, its pictures or a planner's answer is told of each drive."""
         try:
             return list(self._driven(item))
         except (BadClip, ValueError) as error:
             return [FailedDrive(item.ref.clip_id, str(error))]
 
-    def _driven(self, item: DriveItem) -> Iterator[DriveRow | FailedDrive]:
+    def _driven(self, item: DriveItem) -> Iterator[DriveRow | AlpasimRow | FailedDrive]:
         clip = self._clip(item)
         starts = self._starts(clip, {key.start for _, key in item.keys})
         cameras = self._cameras(clip, item.pictures)
@@ -193,15 +218,20 @@ class DriveWork:
             if key.start not in starts:
                 continue  # the clip has fewer
             try:
-                made = drive(starts[key.start], self._driver(who), self.settings.loop, cameras)
+                with self._driver(who, starts[key.start].scene, cameras) as driver:
+                    made = drive(starts[key.start], driver, self.settings.rules, cameras)
+                rows: list[DriveRow | AlpasimRow] = [self._row(who, key, made, cameras)]
+                if self.settings.loop == "alpasim" and made.n_steps:
+                    columns = score_drive(logged_rollout(made, self.settings.seconds))
+                    rows.append(AlpasimRow(**vars(columns), drive_id=key.drive_id))
             except ValueError as error:
-                yield FailedDrive(clip.clip_id, f"{who.label}: {error}")
+                yield FailedDrive(clip.clip_id, str(error), who.label)
             else:
-                yield self._row(who, key, made, cameras)
+                yield from rows
 
     def _clip(self, item: DriveItem) -> Clip:
         last = NOW + HORIZON_STEPS if any(key.start != LOGGED for _, key in item.keys) else NOW
-        clip, n_steps = read_clip(self.reader, item.ref), self.settings.loop.clip_steps(last)
+        clip, n_steps = read_clip(self.reader, item.ref), self.settings.rules.clip_steps(last)
         painter = painter_of(self.reader)
         return extend_clip(clip, n_steps, None if painter is None else painter.lights(clip, n_steps))
 
@@ -230,8 +260,13 @@ class DriveWork:
             return PaintedCameras(clip, self.settings.render, painter)
         return NoCameras()
 
-    def _driver(self, who: DrivingPlanner) -> Driver:
-        return cached_driver(who, canonical_json(self.settings.settings), self.settings.pdm, self.settings.device)
+    def _driver(self, who: DrivingPlanner, scene: Scene, cameras: DriveCameras) -> AbstractContextManager[Driver]:
+        s = self.settings
+        if s.loop == "own":
+            return nullcontext(cached_driver(who, canonical_json(s.settings), s.pdm, s.device))
+        from planners.drive.contract import DriverSession  # with what AlpaSim's messages need
+
+        return DriverSession(cached_peer(who, canonical_json(s.settings), s.pdm, s.device), scene, cameras.rig)
 
     def _film(self, who: DrivingPlanner, key: DriveKey, made: ClosedLoopDrive, cameras: DriveCameras) -> str:
         """One drive in so many has one, chosen by its id."""
@@ -272,7 +307,23 @@ class DriveWork:
 @lru_cache(maxsize=8)
 def cached_driver(who: DrivingPlanner, changed: str, pdm: Any, device: str) -> Driver:
     """A worker's own, read once. Raises ValueError where it is another than was named when the command began."""
-    one = find_planner(who.spec, who.label, json.loads(changed))
+    return make_driver(_same(find_planner(who.spec, who.label, json.loads(changed)), who), pdm, device)
+
+
+@lru_cache(maxsize=8)
+def cached_peer(who: DrivingPlanner, changed: str, pdm: Any, device: str) -> Any:
+    """The same before AlpaSim's questions, a planners.drive.contract.Peer."""
+    from planners.drive.contract import WIRE, Peer, ask_over_the_wire, peer_in_process, planner_over_the_wire
+
+    if not who.spec.startswith(WIRE):
+        settings = json.loads(changed)
+        return peer_in_process(_same(find_planner(who.spec, who.label, settings), who), settings, pdm, device)
+    address = who.spec.removeprefix(WIRE)
+    _same(planner_over_the_wire(address), who)
+    return Peer(ask_over_the_wire(address), needs_pictures=True)
+
+
+def _same(one: EvaluatedPlanner, who: DrivingPlanner) -> EvaluatedPlanner:
     if one.digest != who.digest:
         raise ValueError(f"{who.spec} has changed since the command began: run it again when its training is through")
-    return make_driver(one, pdm, device)
+    return one

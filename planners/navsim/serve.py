@@ -63,7 +63,9 @@ class AgentObservation:
             raise ValueError(f"driving_command {self.status[: len(COMMANDS)]}: one of {', '.join(COMMANDS)} must be 1")
 
 
-def load_for_agent(planner: str, device: str, shown_by: str) -> tuple[Any, Needs]:
+def load_for_agent(
+    planner: str, device: str, shown_by: str, changed: Mapping[str, Any] | None = None
+) -> tuple[Any, Needs]:
     """A planner that plans from cameras, status and command alone, on its device, and what it needs to plan.
 
     Raises ConfigError for one that wants more than `shown_by` shows an agent, and for a device that is not there.
@@ -75,7 +77,7 @@ def load_for_agent(planner: str, device: str, shown_by: str) -> tuple[Any, Needs
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:  # the latter of a PyTorch without CUDA
         raise ConfigError(f"device={device}: {one_line(error)}") from error
-    who = find_planner(planner)
+    who = find_planner(planner, changed=changed)
     if who.load is None:
         raise ConfigError(f"planner={planner} plans from the log itself, which {shown_by} shows no agent")
     made = who.load()

@@ -23,13 +23,9 @@ from factory.alpasim import wire
 from factory.alpasim.wire import Fault, start_server
 from factory.config.arguments import Refused
 from factory.config.compose import ConfigError
-from factory.exits import COMPLETE
-from factory.store.location import Location
 from planners.alpasim import driver as driver_module
 from planners.alpasim.driver import Driver
 from planners.alpasim.session import HEADING, Moment, Session, driven_on, local_poses, state_at
-from planners.drive.drive import main as drive_main
-from planners.drive.work import open_drives
 from planners.evaluation.planning import plan_samples
 from tasks.world.frames import to_local, to_world
 from tests.factory.alpasim.scrambled import scrambled_message
@@ -464,17 +460,3 @@ def test_the_route_is_told_as_the_rule_has_it_in_the_ego_s_frame_now(curvature: 
     for stamp in (0, 200_000):
         told = [Moment(session, stamp).observed(rule).status[:4].argmax() for rule in ("curvature", "simscale")]
         assert told == [ours, theirs]
-
-
-@pytest.mark.slow
-def test_in_the_town_a_driver_over_the_wire_plans_what_the_planner_plans_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Painted pictures, 3 s; every plan is held to the planner's own of the same row (town_drive.py)."""
-    monkeypatch.setenv("ALPASIM_TOWN_PLANNER", saved(made("ltf_small", command="curvature"), tmp_path / "planner"))
-    town = ["clips.n_clips=1", f"clips.cache_dir={tmp_path / 'towns'}", "clips.settings.lidar_beams=0"]
-    drives = ["seconds=3", "bounds=false", "pictures=[truth]", "render.width=320", "render.height=180"]
-    who = "planner=tests.planners.alpasim.town_drive:OverTheWire"
-    assert drive_main([who, *drives, *town, f"out={tmp_path / 'out'}"]) == COMPLETE
-    (row_of_drive,) = open_drives(Location.parse(tmp_path / "out")).read().to_pylist()
-    assert len(row_of_drive["plans"]) >= 2
