@@ -36,6 +36,7 @@ from factory.graph.steps import TaskStopped
 from factory.readers.base import ClipRef, painter_of
 from factory.store.location import Location
 from factory.store.table import AnotherWriter, KeyedTable
+from planners.alpasim.driver import messages
 from planners.drive.alpasim_score import AlpasimColumns, SummaryEntry, results_summary
 from planners.drive.contract import WIRE, planner_over_the_wire
 from planners.drive.drivers import make_driver
@@ -134,7 +135,9 @@ def _requested_drives(settings: DriveSettings) -> RequestedDrives:
 
 
 def _asked(settings: DriveSettings) -> list[EvaluatedPlanner]:
-    """Who drives. Raises ConfigError."""
+    """Who drives. Raises ConfigError, also without what loop=alpasim needs."""
+    if settings.loop == "alpasim":
+        messages()
     if settings.driver is None:
         return find_planners(settings.planner, settings.planners, settings.bounds, settings.settings)
     if settings.planner is not None or settings.planners is not None:

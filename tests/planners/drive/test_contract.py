@@ -1,6 +1,7 @@
 """The loop that asks as AlpaSim's nuPlan track: both ways alike, what it sends, and what it makes of answers."""
 
 import json
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -220,6 +221,14 @@ def test_nobody_at_the_address_and_other_faults_are_told_in_one_line(
     ):
         assert main([*asked, *more]) == BAD_CONFIG
         assert said in capsys.readouterr().err
+
+
+def test_without_the_messages_package_nothing_is_driven(
+    towns: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "carla_driver_interface", None)
+    assert main(words(towns, tmp_path / "out", "loop=alpasim")) == BAD_CONFIG
+    assert "[planners,alpasim]" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 class Silent:
