@@ -4,6 +4,10 @@ The plan is tracked at 10 Hz by the LQR on the kinematic bicycle that follows ev
 traffic is prepared anew from where all have come to, as between the two stages of a sample. What ends a drive is looked
 at at every 0.1 s (DriveEnd). A collision is at the ego's fault by the rule of no at-fault collision; off the road is a
 body with a corner in no drivable area (docs/reward.md 2a, 2b).
+
+By rule="alpasim" it is AlpaSim's nuPlan track: the first 0.5 s are the log's, then its MPC follows the plans, and a
+drive lasts as long as its recording whatever happens; planners.drive.contract asks and planners.drive.alpasim_score
+judges.
 """
 
 from dataclasses import dataclass, field
@@ -100,6 +104,8 @@ class LoopSettings:
     def __post_init__(self) -> None:
         if not 0.5 <= self.seconds <= 600.0:
             raise ValueError(f"seconds={self.seconds}: a drive lasts from 0.5 to 600 s")
+        if self.n_steps < 1:
+            raise ValueError(f"seconds={self.seconds}: by AlpaSim's rule 0.517 s or more")
         if not 0.0 < self.bound_m < np.inf:
             raise ValueError(f"bound_m={self.bound_m}: must be positive and finite [m]")
 

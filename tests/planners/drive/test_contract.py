@@ -217,6 +217,7 @@ def test_nobody_at_the_address_and_other_faults_are_told_in_one_line(
         (["loop=alpasim", "driver=127.0.0.1:9"], "driver=127.0.0.1:9: get_version: "),
         (["driver=127.0.0.1:9"], "is asked by loop=alpasim"),
         (["loop=alpasim", "planner=human", "perturbed=1"], "begins on the log"),
+        (["loop=alpasim", "planner=human", "seconds=0.51"], "0.517 s or more"),
         (["loop=alpasim", "planner=human", "driver=127.0.0.1:9"], "in the place of planner="),
     ):
         assert main([*asked, *more]) == BAD_CONFIG
