@@ -49,33 +49,36 @@ def messages() -> Any:
 class SceneService:
     """The driver's service before who plans from the scene itself: the drive shows it before it asks."""
 
-    methods = ("get_version", "start_session", "close_session", "submit_image_observation", "submit_route", "drive",
-               "submit_egomotion_observation")  # fmt: skip
-
     def __init__(self, driver: Driver) -> None:
+        """Raises ConfigError without the messages' package."""
         self._driver, self._shown = driver, dict[str, tuple[Scene, MakeSample, Array]]()
+        self._proto = protocol = messages()
+        requests = {
+            "get_version": (lambda _: protocol.VersionId(), protocol.Empty),
+            "start_session": (lambda _: protocol.SessionRequestStatus(), protocol.DriveSessionRequest),
+            "close_session": (self._close_session, protocol.DriveSessionCloseRequest),
+            "submit_image_observation": (lambda _: protocol.Empty(), protocol.RolloutCameraImage),
+            "submit_egomotion_observation": (lambda _: protocol.Empty(), protocol.RolloutEgoTrajectory),
+            "submit_route": (lambda _: protocol.Empty(), protocol.RouteRequest),
+            "drive": (self._drive, protocol.DriveRequest),
+        }
+        self.service = wire.Service(SERVICE, requests)
 
     def show(self, session: str, scene: Scene, look: MakeSample, origin: Array) -> None:
         """What the next question of a session is about; origin: (2,) of its frame in the world [m]."""
         self._shown[session] = scene, look, origin
 
-    def answer(self, method: str, request: bytes) -> bytes:
-        """Of one RPC. Raises ValueError for what is no plan."""
-        protocol = messages()
-        if method == "close_session":
-            self._shown.pop(protocol.DriveSessionCloseRequest.FromString(request).session_uuid, None)
-        if method == "drive":
-            return bytes(self._drive(protocol.DriveRequest.FromString(request)).SerializeToString())
-        answers = {"get_version": protocol.VersionId, "start_session": protocol.SessionRequestStatus}
-        return bytes(answers.get(method, protocol.Empty)().SerializeToString())
+    def _close_session(self, asked: Any) -> Any:
+        self._shown.pop(asked.session_uuid, None)
+        return self._proto.Empty()
 
     def _drive(self, asked: Any) -> Any:
         scene, look, origin = self._shown[asked.session_uuid]
         plan = self._driver.plan(scene, look)
         if isinstance(plan, DriveEnd):
-            return messages().DriveResponse(terminate_session=True)
+            return self._proto.DriveResponse(terminate_session=True)
         poses = np.concatenate([scene.ego_state[None, : HEADING + 1], plan]) - [*origin, 0.0]
-        answer = messages().DriveResponse()
+        answer = self._proto.DriveResponse()
         add_poses(answer.trajectory, {asked.time_now_us + STEP_US * i: pose for i, pose in enumerate(poses)})
         return answer
 
@@ -96,7 +99,7 @@ def peer_in_process(one: EvaluatedPlanner, changed: Mapping[str, Any], pdm: PdmS
     if needs is not None and needs.bev is None and not needs.n_agents:
         return Peer(AlpasimDriver(one.spec, device, changed=changed).service.answer, driver.needs_pictures)
     service = SceneService(driver)
-    return Peer(service.answer, driver.needs_pictures, service)
+    return Peer(service.service.answer, driver.needs_pictures, service)
 
 
 def ask_over_the_wire(address: str) -> Ask:

@@ -25,6 +25,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from factory.alpasim import wire
 from factory.config.arguments import command
 from factory.config.compose import ConfigError, need_run_extra
 from factory.exits import Failed, Stopped
@@ -36,7 +37,6 @@ from factory.graph.steps import TaskStopped
 from factory.readers.base import ClipRef, painter_of
 from factory.store.location import Location
 from factory.store.table import AnotherWriter, KeyedTable
-from planners.alpasim.driver import messages
 from planners.drive.alpasim_score import AlpasimColumns, SummaryEntry, results_summary
 from planners.drive.contract import WIRE, planner_over_the_wire
 from planners.drive.drivers import make_driver
@@ -137,7 +137,7 @@ def _requested_drives(settings: DriveSettings) -> RequestedDrives:
 def _asked(settings: DriveSettings) -> list[EvaluatedPlanner]:
     """Who drives. Raises ConfigError, also without what loop=alpasim needs."""
     if settings.loop == "alpasim":
-        messages()
+        wire.contract("loop=alpasim", "planners,alpasim")
     if settings.driver is None:
         return find_planners(settings.planner, settings.planners, settings.bounds, settings.settings)
     if settings.planner is not None or settings.planners is not None:

@@ -18,11 +18,11 @@ from carla_driver_interface.geometry import Pose
 from carla_driver_interface.geometry import Trajectory as Curve
 from carla_driver_interface.server import serving
 
+from factory.alpasim.wire import start_server
 from factory.datasets.town.reader import SyntheticReader
 from factory.datasets.town.settings import TownSettings
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
 from factory.store.location import Location
-from planners.alpasim.driver import start_server
 from planners.drive.contract import DriverSession, Peer, SceneService, ask_over_the_wire, peer_in_process, plan_of
 from planners.drive.drive import main
 from planners.drive.drivers import DriveEnd
@@ -53,7 +53,7 @@ def driven(start: DriveStart, peer: Peer, settings: LoopSettings = TRACK) -> Clo
 def over_the_wire(peer: Peer) -> Iterator[Peer]:
     """The same service behind a socket."""
     service = getattr(peer.ask, "__self__")  # noqa: B009 - whose bound method it is
-    server, port = start_server(service, "127.0.0.1", 0)
+    server, port = start_server([service], "127.0.0.1", 0)
     yield Peer(ask_over_the_wire(f"127.0.0.1:{port}"), peer.needs_pictures, peer.service)
     server.stop(0)
 
@@ -128,7 +128,7 @@ def test_the_first_half_second_is_the_log_s_whatever_is_planned() -> None:
     """A driver that would stand still; then it brakes, and only then."""
     start = start_on(street_with(car(100.0)), TRACK)
     peer = SceneService(Steady(0.0))
-    made = driven(start, Peer(peer.answer, False, peer))
+    made = driven(start, Peer(peer.service.answer, False, peer))
     assert made.ego_states[:6].tobytes() == start.scene.clip.ego_states[NOW : NOW + 6].tobytes()
     assert made.ego_states[-1, 3] < 1.0 < made.ego_states[6, 3]
 
@@ -147,7 +147,7 @@ def test_a_planner_without_a_plan_ends_the_session() -> None:
             return DriveEnd.NO_PLAN
 
     service = SceneService(Lost(1.0))
-    made = driven(start_on(street_with(car(50.0)), TRACK), Peer(service.answer, False, service))
+    made = driven(start_on(street_with(car(50.0)), TRACK), Peer(service.service.answer, False, service))
     assert (made.ended, made.n_steps) == (DriveEnd.NO_PLAN, 0)
 
 
