@@ -46,6 +46,7 @@ from tasks.render.fit.state import FitState
 from tasks.render.rig.correct import RigCorrection, correct_rig, detect_corners, estimate_ground_height, movable_mask
 from tasks.render.scene.asset import BlockRange, PhotoPose, RenderAsset, photo_rises
 from tasks.render.scene.build import build_asset
+from tasks.render.scene.engine import require_backend
 from tasks.render.scene.features import KnownPoints, driven_roads
 from tasks.render.scene.movers import lift_tracks
 from tasks.render.scene.sensed import median_own_bodies
@@ -246,11 +247,10 @@ def fit_scene(
     A fit that was killed or halted comes to the same bytes as one that was not. Raises TaskStopped once it is
     `stopped`, with all of its iterations kept, ValueError without photos to learn from, and BackendMissing.
     """
-    drawing = fit_backend(backend, threads)
+    require_backend(backend)
     problem, state = prepare_fit(data.photos, data.sweeps, agents, settings, threads=threads, known=data.known)
     begun, said = path.with_suffix(FIT_SUFFIX), path.with_suffix(PROGRESS_SUFFIX)
     state = _resumed(begun, state)
-    first, began = state.iteration, time.monotonic()
 
     def say(iteration: int, loss: float, psnr_db: float) -> None:
         per_s = (iteration - first) / (time.monotonic() - began)
@@ -259,16 +259,18 @@ def fit_scene(
         log.info("%s: %s, loss %.4f", path.stem, text, loss)
         said.write_text(json.dumps({"block": path.stem, "text": text}))
 
-    while state.iteration < settings.iterations:
-        run_iterations(problem, state, settings, state.iteration + STRETCH, say, threads, stopped, drawing)
-        arrays = state.arrays()
-        with atomic_file(begun, sum(array.nbytes for array in arrays.values())) as draft:
-            with draft.open("wb") as file:
-                np.savez(file, **arrays)  # type: ignore[arg-type]
-            append_checksum(draft, begun.name)
-        if state.iteration < settings.iterations and stopped():
-            said.unlink(missing_ok=True)
-            raise TaskStopped(f"{path.stem}: {state.iteration} of {settings.iterations} iterations are done")
+    with fit_backend(backend, threads, stopped) as drawing:
+        first, began = state.iteration, time.monotonic()
+        while state.iteration < settings.iterations:
+            run_iterations(problem, state, settings, state.iteration + STRETCH, say, threads, stopped, drawing)
+            arrays = state.arrays()
+            with atomic_file(begun, sum(array.nbytes for array in arrays.values())) as draft:
+                with draft.open("wb") as file:
+                    np.savez(file, **arrays)  # type: ignore[arg-type]
+                append_checksum(draft, begun.name)
+            if state.iteration < settings.iterations and stopped():
+                said.unlink(missing_ok=True)
+                raise TaskStopped(f"{path.stem}: {state.iteration} of {settings.iterations} iterations are done")
     asset = finish_scene(problem, state, threads)
     begun.unlink(missing_ok=True)
     said.unlink(missing_ok=True)

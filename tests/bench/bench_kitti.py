@@ -10,6 +10,7 @@ through the CPU's kernels.
 
 import sys
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -135,7 +136,7 @@ def main() -> None:
     kinds = {field.name: type(getattr(FitSettings(), field.name)) for field in fields(FitSettings)}
     out.mkdir(parents=True, exist_ok=True)
 
-    backend = TorchBackend(by_kernels, "cpu") if by == "tensors" else fit_backend(Backend(by), threads)
+    drawing = nullcontext(TorchBackend(by_kernels, "cpu")) if by == "tensors" else fit_backend(Backend(by), threads)
 
     drive = steadied(read_drive(root))
     span = int(options.pop("first", "0")), int(options.pop("last", len(drive.times_s) - 1)) + 1
@@ -154,15 +155,16 @@ def main() -> None:
     print("| iterations | s | Gaussians | training | image_02 | image_03 raw | affine | affine + extrinsic |")
     seconds = 0.0
     told: list[float] = []
-    for until in [at for at in SHOWN_AT if at < settings.iterations] + [settings.iterations]:
-        started = time.perf_counter()
-        run_iterations(
-            problem, state, settings, until, lambda at, loss, score: told.append(score), threads, backend=backend
-        )
-        seconds += time.perf_counter() - started
-        np.savez(out / "state.npz", **state.arrays())
-        mean = np.mean(told[-5:]) if told else np.nan  # of the last 500 iterations
-        print(f"| {until} | {seconds:.0f} | {len(state)} | {mean:.2f} | {trial.row()} |", flush=True)
+    with drawing as backend:
+        for until in [at for at in SHOWN_AT if at < settings.iterations] + [settings.iterations]:
+            started = time.perf_counter()
+            run_iterations(
+                problem, state, settings, until, lambda at, loss, score: told.append(score), threads, backend=backend
+            )
+            seconds += time.perf_counter() - started
+            np.savez(out / "state.npz", **state.arrays())
+            mean = np.mean(told[-5:]) if told else np.nan  # of the last 500 iterations
+            print(f"| {until} | {seconds:.0f} | {len(state)} | {mean:.2f} | {trial.row()} |", flush=True)
 
     asset = write_scene(out / "kitti.safetensors", finish_scene(problem, state, threads))
     looks = []

@@ -199,6 +199,7 @@ ILL = (  # what Ray says when it is the machine that failed
     *(exceptions.RuntimeEnvSetupError, exceptions.OutOfMemoryError, exceptions.ObjectLostError),
     *(exceptions.ObjectStoreFullError, exceptions.OutOfDiskError),
 )
+FIT_SHARE = 0.01  # of a GPU: what brings a fit to a node with one, where fits take turns (gsplat_backend.fit_turn)
 TASKS_A_SECOND = 300.0  # that one driver hands out and takes back
 AHEAD_S, MOST_AHEAD_S = 1.0, 8.0  # of attempts that one task makes; as much as so many workers need, less than DRAIN_S
 WARM_S = 90.0  # what kernels usually take on two cores
@@ -330,7 +331,8 @@ class RayGraph(Graph):
                 supplied = [self._supplied[name] for name in STEPS[step][1]]
                 if ticket.step in self._after_drawing:
                     args = tuple(ResultToFetch(arg) if isinstance(arg, ray.ObjectRef) else arg for arg in args)
-                gpu = self._gpu_share if draws else None
+                most = FIT_SHARE if step == "reconstruct" else 1.0
+                gpu = min(self._gpu_share, most) if draws else None
                 memory = self._claims.memory_bytes(ticket.step)
                 memory = memory if self._most_memory is None else min(memory, self._most_memory)
                 cores = int(args[1]) if step == "reconstruct" else 1  # it is told how many threads it has

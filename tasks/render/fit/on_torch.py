@@ -381,6 +381,11 @@ class TorchBackend:
             self._photos[id(shot)] = shot, sent
         return sent
 
+    def release(self) -> None:
+        """Photos leave the device, and what torch keeps of its memory is any process's again."""
+        self._photos.clear()
+        torch.cuda.empty_cache()
+
     def _sent(self, array: object) -> Tensor:
         return torch.as_tensor(array, device=self.device).clone()
 

@@ -1,6 +1,7 @@
 """A block's scene fitted to its photos: one photo an iteration, all of it a function of the inputs and the seed."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -44,7 +45,7 @@ from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap, pixel_directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import Backend, FitSettings
 from tasks.render.splatting.gaussians import moved
-from tasks.render.splatting.gsplat_backend import take_gpu
+from tasks.render.splatting.gsplat_backend import fit_turn, take_gpu
 from tasks.world.arrays import F32, Array, Bools, Ints
 from tasks.world.clip import AgentKind, Pinhole
 
@@ -263,15 +264,21 @@ def run_iterations(
         state.apply_average(problem.road)
 
 
-def fit_backend(backend: Backend, threads: int) -> FitBackend:
-    """Who draws for the fit. Raises BackendMissing where it cannot work on this machine."""
+@contextmanager
+def fit_backend(backend: Backend, threads: int, stopped: Callable[[], bool] = lambda: False) -> Iterator[FitBackend]:
+    """Who draws for the fit, which has its turn on a GPU meanwhile. Raises BackendMissing where it cannot work here."""
     if not backend.on_gpu:
-        return CpuBackend(threads)
-    take_gpu()
-    from tasks.render.fit.on_torch import TorchBackend  # torch is loaded only where it is asked for
-    from tasks.render.splatting.tensors import by_gsplat
+        yield CpuBackend(threads)
+        return
+    with fit_turn(take_gpu(), stopped):
+        from tasks.render.fit.on_torch import TorchBackend  # torch is loaded only where it is asked for
+        from tasks.render.splatting.tensors import by_gsplat
 
-    return TorchBackend(by_gsplat, "cuda")
+        drawing = TorchBackend(by_gsplat, "cuda")
+        try:
+            yield drawing
+        finally:
+            drawing.release()
 
 
 def decay(end: float, progress: float) -> float:

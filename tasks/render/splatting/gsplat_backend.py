@@ -7,6 +7,9 @@ import fcntl
 import importlib
 import os
 import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from itertools import count
 from pathlib import Path
@@ -39,10 +42,12 @@ def require() -> tuple[Any, Any]:
     return torch, gsplat
 
 
-def take_gpu() -> None:
-    """This process draws on its own of the machine's GPUs from here on. Raises BackendMissing."""
+def take_gpu() -> int:
+    """This process draws on its own of the machine's GPUs from here on, which is returned. Raises BackendMissing."""
     torch, _ = require()
-    torch.cuda.set_device(own_place() % torch.cuda.device_count())
+    gpu = own_place() % int(torch.cuda.device_count())
+    torch.cuda.set_device(gpu)
+    return gpu
 
 
 @cache
@@ -50,24 +55,54 @@ def own_place() -> int:
     """The first number that no other process of this user holds here, for as long as this one lives: so GPUs are shared
     evenly. Ray deals shares out one GPU after the other, and a process each task another, where CUDA stays with the
     first."""
+    for place in count():
+        if (file := _hold(_folder() / str(place))) is not None:
+            _HELD.append(file)
+            break
+    return place
+
+
+def _folder() -> Path:
     folder = Path(tempfile.gettempdir()) / f"driving-data-factory-gpu-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    return next(place for place in count() if _hold(folder / str(place)))
+    return folder
 
 
-def _hold(path: Path) -> bool:
-    """Whether the file is this process's from now on, until it ends."""
+FITS_AT_ONCE = 2  # on a GPU: while the host works for one it draws for the other
+LOOK_S = 0.5  # between two looks whether a turn is free
+
+
+@contextmanager
+def fit_turn(gpu: int, stopped: Callable[[], bool] = lambda: False) -> Iterator[None]:
+    """One of a GPU's places for fits, of all processes of this user here: waited for, given back at the end.
+
+    More fits would need more memory and share the same hours. Once `stopped` nothing is waited for.
+    """
+    file = None
+    while file is None and not stopped():
+        for place in range(FITS_AT_ONCE):
+            file = file or _hold(_folder() / f"fit-{gpu}-{place}")
+        if file is None:
+            time.sleep(LOOK_S)
+    try:
+        yield
+    finally:
+        if file is not None:
+            file.close()
+
+
+def _hold(path: Path) -> TextIO | None:
+    """The file, which nobody else holds as long as it is open; None where somebody does."""
     file = path.open("w")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         file.close()
-        return False
-    _HELD.append(file)  # its lock ends with it
-    return True
+        return None
+    return file
 
 
-_HELD: list[TextIO] = []
+_HELD: list[TextIO] = []  # of places: they end with this process
 
 
 def plain_arguments(
