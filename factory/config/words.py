@@ -20,7 +20,7 @@ FILES = (  # last words of the keys that name files and folders
     "--config-dir -cd a anchors b benchmark cache cache_dir cameras checkpoint data drives file files "
     "inference_vocabulary init_from label_vocabulary like logs made maps maps_root masks out own_body pictures planner "
     "planners pretrained real rewards root scene_filter scene_filters sensor_root sensors sim split starts table to "
-    "transforms val vocabularies vocabulary"
+    "transforms usdz val vocabularies vocabulary"
 )
 PATHS = frozenset(FILES.split())
 FREE = ("clips.", "expert.", "planner.settings.")  # groups whose keys may be a plug-in's

@@ -106,7 +106,14 @@ def main(request: Request) -> None:
     sizes = rng.choice(len(share), request.blocks, p=share) + 1
     refs = [ClipRef("virtual", f"log{block:04d}", 1000 * k) for block, n in enumerate(sizes) for k in range(n)]
     memory = 4e9 * request.cpus  # of a node with such GPUs
-    ray.init(num_cpus=request.cpus, num_gpus=request.gpus, _memory=memory, include_dashboard=False, log_to_driver=False)
+    ray.init(
+        address="local",
+        num_cpus=request.cpus,
+        num_gpus=request.gpus,
+        _memory=memory,
+        include_dashboard=False,
+        log_to_driver=False,
+    )
     try:
         for gpu in (0.0, request.gpu_share):  # processes of either kind, which take seconds to start
             ray.get([_warm.options(num_gpus=gpu).remote(request.cpus) for _ in range(request.cpus)])

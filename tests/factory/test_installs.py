@@ -72,7 +72,7 @@ def _modules(node: ast.AST, at_import: bool) -> Iterator[str]:
     ("package", "extras"),
     [
         ("tasks", ("run", "gpu")),
-        ("factory", ("run", "gpu", "navsim")),
+        ("factory", ("run", "gpu", "navsim", "alpasim")),
         ("planners", ("planners", "alpasim")),
     ],
 )

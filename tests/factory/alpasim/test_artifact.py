@@ -21,7 +21,7 @@ from tasks.render.views import render_views
 from tasks.settings import TrafficSettings
 from tasks.world.frames import PACIFICA
 from tests.factory.alpasim.asked import STREET, asked, cameras, pose_message, scenes, street
-from tests.factory.alpasim.test_sensors import picture, shot
+from tests.factory.alpasim.test_scene_service import picture, shot
 from tests.factory.alpasim.test_traffic import proto
 
 
