@@ -19,7 +19,7 @@ from factory.store.location import encode_tree
 from factory.store.schema import BOOKKEEPING, sample_rows_to_table
 from tasks.experts.recovery import RecoveryExpert
 from tasks.render.settings import ImageSource, RenderMode, SceneFrom
-from tasks.render.splatting.gsplat_backend import require
+from tasks.render.splatting.gsplat_backend import FITS_AT_ONCE, require
 from tasks.stages import TASKS, Rejected
 from tasks.world.vocabulary import Vocabulary
 
@@ -171,8 +171,8 @@ def _time_line(run: Run, hours: Mapping[str, float]) -> str:
     spent, bound = sum(hours.values()) / cores, f"{most}, {hours[most] / max(sum(hours.values()), 1e-9):.0%} of it"
     told = f"{spent:.2f} h on {cores} cores"
     if run.work.draws_on_gpu:
-        claimed = {stage for task in TASKS if task.may_draw for stage in task.stages}
-        of_gpus = run.config.gpu_share * sum(hours.get(stage, 0.0) for stage in claimed)
+        # At most: a fit has its turn for its iterations alone.
+        of_gpus = hours.get("reconstruct", 0.0) / FITS_AT_ONCE + run.config.gpu_share * hours.get("render", 0.0)
         gpus = _gpus()
         told += f"; {of_gpus:.2f} GPU-hours, {of_gpus / gpus:.2f} h on {gpus} GPUs"
         if of_gpus / gpus > spent:

@@ -2,10 +2,12 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from factory.config.run import load_config
+from factory.setup import calibrate
 from factory.setup.calibrate import estimate_run_size
 from factory.setup.settings import assemble
 
@@ -32,3 +34,15 @@ def test_a_fit_is_counted_for_each_block_and_not_again_once_it_is_there(tmp_path
     again = estimate_run_size(run, run.refs)
     assert "a block" not in again and "blocks take is not counted" in again
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").glob("**/*.parquet"))
+
+
+def test_eight_gpus_have_a_bill_of_their_own_and_hold_the_run_up_where_they_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fits by two at a time, pictures by `gpu_share`; on so many cores the rest is done sooner."""
+    monkeypatch.setattr(calibrate, "_gpus", lambda: 8)
+    run = SimpleNamespace(config=SimpleNamespace(workers=2000, gpu_share=0.1), work=SimpleNamespace(draws_on_gpu=True))
+    hours = {"reconstruct": 600.0, "perturb": 40.0, "reward": 60.0, "render": 500.0}
+    said = calibrate._time_line(run, hours)  # type: ignore[arg-type]
+    assert "0.60 h on 2000 cores; 350.00 GPU-hours, 43.75 h on 8 GPUs" in said and "the GPUs" in said
+    run.config.workers = 4
+    said = calibrate._time_line(run, hours)  # type: ignore[arg-type]
+    assert "300.00 h on 4 cores" in said and "reconstruct, 50% of it" in said and "the GPUs" not in said
