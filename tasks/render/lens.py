@@ -22,7 +22,7 @@ NEWTON_STEPS = 20
 @dataclass(frozen=True)
 class Lens:
     """How the picture of an ideal pinhole of the same focal lengths, which reaches further, becomes that of a camera
-    with distortion: the way back from `tasks.render.views.undistorted`."""
+    with distortion: the inverse of `tasks.render.views.undistorted`."""
 
     intrinsics: Array  # (3, 3) of that pinhole, in pixels,
     width: int  # and the size of its picture,

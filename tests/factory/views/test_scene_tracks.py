@@ -1,9 +1,9 @@
 """`scene export format=ckpt out=RUN`: a block with its vehicles, where the log had them, as WorldEngine reads it."""
 
 import pickle
-import pickletools
 from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pytest
@@ -102,6 +102,13 @@ def test_a_block_goes_out_with_its_vehicles_and_its_pictures_come_back(
         assert np.abs(first - nobody).max() > 0.1  # the vehicle is in the picture
 
 
+class PlainContainers(pickle.Unpickler):
+    """Reads containers, numbers and text, and nothing that is to be called."""
+
+    def find_class(self, module: str, name: str) -> NoReturn:
+        raise pickle.UnpicklingError(f"{module}.{name} is no plain container")
+
+
 def matrix(quat: list[float]) -> np.ndarray:
     """Of w, x, y, z."""
     return np.asarray(Rotation.from_quat([*quat[1:], quat[0]]).as_matrix())
@@ -111,10 +118,8 @@ def test_alpasim_s_renderer_finds_its_cameras_where_a_run_has_them(run: Store, b
     """By the rules of its MTGS server, written anew (NVlabs/alpasim 9177bd0, plugins/mtgs/server)."""
     out = tmp_path / "town-scene"
     assert main(["export", str(block), f"to={out}", "format=ckpt", f"out={run.location.uri}"]) == 0
-    data = (out / "video_scene_dict.pkl").read_bytes()
-    called = {"GLOBAL", "STACK_GLOBAL", "REDUCE", "BUILD", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "PERSID"}
-    assert not called & {code.name for code, _, _ in pickletools.genops(data)}, "plain containers"
-    ((name, scene),) = pickle.loads(data).items()
+    with (out / "video_scene_dict.pkl").open("rb") as file:
+        ((name, scene),) = PlainContainers(file).load().items()
     parts = torch.load(out / "background" / f"{name}.ckpt", weights_only=True)
     vehicles = read_scene(block).nodes.keys() - {"never seen"}
     assert {part.split("_")[-1] for part in parts} == {"background", "skybox", *vehicles}
