@@ -6,8 +6,9 @@ a GPU are added up in any order, so that no two fits are alike to the last bit.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from itertools import accumulate
 from typing import Any
 
 import cv2
@@ -31,6 +32,7 @@ from tasks.render.fit.state import (
     SHAPES,
     SLACK_M,
     THICKNESS_M,
+    WORLD,
     AdamArray,
     Copies,
     FitState,
@@ -50,21 +52,21 @@ from tasks.world.arrays import F32, Array, Ints, ShortInts
 
 
 class LearnedTensor:
-    """`state.AdamArray`, on a device."""
+    """`state.AdamArray`, on a device; of `steps` each column (N, C) has its own."""
 
     def __init__(self, values: Tensor, first: Tensor, second: Tensor, steps: Tensor) -> None:
         self.values, self.first, self.second, self.steps = values, first, second, steps
 
-    def step(self, rows: Tensor, gradient: Tensor, rate: float, scale: Tensor | None = None) -> None:
-        """`AdamArray.step`."""
-        self.steps[rows] += 1
-        counts = self.steps[rows].double()[:, None]
+    def step(self, rows: Tensor, gradient: Tensor, rate: float | Tensor, scale: Tensor | None = None) -> None:
+        """`AdamArray.step`; columns may have a `rate` each (C,) and a `scale` each (M, C)."""
+        steps = self.steps[rows] + 1
+        counts = steps.double()
         first = BETA1 * self.first[rows] + (1.0 - BETA1) * gradient
         second = BETA2 * self.second[rows] + (1.0 - BETA2) * gradient * gradient
-        self.first[rows], self.second[rows] = first, second
+        self.steps[rows], self.first[rows], self.second[rows] = steps, first, second
         size = rate / (1.0 - BETA1**counts)
         if scale is not None:
-            size = size * scale[:, None]
+            size = size * scale
         spread = (second / (1.0 - BETA2**counts)).sqrt() + EPSILON
         self.values[rows] -= (size * first / spread).float()
 
@@ -72,10 +74,14 @@ class LearnedTensor:
         """`AdamArray.take`."""
         return LearnedTensor(self.values[rows], self.first[rows], self.second[rows], self.steps[rows])
 
-    def forget(self, rows: Ints) -> None:
+    def forget(self, rows: Ints | Tensor) -> None:
         """`AdamArray.forget`."""
         for of in (self.first, self.second, self.steps):
             of[rows] = 0
+
+    def columns(self, first: int, last: int) -> "LearnedTensor":
+        """Some of them, which are stepped with all."""
+        return LearnedTensor(*(of[:, first:last] for of in (self.values, self.first, self.second, self.steps)))
 
 
 def apply_exposure(rgb: Tensor, row: Tensor) -> Tensor:
@@ -218,23 +224,45 @@ def distance_before_bodies(points: Tensor, view: BodyView) -> tuple[Tensor, Tens
 
 
 DEVICE_SIDE = (*SHAPES, "sky")
+WIDTHS = (3, 4, 3, 1, 3)  # of SHAPES
 OF_GAUSSIANS = ("road", "nearest", "wanted")
 KEPT_BYTES = 4e9  # of photos on the device; 16 MB each at 1920 x 1080
 
 
 @dataclass
 class StateTensors:
-    """`FitState`, of which the Gaussians and the sky lie on a device."""
+    """`FitState`, of which the Gaussians and the sky lie on a device.
+
+    What is learned of a Gaussian is one row there, so that all of it is gathered, stepped and moved at once.
+    """
 
     iteration: int
-    learned: dict[str, Any]  # LearnedTensor; exposure, poses and boxes: AdamArray
+    shapes: LearnedTensor  # SHAPES side by side
+    world: dict[str, Any]  # sky: LearnedTensor; exposure, poses and boxes: AdamArray
     owner: ShortInts  # (N,) on the CPU
     road: Tensor
     nearest: Tensor
     wanted: Tensor
     averages: dict[str, Any]  # of the kinds of `learned`
     noted: int
+    learned: dict[str, Any] = field(init=False)
     _surface: tuple[Road, Tensor] | None = None  # the road that was last asked for, and what `lay_flat` takes of it
+
+    def __post_init__(self) -> None:
+        self._hold(self.shapes)
+
+    def _hold(self, shapes: LearnedTensor) -> None:
+        """`learned` is `FitState`'s: of Gaussians these columns."""
+        mine = {name: shapes.columns(end - n, end) for name, n, end in zip(SHAPES, WIDTHS, accumulate(WIDTHS))}
+        self.shapes, self.learned = shapes, mine | self.world
+
+    def step_gaussians(self, rows: Tensor, gradients: Gradients, rates: Mapping[str, float], depths: Tensor) -> None:
+        """`FitState.step_gaussians`."""
+        by = torch.cat([getattr(gradients, name).view(len(rows), -1) for name in SHAPES], dim=1)
+        each = [rates[name] for name, width in zip(SHAPES, WIDTHS) for _ in range(width)]
+        scale = torch.ones_like(by)
+        scale[:, : WIDTHS[0]] = depths[:, None]
+        self.shapes.step(rows, by, torch.tensor(each, dtype=torch.float64, device=by.device), scale)
 
     def record_view(self, rows: Tensor, depths: Tensor, screen: Tensor) -> Tensor:
         """`FitState.record_view`."""
@@ -293,15 +321,13 @@ class StateTensors:
         across = 2.0 * torch.linalg.cross(axis, local)
         turned = local + w * across + torch.linalg.cross(axis, across)
         self.learned["means"].values[targets] += JITTER * turned.float()
-        for name in SHAPES:
-            self.learned[name].forget(torch.cat([named, targets]))
+        self.shapes.forget(torch.cat([named, targets]))
         self._keep_rows(order)
         self.owner = self.owner[copies.rows][copies.order]
 
     def _keep_rows(self, rows: Tensor) -> None:
         """`FitState.keep_rows`, but for the owners."""
-        for name in SHAPES:
-            self.learned[name] = self.learned[name].take(rows)
+        self._hold(self.shapes.take(rows))
         for name in OF_GAUSSIANS:
             setattr(self, name, getattr(self, name)[rows])
 
@@ -320,20 +346,19 @@ class TorchBackend:
 
     def load(self, state: FitState) -> StateTensors:
         """A copy of it, on the device."""
-        learned: dict[str, Any] = dict(state.learned)
-        for name in DEVICE_SIDE:
-            here = state.learned[name]
-            learned[name] = LearnedTensor(*(self._sent(getattr(here, each.name)) for each in fields(AdamArray)))
+        shapes = self._learned([state.learned[name] for name in SHAPES])
+        world = {name: state.learned[name] for name in WORLD} | {"sky": self._learned([state.learned["sky"]])}
         averages = {name: self._sent(of) if name in DEVICE_SIDE else of for name, of in state.averages.items()}
         road, nearest, wanted = (self._sent(getattr(state, name)) for name in OF_GAUSSIANS)
-        return StateTensors(state.iteration, learned, state.owner, road, nearest, wanted, averages, state.noted)
+        return StateTensors(state.iteration, shapes, world, state.owner, road, nearest, wanted, averages, state.noted)
 
     def store(self, held: StateTensors, state: FitState) -> None:
         """Exposure, poses and boxes never left."""
         state.iteration, state.noted, state.owner = held.iteration, held.noted, held.owner
         for name in DEVICE_SIDE:
             there = held.learned[name]
-            state.learned[name] = AdamArray(*(held.to_host(getattr(there, each.name)) for each in fields(AdamArray)))
+            values, first, second, steps = (held.to_host(getattr(there, each.name)) for each in fields(AdamArray))
+            state.learned[name] = AdamArray(values, first, second, steps[:, 0].copy())
         state.averages = {name: held.to_host(of) if name in DEVICE_SIDE else of for name, of in held.averages.items()}
         for name in OF_GAUSSIANS:
             setattr(state, name, held.to_host(getattr(held, name)))
@@ -341,30 +366,28 @@ class TorchBackend:
     def derivatives(self, problem: FitProblem, held: StateTensors, row: int, settings: FitSettings) -> Derivatives:
         """As `FitBackend` has it."""
         shot = problem.train[row]
-        leaves = [held.learned[name].values.detach().requires_grad_() for name in DEVICE_SIDE]
+        shapes, cells_of = (of.values.detach().requires_grad_() for of in (held.shapes, held.world["sky"]))
         exposure = self._sent(held.learned["exposure"].values[row]).requires_grad_()
         height, width = shot.photo.rgb.shape[:2]
         camera = corrected_pose(shot.photo.world_from_camera, held.learned["poses"].values[row])
         eye = Eye(shot.photo.intrinsics, camera, width, height, torch.zeros(6, device=self.device, requires_grad=True))
         parts = visible_parts(problem, held.owner, held.learned["boxes"].values, shot.photo)
-        seen = self.draw(_compose_scene(leaves[:-1], parts), eye)
+        seen = self.draw(_compose_scene(shapes.split(WIDTHS, dim=1), parts), eye)
 
-        rgb, cells = composite_sky(seen.rgb, seen.alpha, leaves[-1], eye.intrinsics, camera)
+        rgb, cells = composite_sky(seen.rgb, seen.alpha, cells_of, eye.intrinsics, camera)
         light, weight, ground = self._photo(shot)
         picture, photo = apply_exposure(rgb, exposure), light.float() / 255.0
         loss = photo_loss(picture, photo, weight, settings.ssim_weight)
         if settings.opaque_weight > 0.0:
             loss = loss + opaque_loss(seen.alpha, ground, settings.opaque_weight)
 
-        asked = [*leaves, exposure, eye.motion, seen.screen]
-        by = torch.autograd.grad(loss, asked, materialize_grads=True)
-        means, quats, log_scales, logits, colours, sky, d_exposure, d_camera, screen = by
+        asked = [shapes, cells_of, exposure, eye.motion, seen.screen]
+        d_shapes, sky, d_exposure, d_camera, screen = torch.autograd.grad(loss, asked, materialize_grads=True)
         spans = [torch.arange(span.start, span.stop, device=self.device) for span in map(_row_slice, parts)]
         rows = torch.cat(spans)[seen.index]
-        tracks, boxes = _box_gradients(parts, leaves[0].detach(), leaves[1].detach(), means, quats)
-        shapes = {"means": means, "quats": quats, "log_scales": log_scales, "logits": logits[:, 0], "colours": colours}
-        back: dict[str, Any] = {name: tensor[rows] for name, tensor in shapes.items()}
-        back |= {"index": rows, "screen": screen}
+        tracks, boxes = _box_gradients(parts, shapes.detach(), d_shapes)
+        back: dict[str, Any] = dict(zip(SHAPES, d_shapes[rows].split(WIDTHS, dim=1)))
+        back |= {"logits": back["logits"][:, 0], "index": rows, "screen": screen}
         back["camera"] = d_camera.double().cpu().numpy()
         error = torch.mean((picture.detach().clamp(0.0, 1.0) - photo).double() ** 2)
         score = float(-10.0 * torch.log10(error))
@@ -386,6 +409,11 @@ class TorchBackend:
         self._photos.clear()
         torch.cuda.empty_cache()
 
+    def _learned(self, arrays: Sequence[AdamArray]) -> LearnedTensor:
+        """Arrays of the same rows, side by side."""
+        each = [(of.values, of.first, of.second, of.steps[:, None].repeat(of.values.shape[1], 1)) for of in arrays]
+        return LearnedTensor(*(torch.cat([self._sent(part) for part in kind], dim=1) for kind in zip(*each)))
+
     def _sent(self, array: object) -> Tensor:
         return torch.as_tensor(array, device=self.device).clone()
 
@@ -401,18 +429,15 @@ def _compose_scene(leaves: Sequence[Tensor], parts: Sequence[OwnedGaussians]) ->
     return SceneTensors(*(torch.cat(tensors) for tensors in zip(*(scene.parts() for scene in scenes))))
 
 
-def _box_gradients(
-    parts: Sequence[OwnedGaussians], means: Tensor, quats: Tensor, d_means: Tensor, d_quats: Tensor
-) -> tuple[Ints, F32]:
+def _box_gradients(parts: Sequence[OwnedGaussians], shapes: Tensor, d_shapes: Tensor) -> tuple[Ints, F32]:
     """Tracks (B,), and derivatives (B, SHIFT_SIZE) by what their boxes are off by; the tensors are the state's."""
-    mine = [part for part in parts if part.track is not None]
-    found = [
-        torch.cat([shift, turn[None]])
-        for part in mine
-        for shift, turn in [
-            box_gradient(part, *(one[_row_slice(part)].double() for one in (means, quats, d_means, d_quats)))
-        ]
-    ]
+    mine, found = [part for part in parts if part.track is not None], []
+    for part in mine:
+        (means, quats), (d_means, d_quats) = (
+            of[_row_slice(part), : sum(WIDTHS[:2])].double().split(WIDTHS[:2], dim=1) for of in (shapes, d_shapes)
+        )
+        shift, turn = box_gradient(part, means, quats, d_means, d_quats)
+        found.append(torch.cat([shift, turn[None]]))
     together = torch.stack(found).float().cpu().numpy() if found else np.zeros((0, SHIFT_SIZE), np.float32)
     return np.array([part.track for part in mine], np.int64), together
 

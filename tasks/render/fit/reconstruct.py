@@ -339,15 +339,16 @@ def _step_boxes(problem: FitProblem, held: LearnedState, settings: FitSettings, 
 
 def _step_gaussians(held: LearnedState, settings: FitSettings, found: Derivatives) -> None:
     """Those that the photo shows."""
-    learned, rows, mine = held.learned, found.rows, found.gaussians
-    nearest = held.record_view(rows, found.depths, mine.screen)
+    nearest = held.record_view(found.rows, found.depths, found.gaussians.screen)
     fall = decay(settings.rate_end, held.iteration / settings.iterations)
-    mean_rate = settings.mean_rate * decay(settings.mean_rate_end, held.iteration / settings.iterations)
-    learned["means"].step(rows, mine.means, mean_rate, nearest)
-    learned["quats"].step(rows, mine.quats, fall * settings.quat_rate)
-    learned["log_scales"].step(rows, mine.log_scales, fall * settings.scale_rate)
-    learned["logits"].step(rows, mine.logits[:, None], fall * settings.opacity_rate)
-    learned["colours"].step(rows, mine.colours, fall * settings.colour_rate)
+    rates = {
+        "means": settings.mean_rate * decay(settings.mean_rate_end, held.iteration / settings.iterations),
+        "quats": fall * settings.quat_rate,
+        "log_scales": fall * settings.scale_rate,
+        "logits": fall * settings.opacity_rate,
+        "colours": fall * settings.colour_rate,
+    }
+    held.step_gaussians(found.rows, found.gaussians, rates, nearest)
 
 
 def refined_pose(problem: FitProblem, state: FitState, photo: Photo) -> Array:

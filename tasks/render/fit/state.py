@@ -13,6 +13,7 @@ from tasks.kernels.compiled import kernel
 from tasks.render.scene.body import BEFORE_M, BodyView, distance_before_bodies
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians, rotations_of
+from tasks.render.splatting.gradient import Gradients
 from tasks.world.arrays import F32, Array, Bools, FloatArray, Ints, ShortInts
 
 # Adam (Kingma and Ba 2015) for rows of an array, each with a count of steps of its own.
@@ -269,6 +270,8 @@ class LearnedState(Protocol):
 
     def record_view(self, rows: Any, depths: Any, screen: Any) -> Any: ...
 
+    def step_gaussians(self, rows: Any, gradients: Gradients, rates: Mapping[str, float], depths: Any) -> None: ...
+
     def lay_flat(self, rows: Any, road: Road) -> None: ...
 
     def keep_round(self, rows: Any, background: float, boxes: float) -> None: ...
@@ -321,6 +324,12 @@ class FitState:
         self.nearest[rows] = np.minimum(self.nearest[rows], depths)
         self.wanted[rows] += np.hypot(screen[:, 0], screen[:, 1])
         return self.nearest[rows]
+
+    def step_gaussians(self, rows: Ints, gradients: Gradients, rates: Mapping[str, float], depths: F32) -> None:
+        """Moves `rows` (M,) against the gradients by them, by `rates` of SHAPES, means times `depths` (M,)."""
+        for name in SHAPES:
+            by = getattr(gradients, name).reshape(len(rows), -1)
+            self.learned[name].step(rows, by, rates[name], depths if name == "means" else None)
 
     def lay_flat(self, rows: Ints, road: Road) -> None:
         """Those of `rows` (M,) that lie on the road stay on it."""
