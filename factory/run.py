@@ -81,7 +81,7 @@ def run(asked: CommandLine, only_plan: bool) -> int:
     from factory.graph.own_process import check_address_answers, run_in_own_process
 
     config = _checked(asked)
-    if config.executor == "ray" and not only_plan:
+    if config.executor == "ray":
         try:
             check_address_answers(os.environ.get("RAY_ADDRESS", ""))
         except ConnectionError as error:

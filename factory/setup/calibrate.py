@@ -154,7 +154,7 @@ def estimate_run_size(run: Run, refs: Sequence[ClipRef]) -> str:
         f"  {'stage':<12}{'seconds':>16}{'core-hours':>12}",
         *(f"  {stage:<12}{each[stage]:>16}{spent:>12.2f}" for stage, spent in hours.items()),
         f"expected for {of}: {made}, {gb}, {sum(hours.values()):.2f} core-hours",
-        _time_line(run, hours),
+        _time_line(run, hours, machines_of(run)),
     ]
     if sums.pictures and not run.work.draws_on_gpu and settings.mode is RenderMode.AUTO:
         drawn = f"{sums.pictures * factor:,.0f} pictures of {settings.width}x{settings.height}"
@@ -164,27 +164,49 @@ def estimate_run_size(run: Run, refs: Sequence[ClipRef]) -> str:
     return "\n".join([*lines, *sums.notes])
 
 
-def _time_line(run: Run, hours: Mapping[str, float]) -> str:
+def _time_line(run: Run, hours: Mapping[str, float], there: "Machines") -> str:
     """How long that takes on what there is, what holds it up, and what memory it wants."""
-    cores = run.config.workers or os.cpu_count() or 1
+    cores = run.config.workers or there.cores
     most = max(hours, key=lambda stage: hours[stage])
     spent, bound = sum(hours.values()) / cores, f"{most}, {hours[most] / max(sum(hours.values()), 1e-9):.0%} of it"
     told = f"{spent:.2f} h on {cores} cores"
     if run.work.draws_on_gpu:
         # At most: a fit has its turn for its iterations alone.
         of_gpus = hours.get("reconstruct", 0.0) / FITS_AT_ONCE + run.config.gpu_share * hours.get("render", 0.0)
-        gpus = _gpus()
+        gpus = max(there.gpus, 1)  # what was measured on, where a cluster has none yet
         told += f"; {of_gpus:.2f} GPU-hours, {of_gpus / gpus:.2f} h on {gpus} GPUs"
         if of_gpus / gpus > spent:
             bound = "the GPUs"
     claim = max(task.memory_gb for task in TASKS)
-    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    return f"{told}, most in {bound}; at most {claim:g} GB a worker, {claim * cores:g} of {there:.0f} GB here"
+    memory = f"at most {claim:g} GB a worker, {claim * cores:g} of {there.memory_gb:.0f} GB {there.where}"
+    return f"{told}, most in {bound}; {memory}"
 
 
-def _gpus() -> int:
-    """Of this machine, which draws with some."""
-    return int(require()[0].cuda.device_count())
+@dataclass(frozen=True)
+class Machines:
+    """What a run would have."""
+
+    where: str
+    cores: int
+    gpus: int
+    memory_gb: float
+
+
+def machines_of(run: Run) -> Machines:
+    """All nodes of the cluster that the run would join, else this machine. Raises ConnectionError where none answers.
+
+    The memory of a cluster is what Ray hands out.
+    """
+    if run.config.executor == "ray" and os.environ.get("RAY_ADDRESS"):
+        from factory.graph.on_ray.graph import joined_cluster, per_node
+
+        with joined_cluster():
+            cores = per_node("CPU")
+            where = f"on {len(cores)} nodes"
+            return Machines(where, sum(cores), sum(per_node("GPU")), sum(per_node("memory")) / 2**30)
+    gpus = int(require()[0].cuda.device_count()) if run.work.draws_on_gpu else 0
+    memory_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return Machines("here", os.cpu_count() or 1, gpus, memory_gb)
 
 
 def paper_deviations_line(config: RunConfig, vocabulary: Vocabulary, tables: Mapping[str, int]) -> str:

@@ -13,8 +13,9 @@ import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -115,6 +116,19 @@ def join_or_start_cluster(workers: int | None) -> bool:
             raise
         raise ConnectionError(no_cluster_text(named, error)) from error
     return where == "local"
+
+
+@contextmanager
+def joined_cluster() -> Iterator[None]:
+    """The cluster of RAY_ADDRESS, left again by who was not in it. Raises ConnectionError where nothing answers."""
+    joins = not ray.is_initialized()
+    if joins:
+        join_or_start_cluster(None)
+    try:
+        yield
+    finally:
+        if joins:
+            ray.shutdown()
 
 
 def tasks_at_once(workers: int | None, is_ours: bool) -> int:

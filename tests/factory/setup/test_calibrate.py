@@ -5,11 +5,21 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from ray.cluster_utils import Cluster
 
+from factory.__main__ import main as factory
 from factory.config.run import load_config
-from factory.setup import calibrate
-from factory.setup.calibrate import estimate_run_size
+from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
+from factory.pipeline import FactoryWork
+from factory.setup.calibrate import Machines, _time_line, estimate_run_size
 from factory.setup.settings import assemble
+from tasks.render.fit import on_torch, reconstruct
+from tasks.render.fit.on_torch import TorchBackend
+from tasks.render.scene import on_device
+from tasks.render.scene.on_device import Device
+from tasks.render.splatting import gsplat_backend
+from tests.bench.by_kernels import by_kernels, rasterization
+from tests.planners.navsim.test_chain import RENDERED, write_navsim
 
 SMALL = (
     "clips=synthetic", "clips.n_clips=4", "vocabulary.k=16", "experts=[pdm_closed,human]", "rounds=1",
@@ -36,13 +46,44 @@ def test_a_fit_is_counted_for_each_block_and_not_again_once_it_is_there(tmp_path
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").glob("**/*.parquet"))
 
 
-def test_eight_gpus_have_a_bill_of_their_own_and_hold_the_run_up_where_they_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fits by two at a time, pictures by `gpu_share`; on so many cores the rest is done sooner."""
-    monkeypatch.setattr(calibrate, "_gpus", lambda: 8)
+def test_gpus_hold_a_run_up_where_the_cores_are_done_sooner() -> None:
+    """Fits by two at a time, pictures by `gpu_share`."""
     run = SimpleNamespace(config=SimpleNamespace(workers=2000, gpu_share=0.1), work=SimpleNamespace(draws_on_gpu=True))
     hours = {"reconstruct": 600.0, "perturb": 40.0, "reward": 60.0, "render": 500.0}
-    said = calibrate._time_line(run, hours)  # type: ignore[arg-type]
+    said = _time_line(run, hours, Machines("here", 4, 8, 64.0))  # type: ignore[arg-type]
     assert "0.60 h on 2000 cores; 350.00 GPU-hours, 43.75 h on 8 GPUs" in said and "the GPUs" in said
-    run.config.workers = 4
-    said = calibrate._time_line(run, hours)  # type: ignore[arg-type]
+    run.config.workers = None
+    said = _time_line(run, hours, Machines("here", 4, 8, 64.0))  # type: ignore[arg-type]
     assert "300.00 h on 4 cores" in said and "reconstruct, 50% of it" in said and "the GPUs" not in said
+
+
+@pytest.mark.slow
+def test_navsim_s_logs_are_billed_for_the_gpus_of_a_cluster(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Measured on a device that computes as this package's kernels do; two nodes have 32 cores and four GPUs each, in
+    name."""
+    write_navsim(tmp_path)
+    monkeypatch.setattr(on_device, "cuda", lambda packed: Device("cpu", rasterization, packed))
+    monkeypatch.setattr(on_torch, "TorchBackend", lambda draw, device: TorchBackend(by_kernels, "cpu"))
+    monkeypatch.setattr(reconstruct, "take_gpu", lambda: 0)
+    monkeypatch.setattr(gsplat_backend, "require", lambda: (None, None))
+    monkeypatch.setattr(FactoryWork, "warm", lambda self: None)  # which builds gsplat's extension
+    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 32, "num_gpus": 4, "include_dashboard": False})
+    try:
+        nodes.add_node(num_cpus=32, num_gpus=4)
+        monkeypatch.setenv("RAY_ADDRESS", nodes.address)
+        clips = [f"clips.root={tmp_path / 'navsim_logs/mini'}", f"clips.maps={tmp_path / 'maps'}"]
+        clips += [f"clips.sensors={tmp_path / 'sensor_blobs/mini'}", f"clips.cache_dir={tmp_path / 'kept'}"]
+        how = ["render.backend=gsplat", "render.frames=now", "executor=ray", "rounds=1", "vocabulary.k=16"]
+        how += [*(key for key in RENDERED if "frames" not in key), "reward.labels=none", "experts=[pdm_closed]"]
+        asked = ["clips=navsim", *clips, "+clips.stride_s=4.0", *how, f"out={tmp_path / 'out'}"]
+        assert factory(["plan", *asked]) == 0
+        assert not ray.is_initialized(), "who joined a cluster to look at it has left it"
+    finally:
+        nodes.shutdown()
+    said = capsys.readouterr().out
+    number = "([0-9.]+)"
+    bill = f"{number} h on 64 cores; {number} GPU-hours, {number} h on 8 GPUs, most in .* GB on 2 nodes"
+    assert re.search(bill, said), said
+    assert re.search(f"  reconstruct +{number} a block", said) and re.search(f"  render +{number} a clip", said)
