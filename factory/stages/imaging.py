@@ -43,7 +43,7 @@ from tasks.render.scene.movers import agents_at_time
 from tasks.render.scene.sensed import Photo
 from tasks.render.seen import PhotoSights, photo_sights
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
-from tasks.render.views import MAP_RIG, draw_map_views, render_views
+from tasks.render.views import MAP_RIG, draw_map_views, views_by_instant
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentTracks, Camera, Clip, Scene, SensorFile
@@ -189,14 +189,14 @@ class Imaging:
         steps = [scene.step + offset for offset in offsets]
         seen = (cameras, poses, agents, steps, self.settings.width, self.settings.height)
         if asset is None:
-            images = draw_map_views(clip.road_map, *seen)
+            images = iter(draw_map_views(clip.road_map, *seen))
         else:
             lifted = asset.lifted(agents, clip_offset_s(clip))
-            images = render_views(asset, cameras, poses, lifted, *seen[3:], self.settings.backend)
+            images = views_by_instant(asset, cameras, poses, lifted, *seen[3:], self.settings.backend)
         found = [
-            self.image(camera.name, offset * STEP_S, poses[f], images[f, c])
-            for f, offset in enumerate(offsets)
-            for c, camera in enumerate(cameras)
+            self.image(camera.name, offset * STEP_S, pose, rgb)
+            for offset, pose, pictures in zip(offsets, poses, images, strict=True)
+            for camera, rgb in zip(cameras, pictures, strict=True)
         ]
         source = ImageSource.MAP if asset is None else ImageSource.RENDER
         measured: dict[str, object] = {}

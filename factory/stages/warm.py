@@ -323,7 +323,7 @@ def _compile_gpu() -> None:
     eye = Pinhole(np.array([[20.0, 0.0, 16.0], [0.0, 20.0, 16.0], [0.0, 0.0, 1.0]]), np.eye(4), 32, 32)
     instant = Instant([eye], NOBODY, [np.eye(3, 4, dtype=np.float32)])
     try:
-        on_device.pictures(on_device.cuda(packed=True), scene, [instant], [None])
+        next(on_device.pictures(on_device.cuda(packed=True), scene, [instant], [None]))
     except (
         RuntimeError,
         OSError,

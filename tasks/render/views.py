@@ -1,6 +1,6 @@
 """What the rig sees from poses nobody drove, with the agents where the simulation put them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -29,7 +29,21 @@ def render_views(
     height: int,
     backend: Backend = Backend.CPU,
 ) -> Bytes:
-    """Images (F, C, height, width, 3) rgb.
+    """Images (F, C, height, width, 3) rgb of F instants: `views_by_instant`, all at once."""
+    return np.stack(list(views_by_instant(asset, cameras, world_from_ego, agents, steps, width, height, backend)))
+
+
+def views_by_instant(
+    asset: RenderAsset,
+    cameras: Sequence[Camera],
+    world_from_ego: Array,
+    agents: AgentTracks,
+    steps: Sequence[float],
+    width: int,
+    height: int,
+    backend: Backend = Backend.CPU,
+) -> Iterator[Bytes]:
+    """Images (C, height, width, 3) rgb of one instant after the other; a GPU draws the next ones meanwhile.
 
     `world_from_ego` (F, 4, 4) in 3-D (`pose_on_ground`), `steps` (F,) rows of `agents` at these instants, or between
     two. The images are those of ideal pinholes, `camera.resized(width, height)` with distortion zero: photos are

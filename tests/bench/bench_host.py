@@ -21,7 +21,7 @@ from tasks.render.scene.asset import Exposure, OwnBody, RenderAsset
 from tasks.render.scene.on_device import Device
 from tasks.render.scene.sky import plain_sky
 from tasks.render.settings import Backend, RenderSettings
-from tasks.render.views import render_views
+from tasks.render.views import views_by_instant
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import AgentKind, AgentTracks, Camera
 from tests.bench.bench_render import cloud
@@ -72,23 +72,26 @@ def nothing_is_drawn(**given: Any) -> Any:
     return torch.empty(*shape, 4, **like), torch.empty(*shape, 1, **like), None
 
 
+def drawn(*asked: Any, **how: Any) -> list[Bytes]:
+    """The pictures of all instants, as a sample's are asked for."""
+    return list(views_by_instant(*asked, **how))
+
+
 def row(width: int, height: int, gaussians: int, vehicles: int, instants: int, repeats: int) -> None:
     """One size."""
     rig = ring(width, height)
     asset, agents = street(gaussians, vehicles, rig)
     poses: Array = np.tile(np.eye(4), (instants, 1, 1))
-    draw = partial(render_views, asset, rig, poses, agents, [float(5 * i) for i in range(instants)], width, height)
+    draw = partial(drawn, asset, rig, poses, agents, [float(5 * i) for i in range(instants)], width, height)
     each = 1.0 / instants
     by_kernels = cpu_milliseconds(draw, 1) * each
-    seen: Bytes = draw()
-    on_device.cuda = lambda packed: Device("meta", nothing_is_drawn, packed, lambda tensor: seen.copy())  # type: ignore[assignment]
-    draws: Callable[[], Bytes] = partial(draw, backend=Backend.GSPLAT)
+    seen: list[Bytes] = draw()
+    on_device.cuda = lambda packed: Device("meta", nothing_is_drawn, packed, lambda tensor: seen[0].copy())  # type: ignore[assignment]
+    draws: Callable[[], list[Bytes]] = partial(draw, backend=Backend.GSPLAT)
     left = cpu_milliseconds(draws, repeats) * each
-    copied = cpu_milliseconds(seen.copy, repeats) * each
+    copied = cpu_milliseconds(lambda: [pictures.copy() for pictures in seen], repeats) * each
     quality = RenderSettings().jpeg_quality
-    jpeg = (
-        cpu_milliseconds(lambda: [encode_jpeg(p, quality) for p in seen.reshape(-1, *seen.shape[2:])], repeats) * each
-    )
+    jpeg = cpu_milliseconds(lambda: [encode_jpeg(p, quality) for pictures in seen for p in pictures], repeats) * each
     total = (left + jpeg) / 1e3
     print(f"| {width}x{height} | {by_kernels:.0f} | {left:.1f} | {copied:.1f} | {jpeg:.1f} | {total:.3f} |", flush=True)
 

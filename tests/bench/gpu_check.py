@@ -81,7 +81,7 @@ class Place:
     def engine(self, asset: RenderAsset, cameras: Sequence[Pinhole], packed: bool) -> Bytes:
         """Finished pictures (C, H, W, 3) as the render stage has them."""
         instant, bodies = Instant(cameras, NOBODY, [SCENE_S_OWN] * len(cameras)), [None] * len(cameras)
-        return pictures(replace(self.drawing, packed=packed), asset, [instant], bodies)[0]
+        return next(pictures(replace(self.drawing, packed=packed), asset, [instant], bodies))
 
     def done(self) -> None:
         """Waits for what was asked of the device."""
@@ -255,7 +255,7 @@ def views(place: Place, n: int, sizes: Sequence[tuple[int, int]], threads: int) 
         most, k = 0.0, np.array([[0.6 * width, 0.0, width / 2], [0.0, 0.6 * width, height / 2], [0.0, 0.0, 1.0]])
         cameras = [Pinhole(k, _shifted(0.1 * i), width, height) for i in range(RIG)]
         eyes = [Eye(k, c.world_from_camera, width, height, still) for c in cameras]
-        expected = render_pictures(asset, [Instant(cameras, NOBODY, [SCENE_S_OWN] * RIG)], [None] * RIG)[0]
+        expected = next(render_pictures(asset, [Instant(cameras, NOBODY, [SCENE_S_OWN] * RIG)], [None] * RIG))
         on_cpu = place.timed(partial(render, asset, cameras[:1], threads=threads))
         single = np.concatenate([place.engine(asset, [c], True) for c in cameras])
         for many, at_once, packed in WAYS:

@@ -6,7 +6,7 @@ call (`gsplat_dense` without packing what they see). All draw ideal pinholes: a 
 photos before they enter a scene (`views.undistorted`), so that images at new poses need none.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -58,20 +58,26 @@ def render_pictures(
     instants: Sequence[Instant],
     bodies: Sequence[OwnBody | None],
     backend: Backend = Backend.CPU,
-) -> Bytes:
-    """Pictures (F, C, H, W, 3) of F instants, whose cameras are of one size, with the `bodies` that these see of their
-    own car; from a GPU nothing else comes back. Raises BackendMissing where the backend cannot work on this machine."""
+) -> Iterator[Bytes]:
+    """Pictures (C, H, W, 3) of one instant after the other, whose cameras are of one size, with the `bodies` that these
+    see of their own car; from a GPU nothing else comes back.
+
+    Raises BackendMissing where the backend cannot work on this machine.
+    """
     if backend.on_gpu:
         from tasks.render.scene import on_device  # torch is loaded only where it is asked for
 
         return on_device.pictures(gpu(backend), asset, [_in_scene(asset, instant) for instant in instants], bodies)
-    first = instants[0].cameras[0]
-    out = np.empty((len(instants), len(bodies), first.height, first.width, 3), np.uint8)
-    for row, instant in zip(out, instants, strict=True):
-        for picture, view, body in zip(row, _render_on_cpu(asset, instant, 1, with_depth=False), bodies, strict=True):
-            cv2.convertScaleAbs(view.rgb, picture, 255.0)
-            if body is not None:
-                body.draw_on(picture)
+    return (_pictures_on_cpu(asset, instant, bodies) for instant in instants)
+
+
+def _pictures_on_cpu(asset: RenderAsset, instant: Instant, bodies: Sequence[OwnBody | None]) -> Bytes:
+    first = instant.cameras[0]
+    out = np.empty((len(bodies), first.height, first.width, 3), np.uint8)
+    for picture, view, body in zip(out, _render_on_cpu(asset, instant, 1, with_depth=False), bodies, strict=True):
+        cv2.convertScaleAbs(view.rgb, picture, 255.0)
+        if body is not None:
+            body.draw_on(picture)
     return out
 
 

@@ -10,7 +10,7 @@ reference by tests.bench.peer_gsplat. Nothing but render.backend=gsplat loads to
 
 import weakref
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from math import pi
@@ -84,10 +84,11 @@ def views(device: Device, asset: RenderAsset, instant: Instant) -> list[View]:
 @torch.inference_mode()
 def pictures(
     device: Device, asset: RenderAsset, instants: Sequence[Instant], bodies: Sequence[OwnBody | None]
-) -> Bytes:
-    """(F, C, H, W, 3) of F instants, whose cameras are of one size, with what each camera sees of its own car.
+) -> Iterator[Bytes]:
+    """(C, H, W, 3) of each instant, whose cameras are of one size, with what each camera sees of its own car.
 
-    Nothing is waited for before the last one was asked for: the device is not idle between instants.
+    Nothing is waited for before the last one was asked for: the device is not idle between instants, and draws on
+    while whoever asked is busy with the first.
     """
     drawn = []
     for instant in instants:
@@ -99,7 +100,7 @@ def pictures(
                 over, share = _body(device, body, picture.shape[1], picture.shape[0])
                 picture.mul_(1.0 - share).add_(over * share).round_()
         drawn.append(rounded.to(torch.uint8))
-    return np.asarray(device.fetch(torch.stack(drawn)))
+    return (np.asarray(device.fetch(of_instant)) for of_instant in drawn)
 
 
 # What lies there stays as long as the objects that it was made of, which nobody changes.

@@ -2,6 +2,7 @@
 
 import gc
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from tasks.render.scene.on_device import Device, finished
 from tasks.render.scene.sky import SkyMap
 from tasks.render.settings import Backend
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
-from tasks.render.views import render_views
+from tasks.render.views import render_views, views_by_instant
 from tasks.world.arrays import F32
 from tasks.world.clip import AgentKind, Camera, Pinhole
 from tests.bench.by_kernels import rasterization
@@ -73,6 +74,28 @@ def test_samples_pictures_are_the_kernels_to_a_step_of_8_bits(rich: RenderAsset)
     apart = np.abs(drawn[0].astype(int) - drawn[1])
     assert apart.max() <= 1 and (apart > 0).mean() < 0.01
     assert (np.abs(drawn[0][:, 1].astype(int) - drawn[0][:, 0]) > 30).mean() > 0.2, "both look at something else"
+
+
+def test_all_instants_are_asked_for_before_the_first_comes_back_alone(
+    rich: RenderAsset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that JPEGs of one are made while the next are drawn."""
+    told: list[str] = []
+
+    def drawn(**given: Any) -> Any:
+        told.append("asked")
+        return rasterization(**given)
+
+    def fetch(tensor: torch.Tensor) -> np.ndarray:
+        told.append("fetched")
+        return tensor.numpy()
+
+    monkeypatch.setattr(on_device, "cuda", lambda packed: Device("cpu", drawn, packed, fetch))
+    rig = [Camera("a", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), turned(0.0))]
+    poses = np.stack([street.ego_pose(x, 0.6) for x in (1.5, 2.5, 3.5)])
+    for pictures in views_by_instant(rich, rig, poses, street.tracks(), [4, 9, 14], 96, 54, Backend.GSPLAT):
+        told.append(f"encoded {len(pictures)}")
+    assert told == ["asked"] * 3 + ["fetched", "encoded 1"] * 3
 
 
 def test_views_of_cameras_of_any_size_in_their_order(rich: RenderAsset) -> None:
