@@ -6,6 +6,7 @@
     python -m planners evaluate benchmark=runs/hard planner=runs/gtrs +settings.inference_entries=8192
 
     python -m planners evaluate benchmark=navhard data=/data/openscene planner=runs/ltf
+    python -m planners evaluate benchmark=navtest planner=human limit=100 pictures=false check=rows.csv   a page of both
 
 The benchmark is the folder that `python -m factory.run preset=hard_benchmark` or `python -m factory import` made, or
 `navhard` or `navtest`, which are made of NAVSIM's folders first and are among the public traffic unless
@@ -28,6 +29,7 @@ prepares of a frame, so name several at once.
 
 import json
 import os
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -60,6 +62,7 @@ from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.bootstrap import Interval, cluster_labels_by_level, paired_interval
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.navsim import write_tables
+from planners.evaluation.navsim_check import write_check
 from planners.evaluation.planner_names import EvaluatedPlanner, compose_with_planner, find_planners, needs_of
 from planners.evaluation.planning import all_plans
 from planners.evaluation.score_rows import RECORD, FrameRow, is_done, read_rows, write_record, write_rows
@@ -104,12 +107,18 @@ class EvaluateSettings:
     planners_at_once: int = 8  # in memory, planning from one reading of the samples
     device: str = "cpu"  # or cuda
     limit: int | None = None  # the first so many clips only
+    check: str | None = None  # of navtest: NAVSIM's own rows of the same planner (.csv, .csv.gz); writes check.html
+    navsim_python: str | None = None  # of NAVSIM's environment, whose solver the check tries; null: this one
     tables: bool = True  # summary.csv of all planners; false where others follow into the same out
 
     def __post_init__(self) -> None:
         for name in ("batch_size", "planners_at_once", "limit"):
             if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.check is None and self.navsim_python is not None:
+            raise ValueError("navsim_python= is of check=<NAVSIM's rows>")
+        if self.check is not None and self.planner is None:
+            raise ValueError("check= holds one planner against its published rows: give planner=, such as human")
 
     @property
     def rules(self) -> Rules:
@@ -319,5 +328,10 @@ def run_evaluation(settings: EvaluateSettings) -> None:
     }
     for line in what_decides(results):
         print(line)
+    if settings.check is not None:
+        (own, *_) = find_planners(settings.planner, None, False, settings.settings)
+        rows, page = read_rows(Path(settings.out) / own.label), Path(settings.out) / "check.html"
+        python = settings.navsim_python or sys.executable
+        print("\n".join(write_check(page, benchmark, rows, Path(settings.check), python)))
     if settings.tables:
         print(f"look at {Path(settings.out) / 'summary.csv'}")

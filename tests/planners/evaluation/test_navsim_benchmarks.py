@@ -1,14 +1,19 @@
 """NAVSIM's benchmarks by their names: one command from its folders to the table, made once, refused by what lacks."""
 
+import csv
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from factory.datasets.navsim.commands import IN_DEVKIT
 from planners.evaluation.evaluate import main
-from planners.evaluation.navsim import read_table
+from planners.evaluation.navsim import LONG, read_table, score_of_columns
+from planners.evaluation.navsim_check import solver_line
+from tasks.reward.aggregate import COLUMNS
+from tasks.subscores import OF_ONE_PLAN
 from tests.factory.datasets.navsim.navsim_town import NOW, TOKENS, frames_of, write_installation
 
 pytestmark = pytest.mark.slow  # a town, a city's map, PDM-Closed
@@ -112,3 +117,42 @@ def test_a_folder_without_logs_or_scenes_is_named(
     monkeypatch.delenv("NAVSIM_DEVKIT_ROOT")
     assert main(words(root, "navtest", tmp_path)) == 2
     assert "give split=... or set NAVSIM_DEVKIT_ROOT" in capsys.readouterr().err
+
+
+def test_navtest_is_checked_against_published_rows_on_one_page(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Rows of the audit have no extended comfort; what differs is counted, and drawn first."""
+    told = [*words(root, "navtest", tmp_path), "limit=1"]
+    assert main(told) == 0
+    with (tmp_path / "out" / "constant_velocity" / "navsim_unfiltered.csv").open() as file:
+        (row, _) = csv.DictReader(file)
+    ours = {name: float(row[name]) for name in (LONG[name] for name in OF_ONE_PLAN)}
+    named = np.full(len(COLUMNS), np.nan)
+    for name in OF_ONE_PLAN:
+        named[COLUMNS.index(name)] = ours[LONG[name]]
+    published = tmp_path / "rows.csv"
+    capsys.readouterr()
+    for changed, n in ((0.0, 0), (0.25, 1)):
+        line = {**ours, LONG["ep"]: ours[LONG["ep"]] - changed, "score": score_of_columns(named[None])[0]}
+        with published.open("w") as file:
+            table = csv.DictWriter(file, ["token", *line])
+            table.writeheader()
+            table.writerows({"token": token, **line} for token in (row["token"], "f" * 16))
+        assert main([*told, f"check={published}"]) == 0
+        said = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines() if line}
+        assert said["numpy"][-4:] == ["sound", "in", "501", "plans"] and said["1"][1] == "tokens"
+        assert [said[LONG[name]][-2] for name in ("ep", "nc")] == [str(n), "0"] and said["score"][-2] == "0"
+        page = (tmp_path / "out" / "constant_velocity" / ".." / "check.html").read_text()
+        assert row["token"] in page and page.count("data:image/jpeg") == 1
+    assert main([*told, f"check={published}", "navsim_python=/bin/false"]) == 2
+    assert "navsim_python=/bin/false: no message: give the python of" in capsys.readouterr().err
+    published.write_text("token,score\nf,1.0\n")
+    assert main([*told, f"check={published}"]) == 2
+    assert "no column 'no_at_fault_collisions'" in capsys.readouterr().err
+
+
+def test_an_affected_solver_is_named_with_what_it_makes_of_a_speed() -> None:
+    found = {"numpy": "1.23.4", "python": "3.9", "machine": "x", "plans": 501, "wrong": 2, "worst_mps": -491.2}
+    line = solver_line({**found, "speed_mps": 12.533835468245853})
+    assert "IS AFFECTED: 2 of 501 speeds are wrong, such as -491.2 m/s for 12.5338; OPENBLAS_CORETYPE=" in line
