@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from factory.config.arguments import GIVEN_ALONE, POSITIONAL, RUN_SETTINGS, Refused, request_keys, run_command
 from factory.config.datasets import find_function
+from factory.config.shapes import key_of
 from factory.config.words import did_you_mean
 from factory.exits import COMPLETE, INTERRUPTED, Stopped
 from factory.views.sample_text import find_sample_id, logged_drive, open_samples
@@ -47,6 +48,7 @@ class ExportRequest:
     resize: bool = False
     missing: Literal["refuse", "black", "none"] = "refuse"
     map_location: str = ""
+    for_: Literal["simscale", "drivor"] = "simscale"
     vocabulary: str | None = None
     executor: Literal["local", "ray"] = "local"
     workers: int | None = None
@@ -57,7 +59,9 @@ class ExportRequest:
             return
         for name in [f.name for f in fields(self) if f.name not in EVERYWHERE]:
             if getattr(self, name) != getattr(type(self), name):
-                raise ValueError(f"{name}=...: of export navsim alone; {self.format} takes sample= or every=, and to=")
+                raise ValueError(
+                    f"{key_of(name)}=...: of export navsim alone; {self.format} takes sample= or every=, and to="
+                )
         if (self.sample is None) == (self.every is None):
             raise ValueError("give either sample=<id> or every=<n>; see --help")
         if self.every == 0:
@@ -93,6 +97,7 @@ def export(request: ExportRequest) -> int:
         resize=true         pictures of other sizes to 1920x1080, which the released agents take for granted
         missing=black|none  for pictures that a sample has not: a black one, or none; refuse is the default
         map_location=<one>  of NAVSIM's four, for logs whose map has another name
+        for=drivor          as DrivoR's training reads it: PDM-Closed's rounds 0 to 4, 14 frames, its configurations
         vocabulary=<.npy>   the trajectories that the labels are of, to be written beside the rewards
         executor=ray        workers on Ray: the cluster of RAY_ADDRESS, whose nodes see `out` and `to` by the same
                             paths, or one of this machine's own; local (the default): processes

@@ -10,11 +10,12 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
+from keyword import iskeyword
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from factory.config.compose import conf_dir, config_groups
 from factory.config.plugins import group_choices
-from factory.config.shapes import allowed_values, defaults_of, required_keys, to_plain, yaml_lines
+from factory.config.shapes import allowed_values, defaults_of, key_of, required_keys, to_plain, yaml_lines
 from factory.config.words import SEVERAL, SHOW, ConfigError, SettingsShown, did_you_mean, expand_home, split_off_cfg
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, Failed, Stopped
 
@@ -179,11 +180,12 @@ def parse(shape: type[Request], argv: Sequence[str]) -> Request:
     kinds, words, rest = request_keys(shape), fields_with(shape, POSITIONAL), fields_with(shape, RUN_SETTINGS)
     given: dict[str, Any] = dict.fromkeys(rest, ())
     for argument in argv:
-        key, equals, value = argument.partition("=")
+        word, equals, value = argument.partition("=")
+        key = f"{word}_" if iskeyword(word) else word
         if key in kinds and value:
             if key in given:
-                raise Refused(f"{key} is given twice")
-            given[key] = expand_home(_value(key, value, kinds[key]), key)
+                raise Refused(f"{word} is given twice")
+            given[key] = expand_home(_value(word, value, kinds[key]), word)
         elif words and not equals and not argument.startswith("-"):
             name = words[0]
             if get_origin(kinds[name]) is tuple:
@@ -195,7 +197,7 @@ def parse(shape: type[Request], argv: Sequence[str]) -> Request:
         elif rest:
             given[rest[0]] += (argument,)
         else:
-            known = [f"{name}=" for name in kinds]
+            known = [f"{key_of(name)}=" for name in kinds]
             near = "" if key in kinds else did_you_mean(key, known)
             raise Refused(f"{argument!r}: expected one of {'..., '.join(known)}...; see --help{near}")
     if shows:

@@ -11,6 +11,7 @@ import tokenize
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, is_dataclass
 from enum import Enum
+from keyword import iskeyword
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -135,7 +136,12 @@ def yaml_lines(
             yield f"{pad}{name}:{comment}"
             yield from yaml_lines(value, others.get(path, dataclass_in(hints.get(name))), others, path)
         else:
-            yield f"{pad}{name}: {_scalar(value)}{comment}"
+            yield f"{pad}{key_of(name)}: {_scalar(value)}{comment}"
+
+
+def key_of(name: str) -> str:
+    """The key of a field; that of `for_` is `for`, which is a word of Python."""
+    return name[:-1] if name.endswith("_") and iskeyword(name[:-1]) else name
 
 
 def _scalar(value: Any) -> str:

@@ -7,7 +7,8 @@ whole goes on.
 
 import json
 import os
-from collections.abc import Mapping
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,11 @@ from typing import Any
 from factory.config.arguments import Refused
 from factory.config.words import ConfigError
 from factory.datasets.navsim.benchmarks import NavsimFolders, import_navhard, import_navtest
-from factory.datasets.navsim.export import Each, ExportSummary, export
-from factory.datasets.navsim.frames import ExportSettings
-from factory.datasets.navsim.import_rows import import_identity, import_rows
+from factory.datasets.navsim.export import Each, ExportSummary, export, scene_filter_yaml
+from factory.datasets.navsim.frames import N_FUTURE, ExportSettings
+from factory.datasets.navsim.import_rows import NO_PICTURES, import_identity, import_rows
 from factory.datasets.navsim.reader import Selection, read_selection
-from factory.datasets.navsim.simscale import RewardFiles, SimscaleImport, simscale_folders
+from factory.datasets.navsim.simscale import RewardFiles, SimscaleFolder, SimscaleImport, simscale_folders
 from factory.exits import INTERRUPTED, Stopped
 from factory.files import matching, why_unusable
 from factory.graph.execute import RunSummary
@@ -47,7 +48,28 @@ def import_simscale(request: Any, store: Store) -> tuple[RunSummary, str]:
     if maps is not None and not maps.is_dir():
         raise Refused(f"maps={request.maps}: no such folder")
     wanted = SimscaleImport(maps, request.pictures, rewards)
-    return import_rows(store, import_identity(request.source, settings), wanted.entries(parts)), ""
+    summary = import_rows(store, import_identity(request.source, settings), wanted.entries(parts))
+    return summary, "\n".join(_list_usable(store, parts))
+
+
+def _list_usable(store: Store, parts: Sequence[SimscaleFolder]) -> Iterator[str]:
+    """Write usable/<name>.yaml, a scene filter of the logs that were imported; a line of counts for each folder."""
+    made: dict[tuple[str, int], list[tuple[str, str]]] = defaultdict(list)
+    for row in store.samples.read(["expert", "candidate_index", "log_id", "frame_tokens"]).to_pylist():
+        made[row["expert"], row["candidate_index"]].append((row["log_id"], row["frame_tokens"]))
+    failed = store.outcomes.read(["attempt_id", "expert", "candidate_index", "error"]).to_pylist()
+    lacking = Counter(
+        (row["expert"], row["candidate_index"])
+        for row in failed
+        if NO_PICTURES in (row["error"] or "") and row["attempt_id"] not in store.samples
+    )
+    for part in parts:
+        key, n_logs = (part.expert, part.candidate), len(matching(part.logs, "*.pkl"))
+        scenes = [part.names_of(log_id, tokens) for log_id, tokens in sorted(made[key])]
+        file = f"usable/{part.name}.yaml"
+        store.location.write(file, scene_filter_yaml(scenes, N_FUTURE).encode())
+        told = f"{n_logs:,} logs, {len(scenes):,} usable, {lacking[key]:,} without pictures"
+        yield f"{part.name}: {told}; the usable ones: {store.location.uri}/{file}"
 
 
 def import_two_stage_benchmark(request: Any, store: Store) -> tuple[RunSummary, str]:
@@ -72,7 +94,13 @@ def export_samples(request: Any, table: KeyedTable, to: Path, trajectories: Arra
     """All samples that the command asks for, as `factory.datasets.navsim.export.export`."""
     rounds = tuple(int(word) for word in request.round)
     named = {name: getattr(request, name) for name in ("tag", "resize", "missing", "map_location")}
-    return export(table, to, ExportSettings(request.expert, rounds, request.split, **named), trajectories, each)
+    return export(
+        table,
+        to,
+        ExportSettings(request.expert, rounds, request.split, **named, consumer=request.for_),
+        trajectories,
+        each,
+    )
 
 
 def _folder(path: str | None) -> Path | None:

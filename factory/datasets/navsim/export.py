@@ -19,15 +19,18 @@ import numpy as np
 from factory.datasets.navsim.frames import (
     BLACK,
     CONFIG,
+    DRIVOR_EXPERT,
+    DRIVOR_ROUNDS,
     MOTION,
-    N_FUTURE,
     N_HISTORY,
     NAMING,
+    RELEASED,
     REWARDS,
     CannotExport,
     ExportSettings,
     SplitNames,
     black_picture,
+    consumer_of,
     is_simulated,
     openscene_frames,
     public_map_location,
@@ -76,7 +79,7 @@ class WrittenLog:
     image_source: str
     sizes: tuple[str, ...]  # of the pictures as written
     distorted: bool  # these are as a lens makes them
-    absent_pictures: int  # of the history's 32
+    absent_pictures: int  # of those that the consumer opens
     left_out_cameras: tuple[str, ...]
     files: tuple[WrittenFile, ...]  # the pickle last
 
@@ -138,7 +141,7 @@ class Journal:
             path.unlink()
             return
         header, *rest = (json.loads(line) for line in data[:whole].splitlines())
-        if header["settings"] != self.settings:
+        if {"consumer": "simscale"} | header["settings"] != self.settings:
             raise ValueError(f"{path}: is of an export with other settings, {header['settings']}: name another folder")
         self.facts |= header
         for entry in rest:
@@ -167,14 +170,17 @@ def _written(stored: Mapping[str, Any]) -> WrittenLog:
 LISTS = {"test": "test_logs", "train": "train_logs", "val": "val_logs"}  # by a sample's split
 
 
-def scene_filter_yaml(logs: Sequence[WrittenLog]) -> str:
-    """Of navsim.common.dataclasses.SceneFilter; unknown keys would be refused (NS dataclasses.py:733-778)."""
+def scene_filter_yaml(scenes: Sequence[tuple[str, str]], n_future: int) -> str:
+    """Of navsim.common.dataclasses.SceneFilter; unknown keys would be refused (NS dataclasses.py:733-778).
+
+    scenes: log and token of each; n_future: frames.
+    """
     return "".join(
         (
             "_convert_: all\n_target_: navsim.common.dataclasses.SceneFilter\nframe_interval: 1\nhas_route: true\n",
-            _list("log_names", (log.log for log in logs)),
-            f"max_scenes: null\nnum_future_frames: {N_FUTURE}\nnum_history_frames: {N_HISTORY}\n",
-            _list("tokens", (log.token for log in logs)),
+            _list("log_names", (log for log, _ in scenes)),
+            f"max_scenes: null\nnum_future_frames: {n_future}\nnum_history_frames: {N_HISTORY}\n",
+            _list("tokens", (token for _, token in scenes)),
         )
     )
 
@@ -270,6 +276,10 @@ def export(
     splits: dict[SplitNames, list[PlannedSample]] = defaultdict(list)
     for sample in planned.values():
         splits[sample.split].append(sample)
+    if settings.consumer == "drivor":  # it opens all five rounds, also those that hold nothing
+        for number in DRIVOR_ROUNDS:
+            splits.setdefault(split_names({"expert": DRIVOR_EXPERT, "candidate_index": 0, "round": number}), [])
+        trajectories = None  # nor does it read rewards: it scores its own plans
     stale = _tidy(journal, planned, splits)
     todo = [sample for sample in planned.values() if not _is_whole(journal, sample)]
     say(f"{len(planned):,} samples chosen, {len(planned) - len(todo):,} of them are there already")
@@ -282,7 +292,7 @@ def export(
     logs = [journal.logs[key] for key in sorted(planned)]
     say("splits, rewards, checksums")
     files = [*_write_split_files(to, settings, logs, splits)]
-    rewards, without = _reward_files(table, to, splits)
+    rewards, without = _reward_files(table, to, splits) if settings.consumer == "simscale" else ([], 0)
     files += rewards
     if trajectories is not None:
         data = BytesIO()
@@ -298,12 +308,16 @@ def plan_export(table: KeyedTable, settings: ExportSettings) -> dict[tuple[str, 
     found: dict[tuple[str, str], PlannedSample] = {}
     seen: dict[str, set[str]] = defaultdict(set)
     tokens: dict[tuple[str, str], str] = {}
-    for sample in _all_rows(table, settings.tag):
+    for sample in _all_rows(table, settings):
         row = sample.row
         for name, value in (("expert", row["expert"]), ("round", str(row["round"])), ("split", row["split"])):
             seen[name].add(value)
         if not _chosen(row, settings):
             continue
+        if settings.consumer == "drivor" and row["round"] not in DRIVOR_ROUNDS:
+            raise CannotExport(
+                f"sample {row['attempt_id']}: of round {row['round']}, and DrivoR reads 0 to 4: round=0,1"
+            )
         public_map_location(row, settings)
         here = (sample.split.folder, sample.token)
         if sample.key in found or here in tokens:
@@ -341,7 +355,7 @@ def write_row_group(table: Location, root: Path, settings: ExportSettings, group
 
 
 def _write_log(root: Path, settings: ExportSettings, row: Sample) -> WrittenLog:
-    names, split = sample_names(row), split_names(row, settings.tag)
+    names, split = sample_names(row, settings), split_names(row, settings.tag)
     seen = sample_pictures(row, names, settings)
     frames = openscene_frames(row, names, seen.cams, settings)
     files = [write_file(root, split.picture(path), jpeg) for path, jpeg in seen.pictures]
@@ -386,19 +400,20 @@ def _write_logs(
                 say(f"{done:,} of {len(todo):,} logs, {rate_text(rate, ' logs')}, {left} left")
 
 
-def _all_rows(table: KeyedTable, tag: str) -> Iterator[PlannedSample]:
+def _all_rows(table: KeyedTable, settings: ExportSettings) -> Iterator[PlannedSample]:
     for path, partition in sorted(table.live_files().items()):
         file = open_parquet(table.location, path)
         for group in range(file.metadata.num_row_groups):
             for number, row in enumerate(read_rows(file, group, partition, PLANNED)):
-                names = sample_names(row)
+                names = sample_names(row, settings)
                 yield PlannedSample(
-                    split_names(row, tag), names.log, names.token, _made_of(row), row, path, group, number
+                    split_names(row, settings.tag), names.log, names.token, _made_of(row), row, path, group, number
                 )
 
 
 def _chosen(row: Sample, settings: ExportSettings) -> bool:
-    wanted = (settings.experts, row["expert"]), (settings.rounds, row["round"]), (settings.splits, row["split"])
+    experts = (DRIVOR_EXPERT,) if settings.consumer == "drivor" else settings.experts
+    wanted = (experts, row["expert"]), (settings.rounds, row["round"]), (settings.splits, row["split"])
     return all(not values or value in values for values, value in wanted)
 
 
@@ -408,7 +423,8 @@ def _made_of(row: Sample) -> str:
 
 def _summary(journal: Journal, written: int, facts: Mapping[str, Any], files: Sequence[WrittenFile]) -> ExportSummary:
     n_bytes = sum(file.bytes for file in (*files, *(file for log in journal.logs.values() for file in log.files)))
-    return ExportSummary(written, len(journal.logs), n_bytes, tuple(_notes(facts, [file.path for file in files])))
+    notes = _notes(facts, [file.path for file in files], journal.settings["consumer"])
+    return ExportSummary(written, len(journal.logs), n_bytes, tuple(notes))
 
 
 def _is_whole(journal: Journal, sample: PlannedSample) -> bool:
@@ -434,19 +450,41 @@ def _write_split_files(
     root: Path, settings: ExportSettings, logs: Sequence[WrittenLog], splits: Iterable[SplitNames]
 ) -> Iterator[WrittenFile]:
     """The YAML files of each split, of the logs that the public loader takes, and its black picture."""
-    folder = f"{CONFIG}/common/train_test_split"
+    n_future, drivor = consumer_of(settings).n_future, settings.consumer == "drivor"
+    all_taken: list[WrittenLog] = []
     for split in sorted(splits):
         of_split = [log for log in logs if log.folder == split.folder]
         taken = [log for log in of_split if log.has_route]
-        yield write_file(root, f"{folder}/scene_filter/{split.yaml}.yaml", scene_filter_yaml(taken).encode())
+        all_taken += taken
         # What run_dataset_caching takes as train_test_split; data_split is the folder that the logs really lie in.
-        content = f"data_split: {split.folder}\ndefaults:\n- scene_filter: {split.yaml}\n"
-        yield write_file(root, f"{folder}/{split.yaml}.yaml", content.encode())
+        yield from _write_split(root, "train_test_split", split.yaml, split.folder, taken, n_future)
         # Which logs a training takes, and which it validates on (SS training/dataset.py:129-146).
         lists = (_list(key, (log.log for log in taken if log.data_split == name)) for name, key in LISTS.items())
         yield write_file(root, split.log_split, "".join(lists).encode())
-        if settings.missing == "black" and any(log.absent_pictures for log in of_split):
+        if any(log.absent_pictures for log in of_split) and (drivor or settings.missing == "black"):
             yield write_file(root, split.picture(BLACK), black_picture())
+        if drivor:
+            yield from _write_split(root, SYNTHETIC, split.folder, split.folder, taken, n_future)
+            for folder in (Path(split.log("")).parent, split.picture("")):
+                (root / folder).mkdir(parents=True, exist_ok=True)
+            if not taken:  # a cache of nothing, which nobody can make: without it the agent does not start
+                yield write_file(root, f"exp/train_metric_{split.folder}/metadata/none.csv", b"file_name\n")
+    if drivor:
+        whole = f"synthetic_reaction_{RELEASED[DRIVOR_EXPERT]}_v1.0"
+        yield from _write_split(root, SYNTHETIC, whole, whole, all_taken, n_future)
+
+
+SYNTHETIC = "train_test_split_synthetic"  # DrivoR's group of configurations
+
+
+def _write_split(
+    root: Path, group: str, name: str, folder: str, logs: Sequence[WrittenLog], n_future: int
+) -> Iterator[WrittenFile]:
+    """A scene filter, and the split that names it and the logs' folder."""
+    scenes = scene_filter_yaml([(log.log, log.token) for log in logs], n_future)
+    yield write_file(root, f"{CONFIG}/common/{group}/scene_filter/{name}.yaml", scenes.encode())
+    content = f"data_split: {folder}\ndefaults:\n- scene_filter: {name}\n"
+    yield write_file(root, f"{CONFIG}/common/{group}/{name}.yaml", content.encode())
 
 
 def _reward_files(
@@ -509,17 +547,21 @@ def _facts(
     }
 
 
-def _notes(facts: Mapping[str, Any], files: Sequence[str]) -> Iterator[str]:
+def _notes(facts: Mapping[str, Any], files: Sequence[str], consumer: str) -> Iterator[str]:
     """What a training would stumble over."""
     rewards = any(path.startswith(REWARDS) for path in files)
     if n := facts["without_route"]:
         yield f"{n:,} logs have no route: the public loader leaves them out, and so do the lists of splits"
     if n := facts["logs_with_absent_pictures"]:
         yield f"{n:,} logs lack pictures that the released agents open"
-    if odd := [size for size in facts["picture_sizes"] if size != "1920x1080"]:
+    if consumer == "drivor":
+        yield "samples end 4 s after now: in a log's fifth second everyone goes straight on at the last velocity"
+    elif odd := [size for size in facts["picture_sizes"] if size != "1920x1080"]:
         yield f"pictures are {', '.join(odd)}: the released agents cut them as if they were 1920x1080; see resize=true"
     if names := facts["cameras_left_out"]:
         yield f"cameras {', '.join(names)} stand for none of NAVSIM's eight and are left out"
+    if consumer == "drivor":
+        return
     if not rewards:
         yield "no sample has vocabulary labels: there are no rewards, which GTRS needs and the other planners do not"
     elif n := facts["without_rewards"]:

@@ -1,4 +1,4 @@
-"""A sample as the twelve frames of an OpenScene log, dictionaries as NAVSIM's loader reads them, and its pictures."""
+"""A sample as the frames of an OpenScene log, dictionaries as NAVSIM's loader reads them, and its pictures."""
 
 import hashlib
 import re
@@ -22,6 +22,7 @@ from tasks.world.frames import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, YAW_RATE
 # What an export is asked for.
 
 Missing = Literal["refuse", "black", "none"]
+ConsumerName = Literal["simscale", "drivor"]
 
 MAP_LOCATIONS = ("sg-one-north", "us-ma-boston", "us-nv-las-vegas-strip", "us-pa-pittsburgh-hazelwood")
 PUBLIC_SIZE = (1920, 1080)  # pixels; the released agents cut their pictures as if they were this large
@@ -42,8 +43,11 @@ class ExportSettings:
     resize: bool = False  # pictures of other sizes, to PUBLIC_SIZE
     missing: Missing = "refuse"  # pictures of eight cameras and four instants that a sample has not
     map_location: str = ""  # of all samples; empty: what their maps say
+    consumer: ConsumerName = "simscale"  # whose training reads it
 
     def __post_init__(self) -> None:
+        if self.consumer == "drivor" and (self.tag or set(self.experts) - {DRIVOR_EXPERT}):
+            raise ValueError(f"for=drivor: it reads reaction_pdm alone: without tag=, and expert={DRIVOR_EXPERT}")
         if self.tag and not (self.tag.isascii() and self.tag.replace("_", "").isalnum()):
             raise ValueError(f"tag={self.tag}: letters, digits and _ alone, as it becomes part of names")
         if self.map_location and self.map_location not in MAP_LOCATIONS:
@@ -51,6 +55,36 @@ class ExportSettings:
                 f"map_location={self.map_location}: the public code knows {', '.join(MAP_LOCATIONS)} "
                 "(navsim/common/dataclasses.py:441)"
             )
+
+
+# What reads an export. Of DrivoR: valeoai/TOAD @ 0110647, the code of valeoai/DrivoR.
+
+DRIVOR_EXPERT, DRIVOR_ROUNDS = "pdm_closed", range(5)  # navsim/agents/drivoR/drivor_agent.py:104-108
+
+
+@dataclass(frozen=True)
+class Consumer:
+    """What a public training opens of a log."""
+
+    n_future: int  # frames
+    cameras: tuple[str, ...]
+    instants: tuple[int, ...]  # frames, of these cameras
+    blackened: tuple[str, ...]  # cameras that a rig need not have: a black picture stands for theirs
+    opens: str  # the same in words
+
+    @property
+    def n_frames(self) -> int:
+        """Of a log."""
+        return N_HISTORY + self.n_future
+
+
+def consumer_of(settings: ExportSettings) -> Consumer:
+    """Of an export."""
+    if settings.consumer == "simscale":
+        return Consumer(N_FUTURE, CAMERAS, tuple(range(N_HISTORY)), (), "eight cameras at four instants")
+    cameras = ("CAM_F0", "CAM_L0", "CAM_R0", "CAM_B0")  # config/common/agent/drivoR.yaml
+    # Its scorer's time to collision looks 1 s behind the 4 s of a plan.
+    return Consumer(10, cameras, (NOW_FRAME,), ("CAM_B0",), f"{', '.join(cameras)} at now")
 
 
 # How logs, frames, splits and files are named, so that the public code finds them and tells real from simulated.
@@ -61,7 +95,7 @@ class ExportSettings:
 HORIZON_S = HORIZON_STEPS * STEP_S
 FRAME_S = 0.5
 N_HISTORY, N_FUTURE = 4, 8  # frames; the history's last is now
-N_FRAMES = N_HISTORY + N_FUTURE
+N_FRAMES = N_HISTORY + N_FUTURE  # that a row reaches to
 NOW_FRAME = N_HISTORY - 1
 HEX16 = re.compile(r"[0-9a-f]{16}")
 RELEASED = {"pdm_closed": "pdm"}  # our names of experts by which SimScale's splits go
@@ -110,8 +144,8 @@ class SampleNames:
 
     log: str  # the pickle's stem and every frame's log_name
     scene: str  # scene_token and log_token
-    tokens: tuple[str, ...]  # (N_FRAMES,)
-    times_s: tuple[float, ...]  # (N_FRAMES,) since the source log's first instant
+    tokens: tuple[str, ...]  # (F,)
+    times_s: tuple[float, ...]  # (F,) since the source log's first instant
     suffix: str  # of every token: the round of a simulated sample, empty for a human one
 
     @property
@@ -125,14 +159,21 @@ class SampleNames:
         return self.scene if self.suffix else self.log
 
 
-def sample_names(row: Mapping[str, Any]) -> SampleNames:
-    """Names of a row with the columns NAMING."""
+def sample_names(row: Mapping[str, Any], settings: ExportSettings) -> SampleNames:
+    """Names of a row with the columns NAMING.
+
+    DrivoR takes a log for one of round k when its name holds -00k anywhere (run_training_full_simscale.py:87-97): what
+    reads so before the round becomes -f0k.
+    """
     now_s = float(row["clip_start_s"]) + float(row["now_s"])
-    times_s = tuple(now_s + (i - NOW_FRAME) * FRAME_S for i in range(N_FRAMES))
+    times_s = tuple(now_s + (i - NOW_FRAME) * FRAME_S for i in range(consumer_of(settings).n_frames))
     suffix = f"-{int(row['round']):03d}" if is_simulated(row) else ""
     tokens = tuple(frame_token(row, time_s) + suffix for time_s in times_s)
-    scene = frame_token(row, now_s - HORIZON_S if suffix else now_s) + suffix
-    return SampleNames(f"{source_log_name(row['dataset'], row['log_id'])}-{scene}", scene, tokens, times_s, suffix)
+    scene = frame_token(row, now_s - HORIZON_S if suffix else now_s)
+    log = f"{source_log_name(row['dataset'], row['log_id'])}-{scene}"
+    if settings.consumer == "drivor":
+        log = re.sub("-00(?=[0-4])", "-f0", log)
+    return SampleNames(log + suffix, scene + suffix, tokens, times_s, suffix)
 
 
 CONFIG = "devkit/navsim/planning/script/config"  # below NAVSIM_DEVKIT_ROOT, once devkit/ is copied over it
@@ -183,18 +224,21 @@ MOTION = (
 
 @dataclass(frozen=True)
 class EgoMotion:
-    """The ego at N_FRAMES instants; velocity and acceleration in ego axes, at the rear axle."""
+    """The ego at F frames; velocity and acceleration in ego axes, at the rear axle."""
 
-    poses: Array  # (12, 3) x, y [m], heading [rad], world
-    local: Array  # (12, 3) the same in the frame of the ego at now
-    global_from_ego: Array  # (12, 4, 4) m
-    quaternions: Array  # (12, 4) w, x, y, z of its rotation
-    dynamics: Array  # (12, 4) vx, vy [m/s], ax, ay [m/s2]
-    yaw_rates: Array  # (12,) rad/s
+    poses: Array  # (F, 3) x, y [m], heading [rad], world
+    local: Array  # (F, 3) the same in the frame of the ego at now
+    global_from_ego: Array  # (F, 4, 4) m
+    quaternions: Array  # (F, 4) w, x, y, z of its rotation
+    dynamics: Array  # (F, 4) vx, vy [m/s], ax, ay [m/s2]
+    yaw_rates: Array  # (F,) rad/s
 
 
-def ego_motion(row: Mapping[str, Any]) -> EgoMotion:
-    """Of a row with the columns MOTION: what it holds exactly where it does, else from its poses at 10 Hz."""
+def ego_motion(row: Mapping[str, Any], n_frames: int = N_FRAMES) -> EgoMotion:
+    """Of a row with the columns MOTION: what it holds exactly where it does, else from its poses at 10 Hz.
+
+    Frames beyond the row's 4 s go straight on at its last velocity.
+    """
     local = np.concatenate([row["ego_history_10hz"], row["label_10hz"]]).astype(np.float64)  # (56, 3)
     dynamics, yaw_rates = (derived[INSTANTS] for derived in derivatives(local))
     poses = to_world(np.asarray(row["now_pose"]), local[INSTANTS])
@@ -208,6 +252,11 @@ def ego_motion(row: Mapping[str, Any]) -> EgoMotion:
     else:  # that log at T is now, and at T+H the last frame
         logged = np.asarray(row["parent_states"])[:, [VX, VY, AX, AY]]
         dynamics[[NOW_FRAME, N_FRAMES - 1]] = logged
+    after_s = FRAME_S * np.arange(1, n_frames - N_FRAMES + 1)[:, None]
+    ahead = np.hstack([dynamics[-1:, :2] * after_s, np.zeros_like(after_s)])
+    poses = np.concatenate([poses, to_world(poses[-1], ahead)])
+    dynamics = np.concatenate([dynamics, np.tile([*dynamics[-1, :2], 0.0, 0.0], (len(after_s), 1))])
+    yaw_rates = np.append(yaw_rates, np.zeros(len(after_s)))
     stored = [] if row["world_from_ego"] is None else [np.asarray(row["world_from_ego"])]  # at now, and of its pictures
     stored += [np.asarray(image["ego_pose"]).reshape(4, 4) for image in row["images"] or ()]
     matrices, quaternions = poses_in_space(poses, np.stack(stored) if stored else np.eye(4)[None])
@@ -259,7 +308,7 @@ def openscene_frames(
     row: Mapping[str, Any], names: SampleNames, cams: tuple[Mapping[str, Any], ...], settings: ExportSettings
 ) -> list[Frame]:
     """The frames of one sample. Raises CannotExport for a place that the public code does not know."""
-    motion, place = ego_motion(row), public_map_location(row, settings)
+    motion, place = ego_motion(row, len(names.tokens)), public_map_location(row, settings)
     command = np.array([row["command"] == name for name in COMMANDS], dtype=np.int64)
     return [
         {
@@ -284,13 +333,13 @@ def openscene_frames(
             "driving_command": command.copy(),
             "cams": cams[i],
             "sample_prev": names.tokens[i - 1] if i > 0 else None,
-            "sample_next": names.tokens[i + 1] if i + 1 < N_FRAMES else None,
+            "sample_next": names.tokens[i + 1] if i + 1 < len(names.tokens) else None,
             "ego2global": motion.global_from_ego[i].copy(),
             "lidar2ego": np.eye(4),
             "lidar2global": motion.global_from_ego[i].copy(),
             "anns": _annotations(row, names, motion, i),
         }
-        for i in range(N_FRAMES)
+        for i in range(len(names.tokens))
     ]
 
 
@@ -321,22 +370,31 @@ def _can_bus(motion: EgoMotion, i: int) -> Any:
 def _lights(row: Mapping[str, Any], i: int) -> list[tuple[int, bool]]:
     states = np.asarray(row["light_states"])  # (S, 56)
     ids = [connector_number(str(lane_id)) for lane_id in row["light_lane_ids"]]
-    return [(number, bool(state[INSTANTS[i]] == RED)) for number, state in zip(ids, states)]
+    return [(number, bool(state[_step_of(i)[0]] == RED)) for number, state in zip(ids, states)]
+
+
+def _step_of(frame: int) -> tuple[int, float]:
+    """The row's step of a frame, and how many seconds after the row's last the frame lies."""
+    return int(INSTANTS[min(frame, N_FRAMES - 1)]), FRAME_S * max(0, frame + 1 - N_FRAMES)
 
 
 def _annotations(row: Mapping[str, Any], names: SampleNames, motion: EgoMotion, i: int) -> dict[str, Any]:
-    """Boxes and velocities in the frame of the ego at this instant, turned by its heading alone, as they are read."""
-    step, ego = INSTANTS[i], motion.local[i]
+    """Boxes and velocities in the frame of the ego at this instant, turned by its heading alone, as they are read.
+
+    After the row's 4 s everyone goes straight on at the last velocity.
+    """
+    (step, after_s), ego = _step_of(i), motion.local[i]
     shape = (len(row["agent_ids"]), AGENT_STEPS)
     here = np.flatnonzero(np.asarray(row["agent_valid"]).reshape(shape)[:, step])
     stored = np.asarray(row["agent_boxes"], np.float64).reshape(*shape, 5)[here, step]
+    of_now = np.asarray(row["agent_velocities"], np.float64).reshape(*shape, 2)[here, step]
+    stored[:, :2] += after_s * of_now
     pose, c, s = to_local(ego, stored[:, :3]), np.cos(ego[2]), np.sin(ego[2])
     boxes, velocities = np.zeros((len(here), 7)), np.zeros((len(here), 3))
     boxes[:, :2], boxes[:, 3:5], boxes[:, 6] = pose[:, :2], stored[:, 3:], pose[:, 2]
     center_z = np.asarray(row["agent_center_z"], np.float64).reshape(shape)[here, step]
     boxes[:, 2] = center_z - motion.global_from_ego[i, 2, 3]
     boxes[:, 5] = np.asarray(row["agent_heights"])[here]
-    of_now = np.asarray(row["agent_velocities"], np.float64).reshape(*shape, 2)[here, step]
     velocities[:, :2] = of_now @ np.array([[c, -s], [s, c]])
     tracks = [str(row["agent_ids"][k]) for k in here]
     return {
@@ -394,8 +452,8 @@ class SamplePictures:
     """A sample's pictures."""
 
     pictures: tuple[tuple[str, bytes], ...]  # where below the split's folder of pictures, and the JPEG
-    cams: tuple[Mapping[str, Mapping[str, Any]], ...]  # (N_FRAMES,) the frames' `cams`
-    absent: int  # of the history's 8 x 4
+    cams: tuple[Mapping[str, Mapping[str, Any]], ...]  # (F,) the frames' `cams`
+    absent: int  # of those that the consumer opens
     left_out: tuple[str, ...]  # cameras of the rig that stand for none of the eight
     sizes: tuple[str, ...]  # width x height [px], as written
     distorted: bool  # as a lens makes them; else of pinholes
@@ -404,16 +462,18 @@ class SamplePictures:
 def sample_pictures(row: Mapping[str, Any], names: SampleNames, settings: ExportSettings) -> SamplePictures:
     """The pictures of a row (columns cameras, images) under its names.
 
-    Raises CannotExport where one of the history's is absent and settings.missing is "refuse".
+    Raises CannotExport where one that the consumer opens is absent and settings.missing is "refuse".
     """
+    opened = consumer_of(settings)
     rig = [_camera(camera) for camera in row["cameras"] or ()]
     chosen = match_cameras(rig)
     stored = {name: _by_frame(row["images"] or (), camera.name) for name, camera in chosen.items()}
-    absent = [(name, i) for name in CAMERAS for i in range(N_HISTORY) if i not in stored.get(name, {})]
-    if absent and settings.missing == "refuse":
-        raise CannotExport(_lacks(row, absent, chosen))
+    absent = [(name, i) for name in opened.cameras for i in opened.instants if i not in stored.get(name, {})]
+    black = [lack for lack in absent if settings.missing == "black" or lack[0] in opened.blackened]
+    if settings.missing == "refuse" and len(black) < len(absent):
+        raise CannotExport(_lacks(row, absent, chosen, opened))
     written = {name: PUBLIC_SIZE if settings.resize else (c.width, c.height) for name, c in chosen.items()}
-    cams: list[dict[str, Mapping[str, Any]]] = [{} for _ in range(N_FRAMES)]
+    cams: list[dict[str, Mapping[str, Any]]] = [{} for _ in names.tokens]
     pictures = []
     for name in CAMERAS:
         camera = chosen.get(name)
@@ -426,7 +486,7 @@ def sample_pictures(row: Mapping[str, Any], names: SampleNames, settings: Export
             if image is not None:
                 assert camera is not None
                 pictures.append((path, _jpeg(image, camera, size)))
-            elif settings.missing == "black" and i < N_HISTORY:
+            elif (name, i) in black:
                 path = BLACK
             cams[i][name] = _entry(path, calibration)
     left_out = tuple(sorted({camera.name for camera in rig} - {camera.name for camera in chosen.values()}))
@@ -490,13 +550,15 @@ def _entry(path: str, camera: Camera) -> Mapping[str, Any]:
     }
 
 
-def _lacks(row: Mapping[str, Any], absent: Sequence[tuple[str, int]], chosen: Mapping[str, Camera]) -> str:
-    nowhere = [name for name in CAMERAS if name not in chosen]
+def _lacks(
+    row: Mapping[str, Any], absent: Sequence[tuple[str, int]], chosen: Mapping[str, Camera], opened: Consumer
+) -> str:
+    nowhere = [name for name in opened.cameras if name not in chosen]
     of_rig = [name for name in chosen if any(camera == name for camera, _ in absent)]
     what = f"no camera stands for {', '.join(nowhere)}" if nowhere else f"{', '.join(of_rig)} lack earlier instants"
     return (
         f"sample {row['attempt_id']}: {what} (images from source {row['image_source']}). The released agents open "
-        "eight cameras at four instants: render with eight cameras and render.frames=history or all, or export with "
+        f"{opened.opens}: render with eight cameras and render.frames=history or all, or export with "
         "missing=black (a black picture stands for what is not there) or missing=none (logs name files that are not "
         "there)"
     )

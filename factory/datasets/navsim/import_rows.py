@@ -62,6 +62,9 @@ HISTORY_FRAMES = FRAMES_BEFORE + 1  # now among them
 SCENE_FRAMES = HISTORY_FRAMES + 8  # with the 4 s that are driven
 
 
+NO_PICTURES = "none of its pictures is in"
+
+
 @dataclass(frozen=True)
 class SceneOrigin:
     """What a scene is called, and what it was read from."""
@@ -143,7 +146,7 @@ def picture_columns(frames: Sequence[Frame], folder: Path, source: ImageSource, 
     """
     images, _ = sensor_files(frames, folder)
     if not images:
-        raise BadClip(file, "cams", f"none of its pictures is in {folder}; pictures=false imports it without")
+        raise BadClip(file, "cams", f"{NO_PICTURES} {folder}; pictures=false imports it without")
     now_s = (len(frames) - 1) * FRAME_STEPS * STEP_S
     rig = {camera.name: camera for camera in cameras_with_pictures(frames[-1], images, file)}
     return {

@@ -121,6 +121,11 @@ class SimscaleFolder:
         """Of its logs' and tokens' names."""
         return "" if self.number is None else f"-{self.number:03d}"
 
+    def names_of(self, log_id: str, frame_tokens: Sequence[str]) -> tuple[str, str]:
+        """Log and token of a row."""
+        seed, frame = frame_tokens
+        return f"{log_id}-{seed}{self.suffix}", f"{seed if self.number is None else frame}{self.suffix}"
+
     @property
     def source(self) -> ImageSource:
         """Of its pictures; NAVSIM's human ones are photos."""

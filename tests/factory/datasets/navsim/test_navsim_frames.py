@@ -38,7 +38,7 @@ Frames = list[dict[str, Any]]
 def frames_of(expert: str, **columns: Any) -> tuple[Any, Frames]:
     """A row, and its log as read back."""
     row = exported(1, expert, **columns)
-    names = sample_names(row)
+    names = sample_names(row, ANY)
     return row, pickle.loads(dumps(openscene_frames(row, names, sample_pictures(row, names, ANY).cams, ANY)))
 
 
@@ -260,7 +260,7 @@ def test_a_scene_without_agents_has_empty_boxes_of_the_same_types() -> None:
 
 def test_a_place_that_the_public_code_does_not_know_is_refused_until_it_is_named() -> None:
     row = exported(0, "human", map_location="PIT_city_47896")
-    names = sample_names(row)
+    names = sample_names(row, ANY)
     with pytest.raises(CannotExport, match=r"its map is of PIT_city_47896.*give map_location="):
         openscene_frames(row, names, ({},) * 12, ANY)
     named = openscene_frames(row, names, ({},) * 12, ExportSettings(map_location="us-ma-boston"))

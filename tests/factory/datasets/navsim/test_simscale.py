@@ -1,12 +1,14 @@
 """SimScale's released layout as samples: what stands in a row, what is counted as failed, what goes on."""
 
 import pickle
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from factory.__main__ import main as factory
 from factory.datasets.navsim import import_rows as table
@@ -88,6 +90,20 @@ def test_between_two_frames_poses_are_linear_and_headings_take_the_short_way(bro
     for k in range(5):  # a share of k fifths of every piece
         wanted = known[:-1] + k / 5 * (known[1:] - known[:-1])
         np.testing.assert_allclose(fine[k:-1:5], wanted, atol=2e-5)
+
+
+def test_logs_without_pictures_are_counted_and_the_others_listed(
+    released: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (shown,) = (released / "sensor_blobs" / PDM).glob(f"{2:016x}*")
+    shutil.rmtree(shown)
+    assert imported(released, tmp_path / "out") == COMPLETE_WITH_FAILURES
+    told = capsys.readouterr().out
+    assert f"{PDM}: 2 logs, 1 usable, 1 without pictures" in told
+    assert f"{RECOVERY}: 1 logs, 1 usable, 0 without pictures" in told
+    listed = yaml.safe_load((tmp_path / "out" / "usable" / f"{PDM}.yaml").read_text())
+    log = simscale.frames(1, 0)
+    assert (listed["log_names"], listed["tokens"]) == ([log[3]["log_name"]], [log[3]["token"]])
 
 
 def test_objects_are_placed_by_the_ego_of_their_frame(brought: Brought) -> None:
