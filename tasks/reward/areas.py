@@ -20,6 +20,8 @@ from tasks.world.arrays import Array, Bools, Bytes, Ints, ShortInts
 from tasks.world.frames import LARGEST, all_within
 from tasks.world.road_map import MapLayer, MapPolygon
 
+Bits = NDArray[np.uint64]
+
 # Map polygons as edges, and what is refused of them.
 
 MIN_WIDTH = 1e-12  # area of a ring over its squared perimeter; what is below is rounding
@@ -107,11 +109,13 @@ SHIFTS = (math.sqrt(5.0), math.sqrt(2.0))  # in x, y: no line of rational slope 
 
 
 class Grid(NamedTuple):
-    """Cells over all edges with free ones around them; a cell's number is row * n_columns + column."""
+    """Cells over all edges with free ones around them, or a window of these; they are numbered row by row."""
 
-    low_x: float  # corner [m]
+    low_x: float  # corner of the whole [m]
     low_y: float
     cell_m: float
+    first_row: int  # of the window
+    first_column: int
     n_rows: int
     n_columns: int
 
@@ -126,14 +130,14 @@ def cover_with_grid(edges: Array) -> tuple[Grid, Ints]:
     while not is_clear:  # nearly always once
         attempt += 1
         grid = _grid(edges, attempt)
-        touched, is_clear = _touched_cells(edges, grid)
+        touched, is_clear = touched_cells(edges, grid)
     return grid, touched
 
 
 def _grid(edges: Array, attempt: int) -> Grid:
     """One of many grids, each with its corner at another place in the cells."""
     if not len(edges):
-        return Grid(0.0, 0.0, CELL_M, 1, 1)
+        return Grid(0.0, 0.0, CELL_M, 0, 0, 1, 1)
     low_x, low_y = edges[:, ::2].min(), edges[:, 1::2].min()
     width, height = edges[:, ::2].max() - low_x, edges[:, 1::2].max() - low_y
     cell_m = max(CELL_M, math.sqrt((width + 4.0 * CELL_M) * (height + 4.0 * CELL_M) / MAX_CELLS))
@@ -142,6 +146,8 @@ def _grid(edges: Array, attempt: int) -> Grid:
         low_x=float(low_x - margin_x),
         low_y=float(low_y - margin_y),
         cell_m=float(cell_m),
+        first_row=0,
+        first_column=0,
         n_rows=int((height + margin_y) / cell_m) + 3,
         n_columns=int((width + margin_x) / cell_m) + 3,
     )
@@ -168,21 +174,41 @@ def line_splits_edge(
 
 
 @kernel
-def changes_along_rows(edges: Array, grid: Grid) -> Ints:
-    """cell << 32 | edge wherever an edge passes between the middles of a cell and of the one on its left."""
+def window_around(grid: Grid, low_x: float, low_y: float, high_x: float, high_y: float) -> Grid:
+    """The part of a whole grid that covers a rectangle [m]; where that reaches beyond, the outermost cells stand."""
+    cell_m, last_row, last_column = grid.cell_m, grid.n_rows - 1.0, grid.n_columns - 1.0
+    first_row = int(min(max((low_y - grid.low_y) / cell_m - 1.0, 0.0), last_row))
+    first_column = int(min(max((low_x - grid.low_x) / cell_m - 1.0, 0.0), last_column))
+    n_rows = int(min(max((high_y - grid.low_y) / cell_m + 1.0, 0.0), last_row)) + 1 - first_row
+    n_columns = int(min(max((high_x - grid.low_x) / cell_m + 1.0, 0.0), last_column)) + 1 - first_column
+    return Grid(grid.low_x, grid.low_y, cell_m, first_row, first_column, n_rows, n_columns)
+
+
+@kernel
+def changes_along_rows(edges: Array, bounded: Bits, grid: Grid) -> tuple[Ints, Bits]:
+    """cell << 32 | edge wherever an edge passes between the middles of a cell and of the one on its left, sorted.
+
+    And the set of regions (rows, W) at the middle of each row's first cell.
+    """
     found = np.empty(_most_cells(edges, grid.cell_m), np.int64)
+    at_start = np.zeros((grid.n_rows, bounded.shape[1]), np.uint64)
     n = 0
     for e in range(edges.shape[0]):
         ax, ay, bx, by = edges[e]
-        row = int((min(ay, by) - grid.low_y) / grid.cell_m - 1.0)
-        y = cell_middle(grid.low_y, grid.cell_m, row)
-        while y < max(ay, by):
+        row = max(int((min(ay, by) - grid.low_y) / grid.cell_m - 1.0) - grid.first_row, 0)
+        y = cell_middle(grid.low_y, grid.cell_m, row + grid.first_row)
+        while y < max(ay, by) and row < grid.n_rows:
             if (ay > y) != (by > y):
-                found[n] = (row * grid.n_columns + _first_right_of(ax, ay, bx, by, y, grid)) << 32 | e
-                n += 1
+                column = _first_right_of(ax, ay, bx, by, y, grid) - grid.first_column
+                if column <= 0:
+                    for w in range(bounded.shape[1]):
+                        at_start[row, w] ^= bounded[e, w]
+                elif column < grid.n_columns:
+                    found[n] = (row * grid.n_columns + column) << 32 | e
+                    n += 1
             row += 1
-            y = cell_middle(grid.low_y, grid.cell_m, row)
-    return found[:n]
+            y = cell_middle(grid.low_y, grid.cell_m, row + grid.first_row)
+    return np.sort(found[:n]), at_start
 
 
 @kernel
@@ -199,7 +225,7 @@ def _first_right_of(ax: float, ay: float, bx: float, by: float, y: float, grid: 
 
 
 @kernel
-def _touched_cells(edges: Array, grid: Grid) -> tuple[Ints, bool]:
+def touched_cells(edges: Array, grid: Grid) -> tuple[Ints, bool]:
     """The pairs of `cover_with_grid`, and whether no middle is on the line of an edge."""
     found = np.empty(_most_cells(edges, grid.cell_m), np.int64)
     n = 0
@@ -209,15 +235,17 @@ def _touched_cells(edges: Array, grid: Grid) -> tuple[Ints, bool]:
         u, v = (ax - grid.low_x) / grid.cell_m, (ay - grid.low_y) / grid.cell_m
         du, dv = (bx - ax) / grid.cell_m, (by - ay) / grid.cell_m
         near = CLEAR_CELLS * grid.cell_m * math.hypot(bx - ax, by - ay)
-        for row in range(int(min(v, v + dv) - SLACK_CELLS), int(max(v, v + dv) + SLACK_CELLS) + 1):
+        low, high = int(min(v, v + dv) - SLACK_CELLS), int(max(v, v + dv) + SLACK_CELLS) + 1
+        for row in range(max(low, grid.first_row), min(high, grid.first_row + grid.n_rows)):
             y = cell_middle(grid.low_y, grid.cell_m, row)
             start, stop = _columns(u, v, du, dv, row)
-            for column in range(start, stop):
+            for column in range(max(start, grid.first_column), min(stop, grid.first_column + grid.n_columns)):
                 side = side_of_edge(ax, ay, bx, by, cell_middle(grid.low_x, grid.cell_m, column), y)
                 is_clear &= abs(side) > near
                 inside = _is_near_cell(u, v, row, column) or _is_near_cell(u + du, v + dv, row, column)
                 entry = e << EDGE | (0 if inside else THROUGH) | (LEFT if side > 0.0 else 0)
-                found[n] = (row * grid.n_columns + column) << 32 | entry
+                cell = (row - grid.first_row) * grid.n_columns + column - grid.first_column
+                found[n] = cell << 32 | entry
                 n += 1
     return found[:n], is_clear
 
@@ -250,8 +278,6 @@ def _most_cells(edges: Array, cell_m: float) -> int:
     return n
 
 
-Bits = NDArray[np.uint64]
-
 # The index.
 
 ROUNDING = 1e-15  # above the error of a difference of two products, relative to their sum
@@ -278,6 +304,8 @@ class MapIndex(NamedTuple):
     low_x: float  # corner of the grid [m]
     low_y: float
     cell_m: float
+    first_row: int  # of the cells
+    first_column: int
     cells: ShortInts  # (rows, columns) set of a cell without edges; -1 - q for crossed cell q
     crossed: ShortInts  # (Q, 6) sets, FIRST, LAST
     entry: ShortInts  # (N,) see cover_with_grid; with the way that passing the edge is a part of
@@ -301,15 +329,45 @@ def index_map(polygons: Sequence[MapPolygon], route_lane_ids: frozenset[str]) ->
     lines = outlines(regions)
     edges, bounded = _merged(lines.edges.view(np.uint64), lines.first, lines.owner, n_words)
     grid, touched = cover_with_grid(edges)
-    changes = np.sort(changes_along_rows(edges, grid))
-    cells, crossed, entry, sets = _arranged(changes, touched, bounded, grid.n_rows * grid.n_columns)
-    _check_rings(regions, lines, edges, bounded, crossed, entry)
-    playing = _packed(plays, n_words)
-    is_played = (sets[:, None] & playing).any(axis=-1)
-    parts = np.packbits(is_played, axis=1, bitorder="little")[:, 0].copy()
-    corner_and_cells = (grid.low_x, grid.low_y, grid.cell_m, cells.reshape(grid.n_rows, grid.n_columns))
     n_lane_words = -(-int(plays[:, LANE].sum()) // 64)
-    return MapIndex(*corner_and_cells, crossed, entry, edges, bounded, sets, parts, playing, n_lane_words)
+    index = assembled(grid, touched, edges, bounded, _packed(plays, n_words), n_lane_words)
+    _check_rings(regions, lines, edges, bounded, index.crossed, index.entry)
+    return index
+
+
+@register_jitable
+def assembled(grid: Grid, touched: Ints, edges: Array, bounded: Bits, playing: Bits, n_lane_words: int) -> MapIndex:
+    """The index of the edges within a grid or a window of it, which all points that are looked up lie in."""
+    changes, at_start = changes_along_rows(edges, bounded, grid)
+    cells, crossed, entry, sets = _arranged(changes, at_start, touched, bounded, grid.n_columns)
+    parts = _parts_of(sets, playing)
+    return MapIndex(
+        grid.low_x,
+        grid.low_y,
+        grid.cell_m,
+        grid.first_row,
+        grid.first_column,
+        cells.reshape(grid.n_rows, grid.n_columns),
+        crossed,
+        entry,
+        edges,
+        bounded,
+        sets,
+        parts,
+        playing,
+        n_lane_words,
+    )
+
+
+@kernel
+def _parts_of(sets: Bits, playing: Bits) -> Bytes:
+    """(S,) bits of the parts that some region of each set plays."""
+    parts = np.zeros(sets.shape[0], np.uint8)
+    for s in range(sets.shape[0]):
+        for part in range(playing.shape[0]):
+            for w in range(sets.shape[1]):
+                parts[s] |= (sets[s, w] & playing[part, w] != 0) << part
+    return parts
 
 
 def _regions(polygons: Sequence[MapPolygon], route_lane_ids: frozenset[str]) -> tuple[list[MapPolygon], Bools]:
@@ -369,16 +427,16 @@ def _merged(ends: Bits, first: Ints, owner: Ints, n_words: int) -> tuple[Array, 
 
 @kernel
 def _arranged(
-    changes: Ints, touched: Ints, bounded: Bits, n_cells: int
+    changes: Ints, at_start: Bits, touched: Ints, bounded: Bits, n_columns: int
 ) -> tuple[ShortInts, ShortInts, ShortInts, Bits]:
-    """`cells` (n_cells,), `crossed`, `entry` and `sets` of the index; changes are sorted."""
+    """`cells`, flat, `crossed`, `entry` and `sets` of the index; see `changes_along_rows`."""
     sides = np.full((bounded.shape[0], 2), -1, np.int32)  # sets last met on the two sides of each edge
-    sets = np.empty((changes.size + 2 * touched.size + 2, bounded.shape[1]), np.uint64)
+    sets = np.empty((len(at_start) + changes.size + 2 * touched.size + 2, bounded.shape[1]), np.uint64)
     sets[0] = 0
     slots = _no_slots(sets.shape[0])
     n_sets = 1 + _row_of(sets, 0, slots)
-    cells = np.zeros(n_cells, np.int32)
-    n_sets = _fill_cells(changes, cells, bounded, sides, sets, slots, n_sets)
+    cells = np.zeros(len(at_start) * n_columns, np.int32)
+    n_sets = _fill_cells(changes, at_start, cells, bounded, sides, sets, slots, n_sets)
     crossed, entry = _crossed(touched, cells)
     n_sets = _find_ways(crossed, entry, bounded, sides, sets, slots, n_sets)
     return cells, crossed, entry, sets[:n_sets].copy()
@@ -386,16 +444,32 @@ def _arranged(
 
 @hidden_kernel
 def _fill_cells(
-    changes: Ints, cells: ShortInts, bounded: Bits, sides: ShortInts, sets: Bits, slots: ShortInts, n_sets: int
+    changes: Ints,
+    at_start: Bits,
+    cells: ShortInts,
+    bounded: Bits,
+    sides: ShortInts,
+    sets: Bits,
+    slots: ShortInts,
+    n_sets: int,
 ) -> int:
-    """Fill in the set at every cell's middle; returns how many sets there are."""
-    current = 0
-    for k in range(changes.size):
-        edge = changes[k] & 0xFFFFFFFF
-        current = _across(bounded, sides, sets, slots, n_sets, current, edge)
+    """Fill in the set at every cell's middle where it is not 0; returns how many sets there are."""
+    k, n_columns = 0, cells.size // len(at_start)
+    for row in range(len(at_start)):
+        for w in range(sets.shape[1]):
+            sets[n_sets, w] = at_start[row, w]
+        current = _row_of(sets, n_sets, slots)
         n_sets = max(n_sets, current + 1)
-        stop = changes[k + 1] >> 32 if k + 1 < changes.size else cells.size
-        cells[changes[k] >> 32 : stop] = current
+        begin, end = row * n_columns, (row + 1) * n_columns
+        while begin < end:
+            stop = min(changes[k] >> 32, end) if k < changes.size else end
+            if current != 0:
+                cells[begin:stop] = current
+            if stop < end:
+                current = _across(bounded, sides, sets, slots, n_sets, current, changes[k] & 0xFFFFFFFF)
+                n_sets = max(n_sets, current + 1)
+                k += 1
+            begin = stop
     return n_sets
 
 
@@ -633,11 +707,13 @@ def _look_up(index: MapIndex, places: Places) -> None:
     """What the index says of the points' cells; its outermost cells, which are empty, stand for all beyond."""
     x, y, found = places.x, places.y, places.number
     low_x, low_y, cell_m = index.low_x, index.low_y, index.cell_m
-    n_rows, n_columns = index.cells.shape
+    first_row, first_column, (n_rows, n_columns) = index.first_row, index.first_column, index.cells.shape
+    last_row, last_column = first_row + n_rows - 1.0, first_column + n_columns - 1.0
+    first = np.int32(first_row * n_columns + first_column)
     for p in range(x.size):
-        column = np.int32(min(max((x[p] - low_x) / cell_m, 0.0), n_columns - 1.0))
-        row = np.int32(min(max((y[p] - low_y) / cell_m, 0.0), n_rows - 1.0))
-        found[p] = row * np.int32(n_columns) + column
+        column = np.int32(min(max((x[p] - low_x) / cell_m, first_column), last_column))
+        row = np.int32(min(max((y[p] - low_y) / cell_m, first_row), last_row))
+        found[p] = row * np.int32(n_columns) + column - first
     cells = index.cells.reshape(-1)
     for p in range(x.size):
         found[p] = cells[found[p]]
