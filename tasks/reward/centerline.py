@@ -97,18 +97,31 @@ def index_centerline(points: Array) -> Centerline:
     Raises ValueError for a line without length.
     """
     xy = np.asarray(points, dtype=np.float64)[:, :2]
-    length = np.sqrt((np.diff(xy, axis=0) ** 2).sum(axis=1))
-    if length.sum() == 0.0:
+    line = line_through(np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1]))
+    if line.segments[-1, 4:].sum() == 0.0:
         raise ValueError("centerline must have a length, got 0 m; give it two points that differ")
-    start = np.concatenate([[0.0], np.cumsum(length[:-1])])
-    segments = np.column_stack([xy[:-1], xy[1:], length, start])
-    first = np.arange(0, len(xy) - 1, CHUNK)
-    n_points = np.minimum(len(xy) - first, CHUNK + 1)
-    members = np.minimum(first[:, None] + np.arange(CHUNK + 1), len(xy) - 1)  # a short chunk repeats the line's end
-    centers = xy[first + n_points // 2]
-    away = xy[members] - centers[:, None]
-    radii = np.hypot(away[..., 0], away[..., 1]).max(axis=1)
-    return Centerline(segments, np.column_stack([centers, radii * SLACK + SLACK_M]))
+    return line
+
+
+@kernel
+def line_through(x: Array, y: Array) -> Centerline:
+    """The index of a line through points (P >= 2,) [m]."""
+    n = len(x) - 1
+    segments, circles = np.empty((n, 6)), np.empty(((n + CHUNK - 1) // CHUNK, 3))
+    along = 0.0
+    for i in range(n):
+        dx, dy = x[i + 1] - x[i], y[i + 1] - y[i]
+        length = math.sqrt(dx * dx + dy * dy)
+        segments[i, 0], segments[i, 1], segments[i, 2], segments[i, 3] = x[i], y[i], x[i + 1], y[i + 1]
+        segments[i, 4], segments[i, 5] = length, along
+        along += length
+    for c in range(len(circles)):
+        first, last = c * CHUNK, min((c + 1) * CHUNK, n)
+        middle, radius = first + (last - first + 1) // 2, 0.0
+        for i in range(first, last + 1):
+            radius = max(radius, math.hypot(x[i] - x[middle], y[i] - y[middle]))
+        circles[c, 0], circles[c, 1], circles[c, 2] = x[middle], y[middle], radius * SLACK + SLACK_M
+    return Centerline(segments, circles)
 
 
 @inlined

@@ -349,8 +349,9 @@ _Columns: Any = make_dataclass("_Columns", [(name, Array) for name in _COLUMNS],
 
 # Rows of a table of scores (N_ROWS, K): the fields of Scores in their order, up to its flags
 N_ROWS = len(_COLUMNS) + 3
+NO_REFERENCE = -1.0  # [m]
 _EP, _N_SCORES = LABELLED.index("ep"), len(LABELLED)
-_EP_RAW_M, _MULTIPLIER, _PDM_SCORE = range(len(_COLUMNS), N_ROWS)
+_EP_RAW_M, _MULTIPLIER, PDM_SCORE = range(len(_COLUMNS), N_ROWS)
 _FACTORS = tuple(LABELLED.index(name) for name in MULTIPLIERS)
 _TERMS = tuple((LABELLED.index(name), weight) for name, weight in WEIGHTS.items())
 
@@ -396,7 +397,7 @@ def score(
     areas, comfort = np.empty((len(states), N_TIMES, 3), np.bool_), np.empty((len(states), N_FLAGS), np.bool_)
     context, in_pairs = rule_context(prepared, with_history), normalise == "pairs"
     obstacles = prepared.indexed_obstacles if len(states) >= INDEX_FROM_ROWS else prepared.obstacles
-    if not _score_all(context, obstacles, states, in_pairs, table, areas, comfort):
+    if not score_all(context, obstacles, states, in_pairs, NO_REFERENCE, table, areas, comfort):
         raise ValueError(f"states must be finite and at most {LARGEST:g}: leave out what is not a drive")
     return Scores(*[*table, areas, comfort])
 
@@ -430,18 +431,19 @@ def select_rows(scores: Scores, index: slice | NDArray[np.integer] | Bools) -> S
 
 
 @kernel
-def _score_all(
+def score_all(
     context: RuleContext,
     obstacles: Obstacles,
     states: Array,  # (K, 41, 11)
     in_pairs: bool,
+    reference_m: float,  # compliant progress of a reference that is not among the states; NO_REFERENCE: there is none
     table: Array,
     areas: Bools,
     comfort: Bools,
 ) -> bool:
     """All rules and sums. One call: on two trajectories entering it takes as long as the rules.
 
-    False where a state is not finite or above LARGEST.
+    table: (N_ROWS, K), areas: (K, 41, 3), comfort: (K, 6), all out. False where a state is not finite or above LARGEST.
     """
     table[:] = math.nan  # what no rule says
     out = Verdicts(table[:_N_SCORES], table[_N_SCORES:_EP_RAW_M], table[_EP_RAW_M], areas, comfort)
@@ -450,25 +452,28 @@ def _score_all(
     for first in range(0, len(states), n):  # the last block is a whole one too, some of it judged again
         if not judge_block(context, obstacles, states, min(first, len(states) - n), n, scratch, out):
             return False
-    _add_up(table, in_pairs)
+    _add_up(table, in_pairs, reference_m)
     return True
 
 
 @kernel
-def _add_up(table: Array, in_pairs: bool) -> None:
+def _add_up(table: Array, in_pairs: bool, reference_m: float) -> None:
     """EP, multiplier and PDM score of a table (N_ROWS, K) from its other rows."""
     for k in range(table.shape[1]):
         multiplier = 1.0
         for row in _FACTORS:
             multiplier *= table[row, k]
         table[_MULTIPLIER, k] = multiplier
-    ep = relative_progress(table[_EP_RAW_M], table[_MULTIPLIER], in_pairs)
+    if reference_m >= 0.0:
+        ep = progress_beside(table[_EP_RAW_M], table[_MULTIPLIER], reference_m)
+    else:
+        ep = relative_progress(table[_EP_RAW_M], table[_MULTIPLIER], in_pairs)
     for k in range(table.shape[1]):
         table[_EP, k] = ep[k]
         total = 0.0
         for row, weight in _TERMS:
             total += weight * table[row, k]
-        table[_PDM_SCORE, k] = table[_MULTIPLIER, k] * total / TOTAL_WEIGHT
+        table[PDM_SCORE, k] = table[_MULTIPLIER, k] * total / TOTAL_WEIGHT
 
 
 @kernel
@@ -478,6 +483,12 @@ def relative_progress(ep_raw_m: Array, multiplier: Array, in_pairs: bool) -> Arr
     if not in_pairs:
         for k in range(len(ep_raw_m)):
             best = max(best, ep_raw_m[k] * multiplier[k])
+    return progress_beside(ep_raw_m, multiplier, best)
+
+
+@kernel
+def progress_beside(ep_raw_m: Array, multiplier: Array, best: float) -> Array:
+    """EP (K,) of each trajectory alone beside a compliant progress `best` [m]."""
     ep = np.ones(len(ep_raw_m))
     for k in range(len(ep_raw_m)):
         best_here = max(best, ep_raw_m[k] * multiplier[k])

@@ -271,7 +271,7 @@ def track(
     ego = _shaped("ego_state0", ego_state0, (EGO_STATE_SIZE,))
     states = np.empty((len(plans), HORIZON_STEPS + 1, EGO_STATE_SIZE))
     given = read_only(ego), read_only(starts), read_only(plans)
-    if not _follow(*given, local, float(vehicle.wheel_base), states):
+    if not follow(*given, local, float(vehicle.wheel_base), states):
         for what, array in (("ego_state0", ego), (name, plans), ("planned_pose0", starts)):
             beyond = np.argwhere(~(np.abs(array) <= LARGEST))
             if len(beyond):
@@ -290,7 +290,7 @@ def _shaped(name: str, value: Array, shape: tuple[int, ...]) -> Array:
 
 
 @kernel
-def _follow(ego: Array, starts: Array, poses: Array, local: bool, wheel_base: float, states: Array) -> bool:
+def follow(ego: Array, starts: Array, poses: Array, local: bool, wheel_base: float, states: Array) -> bool:
     """Fill `states` (K, 41, 11); poses (K, 40, 3), and starts (K, 3) or none, are in the ego's frame if `local`.
 
     False, and nothing filled, where something given is not finite or above LARGEST.

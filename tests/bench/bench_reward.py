@@ -90,11 +90,10 @@ def elsewhere(scene: BenchScene) -> BenchScene:
     return replace(scene, polygons=tuple(replace(polygon) for polygon in scene.polygons))
 
 
-def recorded_row(root: Path, name: str, k: int, peer: str | None) -> Row:
-    """One of the public metric's scenes with its recorded proposals."""
-    module = loader(root)
-    inputs = module.inputs(name)
-    scene = BenchScene(
+def recorded_scene(root: Path, name: str) -> BenchScene:
+    """One of the public metric's scenes."""
+    inputs = loader(root).inputs(name)
+    return BenchScene(
         ego_state0=inputs["ego_state0"],
         past_states=inputs["past_states"],
         centerline=inputs["centerline"],
@@ -102,14 +101,18 @@ def recorded_row(root: Path, name: str, k: int, peer: str | None) -> Row:
         route_lane_ids=frozenset(inputs["route_lane_ids"]),
         objects=logged_tracks(inputs).window(0, N_TIMES),
     )
-    return measured(scene, module.proposals(name, k), peer)
 
 
-def town_row(k: int, peer: str | None) -> Row:
+def recorded_row(root: Path, name: str, k: int, peer: str | None) -> Row:
+    """One of the public metric's scenes with its recorded proposals."""
+    return measured(recorded_scene(root, name), loader(root).proposals(name, k), peer)
+
+
+def town_scene() -> BenchScene:
     """A clip of the synthetic town."""
     reader = SyntheticReader(n_clips=1)
     now = scene_of_clip(reader.read(reader.index().refs[0]))
-    scene = BenchScene(
+    return BenchScene(
         ego_state0=now.ego_state,
         past_states=now.ego_history[list(PAST_STEPS)],
         centerline=now.centerline,
@@ -117,7 +120,11 @@ def town_row(k: int, peer: str | None) -> Row:
         route_lane_ids=now.clip.route.lane_ids,
         objects=now.agents.window(NOW, NOW + N_TIMES),
     )
-    return measured(scene, kinematic_trajectories(k, 0), peer)
+
+
+def town_row(k: int, peer: str | None) -> Row:
+    """A clip of the synthetic town under the kinematic vocabulary."""
+    return measured(town_scene(), kinematic_trajectories(k, 0), peer)
 
 
 def main(root: Path) -> None:
