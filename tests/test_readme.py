@@ -49,6 +49,7 @@ ALL_COMMANDS = [command for page in PAGES for command in commands(page)]
 IN_PROSE = list(dict.fromkeys(command for page in PAGES for command in named_in_prose(page)))
 LOOKS, TRAINS = blocks("README.md", "python")
 RUN_ELSEWHERE = {
+    "docs/bank.md": "tests/tasks/test_bank.py trains with its step",
     "docs/queries.md": "tests/test_queries.py runs them",
 }
 LEFT_OUT = {  # program, and why its commands are not read here; the files that they name have to be there

@@ -1,0 +1,69 @@
+"""Writes the scenes of any reader's clips as a bank that training loops score plans on (docs/bank.md)."""
+
+import multiprocessing
+import zlib
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from itertools import accumulate
+from pathlib import Path
+
+from factory.files import atomic_file
+from factory.readers.base import BadClip, ClipReader, ClipRef
+from tasks.bank import BODY, FORMAT, pack_scene, read_head
+from tasks.caches import Damaged, json_with_checksum
+
+SHARD = 1024  # scenes in a file, some 80 MB; what an interrupted process has to do again at most
+
+
+def write_bank(
+    folder: str | Path, reader: ClipReader, refs: Sequence[ClipRef] | None = None, *, processes: int = 1
+) -> dict[str, str]:
+    """Write the scenes at T of a reader's clips (None: all) to a folder; the same call goes on after an interruption.
+
+    Returns clip id -> why, for clips that cannot be read or scored. processes: above 1 they are spawned, which asks for
+    a reader that pickles and a caller's module that may be imported.
+    Raises Damaged where the folder holds a bank of other clips.
+    """
+    chosen = tuple(reader.index().refs if refs is None else refs)
+    shards = [chosen[first : first + SHARD] for first in range(0, len(chosen), SHARD)]
+    paths = [Path(folder) / f"scenes-{number:05}.json" for number in range(len(shards))]
+    write = partial(_write_shard, reader)
+    if processes == 1:
+        return {clip: why for left in map(write, paths, shards) for clip, why in left.items()}
+    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+        return {clip: why for left in pool.map(write, paths, shards) for clip, why in left.items()}
+
+
+def _write_shard(reader: ClipReader, path: Path, refs: Sequence[ClipRef]) -> dict[str, str]:
+    wanted = {ref.clip_id for ref in refs}
+    if path.exists():
+        head = read_head(path)
+        left: dict[str, str] = head["left_out"]
+        if wanted != {*head["clip_ids"], *left}:
+            raise Damaged(f"{path}: a bank of other clips: choose another folder, or remove it")
+        return left
+    scenes, left_out = dict[str, bytes](), dict[str, str]()
+    for ref in refs:
+        try:
+            scenes[ref.clip_id] = pack_scene(reader.read(ref))
+        except (BadClip, ValueError) as error:
+            left_out[ref.clip_id] = str(error)
+    write_scenes(path, scenes, left_out)
+    return left_out
+
+
+def write_scenes(path: Path, scenes: Mapping[str, bytes], left_out: Mapping[str, str]) -> None:
+    """A shard of packed scenes by clip id: the head `scenes-<number>.json`, and the bytes beside it."""
+    ends = [*accumulate(map(len, scenes.values()), initial=0)]
+    head = {
+        "format": FORMAT,
+        "clip_ids": list(scenes),
+        "ends": ends,
+        "crc32": [zlib.crc32(data) for data in scenes.values()],
+        "left_out": dict(left_out),
+    }
+    with atomic_file(path.with_suffix(BODY), ends[-1]) as draft, draft.open("wb") as file:
+        file.writelines(scenes.values())
+    with atomic_file(path, 100 * len(scenes)) as draft:  # last: a shard with a head is whole
+        draft.write_text(json_with_checksum(head))

@@ -1,0 +1,309 @@
+"""A bank of scenes: the reward of a training step's own proposals, in one call (docs/bank.md).
+
+A scene is kept as its rules take it, packed to the last bit (tasks.reward.packing). What is large of a prepared scene,
+the map's index, is not: it is made anew at every call, of the part of the map that the call's drives reach.
+"""
+
+import os
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.caches import Damaged, parse_json_with_checksum
+from tasks.experts.pdm_closed import plan_for
+from tasks.kernels.compiled import kernel
+from tasks.kernels.threads import run_in_chunks
+from tasks.reward.areas import Grid, RedLanes, assembled, touched_cells, window_around
+from tasks.reward.centerline import line_through
+from tasks.reward.collisions import CIRCUMRADIUS, obstacles_of, with_index
+from tasks.reward.comfort import HISTORY_ROWS, N_FLAGS
+from tasks.reward.epdms import (
+    INDEX_FROM_ROWS,
+    N_ROWS,
+    N_TIMES,
+    NO_REFERENCE,
+    PDM_SCORE,
+    PreparedScene,
+    RuleContext,
+    prepare_scene,
+    score,
+    score_all,
+)
+from tasks.reward.packing import MOST, packed, unpacked
+from tasks.rollout.lqr import follow
+from tasks.subscores import LABELLED, OF_ONE_PLAN
+from tasks.trajectories import COARSE_STEPS, at_ten_hz, interpolated
+from tasks.world.arrays import Array, Bytes
+from tasks.world.clip import HORIZON_STEPS, NOW, Clip, scene_of_clip
+from tasks.world.frames import EGO_STATE_SIZE, LARGEST, PACIFICA, REAR_AXLE_TO_CENTER, X, Y
+
+# A scene as bytes.
+
+N_PARTS = 20
+PLACE, SIZES, EGO, HISTORY, LINE_X, LINE_Y, POINT_X, POINT_Y, EDGE_FROM, EDGE_TO = range(10)
+EDGE_KIND, BOUNDED, PLAYING, BOXES, STOPPED, COLLISION, RED_TIMES, RED_BOUNDS, RED_FIRST, RED_EDGES = range(10, N_PARTS)
+ORDERS = (0, 0, 0, 0, 2, 2, 2, 2, 1, 1, 1, 0, 0, 2, 1, 1, 1, 0, 0, 1)  # of packing
+N_PLACE, N_SIZES, N_LAYERS, BOX = 4, 4, 4, 5  # columns of PLACE and SIZES; parts that a region plays; numbers of a box
+FORMAT = 1
+
+
+def pack_scene(clip: Clip) -> bytes:
+    """A clip's scene at T among the logged traffic, its progress relative to PDM-Closed.
+
+    Raises ValueError as `prepare_scene` for a scene that cannot be scored.
+    """
+    scene = scene_of_clip(clip)
+    prepared = prepare_scene(scene, clip.agents.window(NOW, NOW + N_TIMES))
+    reference = score(prepared, plan_for(scene).driven[None])
+    return pack_prepared(prepared, scene.ego_state, float(reference.ep_raw_m[0] * reference.multiplier[0]))
+
+
+def pack_prepared(prepared: PreparedScene, ego_state: Array, reference_m: float = NO_REFERENCE) -> bytes:
+    """All that `SceneBank.score` asks of a scene, to the last bit.
+
+    ego_state: (11,) where plans begin; reference_m: the reference's progress times its multiplier [m].
+    """
+    index, red, boxes = prepared.map_index, prepared.red_lanes, prepared.obstacles.boxes
+    ends = index.edges.reshape(-1, 2).view(np.int64)  # -0.0 is not 0.0
+    points, first, end = np.unique(ends, axis=0, return_index=True, return_inverse=True)
+    by_place = np.argsort(first)  # along the rings, where the next point is foreseen best
+    end = np.argsort(by_place)[end.ravel()]
+    points, kinds = points[by_place].view(np.float64), np.unique(index.bounded, axis=0, return_inverse=True)
+    parts: list[NDArray[Any]] = [
+        np.array([index.low_x, index.low_y, index.cell_m, reference_m]),
+        np.array([*index.cells.shape, index.n_lane_words, index.bounded.shape[1]]),
+        ego_state,
+        np.empty(0) if prepared.history is None else prepared.history,
+        np.append(prepared.centerline.segments[:, 0], prepared.centerline.segments[-1, 2]),
+        np.append(prepared.centerline.segments[:, 1], prepared.centerline.segments[-1, 3]),
+        *points.T,
+        *(end.reshape(-1, 2).T),
+        kinds[1].ravel(),
+        kinds[0].view(np.int64),
+        index.playing.view(np.int64),
+        boxes.transpose(1, 2, 0),
+        prepared.obstacles.is_stopped,
+        prepared.obstacles.collision_score,
+        red.is_red,
+        red.bounds,
+        red.first,
+        red.edges,
+    ]
+    return packed(parts, ORDERS)
+
+
+OK, DAMAGED, NO_DRIVE = range(3)
+_WHEEL_BASE = PACIFICA.wheel_base
+_SHOWN = tuple(LABELLED.index(name) for name in OF_ONE_PLAN)
+BEYOND_M = REAR_AXLE_TO_CENTER + CIRCUMRADIUS + 1.0  # no part of the body is that far from the rear axle
+
+
+@kernel
+def _score_packed(data: Bytes, poses: Array, in_batch: bool, subscores: Array, scores: Array) -> int:
+    """Sub-scores (P, 8) and scores (P,) of plans (P, 40 or 8, 3) on a packed scene; what went wrong, or OK."""
+    values, starts = unpacked(data, ORDERS)
+    n = starts[1:] - starts[:-1]
+    if len(values) == 0 or n[PLACE] != N_PLACE or n[SIZES] != N_SIZES or n[EGO] != EGO_STATE_SIZE:
+        return DAMAGED
+    floats = values.view(np.float64)
+    at, size = starts[PLACE], starts[SIZES]
+    low_x, low_y, cell_m, reference_m = floats[at], floats[at + 1], floats[at + 2], floats[at + 3]
+    n_rows, n_columns, n_lane_words, n_words = values[size], values[size + 1], values[size + 2], values[size + 3]
+    n_objects, n_lanes, n_edges = n[STOPPED], n[RED_FIRST] - 1, n[EDGE_KIND]
+    if (
+        not (0 < n_rows <= MOST and 0 < n_columns <= MOST // n_rows and 0 <= n_lane_words <= n_words and n_words > 0)
+        or (n[HISTORY] != 0 and n[HISTORY] != HISTORY_ROWS * EGO_STATE_SIZE)
+        or (n[LINE_X] < 2 or n[LINE_X] != n[LINE_Y] or n[POINT_X] != n[POINT_Y])
+        or (n[EDGE_FROM] != n_edges or n[EDGE_TO] != n_edges or n[BOUNDED] % n_words != 0)
+        or (n[PLAYING] != N_LAYERS * n_words or n[BOXES] != n_objects * N_TIMES * BOX or n[COLLISION] != n_objects)
+        or (n_lanes < 0 or n[RED_BOUNDS] != 4 * n_lanes or n[RED_TIMES] != (N_TIMES * n_lanes if n_lanes else 0))
+    ):
+        return DAMAGED
+    high_x, high_y = low_x + n_columns * cell_m, low_y + n_rows * cell_m
+    for p in range(n[POINT_X]):
+        x, y = floats[starts[POINT_X] + p], floats[starts[POINT_Y] + p]
+        if not (low_x <= x <= high_x and low_y <= y <= high_y and abs(x) <= LARGEST and abs(y) <= LARGEST):
+            return DAMAGED
+    edges, bounded = np.empty((n_edges, 4)), np.empty((n_edges, n_words), np.uint64)
+    for e in range(n_edges):
+        start, stop = values[starts[EDGE_FROM] + e], values[starts[EDGE_TO] + e]
+        kind = values[starts[EDGE_KIND] + e]
+        if not (0 <= start < n[POINT_X] and 0 <= stop < n[POINT_X] and 0 <= kind < n[BOUNDED] // n_words):
+            return DAMAGED
+        edges[e, 0], edges[e, 1] = floats[starts[POINT_X] + start], floats[starts[POINT_Y] + start]
+        edges[e, 2], edges[e, 3] = floats[starts[POINT_X] + stop], floats[starts[POINT_Y] + stop]
+        for w in range(n_words):
+            bounded[e, w] = np.uint64(values[starts[BOUNDED] + kind * n_words + w])
+    boxes = np.empty((N_TIMES, n_objects, BOX))
+    for item in range(n_objects):
+        for c in range(BOX):
+            for t in range(N_TIMES):
+                boxes[t, item, c] = floats[starts[BOXES] + (item * BOX + c) * N_TIMES + t]
+    first = values[starts[RED_FIRST] : starts[RED_EDGES]]
+    n_red_edges = n[RED_EDGES] // 4
+    for lane in range(n_lanes):
+        if not 0 <= first[lane] <= first[lane + 1] <= n_red_edges:
+            return DAMAGED
+    red = RedLanes(
+        (values[starts[RED_TIMES] : starts[RED_BOUNDS]] != 0).reshape(N_TIMES if n_lanes else 0, n_lanes),
+        floats[starts[RED_BOUNDS] : starts[RED_FIRST]].copy().reshape(n_lanes, 4),
+        first.copy(),
+        floats[starts[RED_EDGES] : starts[RED_EDGES + 1]].copy().reshape(4, n_red_edges),
+    )
+    obstacles = obstacles_of(
+        boxes, values[starts[STOPPED] : starts[COLLISION]] != 0, floats[starts[COLLISION] : starts[RED_TIMES]].copy()
+    )
+    if len(poses) >= INDEX_FROM_ROWS:
+        obstacles = with_index(obstacles)
+
+    plans = interpolated(poses) if poses.shape[1] == COARSE_STEPS else poses
+    states = np.empty((len(plans), N_TIMES, EGO_STATE_SIZE))
+    ego = floats[starts[EGO] : starts[HISTORY]].copy()
+    if not follow(ego, np.empty((0, 3)), plans, True, _WHEEL_BASE, states):
+        return NO_DRIVE
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for k in range(len(states)):
+        for t in range(N_TIMES):
+            x, y = states[k, t, X], states[k, t, Y]
+            if not (abs(x) <= LARGEST and abs(y) <= LARGEST):
+                return NO_DRIVE
+            low[0], low[1], high[0], high[1] = min(low[0], x), min(low[1], y), max(high[0], x), max(high[1], y)
+    low -= BEYOND_M
+    high += BEYOND_M
+    whole = Grid(low_x, low_y, cell_m, 0, 0, n_rows, n_columns)
+    grid = window_around(whole, low[0], low[1], high[0], high[1])
+    playing = values[starts[PLAYING] : starts[BOXES]].copy().view(np.uint64).reshape(N_LAYERS, n_words)
+    index = assembled(grid, touched_cells(edges, grid)[0], edges, bounded, playing, n_lane_words)
+
+    history = floats[starts[HISTORY] : starts[LINE_X]].copy().reshape(n[HISTORY] // EGO_STATE_SIZE, EGO_STATE_SIZE)
+    line = line_through(floats[starts[LINE_X] : starts[LINE_Y]].copy(), floats[starts[LINE_Y] : starts[POINT_X]].copy())
+    context = RuleContext(line, index, red, history)
+    table = np.empty((N_ROWS, len(states)))
+    areas, comfort = np.empty((len(states), N_TIMES, 3), np.bool_), np.empty((len(states), N_FLAGS), np.bool_)
+    beside = NO_REFERENCE if in_batch else reference_m
+    if not score_all(context, obstacles, states, False, beside, table, areas, comfort):
+        return NO_DRIVE
+    for k in range(len(states)):
+        scores[k] = table[PDM_SCORE, k]
+        for i in range(len(_SHOWN)):
+            subscores[k, i] = table[_SHOWN[i], k]
+    return OK
+
+
+# A folder of them: shards of some thousand scenes, each a file of bytes and a head that says where its scenes are.
+
+Reference = Literal["pdm_closed", "batch"]
+HEAD, BODY = "scenes-*.json", ".bank"
+
+
+@dataclass(frozen=True)
+class BankScores:
+    """Scores of P plans on each of B scenes."""
+
+    subscores: Array  # (B, P, 8) in the order of `names`, 0 .. 1
+    score: Array  # (B, P) EPDMS of one frame, without extended comfort
+    names: tuple[str, ...] = OF_ONE_PLAN
+
+
+class SceneBank:
+    """Scenes by clip id, to score plans on; what `factory.readers.bank.write_bank` wrote. Pickles, and may be forked.
+
+    Raises FileNotFoundError where there are none, Damaged for a head or a body that is not as it was written.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        self._bodies: list[Bytes] = []
+        self._place: dict[str, tuple[int, int, int, int]] = {}  # shard, first byte, past the last, CRC-32
+        heads = sorted(self.folder.glob(HEAD))
+        if not heads:
+            raise FileNotFoundError(f"{folder}: no {HEAD} in it: write it by factory.readers.bank.write_bank")
+        for shard, path in enumerate(heads):
+            head = read_head(path)
+            body = path.with_suffix(BODY)
+            ends = head["ends"]
+            if not body.is_file() or body.stat().st_size != ends[-1]:
+                raise Damaged(f"{body}: not {ends[-1]:,} bytes: remove {path.name} and write the bank again")
+            self._bodies.append(np.memmap(body, np.uint8, "r") if ends[-1] else np.empty(0, np.uint8))
+            places = zip([shard] * len(ends), ends, ends[1:], head["crc32"])
+            self._place.update(zip(head["clip_ids"], places, strict=False))
+        self.clip_ids = tuple(self._place)
+        self._whole: set[str] = set()  # whose bytes were held against their checksum
+
+    def __reduce__(self) -> tuple[type["SceneBank"], tuple[Path]]:
+        return type(self), (self.folder,)
+
+    def __len__(self) -> int:
+        return len(self.clip_ids)
+
+    def n_bytes(self, clip_id: str) -> int:
+        """Of a scene, in the files."""
+        return len(self._bytes_of(clip_id))
+
+    def score(
+        self,
+        clip_ids: Sequence[str],
+        poses: Array,
+        *,
+        reference: Reference = "pdm_closed",
+        threads: int | None = None,
+    ) -> BankScores:
+        """Scores of P plans made at T on each of B scenes, driven by the tracker among the logged traffic.
+
+        Equal to those of `tasks.trajectories.score_trajectories` to the last bit, on any number of threads (None: as
+        many as this process may use). poses: (B, P, 40, 3) at 10 Hz or (B, P, 8, 3) at 2 Hz: x, y [m], heading [rad]
+        in the ego frame at T; a CPU tensor's memory is read as it is. reference: as there.
+        Raises KeyError for an unknown scene, ValueError for other shapes, poses that are no drive or another word, and
+        Damaged where a scene's bytes are not as they were written.
+        """
+        plans = np.require(poses, np.float64, ["C", "W"])
+        if plans.ndim != 4 or len(plans) != len(clip_ids):
+            raise ValueError(
+                f"poses must be ({len(clip_ids)}, P, {HORIZON_STEPS} or {COARSE_STEPS}, 3), got {plans.shape}"
+            )
+        if reference not in get_args(Reference):
+            raise ValueError(f"reference must be one of {get_args(Reference)}, got {reference!r}")
+        n_scenes, n_plans = plans.shape[:2]
+        at_ten_hz(plans.reshape(-1, *plans.shape[2:])[:0])  # its shape
+        scores, subscores = np.empty((n_scenes, n_plans)), np.empty((n_scenes, n_plans, len(OF_ONE_PLAN)))
+        scenes = [self._bytes_of(clip_id) for clip_id in clip_ids]
+
+        def work(b: int, _: int) -> None:
+            went = _score_packed(scenes[b], plans[b], reference == "batch", subscores[b], scores[b])
+            if went == DAMAGED:
+                raise Damaged(
+                    f"{self.folder}: scene {clip_ids[b]}: not as this version writes it: write the bank again"
+                )
+            if went == NO_DRIVE:
+                raise ValueError(f"poses[{b}] ({clip_ids[b]}): a plan or its drive is not finite or above {LARGEST:g}")
+
+        if n_plans:
+            run_in_chunks(work, n_scenes, 1, threads or len(os.sched_getaffinity(0)))
+        return BankScores(subscores, scores)
+
+    def _bytes_of(self, clip_id: str) -> Bytes:
+        if clip_id not in self._place:
+            raise KeyError(f"{self.folder}: no scene {clip_id!r} among its {len(self):,}")
+        shard, first, last, crc = self._place[clip_id]
+        data = self._bodies[shard][first:last]
+        if clip_id not in self._whole:
+            if zlib.crc32(data.tobytes()) != crc:
+                raise Damaged(f"{self.folder}: scene {clip_id}: its checksum is another: write the bank again")
+            self._whole.add(clip_id)
+        return np.asarray(data)
+
+
+def read_head(path: Path) -> dict[str, Any]:
+    """A shard's head: format, clip_ids, ends (first 0), crc32, left_out. Raises Damaged naming the file."""
+    try:
+        head = parse_json_with_checksum(path.read_bytes())
+    except Damaged as error:
+        raise Damaged(f"{path}: {error}: remove it and write the bank again") from error
+    if head["format"] != FORMAT:
+        raise Damaged(f"{path}: format {head['format']}, this version reads {FORMAT}: write the bank again")
+    return head

@@ -1,0 +1,197 @@
+"""A bank of scenes beside the reward without one: `make bench NAME=bank`, `python -m tests.bench.bench_bank`.
+
+The public metric's recorded scenes where they are at hand, else one of the synthetic town. A call scores P plans on
+each of 64 scenes, which are those again and again, on one thread. `today` is a training loop without a bank: the scene
+made ready from its arrays, then tracked and scored. `recorded` says whether all sub-scores and scores of 256 proposals
+are the public ones. The training step is of a head as large as DrivoR's (arXiv 2601.05083, its drivoR.yaml: 64
+proposals of 8 poses, two decoders of 4 layers, 256 wide, on 64 tokens), without pictures; it needs PyTorch.
+
+PEER=<python of an environment with the packages navsim and nuplan-devkit> also runs the public metric, in turns.
+"""
+
+import sys
+import tempfile
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.readers.bank import write_scenes
+from tasks.bank import HEAD, SceneBank, pack_prepared
+from tasks.caches import json_with_checksum
+from tasks.reward.epdms import score
+from tasks.rollout.lqr import track
+from tasks.subscores import RECORDS
+from tasks.world.frames import to_world
+from tasks.world.vocabulary import kinematic_trajectories
+from tests.bench.bench_reward import elsewhere, prepared_scene, recorded_scene, town_scene
+from tests.bench.peer import SAME, BenchScene, beside, peer_python
+from tests.bench.timing import least_and_median_cpu_ms, memory_mb
+from tests.real.reference_scenes import SCENES, loader
+
+B, SIZES, MANY, IN_SHARD, STEPS = 64, (16, 64, 256), 100_000, 1024, 5
+Plans = NDArray[np.float64]
+
+
+def main(root: Path) -> None:
+    """Prints one table, then lines."""
+    has_recorded = (root / "reference").is_dir()
+    if not has_recorded:
+        print(f"no recorded scenes at {root}: a synthetic one instead", file=sys.stderr)
+    scenes = {name: recorded_scene(root, name) for name in SCENES} if has_recorded else {"town": town_scene()}
+    proposals = {
+        name: loader(root).proposals(name, SIZES[-1]) if has_recorded else kinematic_trajectories(SIZES[-1], 0)
+        for name in scenes
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        bank = bank_of(scenes, Path(folder))
+        peer = peer_python()
+        columns = ["scene", "kB", "P", "bank: CPU us each, least / median", "today", "recorded"]
+        columns += ["in turns: ours us each", "public us each", "ratios", "scores"] if peer else []
+        print("| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
+        for name, scene in scenes.items():
+            same = recorded_are(bank, name, proposals[name], root) if has_recorded else "-"
+            for p in SIZES:
+                print(
+                    f"| {name} | {bank.n_bytes(name) / 1e3:.0f} "
+                    + timed(bank, name, scene, proposals[name][:p], same, peer)
+                )
+        print_memory_and_threads(bank, proposals)
+        print_training(bank, proposals)
+    with tempfile.TemporaryDirectory() as folder:
+        print_opening(Path(folder))
+
+
+def bank_of(scenes: dict[str, BenchScene], folder: Path) -> SceneBank:
+    """The scenes without a reference of their own: proposals are a batch."""
+    packed = {name: pack_prepared(prepared_scene(scene), scene.ego_state0) for name, scene in scenes.items()}
+    write_scenes(folder / HEAD.replace("*", "00000"), packed, {})
+    return SceneBank(folder)
+
+
+def recorded_are(bank: SceneBank, name: str, proposals: Plans, root: Path) -> str:
+    """Whether sub-scores and scores of recorded proposals (K, 40, 3) are the recorded ones."""
+    ours, public = bank.score([name], proposals[None]), loader(root).metrics(name, len(proposals))
+    recorded = {record.name: public[record.long_name] for record in RECORDS if record.plans == 1}
+    worst = max(np.abs(ours.subscores[0, :, i] - recorded[known]).max() for i, known in enumerate(ours.names))
+    worst = max(worst, np.abs(ours.score[0] - public["pdm_score"]).max())
+    return "equal" if worst <= SAME else f"differ by {worst:.2g}"
+
+
+def timed(bank: SceneBank, name: str, scene: BenchScene, proposals: Plans, same: str, peer: str | None) -> str:
+    """The rest of a row."""
+    p, ids, many = len(proposals), [name] * B, np.repeat(proposals[None], B, 0)
+
+    def today() -> None:
+        ready = prepared_scene(elsewhere(scene))
+        score(ready, track(scene.ego_state0, proposals, local=True))
+
+    def from_bank() -> SimpleNamespace:
+        found = bank.score([name], proposals[None], threads=1)
+        columns = {known: found.subscores[0, :, i] for i, known in enumerate(found.names)}
+        return SimpleNamespace(**columns, pdm_score=found.score[0])
+
+    ours = least_and_median_cpu_ms(lambda: bank.score(ids, many, threads=1), 10)
+    without = least_and_median_cpu_ms(today, 20)
+    row = " / ".join(f"{1e3 * ms / (B * p):.1f}" for ms in ours)
+    row = f"| {p} | {row} | {' / '.join(f'{1e3 * ms / p:.1f}' for ms in without)} | {same} |"
+    if peer:
+        poses = to_world(scene.ego_state0[:3], proposals)
+        row += f" {beside(peer, scene, poses, from_bank, 5).row(p)} |"  # type: ignore[arg-type]
+    return row
+
+
+def batch_of(bank: SceneBank, proposals: dict[str, Plans], p: int) -> tuple[list[str], Plans]:
+    """Ids (B,) of all scenes in turn and P plans (B, P, 8, 3) of each."""
+    ids = [bank.clip_ids[b % len(bank)] for b in range(B)]
+    return ids, np.stack([proposals[clip_id][:p, 4::5] for clip_id in ids])
+
+
+def print_memory_and_threads(bank: SceneBank, proposals: dict[str, Plans]) -> None:
+    """What a call of 64 x 64 plans adds to the process, and its wall time by threads."""
+    ids, plans = batch_of(bank, proposals, 64)
+    bank.score(ids, plans)
+    before = memory_mb("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew here
+    bank.score(ids, plans)
+    print(f"\n64 scenes x 64 plans at 2 Hz: {memory_mb('VmHWM') - before:.0f} MB more at the peak of a call")
+    for threads in (1, 2):
+        times = []
+        for _ in range(20):
+            begun = time.perf_counter()
+            bank.score(ids, plans, threads=threads)
+            times.append(time.perf_counter() - begun)
+        each_s = float(np.median(times)) / (B * 64)
+        print(f"{threads} thread(s): {1e3 * np.median(times):.1f} ms, {1.0 / each_s:,.0f} plans/s")
+
+
+def print_opening(folder: Path) -> None:
+    """How long a bank takes to be opened whose bodies are holes of the right size."""
+    for number, first in enumerate(range(0, MANY, IN_SHARD)):
+        n = min(IN_SHARD, MANY - first)
+        head = {"format": 1, "clip_ids": [f"{first + i:016x}" for i in range(n)], "crc32": [2**31] * n, "left_out": {}}
+        head["ends"] = [85_000 * i for i in range(n + 1)]
+        path = folder / HEAD.replace("*", f"{number:05}")
+        path.write_text(json_with_checksum(head))
+        with path.with_suffix(".bank").open("wb") as body:
+            body.truncate(85_000 * n)
+    begun, before = time.perf_counter(), memory_mb("VmRSS")
+    bank = SceneBank(folder)
+    seconds = time.perf_counter() - begun
+    print(f"{len(bank):,} scenes opened in {seconds:.2f} s, {memory_mb('VmRSS') - before:.0f} MB")
+
+
+def print_training(bank: SceneBank, proposals: dict[str, Plans]) -> None:
+    """Steps of 64 scenes x 64 proposals with the reward of the step's own proposals and without, in turns."""
+    import torch
+
+    class Head(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.queries = torch.nn.Parameter(torch.randn(64, 256))
+            self.plan, self.judge = (decoder() for _ in range(2))
+            self.to_poses, self.to_scores = torch.nn.Linear(256, 24), torch.nn.Linear(256, 8)
+            self.from_poses = torch.nn.Linear(24, 256)
+
+        def forward(self, tokens: torch.Tensor, anchors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            found = self.plan(self.queries.expand(len(tokens), -1, -1), tokens)
+            plans = anchors + self.to_poses(found).unflatten(-1, (8, 3))
+            return plans, self.to_scores(self.judge(self.from_poses(plans.detach().flatten(2)), tokens))
+
+    def decoder() -> torch.nn.Module:
+        layer = torch.nn.TransformerDecoderLayer(256, 1, 1024, dropout=0.0, batch_first=True)
+        return torch.nn.TransformerDecoder(layer, 4)
+
+    torch.manual_seed(0)
+    planner = Head()
+    optimizer = torch.optim.AdamW(planner.parameters(), 1e-4)
+    ids, plans = batch_of(bank, proposals, 64)
+    anchors, tokens = torch.from_numpy(plans).float(), torch.randn(B, 64, 256)
+
+    def step(with_reward: bool) -> float:
+        begun = time.process_time()
+        found, logits = planner(tokens, anchors)
+        wanted = torch.ones_like(logits)
+        if with_reward:
+            wanted = torch.from_numpy(bank.score(ids, found.detach().numpy()).subscores).float()
+        loss = torch.nn.functional.binary_cross_entropy_with_logits(logits, wanted)
+        loss = loss + torch.nn.functional.l1_loss(found, anchors)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        return time.process_time() - begun
+
+    times: dict[bool, list[float]] = {False: [], True: []}
+    for turn in range(STEPS + 1):
+        for with_reward, seconds in times.items():
+            took = step(with_reward)
+            seconds += [took] if turn else []
+    without, with_it = (min(times[k]) for k in (False, True))
+    size = sum(p.numel() for p in planner.parameters()) / 1e6
+    print(f"a head of {size:.1f} M: CPU time of a step without the reward {without:.2f} s, with it {with_it:.2f} s")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "../shared"))
