@@ -66,7 +66,8 @@ def pack_scene(clip: Clip) -> bytes:
 def pack_prepared(prepared: PreparedScene, ego_state: Array, reference_m: float = NO_REFERENCE) -> bytes:
     """All that `SceneBank.score` asks of a scene, to the last bit.
 
-    ego_state: (11,) where plans begin; reference_m: the reference's progress times its multiplier [m].
+    ego_state: (11,) where plans begin; reference_m: the reference's progress times its multiplier [m], NO_REFERENCE
+    where the plans of a call are always a batch.
     """
     index, red, boxes = prepared.map_index, prepared.red_lanes, prepared.obstacles.boxes
     ends = index.edges.reshape(-1, 2).view(np.int64)  # -0.0 is not 0.0
