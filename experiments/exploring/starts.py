@@ -1,7 +1,7 @@
 """Start states where a planner drove itself: `python experiments/exploring/starts.py <drives> <planner> <file>`.
 
 <drives> is the `out` of `planners drive`. Of each drive from the log that lasted 4 s its first 4 s are the way to a
-start. Drives that then left the road or came into a collision at fault stand first, of those the shortest. The file is
+start. Drives that then left the road or came into a collision at fault stand first. The file is
 for `python -m factory.run perturb.starts=`.
 """
 
@@ -17,7 +17,7 @@ from planners.drive.work import open_drives
 from tasks.world.clip import HORIZON_STEPS
 from tasks.world.frames import HEADING, to_local
 
-COLUMNS = ("clip_id", "planner", "start", "duration_s", "off_road_events", "at_fault_collision", "ego_states")
+COLUMNS = ("clip_id", "planner", "start", "offroad_or_collision_at_fault", "ego_states")
 
 
 def starts_of(drives: pa.Table, planner: str) -> pa.Table:
@@ -26,11 +26,10 @@ def starts_of(drives: pa.Table, planner: str) -> pa.Table:
     for row in drives.to_pylist():
         poses = np.array(row["ego_states"])[:, : HEADING + 1]
         if row["planner"] == planner and row["start"] == LOGGED and len(poses) > HORIZON_STEPS:
-            fails = bool(row["off_road_events"] or row["at_fault_collision"])
             led = to_local(poses[0], poses[1 : HORIZON_STEPS + 1])
-            found.append((not fails, row["duration_s"], row["clip_id"], led.tolist()))
+            found.append((-row["offroad_or_collision_at_fault"], row["clip_id"], led.tolist()))
     found.sort()
-    return pa.table({"clip_id": [one[2] for one in found], "trajectory": [one[3] for one in found]})
+    return pa.table({"clip_id": [one[1] for one in found], "trajectory": [one[2] for one in found]})
 
 
 if __name__ == "__main__":

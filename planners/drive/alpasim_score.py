@@ -76,23 +76,29 @@ class AlpasimColumns:
 
 
 def logged_rollout(made: ClosedLoopDrive, seconds: float) -> LoggedRollout:
-    """Of a drive by AlpaSim's rule among a recording that is `seconds` long, or ends with the log."""
-    scene, first = made.start.scene, np.zeros((1, EGO_STATE_SIZE))
-    first[0, : HEADING + 1] = first_pose(scene)
-    at = np.arange(0, made.n_steps + 1, PLAN_STEPS)
-    log = np.concatenate([first, scene.clip.ego_states[scene.step :]])
+    """Of a drive along a recording that is `seconds` long, or ends with the log."""
+    scene, at = made.start.scene, np.arange(0, made.n_steps + 1, PLAN_STEPS)
+    logged = scene.clip.ego_states[scene.step - 1 :]
+    log, driven = _from_first_pose(logged[:2], logged[1:]), _from_first_pose(scene.ego_history, made.ego_states[at])
     log_s = np.append(0.0, FIRST_QUESTION_S + STEP_S * np.arange(len(log) - 1))
     recorded_s = np.append(log_s[log_s < seconds], min(seconds, log_s[-1]))
     centres = ego_boxes(log, PACIFICA)
     return LoggedRollout(
         stamps_us=_microseconds(np.append(0.0, FIRST_QUESTION_S + STEP_S * at)),
-        ego=ego_boxes(np.concatenate([first, made.ego_states[at]]), PACIFICA),
+        ego=ego_boxes(driven, PACIFICA),
         others=made.agents.boxes[[0, *at]],
         present=made.agents.valid[[0, *at]],
         recorded_us=_microseconds(recorded_s),
         recorded=np.stack([np.interp(recorded_s, log_s, centres[:, i]) for i in (0, 1)], axis=-1),
         road_map=scene.clip.road_map,
     )
+
+
+def _from_first_pose(before: Array, states: Array) -> Array:
+    """States (T + 1, 11) with the recording's first pose before them; before: (>= 2, 11) up to the first of them."""
+    first = np.zeros((1, EGO_STATE_SIZE))
+    first[0, : HEADING + 1] = first_pose(before)
+    return np.concatenate([first, states])
 
 
 def _microseconds(seconds: Array) -> Ints:

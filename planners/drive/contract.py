@@ -1,4 +1,4 @@
-"""A drive whose planner is asked as AlpaSim's nuPlan track asks a driver, in process or over the wire.
+"""A drive's planner is asked as AlpaSim's nuPlan track asks a driver, in process or over the wire.
 
 Of the runtime (NVlabs/alpasim 9177bd0, src/runtime/alpasim_runtime: events/, route_generator.py): the first question
 comes 17 ms after the first pose, with two poses and one picture of each camera; a question each 0.5 s; pictures, pose
@@ -23,7 +23,7 @@ from factory.config.compose import ConfigError
 from planners.alpasim.driver import CONTRACT, SERVICE, add_poses
 from planners.alpasim.driver import Driver as AlpasimDriver
 from planners.alpasim.session import SECOND_US, STEP_US
-from planners.drive.drivers import DriveEnd, Driver, MakeSample, PlannerDriver, make_driver
+from planners.drive.drivers import Driver, MakeSample, PlannerDriver, make_driver
 from planners.drive.loop import FIRST_QUESTION_S, first_pose
 from planners.evaluation.planner_names import EvaluatedPlanner, needs_of
 from tasks.settings import PdmSettings
@@ -75,7 +75,7 @@ class SceneService:
     def _drive(self, asked: Any) -> Any:
         scene, look, origin = self._shown[asked.session_uuid]
         plan = self._driver.plan(scene, look)
-        if isinstance(plan, DriveEnd):
+        if plan is None:
             return self._proto.DriveResponse(terminate_session=True)
         poses = np.concatenate([scene.ego_state[None, : HEADING + 1], plan]) - [*origin, 0.0]
         answer = self._proto.DriveResponse()
@@ -142,7 +142,7 @@ class DriverSession:
     session: str = field(default_factory=lambda: uuid.uuid4().hex)
 
     def __post_init__(self) -> None:
-        self._first_pose = first_pose(self.start)
+        self._first_pose = first_pose(self.start.ego_history)
         self._origin = self._first_pose[:2]
 
     @property
@@ -161,8 +161,8 @@ class DriverSession:
     def __exit__(self, *_: object) -> None:
         self._ask("close_session", messages().DriveSessionCloseRequest(session_uuid=self.session))
 
-    def plan(self, scene: Scene, look: MakeSample) -> Array | DriveEnd:
-        """(40, 3) world poses; NO_PLAN where the driver ends the session. Raises ValueError for what is no plan."""
+    def plan(self, scene: Scene, look: MakeSample) -> Array | None:
+        """(40, 3) world poses; None where the driver ends the session. Raises ValueError for what is no plan."""
         now_us = FIRST_US + STEP_US * (scene.step - self.start.step)
         sent = [self._egomotion(scene, now_us), self._route(scene, now_us)]
         sent += self._pictures(look, now_us) if self.rig else []
@@ -174,7 +174,7 @@ class DriverSession:
         asked = protocol.DriveRequest(session_uuid=self.session, time_now_us=now_us, time_query_us=now_us + EVERY_US)
         answer = protocol.DriveResponse.FromString(self._ask("drive", asked))
         if answer.terminate_session:
-            return DriveEnd.NO_PLAN
+            return None
         return plan_of(answer.trajectory, now_us) + np.append(self._origin, 0.0)
 
     def _ask(self, method: str, message: Any) -> bytes:

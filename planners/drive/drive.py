@@ -1,16 +1,15 @@
-"""`python -m planners drive planner=<who>`: closed loop, from logged or perturbed starts until something ends it.
+"""`python -m planners drive planner=<who>`: closed loop, from logged or perturbed starts as long as the log goes on.
 
     python -m planners drive planner=runs/ltf
     python -m planners drive planner=runs/ltf pictures=[truth,engine] perturbed=2 films=all out=runs/drives
     python -m planners drive clips=av2 clips.root=/data/av2/val planners=[runs/a,runs/b] pictures=engine executor=ray
 
-Who may stand under `planner=`, planners/evaluation/planner_names.py says. Every 0.5 s the planner looks and plans, its
-plan is followed at 10 Hz, the traffic answers. A drive ends with a collision, at the road's end, `bound_m` from where
-the log's sensors were, after `seconds`, and the human's own with its log. docs/driving.md says what is measured.
+Who may stand under `planner=`, planners/evaluation/planner_names.py says. It is AlpaSim's loop: every 0.5 s the planner
+is asked by its messages, in process or over the wire, and its MPC follows the plan. docs/driving.md says what is
+measured.
 
-    out/drives          a Delta table, one row a drive; what stands there is not driven again
+    out/drives          a Delta table, one row a drive, AlpaSim's columns; what stands there is not driven again
     out/summary.csv     all planners of this command, with intervals
-    out/alpasim         a Delta table of loop=alpasim: AlpaSim's columns and scene scores of its drives
     out/results-summary.json   the same in AlpaSim's form
     out/differences.csv what the engine's pictures change, of planners that drove with both
     out/films           MP4 files, as many as films= says
@@ -22,7 +21,7 @@ same command goes on.
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from factory.alpasim import wire
@@ -45,13 +44,11 @@ from planners.drive.starts import LOGGED
 from planners.drive.summary import Row, picture_source_effects, summarise_drives, summary_text, write_summary
 from planners.drive.work import (
     FACTS,
-    AlpasimRow,
     DriveItem,
     DriveWork,
     DrivingPlanner,
     FailedDrive,
     RowCommitter,
-    open_alpasim,
     open_drives,
 )
 from planners.evaluation.planner_names import EvaluatedPlanner, find_planners
@@ -71,11 +68,8 @@ class RequestedDrives:
     planners: Sequence[str]  # labels, in order
 
     def rows(self, table: KeyedTable) -> list[Row]:
-        """Those of the table, by planner and clip, under the labels of now; of loop=alpasim with AlpaSim's columns."""
+        """Those of the table, by planner and clip, under the labels of now."""
         found = {row["drive_id"]: row for row in table.read(FACTS).to_pylist()}
-        if self.work.settings.loop == "alpasim":
-            told = {row.pop("drive_id"): row for row in open_alpasim(self.work.out).read().to_pylist()}
-            found = {drive_id: row | {"alpasim": told.get(drive_id)} for drive_id, row in found.items()}
         asked = [(who.label, found.get(key.drive_id)) for item in self.items for who, key in item.keys]
         rows = [row | {"planner": label} for label, row in asked if row is not None]
         return sorted(rows, key=lambda row: self.planners.index(row["planner"]))
@@ -135,9 +129,8 @@ def _requested_drives(settings: DriveSettings) -> RequestedDrives:
 
 
 def _asked(settings: DriveSettings) -> list[EvaluatedPlanner]:
-    """Who drives. Raises ConfigError, also without what loop=alpasim needs."""
-    if settings.loop == "alpasim":
-        wire.contract("loop=alpasim", "planners,alpasim")
+    """Who drives. Raises ConfigError, also without the messages' package."""
+    wire.contract("planners drive", "planners")
     if settings.driver is None:
         return find_planners(settings.planner, settings.planners, settings.bounds, settings.settings)
     if settings.planner is not None or settings.planners is not None:
@@ -165,10 +158,7 @@ def _drive(work: DriveWork, items: Sequence[DriveItem], table: KeyedTable) -> li
     waiting = [replace(item, keys=left) for item in items if (left := item.missing(done))]
     total = sum(len(item.keys) for item in items)
     failed: list[FailedDrive] = []
-    settings, alpasim = work.settings, open_alpasim(work.out) if work.settings.loop == "alpasim" else None
-    if alpasim is not None:
-        alpasim.claim()
-    rows = RowCommitter(table, alpasim)
+    settings, rows = work.settings, RowCommitter(table)
     n_done = total - sum(len(item.keys) for item in waiting)
     try:
         with (
@@ -178,7 +168,7 @@ def _drive(work: DriveWork, items: Sequence[DriveItem], table: KeyedTable) -> li
             for made in results:
                 rows.add(row for row in made if not isinstance(row, FailedDrive))
                 failed += [row for row in made if isinstance(row, FailedDrive)]
-                n_done += sum(not isinstance(row, AlpasimRow) for row in made)
+                n_done += len(made)
                 progress.show(n_done)
     finally:
         rows.close()
@@ -206,9 +196,9 @@ def _drive_and_print(settings: DriveSettings) -> None:
     if rows:
         lines, apart = summarise_drives(rows, settings.confidence), picture_source_effects(rows, settings.confidence)
         print(summary_text(lines, apart, settings.confidence))
-        if settings.loop == "alpasim":
-            Location.parse(settings.out).write("results-summary.json", _results_summary(rows, failed).encode())
-        if (place := Location.parse(settings.out)).is_local:  # on an object store the table of drives says all
+        place = Location.parse(settings.out)
+        place.write("results-summary.json", _results_summary(rows, failed).encode())
+        if place.is_local:  # on an object store the table of drives says all
             write_summary(Path(place.uri), lines, apart)
             print(f"look at {place.uri}")
     if failed:
@@ -217,11 +207,13 @@ def _drive_and_print(settings: DriveSettings) -> None:
 
 
 def _results_summary(rows: Sequence[Row], failed: Sequence[FailedDrive]) -> str:
-    entries = []
-    for row in rows:
-        columns = AlpasimColumns(**row["alpasim"]) if row["alpasim"] else None
-        why = None if columns else "no step was driven"
-        entries.append(SummaryEntry(row["planner"], row["clip_id"], row["drive_id"], columns, why))
+    names = [field.name for field in fields(AlpasimColumns)]
+    entries = [
+        SummaryEntry(
+            row["planner"], row["clip_id"], row["drive_id"], AlpasimColumns(**{name: row[name] for name in names})
+        )
+        for row in rows
+    ]
     labels = dict.fromkeys(row["planner"] for row in rows)
     for one in failed:
         who = [one.planner] if one.planner else labels

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,18 +17,6 @@ from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene, random_stream
 from tasks.world.frames import HEADING, VX, to_world
 
-
-class DriveEnd(StrEnum):
-    """Why a drive ended."""
-
-    COLLISION = "collision"  # the ego's body touched another, whoever is to blame
-    ROAD_END = "road_end"  # the front bumper is at the end of the route's last lane
-    SCENE_END = "scene_end"  # farther than `bound_m` from all places that the log's sensors were at
-    TIME = "time"  # `seconds` are over
-    LOG_END = "log_end"  # of the log's own drive, which is known no further
-    NO_PLAN = "no_plan"  # the expert found none
-
-
 MakeSample = Callable[[], Sample]  # a sample's row of the scene, with pictures where there are cameras
 
 
@@ -41,8 +28,8 @@ class Driver(Protocol):
         """Whether its plans depend on pictures."""
         ...
 
-    def plan(self, scene: Scene, look: MakeSample) -> Array | DriveEnd:
-        """(40, 3) world poses at 0.1 .. 4.0 s; or why it drives no further. Raises ValueError for what is no plan."""
+    def plan(self, scene: Scene, look: MakeSample) -> Array | None:
+        """(40, 3) world poses at 0.1 .. 4.0 s; None: it has no plan. Raises ValueError for what is no plan."""
         ...
 
 
@@ -52,11 +39,9 @@ class HumanDriver:
 
     needs_pictures: bool = False
 
-    def plan(self, scene: Scene, look: MakeSample) -> Array | DriveEnd:
-        """Beyond the log's last pose straight on at its last speed, which the tracker looks at for its last second."""
+    def plan(self, scene: Scene, look: MakeSample) -> Array:
+        """Beyond the log's last pose straight on at its last speed, which the tracker looks at for its last seconds."""
         ahead = scene.clip.ego_states[scene.step + 1 :]
-        if len(ahead) == 0:
-            return DriveEnd.LOG_END
         poses = ahead[:HORIZON_STEPS, : HEADING + 1]
         further = np.arange(1, HORIZON_STEPS - len(poses) + 1)[:, None] * STEP_S * ahead[-1, VX]
         straight = np.concatenate([further, np.zeros((len(further), 2))], axis=1)
@@ -70,10 +55,10 @@ class PdmClosedDriver:
     settings: PdmSettings
     needs_pictures: bool = False
 
-    def plan(self, scene: Scene, look: MakeSample) -> Array | DriveEnd:
-        """NO_PLAN where the route ahead has no length."""
+    def plan(self, scene: Scene, look: MakeSample) -> Array | None:
+        """None where the route ahead has no length."""
         made = PdmClosed(self.settings).plan(scene, random_stream(0, scene.clip.clip_id, "drive"))
-        return made.poses if isinstance(made, Plan) else DriveEnd.NO_PLAN
+        return made.poses if isinstance(made, Plan) else None
 
 
 @dataclass(frozen=True)
@@ -89,7 +74,7 @@ class PlannerDriver:
         needs = needs_of(self.made)
         return needs is None or needs.image is not None
 
-    def plan(self, scene: Scene, look: MakeSample) -> Array | DriveEnd:
+    def plan(self, scene: Scene, look: MakeSample) -> Array:
         """Raises ValueError, naming the sample, for what is no plan."""
         return to_world(scene.ego_state[: HEADING + 1], plan_samples(self.made, [look()], self.device)[0])
 

@@ -24,7 +24,8 @@ from factory.views.pictures import (
     write_mp4,
     write_text,
 )
-from planners.drive.loop import PLAN_STEPS, ClosedLoopDrive, measure_drive
+from planners.drive.alpasim_score import AlpasimColumns, failure_reason
+from planners.drive.loop import PLAN_STEPS, ClosedLoopDrive
 from tasks.world.arrays import Image
 from tasks.world.clip import STEP_S
 from tasks.world.frames import HEADING, VX
@@ -36,26 +37,28 @@ HOLD = 10  # pictures that the end is shown for
 Rig = Sequence[Mapping[str, Any]] | None  # the column `cameras`
 
 
-def write_film(out: Location, drive_id: str, made: ClosedLoopDrive, rig: Rig, title: str) -> str:
+def write_film(
+    out: Location, drive_id: str, made: ClosedLoopDrive, columns: AlpasimColumns, rig: Rig, title: str
+) -> str:
     """The film's file under `out`, written whole."""
     with TemporaryDirectory() as folder:
         path = Path(folder, "drive.mp4")
-        write_mp4(path, film_frames(made, rig, title))
+        write_mp4(path, film_frames(made, columns, rig, title))
         out.child(FILMS).write(f"{drive_id}.mp4", path.read_bytes())
     return f"{FILMS}/{drive_id}.mp4"
 
 
-def film_frames(made: ClosedLoopDrive, rig: Rig, title: str) -> Iterator[Image]:
+def film_frames(made: ClosedLoopDrive, columns: AlpasimColumns, rig: Rig, title: str) -> Iterator[Image]:
     """RGB pictures (560, 1280, 3), one each 0.1 s, the last several times."""
     sheet = None
     for step in range(made.n_steps + 1):
-        sheet = _sheet(made, rig, title, step)
+        sheet = _sheet(made, columns, rig, title, step)
         yield sheet
     if sheet is not None:
         yield from [sheet] * HOLD
 
 
-def _sheet(made: ClosedLoopDrive, rig: Rig, title: str, step: int) -> Image:
+def _sheet(made: ClosedLoopDrive, columns: AlpasimColumns, rig: Rig, title: str, step: int) -> Image:
     clip, pose = made.start.scene.clip, made.ego_states[step, : HEADING + 1]
     ways = [
         DrawnPath(clip.ego_states[made.start.scene.step :, : HEADING + 1], LOGGED, "logged", dashed=True),
@@ -74,19 +77,15 @@ def _sheet(made: ClosedLoopDrive, rig: Rig, title: str, step: int) -> Image:
     if front is not None:
         seen = next(image for image in images if image["camera"] == front)
         sheet[: CAMERA_PX[1], BEV_PX[0] :] = letterboxed(decode_stored_image(seen), *CAMERA_PX)
-    for row, line in enumerate(_lines(made, front, step, planned)):
+    for row, line in enumerate(_lines(made, columns, front, step, planned)):
         write_text(sheet, line, (BEV_PX[0] + 12, CAMERA_PX[1] + 26 + 24 * row), 0.5)
     return sheet
 
 
-def _lines(made: ClosedLoopDrive, front: str | None, step: int, planned: int) -> list[str]:
+def _lines(made: ClosedLoopDrive, columns: AlpasimColumns, front: str | None, step: int, planned: int) -> list[str]:
     seen = "sees no pictures" if front is None else f"camera {front} at {planned * PLAN_STEPS * STEP_S:.1f} s"
-    along = made.along_m[step] - made.along_m[0]
-    told = [seen, f"{made.ego_states[step, VX]:.1f} m/s  {along:.0f} of {made.road.length_m:.0f} m of the route"]
-    told.append("off the road" if made.off_road[step] else "")
+    told = [seen, f"{made.ego_states[step, VX]:.1f} m/s"]
     if step == made.n_steps:
-        found, hit = measure_drive(made), made.hit
-        whom = "" if hit is None else f": {hit.kind.lower()} {hit.track_id}, {'at' if hit.at_fault else 'not at'} fault"
-        told.append(f"ended: {made.ended}{whom}")
-        told.append(f"route {100.0 * found.route_completed:.0f} %, comfortable {100.0 * found.comfortable:.0f} %")
+        progress, why = 100.0 * min(columns.progress_rel_to_total, 1.0), failure_reason(vars(columns))
+        told.append(f"score {columns.score:.2f}, progress {progress:.0f} %{f', {why}' if why else ''}")
     return told

@@ -17,6 +17,7 @@ import osqp
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve, expm
 
+from tasks.world import frames
 from tasks.world.arrays import Array
 from tasks.world.clip import STEP_S
 from tasks.world.frames import EGO_STATE_SIZE, to_local
@@ -46,10 +47,21 @@ WITHIN = 1e-9  # of a bound that counts as kept
 def car_that_moves(pose: Array, later: Array, after_s: float) -> Array:
     """(8,) the car at a rear-axle pose (3,) that is at `later` (3,) after so long: by the chord, as AlpaSim has it."""
     moved = to_local(pose, later)
-    vx, vy = moved[:2] / after_s
     rate = 2.0 * math.sin(moved[2] / 2.0) / after_s
+    return _car(pose, moved[0] / after_s, moved[1] / after_s, rate, 0.0)
+
+
+def car_at(state: Array) -> Array:
+    """(8,) the car in an ego's state (11,), which has come there in another way."""
+    rate = state[frames.YAW_RATE]
+    accel = state[frames.AX] - rate**2 * REAR_TO_CG
+    return _car(state[: YAW + 1], state[frames.VX], state[frames.VY], rate, accel)
+
+
+def _car(pose: Array, vx: float, vy: float, rate: float, accel: float) -> Array:
+    """(8,) from the velocity of the rear axle."""
     steering = math.atan(rate / vx * WHEELBASE) if vx > 0.25 else 0.0
-    return np.array([*pose, vx, vy + REAR_TO_CG * rate, rate, steering, 0.0])
+    return np.array([*pose, vx, vy + REAR_TO_CG * rate, rate, steering, accel])
 
 
 def follow(car: Array, plan: Array, steps: int) -> tuple[Array, Array]:

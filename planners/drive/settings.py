@@ -8,7 +8,7 @@ from factory.config.compose import fill, refuse_unknown
 from factory.config.datasets import reader_settings
 from factory.config.run import VocabularyChoice, own_settings, refuse_missing_root
 from factory.config.shapes import deep_merge, defaults_of
-from planners.drive.loop import LoopRule, LoopSettings
+from planners.drive.loop import LoopSettings
 from planners.evaluation.planner_names import compose_with_planner
 from tasks.render.settings import RenderSettings
 from tasks.settings import PdmSettings, PerturbSettings, TrafficSettings
@@ -23,15 +23,13 @@ class DriveSettings:
     clips: dict[str, Any]  # the reader, and which clips of its data
     planner: str | None = None  # a training's folder, human, pdm_closed, constant_velocity, or my.module:MyPlanner
     planners: list[str] | dict[str, str] | None = None  # several: a list, or {label: planner, ...}
-    driver: str | None = None  # host:port of a driver of AlpaSim's, in their place; with loop=alpasim
+    driver: str | None = None  # host:port of a driver of AlpaSim's, in their place
     bounds: bool = True  # human, pdm_closed and constant_velocity too
     settings: dict[str, Any] = field(default_factory=dict)  # of planning, changed in all trained planners
     pictures: tuple[Pictures, ...] = ("truth",)  # of planners that look: truth: the town's painter; engine: scenes
     logged: bool = True  # drive from the log at T
     perturbed: int = 0  # drive from so many candidates of each clip too, at T+H
-    loop: LoopRule = "own"  # alpasim: as AlpaSim's nuPlan track drives and scores, docs/driving.md
-    seconds: float = 20.0  # after which a drive ends
-    bound_m: float = 30.0  # from the nearest place that the log's sensors were at, beyond which a drive ends
+    seconds: float = 5.5  # of the log, that are driven
     films: int | Literal["none", "all"] = "none"  # or n for one drive in n: MP4 files under out/films
     out: str = "drives"  # folder or URL; the same command on it drives what is not driven yet
     cache: str | None = None  # folder of scenes, such as a run's out/cache; null: out/cache
@@ -49,16 +47,12 @@ class DriveSettings:
 
     def __post_init__(self) -> None:
         """Raises ValueError for what cannot be driven."""
-        self.rules  # noqa: B018 - raises ValueError for bounds of a drive that cannot be
+        self.rules  # noqa: B018 - raises ValueError for a drive that cannot be
         for name in ("workers", "limit"):
             if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: must be positive, or null for no bound")
         if self.perturbed < 0 or not (self.logged or self.perturbed):
             raise ValueError(f"perturbed={self.perturbed}, logged={self.logged}: there is nothing to drive from")
-        if self.loop == "alpasim" and (self.perturbed or not self.logged):
-            raise ValueError("loop=alpasim begins on the log: perturbed=0 logged=true")
-        if self.driver is not None and self.loop != "alpasim":
-            raise ValueError(f"driver={self.driver}: is asked by loop=alpasim")
         if self.films == 0 or self.one_film_in < 0:
             raise ValueError(f"films={self.films}: must be none, all, or n for one drive in n")
         if len(set(self.pictures)) < len(self.pictures) or not self.pictures:
@@ -69,7 +63,7 @@ class DriveSettings:
     @property
     def rules(self) -> LoopSettings:
         """What every drive depends on."""
-        return LoopSettings(self.seconds, self.bound_m, self.traffic, self.loop)
+        return LoopSettings(self.seconds, self.traffic)
 
     @property
     def one_film_in(self) -> int:

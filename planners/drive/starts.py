@@ -1,9 +1,9 @@
 """Where drives begin: a clip whose world goes on past its window, and the scenes that are driven on from.
 
-A clip is 9.5 s and a drive may be 20: the clip is lengthened. As long as the log is known, which the clip's block says,
-the agents' tracks are the log's. After it no newcomer comes; who is driven by IDM goes on, who replays its log leaves
-with it (tasks.rollout.simulate), and things and what never left its place stay. A light is unknown where nobody says
-better: the synthetic town's phases go on (its painter).
+Planners and traffic look 4 s beyond a drive's end: the clip is lengthened. As long as the log is known, which the
+clip's block says, the agents' tracks are the log's. After it no newcomer comes; who is driven by IDM goes on, who
+replays its log leaves with it (tasks.rollout.simulate), and things and what never left its place stay. A light is
+unknown where nobody says better: the synthetic town's phases go on (its painter).
 """
 
 from dataclasses import dataclass, replace
@@ -18,9 +18,7 @@ from tasks.experts.protocol import Plan
 from tasks.perturb import Perturbation
 from tasks.rollout.lane_following import stands_always
 from tasks.settings import TrafficSettings
-from tasks.world.arrays import Array
 from tasks.world.clip import MOVING_KINDS, PER_STEP, STEP_S, AgentTracks, Clip, Scene, scene_of_clip
-from tasks.world.frames import X, Y
 from tasks.world.road_map import LightState, TrafficLights
 
 LOGGED = -1
@@ -32,7 +30,6 @@ class DriveStart:
     """A scene to drive on from."""
 
     scene: Scene  # of a lengthened clip
-    known: Array  # (P, 2) places that the log's sensors were at, world [m]
     candidate_index: int = NO_CANDIDATE  # that the ego was perturbed by; NO_CANDIDATE: the log at T
     number: int = LOGGED  # among the clip's perturbed starts; LOGGED: the log at T
 
@@ -74,17 +71,9 @@ def _continued(log: AgentTracks, n_steps: int) -> AgentTracks:
     return replace(log, **after)
 
 
-def known_places(clip: Clip) -> Array:
-    """(P, 2) where the ego, and with it every sensor of the clip's block, was [m]: the world is known around these."""
-    block = clip.block
-    files = () if block is None else (*block.images, *block.sweeps)
-    seen = np.array([file.world_from_ego[:2, 3] for file in files]).reshape(-1, 2)
-    return np.unique(np.concatenate([clip.ego_states[:, [X, Y]], seen]), axis=0)
-
-
 def logged_start(clip: Clip) -> DriveStart:
     """From the log at T."""
-    return DriveStart(scene_of_clip(clip), known_places(clip))
+    return DriveStart(scene_of_clip(clip))
 
 
 def perturbed_starts(
@@ -106,5 +95,5 @@ def perturbed_starts(
         plan = plan_for(scene, pdm)
         scores = drive_and_judge(scene, Plan(plan.poses), traffic, pdm, pdm_plan=plan).scores
         if scores.nc[1] == 1.0 and scores.dac[1] == 1.0:
-            found.append(DriveStart(scene, known_places(clip), index, len(found)))
+            found.append(DriveStart(scene, index, len(found)))
     return tuple(found)

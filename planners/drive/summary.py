@@ -16,22 +16,12 @@ from tasks.world.arrays import Array
 Row = Mapping[str, Any]  # of the table `drives`
 M_PER_KM = 1000.0
 SHARES: Mapping[str, Callable[[Row], float]] = {  # of each drive, 0 .. 1
-    "route_completed": lambda row: float(row["route_completed"]),
-    "at_fault_collision": lambda row: float(row["at_fault_collision"]),
-    "off_road": lambda row: float(row["off_road_events"] > 0),
-    "comfortable": lambda row: float(row["comfortable"]),
+    "score": lambda row: float(row["score"]),
+    "progress": lambda row: min(float(row["progress_rel_to_total"]), 1.0),
+    "collision_at_fault": lambda row: float(row["collision_at_fault"]),
+    "offroad": lambda row: float(row["offroad"]),
+    "left_corridor": lambda row: float(row["left_corridor_laterally"]),
 }
-
-
-ALPASIM_SHARES: Mapping[str, Callable[[Row], float]] = {
-    "scene_score": lambda row: row["alpasim"]["score"] if row["alpasim"] else 0.0,
-    "scene_score_july": lambda row: row["alpasim"]["score_july"] if row["alpasim"] else 0.0,
-}
-
-
-def shares_of(rows: Sequence[Row]) -> Mapping[str, Callable[[Row], float]]:
-    """What drives of one command are told by."""
-    return {**SHARES, **(ALPASIM_SHARES if "alpasim" in rows[0] else {})}
 
 
 @dataclass(frozen=True)
@@ -44,15 +34,15 @@ class DriveLine:
     drives: int
     clips: int
     level: str  # of LEVELS, that the intervals are over: the highest of which there are two
-    shares: Mapping[str, Interval]  # of `shares_of`: mean (`b`), low, high
+    shares: Mapping[str, Interval]  # of SHARES: mean (`b`), low, high
     km: float
-    failures: int
-    failures_per_km: Interval
+    incidents: int  # drives with a collision at fault or off the road
+    incidents_per_km: Interval
 
     @property
-    def m_between_failures(self) -> tuple[float, float, float]:
-        """Metres driven for each failure, and bounds; infinite where there was none."""
-        rate = self.failures_per_km
+    def m_between_incidents(self) -> tuple[float, float, float]:
+        """Metres driven for each incident, up to the first of a drive, and bounds; infinite where there was none."""
+        rate = self.incidents_per_km
         with np.errstate(divide="ignore"):
             mean, high, low = M_PER_KM / np.maximum(np.array([rate.b, rate.low, rate.high]), 0.0)
         return float(mean), float(low), float(high)
@@ -73,8 +63,8 @@ def summarise_drives(rows: Sequence[Row], confidence: float = 0.95) -> list[Driv
 
 def _line(planner: str, pictures: str, start: str, rows: Sequence[Row], confidence: float) -> DriveLine:
     level, clusters = coarsest_clusters(rows)
-    km = np.maximum([row["distance_m"] / M_PER_KM for row in rows], 1e-9)  # a drive that stands weighs nothing
-    failed = np.array([row["off_road_events"] + row["at_fault_collision"] for row in rows], dtype=float)
+    km = np.maximum([row["dist_traveled_m"] / M_PER_KM for row in rows], 1e-9)  # a drive that stands weighs nothing
+    failed = np.array([row["offroad_or_collision_at_fault"] for row in rows], dtype=float)
 
     def interval(values: Array, weights: Array | None = None) -> Interval:
         return _mean(values, clusters, confidence, weights)
@@ -86,10 +76,10 @@ def _line(planner: str, pictures: str, start: str, rows: Sequence[Row], confiden
         drives=len(rows),
         clips=len({row["clip_id"] for row in rows}),
         level=level,
-        shares={name: interval(np.array([share(row) for row in rows])) for name, share in shares_of(rows).items()},
+        shares={name: interval(np.array([share(row) for row in rows])) for name, share in SHARES.items()},
         km=float(km.sum()),
-        failures=int(failed.sum()),
-        failures_per_km=interval(failed / km, km),
+        incidents=int(failed.sum()),
+        incidents_per_km=interval(failed / km, km),
     )
 
 
@@ -142,7 +132,7 @@ def picture_source_effects(rows: Sequence[Row], confidence: float = 0.95) -> lis
                 clusters=clusters,
                 confidence=confidence,
             )
-            for name, share in shares_of(rows).items()
+            for name, share in SHARES.items()
         }
         found.append(PictureSourceEffect(planner, start, len(twice), level, shares))
     return found
@@ -157,17 +147,17 @@ def summary_text(lines: Sequence[DriveLine], differences: Sequence[PictureSource
         "drives",
         *(f"{name} %" for name in lines[0].shares),
         "km",
-        "failures",
+        "incidents",
         "m between",
     ]
     rows = [head]
     for line in lines:
         shares = [_bounded(one.b, one, 100.0) for one in line.shares.values()]
-        mean, low, high = line.m_between_failures
+        mean, low, high = line.m_between_incidents
         interval = f"[{_known(low, '.0f')}, {_known(high, '.0f')}]"
-        between = f"{mean:.0f} {interval}" if line.failures else f"> {M_PER_KM * line.km:.0f}"
+        between = f"{mean:.0f} {interval}" if line.incidents else f"> {M_PER_KM * line.km:.0f}"
         facts = [line.planner, line.pictures, line.start, str(line.drives)]
-        rows.append([*facts, *shares, f"{line.km:.2f}", str(line.failures), between])
+        rows.append([*facts, *shares, f"{line.km:.2f}", str(line.incidents), between])
     told = _table(rows)
     if differences:
         rows = [["engine - truth", "start", "pairs", *(f"{name} %" for name in differences[0].shares)]]
@@ -198,10 +188,10 @@ def write_summary(folder: Path, lines: Sequence[DriveLine], differences: Iterabl
     """`summary.csv`, and `differences.csv` where there are any."""
     rows: list[dict[str, object]] = []
     for line in lines:
-        mean, low, high = line.m_between_failures
+        mean, low, high = line.m_between_incidents
         facts = {name: getattr(line, name) for name in ("planner", "pictures", "start", "drives", "clips", "level")}
-        between = {"m_between_failures": mean, "m_between_failures_low": low, "m_between_failures_high": high}
-        rows.append(facts | _columns(line.shares, "b") | {"km": line.km, "failures": line.failures} | between)
+        between = {"m_between_incidents": mean, "m_between_incidents_low": low, "m_between_incidents_high": high}
+        rows.append(facts | _columns(line.shares, "b") | {"km": line.km, "incidents": line.incidents} | between)
     _write_csv(folder / "summary.csv", rows)
     apart: list[dict[str, object]] = [
         {"planner": one.planner, "start": one.start, "pairs": one.drives, "level": one.level}

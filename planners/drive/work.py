@@ -5,7 +5,6 @@ import json
 import math
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
 from typing import Any
@@ -16,18 +15,26 @@ from factory.readers.base import BadClip, ClipReader, ClipRef, painter_of, read_
 from factory.store.location import Location, write_shard
 from factory.store.schema import TableSpec, canonical_json, schema_of
 from factory.store.table import KeyedTable
-from planners.drive.alpasim_score import AlpasimColumns, logged_rollout, score_drive
+from planners.drive.alpasim_score import AlpasimColumns, failure_reason, logged_rollout, score_drive
 from planners.drive.cameras import DriveCameras, NoCameras, PaintedCameras, RenderedCameras, open_rendered_cameras
-from planners.drive.drivers import Driver, make_driver
-from planners.drive.films import write_film
-from planners.drive.loop import DRIVE_VERSION, ClosedLoopDrive, DriveMeasures, drive, measure_drive
+from planners.drive.contract import (
+    WIRE,
+    DriverSession,
+    Peer,
+    ask_over_the_wire,
+    peer_in_process,
+    planner_over_the_wire,
+)
+from planners.drive.films import Rig, write_film
+from planners.drive.loop import DRIVE_VERSION, ClosedLoopDrive, drive
 from planners.drive.settings import DriveSettings, Pictures
 from planners.drive.starts import LOGGED, DriveStart, extend_clip, logged_start, perturbed_starts
 from planners.evaluation.planner_names import EvaluatedPlanner, find_planner
 from tasks.perturb import Perturbation, perturb
 from tasks.rollout.simulate import traffic_record
+from tasks.settings import PdmSettings
 from tasks.stages import stage_versions
-from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Scene, random_stream
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, random_stream
 from tasks.world.vocabulary import Vocabulary
 
 # The table `drives` under `out`: one row a drive, committed as they end, so that no drive is made twice.
@@ -53,7 +60,7 @@ class DriveKey:
 
 
 @dataclass(frozen=True)
-class DriveRow(DriveMeasures):
+class DriveRow(AlpasimColumns):
     """One drive in the table."""
 
     drive_id: str
@@ -69,26 +76,16 @@ class DriveRow(DriveMeasures):
     planner_digest: str
     pictures: str
     psnr_db: float  # of the scene's held-out photos; NaN: no scene, or none was held out
-    ended: str  # planners.drive.drivers.DriveEnd
-    hit_track: str  # what was hit, "": nothing
-    hit_kind: str
-    hit_speed_mps: float  # of the ego; NaN: nothing was hit
+    duration_s: float  # shorter than the recording where the planner had no plan any more
+    failure_reason: str  # the column that makes the score 0, "": none
     film: str  # file under `out`, "": none
     settings: str
     ego_states: tuple[tuple[float, ...], ...]  # (S + 1, 11) at 10 Hz, world
     plans: tuple[tuple[float, ...], ...]  # (P, 120) x, y, heading at 0.1 .. 4.0 s of the plans at 2 Hz, world
 
 
-@dataclass(frozen=True)
-class AlpasimRow(AlpasimColumns):
-    """What AlpaSim tells of a drive of loop=alpasim, in a table of its own."""
-
-    drive_id: str
-
-
 SCHEMA = schema_of(DriveRow)
 DRIVES = TableSpec("drives", SCHEMA, "drive_id")
-ALPASIM = TableSpec("alpasim", schema_of(AlpasimRow), "drive_id")
 FACTS = [field.name for field in fields(DriveRow) if field.name not in ("ego_states", "plans")]
 
 
@@ -97,12 +94,7 @@ def open_drives(out: Location) -> KeyedTable:
     return KeyedTable(out.child("drives"), DRIVES)
 
 
-def open_alpasim(out: Location) -> KeyedTable:
-    """What AlpaSim tells of the drives of loop=alpasim; the table need not be there yet."""
-    return KeyedTable(out.child("alpasim"), ALPASIM)
-
-
-def write_rows(table: KeyedTable, rows: Sequence[DriveRow] | Sequence[AlpasimRow]) -> None:
+def write_rows(table: KeyedTable, rows: Sequence[DriveRow]) -> None:
     """One commit. Raises DuplicateKey, and AnotherWriter where a later command has taken the table over."""
     spec = table.spec
     columns = [pa.array([getattr(row, field.name) for row in rows], field.type) for field in spec.schema]
@@ -112,24 +104,19 @@ def write_rows(table: KeyedTable, rows: Sequence[DriveRow] | Sequence[AlpasimRow
 class RowCommitter:
     """Gathers rows and writes them, a commit each time, every COMMIT_EVERY_S and when it is closed."""
 
-    def __init__(self, table: KeyedTable, alpasim: KeyedTable | None = None) -> None:
-        self._table, self._alpasim = table, alpasim
-        self._rows, self._last = list[DriveRow | AlpasimRow](), time.monotonic()
+    def __init__(self, table: KeyedTable) -> None:
+        self._table, self._rows, self._last = table, list[DriveRow](), time.monotonic()
 
-    def add(self, rows: Iterable[DriveRow | AlpasimRow]) -> None:
+    def add(self, rows: Iterable[DriveRow]) -> None:
         """Rows to be committed."""
         self._rows += rows
         if time.monotonic() - self._last > COMMIT_EVERY_S:
             self.close()
 
     def close(self) -> None:
-        """Commit what is gathered; a drive that is there has its columns, which those of a killed command may have."""
-        if self._alpasim is not None:
-            told = [row for row in self._rows if isinstance(row, AlpasimRow) and row.drive_id not in self._alpasim]
-            if told:
-                write_rows(self._alpasim, told)
-        if driven := [row for row in self._rows if isinstance(row, DriveRow)]:
-            write_rows(self._table, driven)
+        """Commit what is gathered."""
+        if self._rows:
+            write_rows(self._table, self._rows)
         self._rows, self._last = [], time.monotonic()
 
 
@@ -192,7 +179,7 @@ class DriveWork:
         found: dict[str, Any] = {
             "drive": DRIVE_VERSION,
             "stages": stage_versions(),
-            "loop": {"seconds": s.seconds, "bound_m": s.bound_m} | ({} if s.loop == "own" else {"rule": s.loop}),
+            "loop": {"seconds": s.seconds},
             "traffic": traffic_record(s.traffic),
         }
         if start != LOGGED:
@@ -203,14 +190,14 @@ class DriveWork:
             found["render"] = asdict(s.render)
         return found
 
-    def __call__(self, item: DriveItem) -> list[DriveRow | AlpasimRow | FailedDrive]:
+    def __call__(self, item: DriveItem) -> list[DriveRow | FailedDrive]:
         """Drive all of it. What is wrong with a clip, its pictures or a planner's answer is told of each drive."""
         try:
             return list(self._driven(item))
         except (BadClip, ValueError) as error:
             return [FailedDrive(item.ref.clip_id, str(error))]
 
-    def _driven(self, item: DriveItem) -> Iterator[DriveRow | AlpasimRow | FailedDrive]:
+    def _driven(self, item: DriveItem) -> Iterator[DriveRow | FailedDrive]:
         clip = self._clip(item)
         starts = self._starts(clip, {key.start for _, key in item.keys})
         cameras = self._cameras(clip, item.pictures)
@@ -218,16 +205,15 @@ class DriveWork:
             if key.start not in starts:
                 continue  # the clip has fewer
             try:
-                with self._driver(who, starts[key.start].scene, cameras) as driver:
+                with DriverSession(self._peer(who), starts[key.start].scene, cameras.rig) as driver:
                     made = drive(starts[key.start], driver, self.settings.rules, cameras)
-                rows: list[DriveRow | AlpasimRow] = [self._row(who, key, made, cameras)]
-                if self.settings.loop == "alpasim" and made.n_steps:
-                    columns = score_drive(logged_rollout(made, self.settings.seconds))
-                    rows.append(AlpasimRow(**vars(columns), drive_id=key.drive_id))
+                if not made.n_steps:
+                    raise ValueError("the driver ended the session before it had driven")
+                row = self._row(who, key, made, cameras)
             except ValueError as error:
                 yield FailedDrive(clip.clip_id, str(error), who.label)
             else:
-                yield from rows
+                yield row
 
     def _clip(self, item: DriveItem) -> Clip:
         last = NOW + HORIZON_STEPS if any(key.start != LOGGED for _, key in item.keys) else NOW
@@ -260,26 +246,24 @@ class DriveWork:
             return PaintedCameras(clip, self.settings.render, painter)
         return NoCameras()
 
-    def _driver(self, who: DrivingPlanner, scene: Scene, cameras: DriveCameras) -> AbstractContextManager[Driver]:
+    def _peer(self, who: DrivingPlanner) -> Peer:
         s = self.settings
-        if s.loop == "own":
-            return nullcontext(cached_driver(who, canonical_json(s.settings), s.pdm, s.device))
-        from planners.drive.contract import DriverSession  # with what AlpaSim's messages need
+        return cached_peer(who, canonical_json(s.settings), s.pdm, s.device)
 
-        return DriverSession(cached_peer(who, canonical_json(s.settings), s.pdm, s.device), scene, cameras.rig)
-
-    def _film(self, who: DrivingPlanner, key: DriveKey, made: ClosedLoopDrive, cameras: DriveCameras) -> str:
+    def _film(
+        self, who: DrivingPlanner, key: DriveKey, made: ClosedLoopDrive, columns: AlpasimColumns, rig: Rig
+    ) -> str:
         """One drive in so many has one, chosen by its id."""
         one_in = self.settings.one_film_in
         if one_in == 0 or int(key.drive_id, 16) % one_in:
             return ""
         start = "log" if key.start == LOGGED else f"start {key.start}"
-        return write_film(self.out, key.drive_id, made, cameras.rig, f"{who.label}, {key.pictures}, {start}")
+        return write_film(self.out, key.drive_id, made, columns, rig, f"{who.label}, {key.pictures}, {start}")
 
     def _row(self, who: DrivingPlanner, key: DriveKey, made: ClosedLoopDrive, cameras: DriveCameras) -> DriveRow:
-        clip, hit = made.start.scene.clip, made.hit
+        clip, columns = made.start.scene.clip, score_drive(logged_rollout(made, self.settings.seconds))
         return DriveRow(
-            **vars(measure_drive(made)),
+            **vars(columns),
             drive_id=key.drive_id,
             clip_id=clip.clip_id,
             dataset=clip.dataset,
@@ -293,11 +277,9 @@ class DriveWork:
             planner_digest=who.digest,
             pictures=key.pictures,
             psnr_db=cameras.asset.psnr_db if isinstance(cameras, RenderedCameras) else math.nan,
-            ended=str(made.ended),
-            hit_track="" if hit is None else hit.track_id,
-            hit_kind="" if hit is None else hit.kind,
-            hit_speed_mps=math.nan if hit is None else hit.speed_mps,
-            film=self._film(who, key, made, cameras),
+            duration_s=made.n_steps * STEP_S,
+            failure_reason=failure_reason(vars(columns)) or "",
+            film=self._film(who, key, made, columns, cameras.rig),
             settings=key.settings,
             ego_states=tuple(map(tuple, made.ego_states.tolist())),
             plans=tuple(map(tuple, made.plans.reshape(len(made.plans), -1).tolist())),
@@ -305,16 +287,8 @@ class DriveWork:
 
 
 @lru_cache(maxsize=8)
-def cached_driver(who: DrivingPlanner, changed: str, pdm: Any, device: str) -> Driver:
+def cached_peer(who: DrivingPlanner, changed: str, pdm: PdmSettings, device: str) -> Peer:
     """A worker's own, read once. Raises ValueError where it is another than was named when the command began."""
-    return make_driver(_same(find_planner(who.spec, who.label, json.loads(changed)), who), pdm, device)
-
-
-@lru_cache(maxsize=8)
-def cached_peer(who: DrivingPlanner, changed: str, pdm: Any, device: str) -> Any:
-    """The same before AlpaSim's questions, a planners.drive.contract.Peer."""
-    from planners.drive.contract import WIRE, Peer, ask_over_the_wire, peer_in_process, planner_over_the_wire
-
     if not who.spec.startswith(WIRE):
         settings = json.loads(changed)
         return peer_in_process(_same(find_planner(who.spec, who.label, settings), who), settings, pdm, device)

@@ -4,7 +4,7 @@ An arm is one set-up's trainings with several seeds. All are held against each o
 made; intervals are over whole towns, or whole logs or clips where there are no two towns, and over pairs of seeds.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -32,20 +32,8 @@ DRIVES = "drives"
 RULES = CompareSettings(a="", b="")  # draws, confidence and seed as `python -m planners compare` has them
 
 
-def route_without_failure(row: Row) -> float:
-    """Route completed where nothing went wrong: 0 of a drive with a collision at fault, or off the road."""
-    failed = row["at_fault_collision"] or row["off_road_events"] > 0
-    return 0.0 if failed else float(row["route_completed"])
-
-
-def failures(row: Row) -> float:
-    """Collisions at fault and departures from the road."""
-    return float(row["off_road_events"] + row["at_fault_collision"])
-
-
-IN_PERCENT: Mapping[str, Callable[[Row], float]] = {"clean_route": route_without_failure, **SHARES}
-PER_KM = "failures_per_km"
-DRIVEN = (*IN_PERCENT, PER_KM)  # measures, the first of them the one that arms are judged by
+PER_KM = "incidents_per_km"
+DRIVEN = (*SHARES, PER_KM)  # measures, the first of them the one that arms are judged by
 
 
 @dataclass(frozen=True)
@@ -69,10 +57,10 @@ class ArmDrives:
     def values(self, who: str, measure: str) -> tuple[Array, Array]:
         """(seeds, starts) of a measure, and what each counts in a mean."""
         if measure != PER_KM:
-            found = np.array([[100.0 * IN_PERCENT[measure](row) for row in rows] for rows in self.rows[who]])
+            found = np.array([[100.0 * SHARES[measure](row) for row in rows] for rows in self.rows[who]])
             return found, np.ones_like(found)
-        km = np.array([[max(row["distance_m"] / M_PER_KM, 1e-9) for row in rows] for rows in self.rows[who]])
-        return np.array([[failures(row) for row in rows] for rows in self.rows[who]]) / km, km
+        km = np.array([[max(row["dist_traveled_m"] / M_PER_KM, 1e-9) for row in rows] for rows in self.rows[who]])
+        return np.array([[row["offroad_or_collision_at_fault"] for row in rows] for rows in self.rows[who]]) / km, km
 
     def difference(self, who: str, reference: str | None, measure: str) -> Interval:
         """Of a measure from the reference's; None: from nothing."""

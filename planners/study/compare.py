@@ -10,8 +10,8 @@ A run is a folder that `python -m planners evaluate` made of one planner, or a t
 one planner with other seeds: clips and seeds are both drawn, pairs of seeds where both sides have equally many.
 
 The last line is one sentence: the two-stage score of b and a, their difference, its interval over towns (logs or clips
-where those are unknown), and whether zero lies outside. With drives= it goes on with the routes that were driven
-cleanly in closed loop: what is completed of a route, 0 of a drive with a collision at fault or off the road.
+where those are unknown), and whether zero lies outside. With drives= it goes on with the scene scores of drives in
+closed loop (docs/driving.md).
 """
 
 import json
@@ -44,10 +44,9 @@ Record = Mapping[str, Any]  # of an evaluated planner
 
 
 def drives_sentence(drives: str, a: Sequence[Record], b: Sequence[Record], settings: CompareSettings) -> str:
-    """Of the routes that both sides drove cleanly. Raises ConfigError where they drove not from equal starts."""
+    """Of the scene scores of both sides' drives. Raises ConfigError where they drove not from equal starts."""
     from planners.drive.summary import coarsest_clusters  # with PyTorch
     from planners.drive.work import FACTS, open_drives
-    from planners.study.arms import route_without_failure
 
     driven: dict[str, dict[str, Any]] = {}
     for row in open_drives(Location.parse(drives)).read(FACTS).to_pylist():
@@ -62,16 +61,16 @@ def drives_sentence(drives: str, a: Sequence[Record], b: Sequence[Record], setti
             "into it by one `python -m planners drive planners=[...]`"
         )
     level, clusters = coarsest_clusters([of[0][start] for start in sorted(of[0])])
-    clean = np.array([[route_without_failure(one[start]) for start in sorted(one)] for one in of])
+    scores = np.array([[one[start]["score"] for start in sorted(one)] for one in of])
     found = paired_interval(
-        clean[: len(a)],
-        clean[len(a) :],
+        scores[: len(a)],
+        scores[len(a) :],
         clusters=clusters,
         confidence=settings.confidence,
         draws=settings.draws,
         seed=settings.seed,
     )
-    return difference_sentence("routes driven cleanly", found, level, settings.confidence, " %")
+    return difference_sentence("scene scores driven", found, level, settings.confidence, " %")
 
 
 @command("compare", CompareSettings)

@@ -227,15 +227,14 @@ def _coverage(shot: Snapshot) -> Json:
 
 FILMS = "films"  # folder below the run, <drive_id>.mp4
 MOST_SHOWN = 200  # drives, those that failed first
-_TEXTS = ("drive_id", "clip_id", "log_id", "planner", "pictures", "ended", "hit_kind", "film")
-_NUMBERS = ("duration_s", "distance_m", "route_completed", "comfortable")
+_TEXTS = ("drive_id", "clip_id", "log_id", "planner", "pictures", "failure_reason", "film")
+_FLAGS = ("collision_at_fault", "offroad", "left_corridor_laterally", "offroad_or_collision_at_fault")
+_NUMBERS = ("duration_s", "dist_traveled_m", "score", *_FLAGS)
 SCHEMA = pa.schema(
     [
         *((name, pa.string()) for name in _TEXTS),
         *((name, pa.float64()) for name in _NUMBERS),
         ("start", pa.int32()),  # -1: from the log
-        ("off_road_events", pa.int32()),
-        ("at_fault_collision", pa.bool_()),
     ]
 )
 Row = Mapping[str, Any]
@@ -270,7 +269,7 @@ def drives_as_json(rows: Sequence[Row], with_films: bool = True) -> dict[str, An
     for row in rows:
         start = "logged" if row["start"] < 0 else "perturbed"
         groups.setdefault((row["planner"], row["pictures"], start), []).append(row)
-    listed = sorted(rows, key=lambda row: (-_failures(row), row["route_completed"], row["drive_id"]))[:MOST_SHOWN]
+    listed = sorted(rows, key=lambda row: (row["score"], row["drive_id"]))[:MOST_SHOWN]
     facts = [name for name in SCHEMA.names if with_films or name != "film"]
     return {
         "total": len(rows),
@@ -279,22 +278,18 @@ def drives_as_json(rows: Sequence[Row], with_films: bool = True) -> dict[str, An
     }
 
 
-def _failures(row: Row) -> int:
-    return int(row["off_road_events"]) + int(row["at_fault_collision"])
-
-
 def _line(planner: str, pictures: str, start: str, rows: Sequence[Row]) -> dict[str, Any]:
-    failures, metres = sum(map(_failures, rows)), sum(row["distance_m"] for row in rows)
+    means = {name: sum(row[name] for row in rows) / len(rows) for name in _NUMBERS}
+    incidents, metres = (len(rows) * means[name] for name in ("offroad_or_collision_at_fault", "dist_traveled_m"))
     return {
         "planner": planner,
         "pictures": pictures,
         "start": start,
         "drives": len(rows),
-        "route_completed": sum(row["route_completed"] for row in rows) / len(rows),
-        "at_fault_collision": sum(row["at_fault_collision"] for row in rows) / len(rows),
-        "off_road": sum(row["off_road_events"] > 0 for row in rows) / len(rows),
-        "comfortable": sum(row["comfortable"] for row in rows) / len(rows),
+        "score": means["score"],
+        "collision_at_fault": means["collision_at_fault"],
+        "offroad": means["offroad"],
+        "left_corridor": means["left_corridor_laterally"],
         "km": metres / 1000.0,
-        "failures": failures,
-        "m_between_failures": metres / failures if failures else None,
+        "m_between_incidents": metres / incidents if incidents else None,
     }

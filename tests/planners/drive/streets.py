@@ -6,14 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factory.store.reader import Sample
-from planners.drive.drivers import DriveEnd
 from planners.drive.loop import LoopSettings
 from planners.drive.starts import DriveStart, extend_clip, logged_start
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Clip, Scene
 from tasks.world.frames import HEADING, VX, to_world
 from tests.tasks.streets import street_clip
-
-FAR = LoopSettings(seconds=60.0, bound_m=1000.0)
 
 
 @dataclass(frozen=True)
@@ -24,7 +21,7 @@ class Steady:
     turn_rad: float = 0.0
     needs_pictures: bool = False
 
-    def plan(self, scene: Scene, look: Callable[[], Sample]) -> np.ndarray | DriveEnd:
+    def plan(self, scene: Scene, look: Callable[[], Sample]) -> np.ndarray:
         along = self.speed_mps * STEP_S * np.arange(1, HORIZON_STEPS + 1)
         cos, sin = np.cos(self.turn_rad), np.sin(self.turn_rad)
         local = np.column_stack([cos * along, sin * along, np.full(HORIZON_STEPS, self.turn_rad)])

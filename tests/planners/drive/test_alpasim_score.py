@@ -26,7 +26,7 @@ from tests.planners.drive.streets import Steady, car, nobody, start_on, street_w
 from tests.tasks.streets import street_clip
 
 JUDGED = json.loads((Path(__file__).parent / "alpasim_judged.json").read_text())
-TRACK = LoopSettings(seconds=5.5, rule="alpasim")
+TRACK = LoopSettings(seconds=5.5)
 
 
 def rollout(given: dict[str, Any]) -> LoggedRollout:

@@ -107,17 +107,17 @@ def test_other_settings_are_other_drives(towns: Path, tmp_path: Path) -> None:
         BAD_CONFIG,
     )
     n_before = len(rows(tmp_path))
-    assert main(words(towns, tmp_path, "limit=1", "bound_m=20")) == COMPLETE
+    assert main(words(towns, tmp_path, "limit=1", "seconds=2")) == COMPLETE
     assert len(rows(tmp_path)) == n_before + 1
 
 
 def test_a_row_holds_the_drive(towns: Path, tmp_path: Path) -> None:
     assert main(words(towns, tmp_path, "limit=1")) == COMPLETE
     (row,) = rows(tmp_path)
-    assert (row["planner"], row["pictures"], row["start"], row["ended"]) == ("constant_velocity", "none", -1, "time")
-    assert row["duration_s"] == pytest.approx(3.0)
-    assert len(row["ego_states"]) == 31 and len(row["ego_states"][0]) == 11  # type: ignore[arg-type, index]
-    assert len(row["plans"]) == 6 and len(row["plans"][0]) == 120  # type: ignore[arg-type, index]
+    assert (row["planner"], row["pictures"], row["start"]) == ("constant_velocity", "none", -1)
+    assert row["duration_s"] == pytest.approx(2.5)
+    assert len(row["ego_states"]) == 26 and len(row["ego_states"][0]) == 11  # type: ignore[arg-type, index]
+    assert len(row["plans"]) == 5 and len(row["plans"][0]) == 120  # type: ignore[arg-type, index]
 
 
 def test_a_drive_that_cannot_be_made_is_told_and_the_others_are_kept(

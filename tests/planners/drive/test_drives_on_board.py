@@ -29,7 +29,7 @@ def test_the_board_shows_drives_as_they_are_committed_and_their_films(towns: Pat
     answer = json.loads(board.answer("/api/drives").body)
     (line,), (one,) = answer["lines"], answer["drives"]
     assert (answer["total"], line["planner"], line["start"], line["drives"]) == (1, "constant_velocity", "logged", 1)
-    assert one["ended"] == "time" and one["film"] == f"films/{one['drive_id']}.mp4"
+    assert one["failure_reason"] == "" and one["film"] == f"films/{one['drive_id']}.mp4"
     film = board.answer(f"/film/{one['drive_id']}.mp4")
     assert (film.status, film.kind) == (200, "video/mp4") and len(film.body) > 1000
     assert board.answer("/film/0123.mp4").status == 404
@@ -39,15 +39,15 @@ def test_the_board_shows_drives_as_they_are_committed_and_their_films(towns: Pat
 
 
 def test_those_that_failed_come_first_and_a_file_of_its_own_names_no_films(tmp_path: Path) -> None:
-    facts = dict.fromkeys(SCHEMA.names, "") | dict.fromkeys(("duration_s", "distance_m", "comfortable"), 100.0)
+    facts = dict.fromkeys(SCHEMA.names, "") | dict.fromkeys(SCHEMA.names[7:], 0.0) | {"dist_traveled_m": 100.0}
     rows = [
-        facts | {"drive_id": name, "start": start, "route_completed": 0.5, "off_road_events": events}
-        | {"at_fault_collision": hit, "planner": "a", "pictures": "none"}
-        for name, start, events, hit in (("a", -1, 0, False), ("b", 0, 1, True), ("c", 1, 1, False))
+        facts | {"drive_id": name, "start": start, "score": score, "offroad_or_collision_at_fault": float(score == 0)}
+        | {"planner": "a", "pictures": "none"}
+        for name, start, score in (("a", -1, 0.9), ("b", 0, 0.0), ("c", 1, 0.7))
     ]  # fmt: skip
     found = drives_as_json(rows, with_films=False)
     assert [row["drive_id"] for row in found["drives"]] == ["b", "c", "a"]
     assert "film" not in found["drives"][0]
     logged, perturbed = found["lines"]
-    assert (logged["m_between_failures"], perturbed["m_between_failures"]) == (None, pytest.approx(200.0 / 3.0))
+    assert (logged["m_between_incidents"], perturbed["m_between_incidents"]) == (None, pytest.approx(200.0))
     assert Drives(Location.parse(tmp_path)).rows() == []

@@ -114,7 +114,7 @@ def test_a_planner_that_looks_drives_by_the_painter_s_pictures(towns: Path, tmp_
     assert main([*words(towns, tmp_path, "limit=1", *LOOKING), "seconds=1.5"]) == COMPLETE
     (row,) = rows(tmp_path)
     assert (row["pictures"], row["planner"]) == ("truth", "tests.planners.drive.looking.Bright")
-    assert len(row["plans"]) == 3  # type: ignore[arg-type]
+    assert len(row["plans"]) == 2  # type: ignore[arg-type]
 
 
 def test_other_logs_have_no_painter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

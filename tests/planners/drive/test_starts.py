@@ -1,14 +1,13 @@
-"""Worlds that go on past their log, and how far along a road a place lies."""
+"""Worlds that go on past their log, and where drives begin aside of it."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from planners.drive.loop import route_ahead
-from planners.drive.starts import extend_clip, known_places, perturbed_starts
+from planners.drive.starts import extend_clip, perturbed_starts
 from tasks.settings import PdmSettings, TrafficSettings
-from tasks.world.clip import CLIP_STEPS, NOW, Block, SensorFile
+from tasks.world.clip import CLIP_STEPS, NOW, Block
 from tasks.world.road_map import LightState
 from tests.tasks.streets import perturbed, street_clip
 
@@ -42,15 +41,6 @@ def test_lights_that_somebody_knows_are_taken() -> None:
         extend_clip(clip, 201, lights)
 
 
-def test_the_world_is_known_where_the_ego_and_the_sensors_were() -> None:
-    clip, pose = street_clip(), np.eye(4)
-    pose[:2, 3] = 200.0, 5.0
-    block = Block(clip.start_s, clip.agents, (SensorFile("front", "1.jpg", 20.0, pose),), ())
-    places = known_places(replace(clip, block=block))
-    assert len(places) == CLIP_STEPS + 1
-    assert [200.0, 5.0] in places.tolist()
-
-
 def test_perturbed_starts_are_those_that_pdm_closed_can_drive_on_from() -> None:
     """In the order of the candidates; more are not there than asked for."""
     clip = extend_clip(street_clip(), 300)
@@ -61,22 +51,3 @@ def test_perturbed_starts_are_those_that_pdm_closed_can_drive_on_from() -> None:
     for start in found:
         assert start.scene.step == NOW + 40
         assert (start.scene.ego_state == listed.candidates[start.candidate_index].rollout.ego_states[-1]).all()
-
-
-def test_a_place_is_found_near_the_one_before_where_a_road_crosses_itself() -> None:
-    """A loop of 200 m that comes back over its own beginning: the crossing lies at 50 m and at 250 m of the road."""
-    corners = np.array([[0.0, 0.0], [100.0, 0.0], [100.0, 50.0], [50.0, 50.0], [50.0, -50.0]])
-    line = np.column_stack([corners, np.zeros(len(corners))])
-    road = route_ahead(line, np.zeros(3), np.zeros((1, 2)), bound_m=1e6)
-    crossing = np.array([50.0, 0.0])
-    assert road.place_m(crossing, 48.0) == pytest.approx(50.0)
-    assert road.place_m(crossing, 248.0) == pytest.approx(250.0)
-
-
-def test_a_road_is_known_up_to_its_first_unknown_place() -> None:
-    line = np.column_stack([np.arange(0.0, 301.0), np.zeros(301), np.zeros(301)])
-    road = route_ahead(
-        line, np.array([10.0, 1.0, 0.0]), np.array([[10.0, 0.0], [60.0, 0.0], [200.0, 0.0]]), bound_m=30.0
-    )
-    assert (road.start_m, road.known_m) == (10.0, 90.0)
-    assert road.length_m == 80.0

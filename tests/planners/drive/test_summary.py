@@ -7,32 +7,34 @@ import pytest
 
 from planners.drive.summary import picture_source_effects, summarise_drives, summary_text
 
+FLAGS = ("collision_at_fault", "offroad", "left_corridor_laterally", "offroad_or_collision_at_fault")
+
 
 def row(clip: int, *, planner: str = "a", pictures: str = "none", start: int = -1, **more: Any) -> dict[str, Any]:
-    """A kilometre without a failure, of a clip that is a town of its own."""
+    """A kilometre without an incident, of a clip that is a town of its own."""
     facts = {"planner": planner, "pictures": pictures, "start": start, "clip_id": f"{clip}"}
-    facts |= {"log_id": f"town-{clip}-0000-straight", "distance_m": 1000.0, "off_road_events": 0}
-    return facts | {"at_fault_collision": False, "comfortable": 1.0, "route_completed": 1.0} | more
+    facts |= {"log_id": f"town-{clip}-0000-straight", "dist_traveled_m": 1000.0} | dict.fromkeys(FLAGS, 0.0)
+    return facts | {"score": 1.0, "progress_rel_to_total": 1.0} | more
 
 
-def test_metres_between_failures_are_all_metres_over_all_failures() -> None:
-    """3 km with 2 failures in one of three clips: a bootstrap draws 0 to 3 times that clip of three."""
-    (line,) = summarise_drives([row(0, off_road_events=1, at_fault_collision=True), row(1), row(2)])
-    mean, low, high = line.m_between_failures
-    assert (line.km, line.failures, mean) == (3.0, 2, pytest.approx(1500.0))
-    assert (low, high) == (pytest.approx(500.0), np.inf)
-    assert line.shares["at_fault_collision"].b == pytest.approx(1 / 3)
+def test_metres_between_incidents_are_all_metres_over_all_incidents() -> None:
+    """3 km with an incident in one of three clips: a bootstrap draws 0 to 3 times that clip of three."""
+    (line,) = summarise_drives([row(0, offroad_or_collision_at_fault=1.0, collision_at_fault=1.0), row(1), row(2)])
+    mean, low, high = line.m_between_incidents
+    assert (line.km, line.incidents, mean) == (3.0, 1, pytest.approx(3000.0))
+    assert (low, high) == (pytest.approx(1000.0), np.inf)
+    assert line.shares["collision_at_fault"].b == pytest.approx(1 / 3)
 
 
-def test_without_a_failure_there_is_no_bound() -> None:
+def test_without_an_incident_there_is_no_bound() -> None:
     (line,) = summarise_drives([row(0), row(1)])
-    assert line.m_between_failures == (np.inf, np.inf, np.inf)
+    assert line.m_between_incidents == (np.inf, np.inf, np.inf)
 
 
 def test_a_longer_drive_counts_by_its_metres() -> None:
-    """One failure in 1 km of one clip and none in 9 km of the other: 10 km each."""
-    (line,) = summarise_drives([row(0, off_road_events=1), row(1, distance_m=9000.0)])
-    assert line.m_between_failures[0] == pytest.approx(10_000.0)
+    """One incident in 1 km of one clip and none in 9 km of the other: 10 km each."""
+    (line,) = summarise_drives([row(0, offroad_or_collision_at_fault=1.0), row(1, dist_traveled_m=9000.0)])
+    assert line.m_between_incidents[0] == pytest.approx(10_000.0)
 
 
 def test_whole_towns_are_drawn_and_from_one_nothing_can_be() -> None:
@@ -55,13 +57,13 @@ def test_planners_pictures_and_kinds_of_starts_are_told_apart() -> None:
 
 def test_what_the_engine_changes_is_over_the_starts_that_both_were_driven_from() -> None:
     """Three starts with the painter's pictures, of which two were driven with the engine's as well."""
-    truth = [row(i, pictures="truth", route_completed=0.5) for i in range(3)]
-    engine = [row(i, pictures="engine", route_completed=0.5 - 0.1 * i) for i in range(2)]
+    truth = [row(i, pictures="truth", score=0.5) for i in range(3)]
+    engine = [row(i, pictures="engine", score=0.5 - 0.1 * i) for i in range(2)]
     (one,) = picture_source_effects([*truth, *engine])
     assert one.drives == 2
-    assert one.shares["route_completed"].difference == pytest.approx(-0.05)
-    assert one.shares["route_completed"].low == pytest.approx(-0.1)
-    assert one.shares["at_fault_collision"].difference == 0.0
+    assert one.shares["score"].difference == pytest.approx(-0.05)
+    assert one.shares["score"].low == pytest.approx(-0.1)
+    assert one.shares["collision_at_fault"].difference == 0.0
     assert picture_source_effects(truth) == []
 
 

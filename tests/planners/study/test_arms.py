@@ -12,7 +12,6 @@ from planners.study.arms import (
     arm_differences,
     comparison_tables,
     read_arm_drives,
-    route_without_failure,
 )
 from planners.training.many import Training
 from tests.planners.drive.test_summary import row
@@ -37,37 +36,34 @@ def drives_of(
     return read_arm_drives(everyone, str(tmp_path), "")
 
 
-def test_a_drive_with_a_failure_has_completed_nothing_cleanly() -> None:
-    assert route_without_failure(row(0, route_completed=0.7)) == 0.7
-    assert route_without_failure(row(0, route_completed=0.7, off_road_events=2)) == 0.0
-    assert route_without_failure(row(0, route_completed=0.7, at_fault_collision=True)) == 0.0
-
-
 def test_arms_are_held_against_each_other_where_all_have_driven(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
-    """The second arm completes a tenth more of three routes; each has driven one that the other has not."""
-    rows = [row(i, planner=f"{ARMS[0]}-0", route_completed=0.5) for i in (0, 1, 2, 4)]
-    rows += [row(i, planner=f"{ARMS[1]}-0", route_completed=0.6) for i in range(4)]
-    rows += [row(i, planner="constant_velocity", route_completed=0.2) for i in range(3)]
+    """The second arm scores a tenth more in three drives; each has driven one that the other has not."""
+    rows = [row(i, planner=f"{ARMS[0]}-0", score=0.5) for i in (0, 1, 2, 4)]
+    rows += [row(i, planner=f"{ARMS[1]}-0", score=0.6) for i in range(4)]
+    rows += [row(i, planner="constant_velocity", score=0.2) for i in range(3)]
     (found,) = drives_of(monkeypatch, tmp_path, rows)
     assert (found.kind, found.level, len(found.clusters)) == ("logged", "town", 3)
     apart = {(one["arm"], one["reference"], one["measure"]): one for one in arm_differences([found], [PAIR])}
-    more = apart[ARMS[1], ARMS[0], "clean_route"]
+    more = apart[ARMS[1], ARMS[0], "score"]
     assert [more[name] for name in ("difference", "low", "high")] == pytest.approx([10.0, 10.0, 10.0])
-    assert apart[ARMS[0], "constant_velocity", "route_completed"]["difference"] == pytest.approx(30.0)
+    assert apart[ARMS[0], "constant_velocity", "score"]["difference"] == pytest.approx(30.0)
     assert "**+10.0** [+10.0, +10.0]" in comparison_tables([found], list(apart.values()), [])
 
 
-def test_towns_are_drawn_whole_and_failures_count_by_the_kilometre(
+def test_towns_are_drawn_whole_and_incidents_count_by_the_kilometre(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Any
 ) -> None:
-    """Two towns of two drives; the second arm fails once in 4 km, and from two towns any rate of a drive may be."""
+    """Two towns of two drives; the second arm has an incident in 4 km, and from two towns any rate may be."""
     log = {i: f"town-{i // 2}-000{i % 2}-straight" for i in range(4)}
     rows = [row(i, planner=f"{ARMS[0]}-0", log_id=log[i]) for i in range(4)]
-    rows += [row(i, planner=f"{ARMS[1]}-0", log_id=log[i], off_road_events=int(i == 0)) for i in range(4)]
+    rows += [
+        row(i, planner=f"{ARMS[1]}-0", log_id=log[i], score=float(i > 0), offroad_or_collision_at_fault=float(i == 0))
+        for i in range(4)
+    ]
     (found,) = drives_of(monkeypatch, tmp_path, rows)
-    one = found.difference(ARMS[1], ARMS[0], "failures_per_km")
+    one = found.difference(ARMS[1], ARMS[0], "incidents_per_km")
     assert (one.difference, one.low, one.high) == pytest.approx((0.25, 0.0, 1.0))
-    clean = found.difference(ARMS[1], None, "clean_route")
+    clean = found.difference(ARMS[1], None, "score")
     assert (clean.b, clean.low, clean.high) == pytest.approx((75.0, 0.0, 100.0))
 
 
@@ -84,8 +80,8 @@ def test_seeds_are_pairs(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None
     """The same gain in each of two seeds that differ by much has no width."""
     rows = []
     for seed, base in ((0, 0.1), (1, 0.8)):
-        rows += [row(i, planner=f"{ARMS[0]}-{seed}", route_completed=base) for i in range(2)]
-        rows += [row(i, planner=f"{ARMS[1]}-{seed}", route_completed=base + 0.1) for i in range(2)]
+        rows += [row(i, planner=f"{ARMS[0]}-{seed}", score=base) for i in range(2)]
+        rows += [row(i, planner=f"{ARMS[1]}-{seed}", score=base + 0.1) for i in range(2)]
     (found,) = drives_of(monkeypatch, tmp_path, rows, seeds=2)
-    one = found.difference(ARMS[1], ARMS[0], "clean_route")
+    one = found.difference(ARMS[1], ARMS[0], "score")
     np.testing.assert_allclose((one.difference, one.low, one.high), 10.0)

@@ -51,16 +51,16 @@ def driven(out: Path, *rows: dict[str, Any]) -> None:
     table.commit([write_shard(table.location, DRIVES, pa.Table.from_pylist(named, schema=SCHEMA))])
 
 
-def drive(planner: str, town: int, completed: float, **more: Any) -> dict[str, Any]:
+def drive(planner: str, town: int, score: float, **more: Any) -> dict[str, Any]:
     where = {"clip_id": f"c{town}", "log_id": f"town-{town}-0000-curve", "start": -1, "pictures": "none"}
-    return where | {"planner_digest": planner, "route_completed": completed} | more
+    return where | {"planner_digest": planner, "score": score} | more
 
 
 def test_the_last_line_tells_scores_and_drives_over_towns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A tenth better in every clip; of four routes one more is driven cleanly, so zero lies within."""
+    """A tenth better in every clip; of four drives one more scores, so zero lies within."""
     a, b = evaluated(tmp_path / "real", 0.5), evaluated(tmp_path / "mixed", 0.6)
     failed = {"real": 2, "mixed": 1}
-    rows = [drive(who, i, 1.0, off_road_events=int(i < n)) for who, n in failed.items() for i in range(TOWNS)]
+    rows = [drive(who, i, float(i >= n)) for who, n in failed.items() for i in range(TOWNS)]
     driven(tmp_path / "drives", *rows)
     assert main([f"a={a}", f"b={b}", f"drives={tmp_path / 'drives'}", "draws=200"]) == 0
     last = capsys.readouterr().out.splitlines()[-1]
@@ -68,7 +68,7 @@ def test_the_last_line_tells_scores_and_drives_over_towns(tmp_path: Path, capsys
     half = 100 * 3.182446 * 0.25  # Student's t of three degrees of freedom, times the standard error
     ends = f"{25 - half:+.1f} to +100.0"  # no mean leaves the range of its scores
     routes = f"75.0 % against 50.0 %, +25.0 (95 % over 4 towns: {ends}), no difference told from zero"
-    assert last == f"{scores}; routes driven cleanly {routes}"
+    assert last == f"{scores}; scene scores driven {routes}"
     assert main([f"a={a}", f"b={b}", "draws=200"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == scores
 

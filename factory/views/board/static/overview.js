@@ -70,18 +70,18 @@ function drives(d) {
   const lines = d.lines.map((l) =>
     h("tr", { "data-driver": [l.planner, l.pictures, l.start].join(" ") },
       named(l.planner, `${l.start}${l.pictures === "none" ? "" : `, ${l.pictures}`}`),
-      h("td", { class: "n" }, count(l.drives)), h("td", null, bar(l.route_completed, percent(l.route_completed))),
-      h("td", { class: "n" }, percent(l.at_fault_collision)), h("td", { class: "n" }, percent(l.off_road)), h("td", { class: "n roomy" }, percent(l.comfortable)),
-      h("td", { class: "n roomy" }, l.m_between_failures === null ? `> ${count(Math.round(1000 * l.km))}` : count(Math.round(l.m_between_failures)))));
+      h("td", { class: "n" }, count(l.drives)), h("td", null, bar(l.score, percent(l.score))),
+      h("td", { class: "n" }, percent(l.collision_at_fault)), h("td", { class: "n" }, percent(l.offroad)), h("td", { class: "n roomy" }, percent(l.left_corridor)),
+      h("td", { class: "n roomy" }, l.m_between_incidents === null ? `> ${count(Math.round(1000 * l.km))}` : count(Math.round(l.m_between_incidents)))));
   const each = d.drives.map((r) =>
     h("tr", { "data-drive": r.drive_id },
       named(r.planner, `${r.log_id}${r.start < 0 ? "" : `, start ${r.start}`}`),
-      h("td", null, r.at_fault_collision ? `hit a ${r.hit_kind.toLowerCase()}` : r.ended.replace("_", " ")),
-      h("td", { class: "n" }, percent(r.route_completed)), h("td", { class: "n roomy" }, span(r.duration_s)),
+      h("td", null, r.failure_reason.replaceAll("_", " ")),
+      h("td", { class: "n" }, percent(r.score)), h("td", { class: "n roomy" }, span(r.duration_s)),
       h("td", null, r.film ? h("a", { href: `/film/${r.drive_id}.mp4` }, "film") : "")));
-  return section("Planners in closed loop", "Each plans twice a second and drives on among traffic that answers, until a collision, the end of the road or of the known scene, or its time is up. Intervals: summary.csv.",
-    table("drivers", ["planner", "drives", "route completed", "at fault", "off road", "comfortable*", "m between failures*"], lines),
-    fold("The drives", "those that failed first", table("drives", ["drive", "ended", "route", "time*", ""], each)));
+  return section("Planners in closed loop", "Each plans twice a second as long as the log goes on, scored as by AlpaSim. Intervals: summary.csv.",
+    table("drivers", ["planner", "drives", "score", "collision at fault", "off road", "left corridor*", "m between incidents*"], lines),
+    fold("The drives", "those that failed first", table("drives", ["drive", "failed by", "score", "time*", ""], each)));
 }
 
 function acceptance(o) {
