@@ -249,7 +249,8 @@ class Driver:
 
     def _close_session(self, message: Any) -> Any:
         rollout = self.rollouts.end(message.session_uuid)
-        log.warning("session %s: %s", message.session_uuid, _told(rollout.counts))
+        level = logging.WARNING if rollout.counts["fallbacks"] else logging.INFO
+        log.log(level, "session %s: %s", message.session_uuid, _told(rollout.counts))
         return self._proto.Empty()
 
     def _submit_image(self, message: Any) -> Any:

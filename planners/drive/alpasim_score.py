@@ -35,7 +35,9 @@ RELEVANT_FROM_US = 1_000_000  # after the first instant: the forced 0.5 s and a 
 FULL_PROGRESS, SHORT_M = 0.8, 5.0  # of the recording; recordings so short need none
 FAILURES = ("collision_at_fault", "offroad", "left_corridor_laterally")  # the last one since October
 SETTLED = 2  # instants whose distances AlpaSim sets by hand
-LAST = ("progress", "progress_rel_to_total", "dist_traveled_m")  # told by their last instant, all else by its maximum
+LAST = ("progress", "progress_rel_to_total", "dist_traveled_m")  # told by their last instant
+LEAST = ("progress_rel", "min_distance_to_lane_boundary_m", "min_distance_to_obstacle_m")  # by the least, all else most
+WRONG_LANE_RAD, BESIDE_M = 2.0 * math.pi / 3.0, 0.01  # to a lane's direction, which is taken from so far to both sides
 
 
 @dataclass(frozen=True)
@@ -61,10 +63,14 @@ class AlpasimColumns:
     collision_any: float
     collision_at_fault: float  # front or lateral
     offroad: float
+    wrong_lane: float  # on a lane of the other direction; AlpaSim's, who wraps no angle: also where both look west
     offroad_or_collision: float
     offroad_or_collision_at_fault: float
     progress: float  # along the whole recording, 0 .. 1
     progress_rel_to_total: float  # along what of it was driven by the last instant; above 1 beyond it
+    progress_rel: float  # along what of the recording was driven by the time
+    min_distance_to_lane_boundary_m: float  # of all lanes nearby together; 0 outside of them
+    min_distance_to_obstacle_m: float  # NaN: there was nobody
     dist_to_gt_trajectory: float  # m
     lateral_dist_to_gt_trajectory: float  # m; beyond the recording's end only across
     left_corridor_laterally: float
@@ -109,22 +115,30 @@ def score_drive(rollout: LoggedRollout) -> AlpasimColumns:
     """All columns. Raises ValueError for fewer instants than a step makes."""
     if len(rollout.stamps_us) <= SETTLED:
         raise ValueError(f"{len(rollout.stamps_us)} instants: AlpaSim's columns are of a step of 0.5 s at least")
-    hit, off, along = collisions(rollout), off_road(rollout), along_the_recording(rollout)
+    hit, road, along = collisions(rollout), on_the_road(rollout), along_the_recording(rollout)
+    off, along["min_distance_to_obstacle_m"] = road["offroad"], hit.pop("min_distance_to_obstacle_m")
+    along["min_distance_to_lane_boundary_m"] = road["min_distance_to_lane_boundary_m"]
     anywhere, at_fault = np.any(list(hit.values()), axis=0), hit["collision_front"] | hit["collision_lateral"]
     counts = counted(rollout.stamps_us, anywhere | off, along["dist_to_gt_trajectory"])
     flags = hit | {
         "collision_any": anywhere,
         "collision_at_fault": at_fault,
         "offroad": off,
+        "wrong_lane": road["wrong_lane"],
         "offroad_or_collision": anywhere | off,
         "offroad_or_collision_at_fault": at_fault | off,
         "left_corridor_laterally": along["lateral_dist_to_gt_trajectory"] >= CORRIDOR_M,
     }
     found = {name: float(values[counts].max()) for name, values in flags.items()}
-    found |= {
-        name: float(values[counts][-1] if name in LAST else values[counts].max()) for name, values in along.items()
-    }
+    found |= {name: _over_time(name, values[counts]) for name, values in along.items()}
     return AlpasimColumns(**found, score_july=scene_score(found, october=False), score=scene_score(found, october=True))
+
+
+def _over_time(name: str, values: Array) -> float:
+    if name in LAST:
+        return float(values[-1])
+    known = values[~np.isnan(values)]
+    return math.nan if not len(known) else float(known.min() if name in LEAST else known.max())
 
 
 def scene_score(columns: Mapping[str, float], october: bool) -> float:
@@ -170,22 +184,24 @@ def bodies(boxes: Array) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     return whole, shapely.intersection(front, whole), shapely.intersection(rear, whole)
 
 
-def collisions(rollout: LoggedRollout) -> dict[str, Bools]:
-    """(T,) whether another body meets the ego's front, else its rear, else its sides.
+def collisions(rollout: LoggedRollout) -> dict[str, Any]:
+    """(T,) whether another body meets the ego's front, else its rear, else its sides; and how far the nearest is [m].
 
     Of several that touch it at once the tree's last is told, as AlpaSim does.
     """
     whole, front, rear = bodies(rollout.ego)
-    found = np.zeros((3, len(whole)), bool)
+    found, nearest = np.zeros((3, len(whole)), bool), np.full(len(whole), np.nan)
     for t, present in enumerate(rollout.present):
         others = bodies(rollout.others[t][present])[0]
+        nearest[t] = shapely.distance(whole[t], others).min() if len(others) else np.nan
         tree = shapely.STRtree([whole[t], *others])
         touching = [i for i in tree.query(whole[t], predicate="intersects") if i != 0]
         if touching:
             other = tree.geometries[touching[-1]]
             place = 0 if other.intersects(front[t]) else 1 if other.intersects(rear[t]) else 2
             found[place, t] = True
-    return {f"collision_{where}": flags for where, flags in zip(("front", "rear", "lateral"), found)}
+    flags = {f"collision_{where}": flags for where, flags in zip(("front", "rear", "lateral"), found)}
+    return flags | {"min_distance_to_obstacle_m": nearest}
 
 
 # The road.
@@ -203,17 +219,32 @@ def _shapes(road_map: RoadMap) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]
     )
 
 
-def off_road(rollout: LoggedRollout) -> Bools:
-    """(T,) where neither a lane nor the lanes nearby hold the body, and no areas nearby cover it."""
+def on_the_road(rollout: LoggedRollout) -> dict[str, Any]:
+    """(T,) off the road: neither a lane nor the lanes nearby hold the body, and no areas nearby cover it; on a lane of
+    the other direction; and how far the boundary of the lanes nearby is [m], 0 outside of them."""
     centerlines, lanes, areas = _shapes(rollout.road_map)
-    outside = np.zeros(len(rollout.ego), bool)
+    (outside, wrong), gap = np.zeros((2, len(rollout.ego)), bool), np.zeros(len(rollout.ego))
     for t, body in enumerate(bodies(rollout.ego)[0]):
         centre = shapely.Point(rollout.ego[t, :2])
-        near = lanes[shapely.dwithin(centerlines, centre, LANES_M)]
-        if shapely.contains(near, body).any() or shapely.union_all(near).contains(body):
-            continue
-        outside[t] = not shapely.union_all(areas[shapely.dwithin(areas, centre, AREAS_M)]).covers(body)
-    return outside
+        close = shapely.dwithin(centerlines, centre, LANES_M)
+        near, middle = lanes[close], body.centroid
+        turned = _directions(centerlines[close][shapely.contains(near, middle)], middle) - rollout.ego[t, 2]
+        wrong[t] = (np.abs(turned) > WRONG_LANE_RAD).any()
+        together = shapely.union_all(near)
+        if together.contains(body):
+            gap[t] = body.distance(together.boundary)
+        elif not shapely.contains(near, body).any():
+            outside[t] = not shapely.union_all(areas[shapely.dwithin(areas, centre, AREAS_M)]).covers(body)
+    return {"offroad": outside, "wrong_lane": wrong, "min_distance_to_lane_boundary_m": gap}
+
+
+def _directions(lines: NDArray[Any], place: shapely.Point) -> Array:
+    """(L,) of lines beside a place [rad]."""
+    along = shapely.line_locate_point(lines, place)
+    ahead = shapely.line_interpolate_point(lines, np.minimum(along + BESIDE_M, shapely.length(lines)))
+    behind = shapely.line_interpolate_point(lines, np.maximum(along - BESIDE_M, 0.0))
+    x, y = (shapely.get_coordinates(ahead) - shapely.get_coordinates(behind)).T
+    return np.arctan2(y, x)
 
 
 # Along the recording.
@@ -237,8 +268,12 @@ def along_the_recording(rollout: LoggedRollout) -> dict[str, Array]:
     }
     for values in found.values():
         values[:SETTLED] = 0.0
+    by_now = [shapely.LineString(recorded[: t + 1]) for t in range(SETTLED, len(recorded))]
     return found | {
         "progress": progress,
+        "progress_rel": np.append(
+            np.ones(SETTLED), shapely.line_locate_point(by_now, centres[SETTLED:], normalized=True)
+        ),
         "progress_rel_to_total": progress * (total / reached if reached > 0.0 else 1.0),
         "gt_dist_traveled_m": np.full(len(progress), total),
     }
@@ -287,8 +322,9 @@ def results_summary(drives: Sequence[SummaryEntry]) -> str:
 
 
 def _metrics(columns: AlpasimColumns) -> dict[str, float]:
-    """AlpaSim's own columns, by its names."""
-    found = {name: value for name, value in asdict(columns).items() if not name.startswith("score")}
+    """AlpaSim's own columns, by its names, as far as they are known."""
+    told = asdict(columns).items()
+    found = {name: value for name, value in told if not name.startswith("score") and not math.isnan(value)}
     return found | {"progress_clipped_rel": columns.progress_rel_to_total}
 
 
@@ -322,7 +358,7 @@ def _run_entry(name: str, drives: Sequence[SummaryEntry]) -> dict[str, Any]:
     """Means over a run's drives that did not fail, and km per incident; null where there was none."""
     made = [_metrics(one.columns) for one in drives if one.run_name == name and one.columns is not None]
     means: dict[str, float | None] = {
-        key: float(np.mean([one[key] for one in made])) for key in (made[0] if made else ())
+        key: float(np.mean([one[key] for one in made if key in one])) for key in set().union(*made)
     }
     km = sum(one["dist_traveled_m"] for one in made) / 1000.0
     for ending in ("", "_at_fault"):

@@ -27,6 +27,7 @@ COLUMNS = (
     *("dist_to_gt_trajectory", "lateral_dist_to_gt_trajectory", "left_corridor_laterally", "dist_to_gt_location"),
     *("dist_traveled_m", "gt_dist_traveled_m"),
 )
+JULY = ("wrong_lane", "min_distance_to_lane_boundary_m", "min_distance_to_obstacle_m", "progress_rel")
 STAMPS_US = [0, *(17_000 + 500_000 * np.arange(N_INSTANTS - 1)).tolist()]
 
 
@@ -188,6 +189,7 @@ def judged(alpasim: Path, october: bool) -> list[dict[str, Any]]:
     from eval.schema import EvalConfig, MetricAggregationModifiersConfig, MetricVehicleConfig
     from eval.scorers.collision import CollisionScorer
     from eval.scorers.ground_truth import GroundTruthScorer
+    from eval.scorers.min_distance_to_obstacle import MinDistanceToObstacleScorer
     from eval.scorers.offroad import OffRoadScorer
 
     truth: Any = GroundTruthScorer
@@ -218,7 +220,11 @@ def judged(alpasim: Path, october: bool) -> list[dict[str, Any]]:
             force_gt_duration_us=500_000,
         )
         result = SimulationResult.from_scenario_input(given, cfg)
-        metrics = [m for kind in (CollisionScorer, OffRoadScorer, truth) for m in kind(cfg).calculate(result)]
+        metrics = [
+            m
+            for kind in (CollisionScorer, OffRoadScorer, MinDistanceToObstacleScorer, truth)
+            for m in kind(cfg).calculate(result)
+        ]
         relevant = [float(stamp >= result.first_driven_timestamp_us) for stamp in STAMPS_US]
         flag = type(metrics[0])("eval_relevant", STAMPS_US, relevant, [True] * N_INSTANTS, metrics[0].time_aggregation)
         frames.append(create_metrics_dataframe([*metrics, flag], f"{number:02d}", "0", "run", "run"))
@@ -266,6 +272,7 @@ def main() -> None:
     sys.stdout = own
     for given, old, new in zip(rollouts(), july, october):
         columns = {name: round(new["metrics"][name], 9) for name in COLUMNS}
+        columns |= {name: round(old["metrics"][name], 9) for name in JULY}
         told.append(given | {"columns": columns, "score": new["score"], "score_july": old["score"]})
     print(json.dumps({"scored": told, "followed": followed()}, separators=(",", ":")))
 

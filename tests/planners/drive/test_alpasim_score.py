@@ -107,6 +107,13 @@ def test_what_counts_begins_after_a_second_and_ends_with_an_incident_or_four_met
     assert counted(stamps[:3], none[:3], near[:3]).all(), "of a single step everything counts, as for AlpaSim"
 
 
+def test_against_its_lane_s_direction_a_car_is_on_the_wrong_lane() -> None:
+    ahead = straight(8.0, 8.0)
+    turned = replace(ahead, ego=ahead.ego + np.array([0.0, 0.0, 3.0, 0.0, 0.0]))
+    assert (score_drive(ahead).wrong_lane, score_drive(turned).wrong_lane) == (0.0, 1.0)
+    assert np.isnan(score_drive(ahead).min_distance_to_obstacle_m)
+
+
 def test_a_body_is_shrunk_by_two_percent_and_its_corners_are_rounded() -> None:
     """Its area lacks four corners of (1 - pi / 4) r^2."""
     whole, front, _ = bodies(np.array([10.0, 5.0, 0.3, 5.0, 2.0]))
