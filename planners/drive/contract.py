@@ -102,8 +102,8 @@ def peer_in_process(one: EvaluatedPlanner, changed: Mapping[str, Any], pdm: PdmS
     return Peer(service.service.answer, driver.needs_pictures, service)
 
 
-def ask_over_the_wire(address: str) -> Ask:
-    """Questions to a driver at host:port."""
+def ask_over_the_wire(address: str, who: str = "driver", service: str = SERVICE) -> Ask:
+    """Questions to a driver at host:port, or to another service that `who` names."""
     messages()
     import grpc
 
@@ -111,25 +111,30 @@ def ask_over_the_wire(address: str) -> Ask:
     channel = grpc.insecure_channel(address, options=limits)
 
     def ask(method: str, request: bytes) -> bytes:
-        call = channel.unary_unary(f"/{SERVICE}/{method}")
+        call = channel.unary_unary(f"/{service}/{method}")
         patience_s = STARTUP_S if method == "get_version" else PATIENCE_S
         try:
             return bytes(call(request, timeout=patience_s, metadata=CONTRACT, wait_for_ready=method == "get_version"))
         except grpc.RpcError as error:
-            raise ValueError(f"driver={address}: {method}: {error.code().name} {error.details()}") from error
+            raise ValueError(f"{who}={address}: {method}: {error.code().name} {error.details()}") from error
 
     return ask
 
 
 def planner_over_the_wire(address: str) -> EvaluatedPlanner:
     """A driver at host:port, as it names itself. Raises ConfigError where nobody answers."""
-    protocol = messages()
+    name, digest = version_of(ask_over_the_wire(address))
+    return EvaluatedPlanner(name or address, digest, spec=f"{WIRE}{address}")
+
+
+def version_of(ask: Ask) -> tuple[str, str]:
+    """How a service names itself, and 16 hex digits of all that it says of its version. Raises ConfigError where nobody
+    answers."""
     try:
-        version = protocol.VersionId.FromString(ask_over_the_wire(address)("get_version", b""))
+        version = messages().VersionId.FromString(ask("get_version", b""))
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    digest = sha256(f"{version.version_id} {version.git_hash}".encode()).hexdigest()[:16]
-    return EvaluatedPlanner(version.version_id or address, digest, spec=f"{WIRE}{address}")
+    return version.version_id, sha256(f"{version.version_id} {version.git_hash}".encode()).hexdigest()[:16]
 
 
 @dataclass

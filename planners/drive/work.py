@@ -11,6 +11,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from factory.alpasim.sensors import SERVICE
 from factory.readers.base import BadClip, ClipReader, ClipRef, painter_of, read_clip
 from factory.store.location import Location, write_shard
 from factory.store.schema import TableSpec, canonical_json, schema_of
@@ -19,14 +20,17 @@ from planners.drive.alpasim_score import AlpasimColumns, failure_reason, logged_
 from planners.drive.cameras import DriveCameras, NoCameras, PaintedCameras, RenderedCameras, open_rendered_cameras
 from planners.drive.contract import (
     WIRE,
+    Ask,
     DriverSession,
     Peer,
     ask_over_the_wire,
     peer_in_process,
     planner_over_the_wire,
+    version_of,
 )
 from planners.drive.films import Rig, write_film
 from planners.drive.loop import DRIVE_VERSION, ClosedLoopDrive, drive
+from planners.drive.renderer import ServedCameras
 from planners.drive.settings import DriveSettings, Pictures
 from planners.drive.starts import LOGGED, DriveStart, extend_clip, logged_start, perturbed_starts
 from planners.evaluation.planner_names import EvaluatedPlanner, find_planner
@@ -50,7 +54,7 @@ class DriveKey:
     content_digest: str  # of the log, "" where its reader does not say
     start: int  # number of the clip's perturbed start; -1: from the log at T
     planner_digest: str
-    pictures: str  # truth, engine, none
+    pictures: str  # truth, engine, renderer, none
     settings: str  # all that it depends on beside, canonical JSON
 
     @property
@@ -188,6 +192,8 @@ class DriveWork:
             found["pdm"] = asdict(s.pdm)
         if pictures != "none":
             found["render"] = asdict(s.render)
+        if pictures == "renderer":
+            found["renderer"] = version_of(_renderer(s.renderer))[1]
         return found
 
     def __call__(self, item: DriveItem) -> list[DriveRow | FailedDrive]:
@@ -240,6 +246,8 @@ class DriveWork:
 
             cache_dir = self.settings.cache or cache_folder(self.out.uri)
             return open_rendered_cameras(clip, self.settings.render, cache_dir)
+        if pictures == "renderer":
+            return ServedCameras(clip, self.settings.render, _renderer(self.settings.renderer))
         if pictures == "truth":
             painter = painter_of(self.reader)
             assert painter is not None, "pictures=truth goes with a reader that has a painter"
@@ -284,6 +292,12 @@ class DriveWork:
             ego_states=tuple(map(tuple, made.ego_states.tolist())),
             plans=tuple(map(tuple, made.plans.reshape(len(made.plans), -1).tolist())),
         )
+
+
+@lru_cache(maxsize=8)
+def _renderer(address: str | None) -> Ask:
+    assert address is not None, "settings without it are refused"
+    return ask_over_the_wire(address, "renderer", SERVICE)
 
 
 @lru_cache(maxsize=8)
