@@ -38,7 +38,7 @@ def test_the_page_s_own_commands_end_with_a_sentence(
     for _, _, program, *words in page_commands(TENTH):
         assert not PROGRAMS[program](words), capfd.readouterr().err
     last = capfd.readouterr().out.splitlines()[-1]
-    said = re.fullmatch(rf"mixed against real: two-stage EPDMS {CLAIM}; routes driven cleanly {CLAIM}", last)
+    said = re.fullmatch(rf"mixed against real: two-stage EPDMS {CLAIM}; scene scores driven {CLAIM}", last)
     assert said, last
     first = tmp_path / "runs" / "first"
     with (first / "scores" / "summary.csv").open() as file:

@@ -199,7 +199,7 @@ class Driver:
 
         Raises ConfigError for a planner that wants more than AlpaSim sends, and without the messages' package.
         """
-        self._proto, self._given = wire.contract("protocol=alpasim", "planners,alpasim"), cameras
+        self._proto, self._given = wire.contract("protocol=alpasim", "planners"), cameras
         made, needs = load_for_agent(planner, device, "AlpaSim", changed)
         self._rule: CommandRule = command or needs.command
         self._needs = replace(needs, command="navsim")  # the rows have one already, by the rule

@@ -43,7 +43,7 @@ Ask = Callable[[str, bytes], bytes]  # an RPC by its name: bytes of a request in
 
 def messages() -> Any:
     """The messages' classes. Raises ConfigError without their package."""
-    return wire.contract("AlpaSim", "planners,alpasim")
+    return wire.contract("AlpaSim", "planners")
 
 
 class SceneService:
