@@ -68,14 +68,12 @@ log = logging.getLogger(__name__)
 def kernel_parts(simulates: bool, traffic: str, render: RenderSettings, photos_alone: bool) -> list[str]:
     """What a run enters.
 
-    simulates: it has another expert than `human`; traffic: the mode of the drives' traffic, of which the public one,
-    "navsim", has no kernels. photos_alone: clips may have photos and no lidar.
+    simulates: it has another expert than `human`; traffic: the mode of the drives' traffic. photos_alone: clips may
+    have photos and no lidar.
     """
     parts = ["judge", "plan"]
-    if simulates and traffic == "custom":
-        parts.append("policy")
-    if simulates and traffic == "idm":
-        parts.append("drive")
+    if simulates and traffic != "replay":
+        parts.append({"idm": "drive", "navsim": "navsim", "custom": "policy"}[traffic])
     if render.mode is RenderMode.AUTO:
         parts.append("fit" if render.scene is SceneFrom.FIT else "render")
         if render.rig.may_correct(photos_alone):
@@ -233,6 +231,12 @@ def _compile_drive() -> None:
     simulate(scene, ahead, TrafficSettings())
 
 
+def _compile_navsim() -> None:
+    """The public traffic around one ego."""
+    scene, ahead = _tiny_scene()
+    simulate(scene, ahead, TrafficSettings(mode="navsim"))
+
+
 class _StandingPolicy:
     """A traffic policy that is none."""
 
@@ -346,6 +350,7 @@ PARTS: dict[str, Callable[[], object]] = {
     "judge": _compile_judge,
     "plan": _compile_plan,
     "drive": _compile_drive,
+    "navsim": _compile_navsim,
     "policy": _compile_policy,
     "render": compile_render_kernels,
     "fit": _compile_fit,

@@ -286,7 +286,7 @@ def _answer(traffic: TrafficScene, ego_states: Array, steps: int) -> tuple[Agent
     start, n_rows = traffic.scene.step, len(ego_states)
     window = _extend_tracks(traffic.scene.agents, start + n_rows).window(start, start + n_rows)
     if traffic.navsim is not None:
-        return roll_out_navsim(traffic.navsim, traffic.settings, window, ego_states)
+        return roll_out_navsim(traffic.navsim, _driver(traffic.settings), window, ego_states)
     if traffic.roles is None or traffic.paths is None or len(window) == 0:
         return window, np.zeros(len(window), dtype=bool)
     n, policy = len(window), traffic.settings.policy
@@ -364,6 +364,10 @@ def _check_states(ego_states: Array, n_rows: int) -> None:
         raise ValueError(f"ego_states are not finite or above {LARGEST:g}: leave the ego out")
 
 
+def _driver(settings: TrafficSettings) -> IdmDriver:
+    return IdmDriver(*(getattr(settings, name) for name in IdmDriver._fields))
+
+
 def _kernel_inputs(
     traffic: TrafficScene, window: AgentTracks
 ) -> tuple[int, AgentStates, AgentStates, Roles, Paths, IdmDriver]:
@@ -373,7 +377,7 @@ def _kernel_inputs(
     if window.n_steps > len(paths.line_state):  # lights and stops stay as the last step knows them
         more = window.n_steps - len(paths.line_state)
         paths = paths._replace(line_state=np.concatenate([paths.line_state, np.repeat(paths.line_state[-1:], more, 0)]))
-    driver = IdmDriver(*(getattr(traffic.settings, name) for name in IdmDriver._fields))
+    driver = _driver(traffic.settings)
     if traffic.yielding is not None:
         driver = driver._replace(headway_s=min(driver.headway_s, SHORTEST_HEADWAY_S))
     return (

@@ -129,6 +129,15 @@ def test_a_reader_s_settings_tell_whether_photos_may_come_without_lidar(words: l
     assert photos_alone(load_config([*words, "out=somewhere"])) is alone
 
 
+def test_the_public_traffic_needs_kernels_of_its_own_and_no_idm(tmp_path: Path, towns: str) -> None:
+    navsim = ("traffic=navsim", "reward.labels=none")
+    before, after = run_with_these(
+        ["judge", "plan", "navsim"], tmp_path, *TOWN, *BLIND, *navsim, towns, "executor=local"
+    )
+    assert after == before
+    assert not any(name.startswith("tasks/rollout/simulate") for name in after)
+
+
 def test_replayed_traffic_needs_no_idm(tmp_path: Path, towns: str) -> None:
     replay = ("traffic=replay", "reward.labels=none")
     before, after = run_with_these(["judge", "plan"], tmp_path, *TOWN, *BLIND, *replay, towns, "executor=local")

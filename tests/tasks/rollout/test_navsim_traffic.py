@@ -19,15 +19,18 @@ from numpy.typing import NDArray
 from tasks.attempt import drive_and_judge
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Plan
-from tasks.rollout.navsim import idm_acceleration
+from tasks.rollout.idm import IdmDriver
+from tasks.rollout.navsim import drive_agents, idm_acceleration
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out, simulate
 from tasks.world.clip import NOW, STEP_S, AgentKind, Rollout, Scene
 from tasks.world.frames import PACIFICA
+from tasks.world.road_map import RoadMap
 from tests.tasks.rollout import slow_navsim, worlds
 from tests.tasks.rollout.crowds import Crowd, crowd, crowd_of
 from tests.tasks.rollout.worlds import CAR, Track
 
 NAVSIM = TrafficSettings(mode="navsim")
+DRIVER = IdmDriver(*(getattr(NAVSIM, name) for name in IdmDriver._fields))
 RECORDED = Path(__file__).parent / "recorded" / "navsim_traffic.npz"
 seeds = st.integers(0, 2**31)
 
@@ -61,6 +64,30 @@ def test_crowds_move_as_the_public_code_has_moved_them() -> None:
         np.testing.assert_allclose(ours.agents.velocities, answer["public_velocities"], rtol=0, atol=1e-9)
         seen += int(ours.simulated.sum())
     assert seen > 40
+
+
+def test_geos_is_asked_about_fewer_than_half_of_the_looks() -> None:
+    looks = asked = 0
+    for one, _ in recorded():
+        agents = prepare_traffic(one.scene, NAVSIM).navsim
+        assert agents is not None
+        tracks, times = drive_agents(agents, DRIVER, one.ego_states)
+        looks, asked = looks + int(np.isfinite(tracks[..., 3]).sum()), asked + times
+    assert 0 < asked < 0.5 * looks, (asked, looks)
+
+
+def test_far_from_the_map_s_origin_the_traffic_is_the_same() -> None:
+    """Where numbers are rounded to 5e-10 m, as in the public maps."""
+    one, far = crowd(worlds.fork(), 3, (5, 12)), np.array([664430.0, 3997650.0])
+    moved = {
+        name: replace(lane, ring=lane.ring + far, centerline=lane.centerline + np.pad(far, (0, 1)))
+        for name, lane in one.road_map.lanes.items()
+    }
+    now, ego = one.now + np.pad(far, (0, 5)), one.ego_states + np.pad(far, (0, 9))
+    there = replace(one, road_map=RoadMap(moved, ()), now=now, ego_states=ego)
+    here, away = (roll_out(prepare_traffic(of.scene, NAVSIM), of.ego_states).agents for of in (one, there))
+    assert here.valid[-1].any() and np.array_equal(here.valid, away.valid)
+    np.testing.assert_allclose(away.boxes[..., :2] - far, here.boxes[..., :2], rtol=0, atol=1e-7)
 
 
 @pytest.mark.slow
@@ -100,7 +127,7 @@ def test_alone_a_car_drives_its_lane_as_if_a_wall_stood_at_its_end_but_one_point
     }
     rollout = run(worlds.scene(lanes, Track(20.0, speed=5.0), ego=BESIDE))
     left = 50.0 - 0.75 - 20.0 - CAR[0] / 2.0
-    assert first_acceleration(rollout, 0) == pytest.approx(idm_acceleration(5.0, 10.0, left, 0.0, NAVSIM), abs=1e-9)
+    assert first_acceleration(rollout, 0) == pytest.approx(idm_acceleration(5.0, 10.0, left, 0.0, DRIVER), abs=1e-9)
     assert rollout.agents.boxes[-1, 0, 0] < 50.0 - 0.75 - CAR[0] / 2.0 and rollout.simulated.tolist() == [True]
 
 
@@ -108,14 +135,14 @@ def test_the_egos_box_stands_about_its_rear_axle() -> None:
     """As in the public code, 1.461 m too far back: the gap ends at the rear axle less half of the ego's length."""
     rollout = run(worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), ego=(30.0, 0.0, 0.0), ego_speed=3.0))
     gap = 30.0 - PACIFICA.half_length - CAR[0] / 2.0
-    assert first_acceleration(rollout, 0) == pytest.approx(idm_acceleration(8.0, 10.0, gap, 3.0, NAVSIM), abs=1e-9)
+    assert first_acceleration(rollout, 0) == pytest.approx(idm_acceleration(8.0, 10.0, gap, 3.0, DRIVER), abs=1e-9)
 
 
 def test_who_drives_beside_a_car_and_reaches_into_its_way_is_its_leader() -> None:
     """Two lanes that overlap: middles 1.5 m apart, cars 1.9 m wide."""
     lanes = {name: worlds.lane(name, [(-100.0, y), (500.0, y)]) for name, y in (("right", 0.0), ("left", 1.5))}
     rollout = run(worlds.scene(lanes, Track(0.0, -0.5, speed=6.0), Track(20.0, 2.5, speed=2.0), ego=BESIDE))
-    expected = idm_acceleration(6.0, 10.0, 20.0 - CAR[0], 2.0, NAVSIM)
+    expected = idm_acceleration(6.0, 10.0, 20.0 - CAR[0], 2.0, DRIVER)
     assert first_acceleration(rollout, 0) == pytest.approx(expected, abs=1e-9)
     assert rollout.agents.boxes[1, :, 1].tolist() == [0.0, 1.5]
 
@@ -128,10 +155,10 @@ def test_a_limit_stays_for_those_after_it_that_have_none() -> None:
     before, slow, after = Track(0.0, speed=4.0), Track(0.0, 20.0, speed=4.0), Track(90.0, speed=4.0)
     rollout = run(worlds.scene(lanes, before, slow, after, ego=BESIDE))
     end = lambda x: 900.0 - 0.75 - x - CAR[0] / 2.0  # noqa: E731
-    behind = idm_acceleration(4.0, 10.0, 90.0 - CAR[0], 4.0, NAVSIM)
+    behind = idm_acceleration(4.0, 10.0, 90.0 - CAR[0], 4.0, DRIVER)
     assert first_acceleration(rollout, 0) == pytest.approx(behind, abs=1e-9)
     for i, x in ((1, 0.0), (2, 90.0)):
-        expected = idm_acceleration(4.0, 5.0, end(x), 0.0, NAVSIM)
+        expected = idm_acceleration(4.0, 5.0, end(x), 0.0, DRIVER)
         assert first_acceleration(rollout, i) == pytest.approx(expected, abs=1e-9)
 
 
