@@ -137,8 +137,7 @@ def _run(
     from factory.store.funnel import image_sources_text
     from factory.store.location import BadLocation, Location
     from factory.store.samples import OtherSchema, Store
-    from factory.views.board.report import write_facts, write_report
-    from factory.views.card import write_card
+    from factory.views.board.report import write_pages
     from factory.views.sample_text import prepared_episode
     from factory.views.status import failure_summary
 
@@ -201,11 +200,8 @@ def _run(
                 print(f"{stage:<12}{n:>8}{total:>10.1f}{total / n:>10.2f}")
     if set(config.experts) >= NEEDED and summary.exit_code == COMPLETE:
         print(write_benchmark(store, refs, assembled.work.identity, config.rounds, config.benchmark))
-    write_facts(store, assembled)
-    where = store.location.uri
-    print(f"report: {write_report(store)}")
-    print(f"card: {write_card(store)}")
-    print(f"look at samples: python -m factory dashboard out={where}")
+    report, card = write_pages(store, assembled)
+    print(f"report: {report}\ncard: {card}\nlook at samples: python -m factory dashboard out={store.location.uri}")
     if summary.exit_code == COMPLETE_WITH_FAILURES:
         print(failure_summary(store))
     return summary.exit_code

@@ -41,6 +41,12 @@ def write_card(store: Store) -> str:
     return where
 
 
+def written_card(store: Store) -> str | None:
+    """Where the card is; None where none of ours is there."""
+    there = store.location.read(FILE)
+    return f"{store.location.uri}/{FILE}" if there is not None and MARK.encode() in there else None
+
+
 def card(store: Store) -> str:
     """The text: YAML front matter, then Markdown."""
     samples, outcomes, lists = funnel_tables(store, COLUMNS)

@@ -81,6 +81,22 @@ def test_status_card_dashboard_and_report_have_one_line(out: Path, capsys: pytes
 
 
 @pytest.mark.slow
+def test_the_same_command_again_leaves_its_pages_and_makes_those_again_that_are_not_of_its_rows(
+    root: Path, tmp_path: Path
+) -> None:
+    pages = [tmp_path / "report.html", tmp_path / "README.md"]
+    assert run(root, tmp_path) == COMPLETE
+    made = [page.stat().st_mtime_ns for page in pages]
+    assert run(root, tmp_path) == COMPLETE and made == [page.stat().st_mtime_ns for page in pages]
+    (tmp_path / "report.json").write_text("{")  # not readable: nothing says what they are of
+    assert run(root, tmp_path) == COMPLETE
+    again = [page.stat().st_mtime_ns for page in pages]
+    assert all(later > first for later, first in zip(again, made))
+    pages[1].unlink()
+    assert run(root, tmp_path) == COMPLETE and pages[1].is_file()
+
+
+@pytest.mark.slow
 def test_a_sample_says_what_was_repaired_in_its_clip(
     out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

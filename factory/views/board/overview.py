@@ -249,6 +249,11 @@ class Drives:
         self._seen: int | None = None
         self._rows: list[dict[str, Any]] = []
 
+    @property
+    def files(self) -> list[str]:
+        """Of their table, as it was opened."""
+        return sorted(self._table.live_files())
+
     def rows(self) -> Sequence[Row]:
         """All of them, in the order of their ids; none where nobody has driven."""
         with self._lock:

@@ -4,11 +4,13 @@ Scripts and numbers are those of the live page; nothing is fetched, and the file
 """
 
 import base64
+import hashlib
 import json
 import re
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,15 +18,18 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from factory import __version__
 from factory.config.arguments import Refused
+from factory.files import DamagedFile
 from factory.store.reader import decode_stored_image
-from factory.store.samples import FACTS, Store
+from factory.store.samples import CURRENT_RUN, FACTS, LAST_RUN, RUN_FILE, Store
 from factory.store.schema import NOW_INDEX
 from factory.store.table import text_equals
 from factory.views.board.gallery import Pictures, failures, gallery, gallery_card, newest_first_place, sample_page
 from factory.views.board.overview import Drives, drives_as_json, overview
 from factory.views.board.server import STATIC
 from factory.views.board.watch import Snapshot, Watch
+from factory.views.card import write_card, written_card
 from factory.views.pictures import front_camera, images_at_now, small_jpeg
 from factory.views.status import value_counts
 from tasks.caches import json_with_checksum
@@ -62,12 +67,33 @@ def write_report(store: Store, to: str | None = None) -> str:
     return str(Path(to).expanduser().resolve())
 
 
-def write_facts(store: Store, assembled: "Run") -> None:
-    """Write report.json, for this report and later ones."""
+def write_pages(store: Store, assembled: "Run") -> tuple[str, str]:
+    """Report and card at the end of a run, and report.json for later ones; where each is, as their writers say it.
+
+    Pages that were made of the same tables, files and facts by this version stay as they are.
+    """
+    facts, made_of, known = run_facts(assembled), hashlib.sha256(__version__.encode()), dict[str, Any]()
+    rows = [sorted(table.live_files()) for table in store.tables]
+    made_of.update(json.dumps([facts, rows, Drives(store.location).files]).encode())
+    for name in (RUN_FILE, CURRENT_RUN, LAST_RUN):
+        made_of.update(store.location.read(name) or b"-")
+    digest = made_of.hexdigest()
+    with suppress(DamagedFile):
+        known = store.document(FACTS)
+    if known.get("pages_of") == digest and store.location.has(FILE) and (there := written_card(store)):
+        return f"{store.location.uri}/{FILE}", there
+    store.location.write(FACTS, json_with_checksum(facts).encode())
+    where = write_report(store), write_card(store)
+    store.location.write(FACTS, json_with_checksum(facts | {"pages_of": digest}).encode())
+    return where
+
+
+def run_facts(assembled: "Run") -> dict[str, Any]:
+    """What the tables do not say of a run."""
     config, index, vocabulary = assembled.config, assembled.index, assembled.work.vocabulary
     n_found = len(index.refs) + len(index.broken)
     planned = n_found if config.limit is None else min(config.limit, n_found)
-    facts = {
+    return {
         "facts": {
             "clips of the newest run": f"{planned} of {n_found} found",
             "rounds": str(config.rounds),
@@ -80,7 +106,6 @@ def write_facts(store: Store, assembled: "Run") -> None:
             "Broken logs": {f"{ref.log_id} at {ref.start_ms} ms": why for ref, why in index.broken.items()},
         },
     }
-    store.location.write(FACTS, json_with_checksum(facts).encode())
 
 
 def report_page(store: Store, shot: Snapshot, pictures: Pictures, extra: Mapping[str, Any]) -> bytes:
