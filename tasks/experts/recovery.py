@@ -107,7 +107,7 @@ def _integrators() -> tuple[Array, Array, Array]:
 
 def _along(wanted: Array, speed0: float, accel0: float, settings: FeasibleSettings) -> tuple[Array, Array] | str:
     """Distance and speed (41,) each at 0 .. 4.0 s."""
-    to_accel, to_speed, to_distance = _integrators()
+    _, to_speed, to_distance = _integrators()
     free_speed = speed0 + accel0 * T_S
     free_distance = speed0 * T_S + accel0 * T_S**2 / 2.0
 
@@ -122,10 +122,11 @@ def _along(wanted: Array, speed0: float, accel0: float, settings: FeasibleSettin
     low_accel = np.minimum(settings.accel_min_mps2, released)
     high_accel = np.maximum(settings.accel_max_mps2, released)
     weight = settings.weight_progress * _at_the_end(settings)
+    hessian, rows = _along_matrices(settings)
     jerk = _solve(
-        hessian=to_distance.T @ (weight * to_distance) + settings.weight_jerk * np.eye(N),
+        hessian=hessian,
         gradient=to_distance.T @ (weight[:, 0] * (free_distance - wanted)),
-        rows=np.concatenate([to_speed, to_accel, np.eye(N)]),
+        rows=rows,
         low=np.concatenate([low_speed - free_speed, low_accel - accel0, np.full(N, -settings.jerk_max_mps3)]),
         high=np.concatenate([np.full(N, np.inf), high_accel - accel0, np.full(N, settings.jerk_max_mps3)]),
         settings=settings,
@@ -136,6 +137,25 @@ def _along(wanted: Array, speed0: float, accel0: float, settings: FeasibleSettin
     distance = np.concatenate([[0.0], free_distance + to_distance @ jerk])
     speed = np.concatenate([[speed0], free_speed + to_speed @ jerk])
     return distance, speed
+
+
+@cache
+def _along_matrices(settings: FeasibleSettings) -> tuple[sparse.csc_matrix, sparse.csc_matrix]:
+    """(hessian, rows) of the problem along the path, wherever it starts."""
+    to_accel, to_speed, to_distance = _integrators()
+    weight = settings.weight_progress * _at_the_end(settings)
+    hessian = to_distance.T @ (weight * to_distance) + settings.weight_jerk * np.eye(N)
+    return _upper(hessian), sparse.csc_matrix(np.concatenate([to_speed, to_accel, np.eye(N)]))
+
+
+@cache
+def _across_rows() -> sparse.csc_matrix:
+    """Of the problem across it."""
+    return sparse.csc_matrix(np.concatenate([STEP_S * np.tril(np.ones((N, N))), np.eye(N)]))
+
+
+def _upper(hessian: Array) -> sparse.csc_matrix:
+    return sparse.csc_matrix(np.triu(hessian))
 
 
 def _across(wanted: Array, speed: Array, kappa0: float, settings: FeasibleSettings) -> Array | str:
@@ -158,12 +178,14 @@ def _across(wanted: Array, speed: Array, kappa0: float, settings: FeasibleSettin
     bound = np.maximum(bound, abs(kappa0) - STEP_S * np.cumsum(rate))
     more = _at_the_end(settings)
     change = _solve(
-        hessian=to_lateral.T @ (settings.weight_lateral * more * to_lateral)
-        + to_heading.T @ (settings.weight_heading * more * to_heading)
-        + settings.weight_yaw_accel * np.diag(np.maximum(mean_speed, SLOW_MPS) ** 2),
+        hessian=_upper(
+            to_lateral.T @ (settings.weight_lateral * more * to_lateral)
+            + to_heading.T @ (settings.weight_heading * more * to_heading)
+            + settings.weight_yaw_accel * np.diag(np.maximum(mean_speed, SLOW_MPS) ** 2)
+        ),
         gradient=to_lateral.T @ (settings.weight_lateral * more[:, 0] * free_lateral)
         + to_heading.T @ (settings.weight_heading * more[:, 0] * (free_heading - wanted[1:])),
-        rows=np.concatenate([to_kappa, np.eye(N)]),
+        rows=_across_rows(),
         low=np.concatenate([-bound - kappa0, -rate]),
         high=np.concatenate([bound - kappa0, rate]),
         settings=settings,
@@ -182,18 +204,24 @@ def _at_the_end(settings: FeasibleSettings) -> Array:
 
 
 def _solve(
-    hessian: Array, gradient: Array, rows: Array, low: Array, high: Array, settings: FeasibleSettings, what: str
+    hessian: sparse.csc_matrix,
+    gradient: Array,
+    rows: sparse.csc_matrix,
+    low: Array,
+    high: Array,
+    settings: FeasibleSettings,
+    what: str,
 ) -> Array | str:
-    """argmin 1/2 x' H x + g' x, low <= rows x <= high; or why there is none.
+    """argmin 1/2 x' H x + g' x, low <= rows x <= high, of H the upper triangle; or why there is none.
 
     The solver is fresh and its step size adapts by iteration count, never by the clock: the result does not depend on
     what was solved before or on how busy the machine is.
     """
-    solver = osqp.OSQP()
+    solver = osqp.OSQP(algebra="builtin")  # its default where no other is installed; to look for others takes longer
     solver.setup(
-        P=sparse.csc_matrix(np.triu(hessian)),
+        P=hessian,
         q=gradient,
-        A=sparse.csc_matrix(rows),
+        A=rows,
         l=low,
         u=high,
         verbose=False,
