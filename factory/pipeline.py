@@ -3,7 +3,6 @@
 The stages behind the machine: what `factory.graph.steps.Work` asks for, with real clips and the science of tasks/.
 """
 
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -17,6 +16,7 @@ from factory.graph.steps import (
     PreparedClip,
     RejectedAttempt,
     SampleColumns,
+    Spent,
     StopCheck,
     never_stop,
 )
@@ -80,7 +80,7 @@ class WholeClip:
 
     clip: Clip
     found: Perturbation | Rejected  # Rejected by render or perturb: no simulated expert has anything to try
-    seconds: Mapping[str, float]  # by stage
+    seconds: Mapping[str, Spent]  # by stage
     cameras_left_out: tuple[str, ...] = field(default=(), kw_only=True)  # too poor in its block to be drawn
 
     @property
@@ -127,19 +127,19 @@ class Drive:
 
 
 class Stopwatch:
-    """Seconds by stage."""
+    """What was spent, by stage."""
 
     def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
+        self.seconds: dict[str, Spent] = {}
 
     @contextmanager
     def timing(self, stage: str) -> Iterator[None]:
         """Adds the time spent inside to the stage."""
-        start = time.perf_counter()
+        began = Spent.now()
         try:
             yield
         finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+            self.seconds[stage] = self.seconds.get(stage, Spent()) + (Spent.now() - began)
 
 
 @dataclass(frozen=True)

@@ -194,10 +194,9 @@ def _run(
         return summary.exit_code
     print(image_sources_text(store, [ref.clip_id for ref in refs]))
     if summary.seconds:
-        print(f"{'stage':<12}{'tasks':>8}{'seconds':>10}{'each':>10}")
-        for stage, (n, total) in summary.seconds.items():
-            if n:
-                print(f"{stage:<12}{n:>8}{total:>10.1f}{total / n:>10.2f}")
+        print(f"{'stage':<12}{'tasks':>8}{'CPU s':>10}{'each':>10}{'seconds':>10}")
+        for stage, (n, spent) in summary.seconds.items():
+            print(f"{stage:<12}{n:>8}{spent.cpu_s:>10.1f}{spent.cpu_s / n:>10.3f}{spent.wall_s:>10.1f}")
     if set(config.experts) >= NEEDED and summary.exit_code == COMPLETE:
         print(write_benchmark(store, refs, assembled.work.identity, config.rounds, config.benchmark))
     report, card = write_pages(store, assembled)

@@ -47,6 +47,7 @@ from factory.graph.steps import (
     Failure,
     MakeEpisode,
     PrepareReport,
+    Spent,
 )
 from factory.readers.base import ClipRef
 from factory.store.episodes import EPISODES_FOLDER, episode_name, wants_episode
@@ -377,7 +378,7 @@ class RunDriver:
         self._records = RunRecords(identity, digests)
         self.executed = RunTotals(found_done=plan.found_done)
         self.notes: list[str] = []
-        self._seconds: dict[str, list[float]] = defaultdict(lambda: [0, 0.0])
+        self._seconds: dict[str, tuple[int, Spent]] = defaultdict(lambda: (0, Spent()))
         self._fresh: set[str] = set()  # attempt_ids that failed in this run
         self._building: dict[Ticket, BlockBuild] = {}
         self._preparing: dict[Ticket, ClipPlan] = {}
@@ -406,9 +407,9 @@ class RunDriver:
         self.stop()
 
     @property
-    def seconds(self) -> dict[str, tuple[int, float]]:
-        """Stage -> (tasks, seconds) of this run."""
-        return {stage: (int(n), total) for stage, (n, total) in sorted(self._seconds.items())}
+    def seconds(self) -> dict[str, tuple[int, Spent]]:
+        """Stage -> tasks of this run, and what they spent."""
+        return dict(sorted(self._seconds.items()))
 
     @property
     def has_failures(self) -> bool:
@@ -667,8 +668,10 @@ class RunDriver:
             self._metrics.record_accepted(stamp.expert, stamp.round)
         else:
             what = report if isinstance(report, Failure) else report.rejected
-            measured = ({}, {}) if isinstance(report, Failure) else (dict(report.subscores), dict(report.seconds))
             assert what is not None
+            measured: tuple[dict[str, float], dict[str, float]] = {}, {}
+            if isinstance(report, AttemptReport):
+                measured = dict(report.subscores), {stage: spent.wall_s for stage, spent in report.seconds.items()}
             outcome = self._records.outcome(
                 clip.ref, stamp.attempt_id, stamp.expert, stamp.candidate_index, what, tries_so_far(known), *measured
             )
@@ -699,8 +702,8 @@ class RunDriver:
     def _may_retry(self, past: PastAttempt) -> bool:
         return past.attempt_id not in self._fresh and self._policy(past)
 
-    def _add_seconds(self, seconds: Mapping[str, float], work: Workload) -> None:
-        work.spent_s += sum(seconds.values())
+    def _add_seconds(self, seconds: Mapping[str, Spent], work: Workload) -> None:
         for stage, spent in seconds.items():
-            self._seconds[stage][0] += 1
-            self._seconds[stage][1] += spent
+            n, total = self._seconds[stage]
+            self._seconds[stage] = n + 1, total + spent
+            work.spent_s += spent.wall_s

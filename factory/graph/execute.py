@@ -40,7 +40,7 @@ from factory.graph.local import (
 from factory.graph.own_process import AGAIN, NEW_CLUSTERS, new_cluster_text
 from factory.graph.plan import RunPlan, RunRecords, make_plan, plan_after_crash, retry_policy
 from factory.graph.progress import Outlook, RunMetrics, RunTotals
-from factory.graph.steps import NotReady, Work
+from factory.graph.steps import NotReady, Spent, Work
 from factory.readers.base import ClipRef
 from factory.store.funnel import Funnel, funnel_of
 from factory.store.location import BadLocation
@@ -60,7 +60,7 @@ class RunSummary:
     message: str = ""
     counts: dict[str, int] = field(default_factory=dict)  # accepted, rejected, failed, exhausted, of the planned clips
     executed: RunTotals = field(default_factory=RunTotals)
-    seconds: dict[str, tuple[int, float]] = field(default_factory=dict)  # stage -> (tasks, seconds) of this run
+    seconds: dict[str, tuple[int, Spent]] = field(default_factory=dict)  # stage -> tasks of this run, what they spent
     notes: list[str] = field(default_factory=list)
     funnel: Funnel | None = None
     began_ms: int = 0  # since 1970; 0: nothing was left to do
@@ -340,7 +340,10 @@ def write_last_run(store: Store, summary: RunSummary) -> None:
         "message": summary.message,
         "counts": summary.counts,
         "executed": asdict(summary.executed),
-        "seconds": {stage: {"tasks": n, "seconds": total} for stage, (n, total) in summary.seconds.items()},
+        "seconds": {
+            stage: {"tasks": n, "seconds": spent.wall_s, "cpu_seconds": spent.cpu_s}
+            for stage, (n, spent) in summary.seconds.items()
+        },
         "notes": summary.notes,
     }
     store.location.write(LAST_RUN, json_with_checksum(document).encode())

@@ -310,8 +310,8 @@ class RunMetrics:
     def _record_report(self, report: object) -> None:
         if isinstance(report, PrepareReport | BlockReport | AttemptReport):
             for stage, spent in report.seconds.items():
-                self._add(STAGE_SECONDS, spent, stage=stage)
-                self._add(STAGE_SPENT, spent, stage=stage)
+                self._add(STAGE_SECONDS, spent.wall_s, stage=stage)
+                self._add(STAGE_SPENT, spent.wall_s, stage=stage)
         if isinstance(report, PrepareReport):
             self._record_lookup("prepared", report.from_cache)
         elif isinstance(report, BlockReport):

@@ -54,6 +54,25 @@ class NotReady(ValueError):
 
 
 @dataclass(frozen=True)
+class Spent:
+    """Time in a stage, of one task or of several."""
+
+    wall_s: float = 0.0
+    cpu_s: float = 0.0  # of all threads of the process
+
+    @staticmethod
+    def now() -> "Spent":
+        """By this process's clocks; a later one less an earlier one is what was spent."""
+        return Spent(time.perf_counter(), time.process_time())
+
+    def __add__(self, more: "Spent") -> "Spent":
+        return Spent(self.wall_s + more.wall_s, self.cpu_s + more.cpu_s)
+
+    def __sub__(self, before: "Spent") -> "Spent":
+        return Spent(self.wall_s - before.wall_s, self.cpu_s - before.cpu_s)
+
+
+@dataclass(frozen=True)
 class PreparedClip:
     """The stages `clip` and `perturb` of one clip: everything its attempts need."""
 
@@ -63,7 +82,7 @@ class PreparedClip:
     gate_counts: Mapping[str, int]  # gate -> vocabulary entries it dropped, in the gates' order
     payload: object  # tree of frozen dataclasses, dicts, tuples, numpy arrays and scalars (factory.store.location)
     dropped: Rejected | None = None  # why there are no candidates; the human row is scored all the same
-    seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
+    seconds: Mapping[str, Spent] = field(default_factory=dict)  # by stage
     scenes: "BenchmarkClip | None" = None  # to be kept beside the tables before any row of the clip is
     repairs: tuple[RepairCount, ...] = ()  # in what it was read from
     repair_records: tuple[Repair, ...] = ()  # the same one by one, factory.store.samples.MOST_RECORDS at most
@@ -74,7 +93,7 @@ class AcceptedDrive:
     """A drive that the reward accepts, on its way to a sample: all that it takes to draw and to label it."""
 
     payload: object  # the work's own; it can be pickled
-    seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
+    seconds: Mapping[str, Spent] = field(default_factory=dict)  # by stage
 
 
 @dataclass(frozen=True)
@@ -82,7 +101,7 @@ class SampleColumns:
     """Some columns of a sample, of factory.store.schema less the ones in its BOOKKEEPING."""
 
     row: Mapping[str, object]
-    seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
+    seconds: Mapping[str, Spent] = field(default_factory=dict)  # by stage
     scene_at_hand: bool | None = None  # the worker had the scene to draw in its memory; None: nothing was drawn
 
 
@@ -92,7 +111,7 @@ class RejectedAttempt:
 
     rejected: Rejected
     subscores: Mapping[str, float] = field(default_factory=dict)  # as far as they were computed
-    seconds: Mapping[str, float] = field(default_factory=dict)
+    seconds: Mapping[str, Spent] = field(default_factory=dict)
     scene_at_hand: bool | None = None
 
 
@@ -100,7 +119,7 @@ class RejectedAttempt:
 class BlockReport:
     """A clip's block is in this machine's cache."""
 
-    seconds: Mapping[str, float]  # by stage
+    seconds: Mapping[str, Spent]  # by stage
     from_cache: bool  # it was there
     psnr_db: float | None = None  # of its held-out photos; None where there are none
 
@@ -230,7 +249,7 @@ class PrepareReport:
     from_cache: bool
     note: str = ""  # why the cache was of no use, where a file was there
     uncached: str = ""  # why it could not be kept for later runs
-    seconds: Mapping[str, float] = field(default_factory=dict)
+    seconds: Mapping[str, Spent] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -251,7 +270,7 @@ class AttemptReport:
     n_bytes: int = 0  # of the row
     licence: str = ""  # of its source
     subscores: Mapping[str, float] = field(default_factory=dict)
-    seconds: Mapping[str, float] = field(default_factory=dict)
+    seconds: Mapping[str, Spent] = field(default_factory=dict)
     scene_at_hand: bool | None = None
     psnr_db: float | None = None  # of the block that an accepted one is drawn from
 
@@ -326,7 +345,7 @@ def prepare(
     A log that was changed is an input failure where its rows are to be continued, else its cached clip is not used.
     """
     cache, key = ClipCache(out.child("cache/prepared")), cache_key(ref.clip_id, work.identity.prepare_digest)
-    note, began = "", time.perf_counter()
+    note, began = "", Spent.now()
     try:
         stored = cache.load(key)
     except BadCacheFile as error:
@@ -342,7 +361,7 @@ def prepare(
     if isinstance(stored, PreparedClip):
         _refuse_changed(ref, stored.content_digest, wanted_content)
         _keep_scenes(out, stored)
-        seconds = {"cache": time.perf_counter() - began}
+        seconds = {"cache": Spent.now() - began}
         return PrepareReport(replace(stored, payload=None, scenes=None), True, note, "", seconds), stored
     result = work.prepare(ref)
     if isinstance(result, Rejected):
@@ -379,7 +398,7 @@ def attempt(
 ) -> tuple[AttemptReport | AttemptUnfinished | Failure, pa.Table | PartialAttempt | None]:
     """Some stages of one attempt, from where it stands; an accepted one is checked against the schema here, where its
     traceback still means something."""
-    began, stage = time.perf_counter(), ""
+    began, stage = Spent.now(), ""
     try:
         for stage in stages:
             result = run_stage(work, stage, so_far, stamp.candidate_index, stamp.expert)
@@ -388,7 +407,7 @@ def attempt(
             so_far = result
         if isinstance(result, PartialAttempt):
             return AttemptUnfinished(), result
-        seconds = result.seconds or {"attempt": time.perf_counter() - began}
+        seconds = result.seconds or {"attempt": Spent.now() - began}
         if isinstance(result, RejectedAttempt):
             subscores, at_hand = dict(result.subscores), result.scene_at_hand
             return AttemptReport(result.rejected, subscores=subscores, seconds=seconds, scene_at_hand=at_hand), None

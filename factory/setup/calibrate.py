@@ -109,14 +109,14 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
             continue
         sums.candidates += len(prepared.candidates)
         sums.cache_bytes += len(encode_tree(prepared))
-        sums.seconds.update(prepared.seconds)
+        sums.seconds.update({stage: spent.wall_s for stage, spent in prepared.seconds.items()})
         for expert in run.config.experts:
             once = run.work.once(expert)
             wanted = 1 if once else run.config.rounds
             for candidate in candidate_order(once, len(prepared.candidates)):
                 result = run_attempt(run.work, prepared, candidate, expert)
                 sums.attempts += 1
-                sums.seconds.update(result.seconds)
+                sums.seconds.update({stage: spent.wall_s for stage, spent in result.seconds.items()})
                 if isinstance(result, SampleColumns):
                     sums.accepted += 1
                     if result.row.get("image_source") == ImageSource.RENDER:

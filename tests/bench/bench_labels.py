@@ -45,7 +45,7 @@ def main(shared: Path, n_random: int = 20) -> None:
             Execution("local", shard_seconds=1e9),
             say=lambda line: None,
         )
-        n, seconds = summary.seconds["labels"]
+        n, spent = summary.seconds["labels"]
         table = SampleTable(out)
         places = np.random.default_rng(0).integers(0, len(table), n_random).tolist()
         stored = table.sample(0, LABEL_COLUMNS)
@@ -60,7 +60,7 @@ def main(shared: Path, n_random: int = 20) -> None:
 
         print(f"{len(table)} samples, K = {K:,}\n\n| labels of one sample | |\n|---|---|")
         print(f"| stored, mean | {compressed_bytes(store) / len(table) / 1e3:.1f} kB |")
-        print(f"| driven and scored | {seconds / n:.2f} s |")
+        print(f"| driven and scored | {spent.cpu_s / n:.3f} CPU s |")
         print(f"| read and decoded in a pass over all | {milliseconds(one_pass, 5) / len(table):.2f} ms |")
         print(f"| read and decoded at random, file open | {milliseconds(at_random, 5) / n_random:.2f} ms |")
         print(f"| decoded | {milliseconds(lambda: labels_of(stored), 50):.2f} ms |")

@@ -29,7 +29,7 @@ from factory.config.arguments import run_request_command
 from factory.exits import COMPLETE
 from factory.graph.execute import Execution, execute
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
-from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt, SampleColumns
+from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt, SampleColumns, Spent
 from factory.readers.base import ClipRef
 from factory.store.samples import Store
 from tasks.stages import Rejected
@@ -75,10 +75,10 @@ class WaitingWork(ToyWork):
         time.sleep(self.seconds)
         chance = zlib.crc32(name.encode()) / 2**32
         if chance < self.threshold:
-            return RejectedAttempt(Rejected("reward", "nc"), {"nc": chance}, {"reward": 0.01})
+            return RejectedAttempt(Rejected("reward", "nc"), {"nc": chance}, {"reward": Spent(0.01)})
         digest = prepared.content_digest
         return AcceptedDrive(
-            (name, any_row() | {"clip_id": prepared.clip_id, "content_digest": digest}), {"reward": 0.01}
+            (name, any_row() | {"clip_id": prepared.clip_id, "content_digest": digest}), {"reward": Spent(0.01)}
         )
 
     def draw(self, driven: AcceptedDrive) -> SampleColumns:

@@ -21,6 +21,7 @@ from factory.graph.steps import (
     PreparedClip,
     RejectedAttempt,
     SampleColumns,
+    Spent,
     StopCheck,
     never_stop,
 )
@@ -138,7 +139,7 @@ class ToyWork:
         self._note(f"reconstruct {ref.log_id}")
         time.sleep(self.seconds)
         self._trouble(ref.log_id)
-        return BlockReport({"reconstruct": 0.5}, from_cache=False, psnr_db=28.0)
+        return BlockReport({"reconstruct": Spent(0.5)}, from_cache=False, psnr_db=28.0)
 
     def doing(self) -> str:
         return ""
@@ -161,7 +162,7 @@ class ToyWork:
         payload = {"name": f"{ref.log_id}:{ref.start_ms}", "states": rng.random((6, 41, 3)), "kinds": ("a", "b")}
         dropped = Rejected("perturb", "no_gated_candidate") if empty else None
         counts = {"heading": 7, "lateral": 3}
-        return PreparedClip(ref.clip_id, self.content, candidates, counts, payload, dropped, {"perturb": 0.1})
+        return PreparedClip(ref.clip_id, self.content, candidates, counts, payload, dropped, {"perturb": Spent(0.1)})
 
     def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive | RejectedAttempt:
         payload = prepared.payload
@@ -177,20 +178,20 @@ class ToyWork:
         row = row_of(rng)
         row["clip_id"], row["content_digest"] = prepared.clip_id, prepared.content_digest
         row["label_10hz"] = payload["states"][candidate % 6, 1:].astype(np.float32)
-        return AcceptedDrive((name, row), {"reward": 0.01})
+        return AcceptedDrive((name, row), {"reward": Spent(0.01)})
 
     def draw(self, driven: AcceptedDrive) -> SampleColumns | RejectedAttempt:
         name, row = driven.payload  # type: ignore[misc]
         self._note(f"render {name} on {where()}")
         if self._trouble(f"{name}:render") == "unfit":
-            return RejectedAttempt(Rejected("render", "blank"), {"nc": 1.0}, {"render": 0.02})
-        return SampleColumns({key: row[key] for key in PICTURES} | {"tags": ["drawn"]}, {"render": 0.02}, True)
+            return RejectedAttempt(Rejected("render", "blank"), {"nc": 1.0}, {"render": Spent(0.02)})
+        return SampleColumns({key: row[key] for key in PICTURES} | {"tags": ["drawn"]}, {"render": Spent(0.02)}, True)
 
     def label(self, driven: AcceptedDrive) -> SampleColumns:
         name, row = driven.payload  # type: ignore[misc]
         self._note(f"label {name} on {where()}")
         self._trouble(f"{name}:label")
-        return SampleColumns({key: value for key, value in row.items() if key not in PICTURES}, {"labels": 0.03})
+        return SampleColumns({key: value for key, value in row.items() if key not in PICTURES}, {"labels": Spent(0.03)})
 
     def _note(self, line: str) -> None:
         if self.journal:

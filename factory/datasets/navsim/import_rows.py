@@ -35,6 +35,7 @@ from factory.files import DiskFull
 from factory.graph.driver import SHARD_BYTES
 from factory.graph.execute import RunSummary, write_last_run
 from factory.graph.progress import RateBar, RunTotals
+from factory.graph.steps import Spent
 from factory.readers.base import BadClip, failures_as_bad_clip
 from factory.readers.pictures import BadPicture, check_size, without_exif
 from factory.stages.rows import scene_columns
@@ -241,7 +242,7 @@ def import_rows(store: Store, identity: RunIdentity, entries: Sequence[ImportEnt
     summary = RunSummary(COMPLETE, executed=RunTotals(found_done=len(entries) - len(waiting)), began_ms=began_ms)
     counts = dict.fromkeys((kind.value for kind in Kind), 0)
     stopped: list[bool] = []
-    began = time.monotonic()
+    began = Spent.now()
     try:
         store.begin_run(records)
         batch = _Batch(store)
@@ -261,7 +262,7 @@ def import_rows(store: Store, identity: RunIdentity, entries: Sequence[ImportEnt
     except DiskFull as error:
         summary.exit_code, summary.message = INTERRUPTED, f"{error}; free disk space and run the same command again"
     summary.counts = counts
-    summary.seconds = {"import": (summary.executed.attempts, time.monotonic() - began)}
+    summary.seconds = {"import": (summary.executed.attempts, Spent.now() - began)}
     write_last_run(store, summary)
     return summary
 

@@ -80,7 +80,7 @@ def test_by_default_a_simulated_sample_is_labelled_among_its_simulated_traffic()
     assert differing(row, among(judged, judged.rollout.agents, work.vocabulary)) == []
     log = judged.scene.clip.agents.window(judged.scene.step, judged.scene.step + 41)
     assert differing(row, among(judged, log, work.vocabulary)), "replaying the log would be seen"
-    assert accepted.seconds["labels"] > 0.0
+    assert accepted.seconds["labels"].cpu_s > 0.0
 
 
 def test_by_default_a_human_sample_is_labelled_among_the_log() -> None:

@@ -122,9 +122,10 @@ function times(o) {
   const sorted = [...o.stage_times].filter((t) => t.seconds > 0.005 * all).sort((a, b) => b.seconds - a.seconds);
   const rows = sorted.map((t) =>
     h("tr", null, named(t.stage), h("td", null, bar(t.seconds / sorted[0].seconds, span(t.seconds))),
-      h("td", { class: "n" }, count(t.tasks)), h("td", { class: "n" }, t.tasks ? `${(t.seconds / t.tasks).toFixed(3)} s` : "-")));
+      h("td", { class: "n" }, t.cpu_seconds === undefined ? "-" : span(t.cpu_seconds)), h("td", { class: "n" }, count(t.tasks)),
+      h("td", { class: "n" }, t.tasks ? `${(t.seconds / t.tasks).toFixed(3)} s` : "-")));
   return rows.length ? fold("Where the time goes", sorted.slice(0, 2).map((t) => `${t.stage} ${span(t.seconds)}`).join(", "),
-    h("p", { class: "lead" }, `Worker time by stage from half a percent on, of ${o.stage_times_of}.`), table("seconds", ["stage", "time", "tasks", "each"], rows)) : null;
+    h("p", { class: "lead" }, `Worker time by stage from half a percent on, of ${o.stage_times_of}.`), table("seconds", ["stage", "time", "of CPU", "tasks", "each"], rows)) : null;
 }
 
 function coverage(o) {
