@@ -7,7 +7,9 @@ drawn as pairs, else on each side by itself. An interval runs between percentile
 
 Clips that share a log or a town are no independent draws: where their clusters are given, whole clusters are drawn.
 From few clusters, as six towns are, such a bootstrap is too narrow, so the interval then holds the one of Student's t
-with a degree of freedom less than there are clusters as well (Cameron & Miller 2015, VI.A; trainings as they are).
+with a degree of freedom less than there are clusters as well (Cameron & Miller 2015, VI.A; trainings as they are) and,
+of fewer than FEW_CLUSTERS, that of the wild cluster bootstrap. What is clear is clear by each of them; beside them
+stands a p of sign flips (planners/evaluation/few_clusters.py).
 """
 
 import re
@@ -15,8 +17,8 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
 
+from planners.evaluation.few_clusters import ClusterScores, Span, sign_flip_p, student_interval, wild_interval
 from tasks.world.arrays import Array, Indices
 
 LEVELS = ("clip", "log", "town")
@@ -37,6 +39,7 @@ def cluster_labels_by_level(clips: Sequence[str], logs: Sequence[str]) -> Mappin
 
 
 DRAWS_AT_ONCE = 256  # bounds memory
+FEW_CLUSTERS = 20  # fewer are drawn wildly too
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,9 @@ class Interval:
     a: float = np.nan
     b: float = np.nan
     n: int = 0  # clips, or clusters of them, that were drawn
+    student: Span = (np.nan, np.nan)  # of Student's t over clusters alone; NaN over clips
+    wild: Span = (np.nan, np.nan)  # of the wild cluster bootstrap; NaN from FEW_CLUSTERS on
+    p: float = np.nan  # of sign flips of whole clusters, two-sided; exact up to 20 clusters
 
     @property
     def is_clear(self) -> bool:
@@ -93,19 +99,25 @@ def paired_interval(
         of_b = of_a if paired else _draw_counts(rng, size, len(b))
         differences[start : start + size] = _means(b, counts[1], of_b, clips) - _means(a, counts[0], of_a, clips)
     low, high = np.quantile(differences, [(1.0 - confidence) / 2.0, (1.0 + confidence) / 2.0])
-    if clusters is not None:
-        errors = _cluster_influences(b, counts[1], cluster_of_clip) - _cluster_influences(a, counts[0], cluster_of_clip)
-        error = np.sqrt(n_clusters / (n_clusters - 1) * (errors**2).sum())
-        half = stdtrit(n_clusters - 1, (1.0 + confidence) / 2.0) * error
-        low = min(low, max(mean_b - mean_a - half, b.min() - a.max()))  # no mean leaves the range of its scores
-        high = max(high, min(mean_b - mean_a + half, b.max() - a.min()))
-    return Interval(mean_b - mean_a, float(low), float(high), mean_a, mean_b, n_clusters)
+    if clusters is None:
+        return Interval(mean_b - mean_a, float(low), float(high), mean_a, mean_b, n_clusters)
+    (off_b, size_b), (off_a, size_a) = (_moved(x, w, cluster_of_clip) for x, w in ((b, counts[1]), (a, counts[0])))
+    scores = ClusterScores(mean_b - mean_a, off_b - off_a, (size_a + size_b) / 2.0)
+    least, most = float(b.min() - a.max()), float(b.max() - a.min())  # no mean leaves the range of its scores
+    spans = [student_interval(scores, confidence)]
+    spans += [wild_interval(scores, confidence, draws, seed)] if n_clusters < FEW_CLUSTERS else []
+    spans = [(max(one[0], least), min(one[1], most)) for one in spans]
+    low, high = (float(end(each)) for end, each in zip((min, max), zip(*spans, (low, high))))
+    wild = spans[1] if len(spans) > 1 else (np.nan, np.nan)
+    p = sign_flip_p(scores, draws, seed)
+    return Interval(mean_b - mean_a, low, high, mean_a, mean_b, n_clusters, spans[0], wild, p)
 
 
-def _cluster_influences(scores: Array, weights: Array, cluster_of_clip: Indices) -> Array:
-    """(G,) by how much the scores of each cluster move the weighted mean."""
+def _moved(scores: Array, weights: Array, cluster_of_clip: Indices) -> tuple[Array, Array]:
+    """(G,) by how much the scores of each cluster move the weighted mean, and each cluster's share of its weights."""
     off = weights * (scores - (scores * weights).sum() / weights.sum())
-    return np.bincount(cluster_of_clip, off.sum(axis=0)) / weights.sum()
+    moved, shares = (np.bincount(cluster_of_clip, x.sum(axis=0)) / weights.sum() for x in (off, weights))
+    return moved, shares
 
 
 def _draw_counts(rng: np.random.Generator, size: int, n: int) -> Array:

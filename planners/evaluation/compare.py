@@ -23,6 +23,7 @@ from planners.evaluation.aggregation import (
     group_by_clip,
 )
 from planners.evaluation.bootstrap import LEVELS, Interval, cluster_labels_by_level, paired_interval
+from planners.evaluation.few_clusters import Span
 from planners.evaluation.score_rows import read_record, read_rows
 
 
@@ -146,13 +147,22 @@ def score_sentence(found: Mapping[Measure, ByLevel], settings: CompareSettings) 
 
 
 def difference_sentence(what: str, one: Interval, level: str, confidence: float, unit: str = "") -> str:
-    """What both sides have in hundredths, the difference, its interval over clusters of a level, and what that says."""
+    """What both sides have in hundredths, the difference, its interval over clusters of a level, and what that says.
+
+    Of few clusters it names both intervals where they differ, and the p of sign flips.
+    """
     said = f"{what} {100 * one.b:.1f}{unit} against {100 * one.a:.1f}{unit}, {100 * one.difference:+.1f}"
     if not np.isfinite(one.low):
         return f"{said} (no interval)"
     verdict = ("better" if one.low > 0.0 else "worse") if one.is_clear else "no difference told from zero"
-    ends = f"{100 * one.low:+.1f} to {100 * one.high:+.1f}"
-    return f"{said} ({100 * confidence:g} % over {one.n} {level}s: {ends}), {verdict}"
+    ends, student, wild = (_ends(span) for span in ((one.low, one.high), one.student, one.wild))
+    both = f"; t {student}, wild bootstrap {wild}" if np.isfinite(one.wild[0]) and student != wild else ""
+    flips = f"; p {one.p:.2g}" if np.isfinite(one.p) else ""
+    return f"{said} ({100 * confidence:g} % over {one.n} {level}s: {ends}{both}{flips}), {verdict}"
+
+
+def _ends(span: Span) -> str:
+    return f"{100 * span[0]:+.1f} to {100 * span[1]:+.1f}"
 
 
 def write_csv(path: Path, found: Mapping[Measure, ByLevel]) -> None:

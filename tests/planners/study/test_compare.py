@@ -26,6 +26,11 @@ def test_a_sentence_says_what_an_interval_says() -> None:
     assert said(-0.023, 0.113) == f"{numbers} (95 % over 8 towns: -2.3 to +11.3), no difference told from zero"
     assert said(0.01, 0.08) == f"{numbers} (95 % over 8 towns: +1.0 to +8.0), better"
     assert said(np.nan, np.nan) == f"{numbers} (no interval)"
+    few = Interval(0.045, -0.02, 0.12, 0.265, 0.31, 6, (-0.02, 0.11), (-0.01, 0.12), 0.1875)
+    assert difference_sentence("EPDMS", few, "town", 0.95) == (
+        f"{numbers} (95 % over 6 towns: -2.0 to +12.0; t -2.0 to +11.0, wild bootstrap -1.0 to +12.0; p 0.19), "
+        "no difference told from zero"
+    )
     worse = difference_sentence("routes", Interval(-0.1, -0.2, -0.05, 0.5, 0.4, n=3), "log", 0.9, " %")
     assert worse == "routes 40.0 % against 50.0 %, -10.0 (90 % over 3 logs: -20.0 to -5.0), worse"
 
@@ -64,9 +69,13 @@ def test_the_last_line_tells_scores_and_drives_over_towns(tmp_path: Path, capsys
     driven(tmp_path / "drives", *rows)
     assert main([f"a={a}", f"b={b}", f"drives={tmp_path / 'drives'}", "draws=200"]) == 0
     last = capsys.readouterr().out.splitlines()[-1]
-    scores = "mixed against real: two-stage EPDMS 60.0 against 50.0, +10.0 (95 % over 4 towns: +10.0 to +10.0), better"
+    scores = (
+        "mixed against real: two-stage EPDMS 60.0 against 50.0, +10.0 "
+        "(95 % over 4 towns: +10.0 to +10.0; p 0.12), better"
+    )
     half = 100 * 3.182446 * 0.25  # Student's t of three degrees of freedom, times the standard error
-    ends = f"{25 - half:+.1f} to +100.0"  # no mean leaves the range of its scores
+    student = f"{25 - half:+.1f} to +100.0"  # no mean leaves the range of its scores
+    ends = f"-100.0 to +100.0; t {student}, wild bootstrap -100.0 to +100.0; p 1"
     routes = f"75.0 % against 50.0 %, +25.0 (95 % over 4 towns: {ends}), no difference told from zero"
     assert last == f"{scores}; scene scores driven {routes}"
     assert main([f"a={a}", f"b={b}", "draws=200"]) == 0
