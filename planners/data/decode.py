@@ -17,6 +17,7 @@ from factory.store.schema import COLUMNS, LABEL_COLUMNS, Column
 from planners.data.batch import COMMANDS, Batch, BevLayout, ImageLayout, Needs, one_hot_command
 from planners.data.images import stitch
 from planners.data.index import AGENT_COLUMNS, BEV_COLUMNS
+from planners.data.jitter import Offset
 from tasks.reward.label_bytes import CRC_BYTES
 from tasks.subscores import LABELLED
 from tasks.world.arrays import Bools, Bytes
@@ -24,6 +25,10 @@ from tasks.world.commands import command_of_points, route_points
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+# Columns in the frame of the ego at now: lists of points, and what begins with x, y, heading.
+GEOMETRY = ("lane_polygons", "lane_centerlines", "drivable_rings", "crossing_rings")
+POSES = ("route_centerline", "agent_boxes")
 
 Stitch = Callable[[Sequence[Bytes], ImageLayout, Bytes], None]
 
@@ -74,6 +79,30 @@ class StoredRows:
         self._stitched(self.jpegs(row), layout, out)
         if keep:
             self._pictures[row, layout] = out.copy()
+
+
+class MovedRows(StoredRows):
+    """Rows as the ego sees them where it is put; its status and the way that it came are its own and move with it."""
+
+    def __init__(self, stored: StoredRows, offset: Offset) -> None:
+        self._stored, self._offset = stored, offset
+
+    def value(self, column: str, row: int) -> Any:
+        if column in ("label_10hz", "label_2hz"):
+            bent = self._offset.bent_back(self._stored.value("label_10hz", row))
+            return bent if column == "label_10hz" else bent[4::5]
+        value = self._stored.value(column, row)
+        if column in GEOMETRY:
+            return [self._offset.seen(points).astype(np.float32) for points in value]
+        return self._offset.seen_poses(value).astype(np.float32) if column in POSES else value
+
+    def values(self, columns: Sequence[str], row: int) -> dict[str, Any]:
+        return {column: self.value(column, row) for column in columns}
+
+    def raster(self, row: int, layout: BevLayout) -> Bytes:
+        from planners.data.bev import bev_raster
+
+        return bev_raster(self.values(BEV_COLUMNS, row), layout)
 
 
 class BatchBuffer:

@@ -27,10 +27,11 @@ import pyarrow as pa
 
 from factory.store.location import raising_damaged_file
 from planners.data.batch import Batch, Needs
-from planners.data.decode import BatchBuffer, StoredRows, count_labels
+from planners.data.decode import BatchBuffer, MovedRows, StoredRows, count_labels
 from planners.data.files import leaf_paths
 from planners.data.images import GB, PictureCache, stitch
 from planners.data.index import Dataset, Feed, make_feed, order_inputs
+from planners.data.jitter import check_jitter, draw_offset
 from planners.data.mix import EpochOrder, MixSettings, Side, WindowKey, make_order
 from tasks.world.arrays import Ints
 
@@ -194,6 +195,7 @@ class Loader:
             raise ValueError(f"a global batch of {batch_size} samples does not divide among {world} processes")
         self.mix, self.batch_size, self.rank, self.world, self.seed = mix, batch_size, rank, world, seed
         self._needs, self._workers, self._pinned = needs, workers, pinned
+        check_jitter(mix.jitter, needs)
         self._feed = make_feed(dataset, needs)
         samples = order_inputs(self._feed)
         self._order = make_order(samples, mix, batch_size, seed)
@@ -302,7 +304,7 @@ class Loader:
             batch = first
             while True:
                 while batch < n and len(coming) < ahead and (not coming or self._ready(order, windows[batch])):
-                    coming.append(self._started(order, rows[batch], windows[batch], decoders))
+                    coming.append(self._started(epoch, order, rows[batch], windows[batch], decoders))
                     self._memory.release(batch)
                     batch += 1
                 if not coming:
@@ -318,18 +320,21 @@ class Loader:
         return all(self._memory.is_ready(order.keys[window]) for window in np.unique(windows))
 
     def _started(
-        self, order: EpochOrder, samples: Ints, windows: Ints, decoders: Executor
+        self, epoch: int, order: EpochOrder, samples: Ints, windows: Ints, decoders: Executor
     ) -> tuple[Ints, BatchBuffer, list[Future[None]]]:
         """A batch that threads are filling."""
         by_window = {window: self._memory.rows(order.keys[window]) for window in np.unique(windows).tolist()}
         rows = [by_window[window][sample] for sample, window in zip(samples.tolist(), windows.tolist())]
+        ids, simulated = self.dataset.rows.attempt_id[samples], self.dataset.rows.simulated[samples]
         n_labels = count_labels(*rows[0]) if self._needs.labels is not None else 0
         buffer = BatchBuffer(len(rows), self._needs, n_labels, self._pinned, keep_pictures=self._pictures_bytes > 0)
 
         def fill(start: int) -> None:
             for i in range(start, min(start + TASK, len(rows))):
                 try:
-                    buffer.fill(i, *rows[i])
+                    stored, row = rows[i]
+                    offset = None if simulated[i] else draw_offset(self.mix.jitter, self.seed, epoch, str(ids[i]))
+                    buffer.fill(i, stored if offset is None else MovedRows(stored, offset), row)
                 except Exception as error:
                     raise ValueError(f"{self.dataset.name(int(samples[i]))}: {error}") from error
 

@@ -10,12 +10,13 @@ the real side; the simulated stream goes on from epoch to epoch.
 """
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Literal
 
 import numpy as np
 
+from planners.data.jitter import JitterSettings
 from tasks.world.arrays import Bools, Ints
 
 WindowKey = tuple[int, int, int]  # side, pass, window
@@ -28,6 +29,7 @@ class MixSettings:
     sim_ratio: Literal["natural"] | float = "natural"  # or sim / (sim + real) in every global batch, below 1
     imitation: Literal["all", "real", "none"] = "all"  # the samples whose plan is a label
     shuffle_mb: int = 2048  # memory of a process for the samples that are shuffled
+    jitter: JitterSettings = field(default_factory=JitterSettings)
 
     def __post_init__(self) -> None:
         if self.shuffle_mb < 1:

@@ -56,8 +56,9 @@ def wild_interval(scores: ClusterScores, confidence: float, draws: int, seed: in
     if scores.error <= EQUAL * abs(scores.difference):
         return scores.difference, scores.difference
     p = wild_p(scores, cluster_weights(len(scores.off), draws, seed))
-    low, high = (_farthest(lambda x, side=side: p(side * x * scores.error), 1.0 - confidence) for side in (1.0, -1.0))
-    return scores.difference - low * scores.error, scores.difference + high * scores.error
+    below = _farthest(lambda errors: p(errors * scores.error), 1.0 - confidence)
+    above = _farthest(lambda errors: p(-errors * scores.error), 1.0 - confidence)
+    return scores.difference - below * scores.error, scores.difference + above * scores.error
 
 
 def cluster_weights(n: int, draws: int, seed: int) -> Array:
@@ -66,7 +67,7 @@ def cluster_weights(n: int, draws: int, seed: int) -> Array:
     if n < FEWEST_RADEMACHER:
         return rng.choice(WEBB, (draws, n))
     if 2**n <= draws:
-        return 1.0 - 2.0 * (np.arange(2**n)[:, None] >> np.arange(n) & 1)
+        return np.where(np.arange(2**n)[:, None] >> np.arange(n) & 1, -1.0, 1.0)
     return rng.choice([-1.0, 1.0], (draws, n))
 
 

@@ -14,9 +14,18 @@ from torch.nn import functional as F
 
 from planners.data.batch import Batch, Needs
 from planners.data.bev import BevClass
-from planners.models.planner import Planner, add_base_plan, constant_velocity_plan, evaluating, imitation_l1
+from planners.models.planner import (
+    Planner,
+    add_base_plan,
+    constant_velocity_plan,
+    evaluating,
+    imitation_l1,
+    visible_status,
+)
 from planners.models.settings import ConstantVelocitySettings, EgoMlpBevSettings, EgoMlpSettings
 from tasks.world.arrays import FloatArray
+
+CREEP_MPS = 1.0
 
 
 class ConstantVelocity(Planner):
@@ -35,6 +44,20 @@ class ConstantVelocity(Planner):
 
     def plan(self, batch: Batch) -> Tensor:
         return constant_velocity_plan(batch)
+
+
+class GoStraight(ConstantVelocity):
+    """The same, never slower than `CREEP_MPS`: a constant velocity that stands never drives again.
+
+    What AlpaSim's SimScale driver does without a plan (NVlabs/alpasim, NAVSIM_MODEL_ADAPTATION.md).
+    """
+
+    name: ClassVar[str] = "planners.models.baselines:GoStraight"
+
+    def plan(self, batch: Batch) -> Tensor:
+        steady = constant_velocity_plan(batch)
+        slowest = torch.arange(1, 9, device=steady.device) * 0.5 * CREEP_MPS
+        return torch.stack([steady[..., 0].maximum(slowest), steady[..., 1], steady[..., 2]], -1)
 
 
 class EgoMlp(Planner):
@@ -56,7 +79,7 @@ class EgoMlp(Planner):
 
     def features(self, batch: Batch) -> Tensor:
         """(B, 8 + seen) that the layers take."""
-        return batch.status
+        return visible_status(self.settings.status, batch.status)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         return {"trajectory": imitation_l1(self._poses(batch), batch)}
@@ -96,4 +119,4 @@ class EgoMlpBev(EgoMlp):
         x = told.permute(0, 1, 4, 2, 3).flatten(1, 2)
         for convolve in self.convolutions:
             x = F.relu(convolve(x))
-        return torch.cat([batch.status, F.relu(self.fold(x.flatten(1)))], -1)
+        return torch.cat([visible_status(self.settings.status, batch.status), F.relu(self.fold(x.flatten(1)))], -1)

@@ -40,7 +40,7 @@ from planners.models.layers import (
     copy_first_layer,
     initialise_as_public,
 )
-from planners.models.planner import Planner, TrainingData, evaluating, read_array
+from planners.models.planner import Planner, TrainingData, evaluating, read_array, visible_status
 from planners.models.settings import DiffusionDriveSettings
 from tasks.world.arrays import FloatArray
 from tasks.world.vocabulary import refuse_other_meaning
@@ -385,7 +385,7 @@ class DiffusionDrive(Planner):
         """What plans are decoded from. Raises ValueError for a batch without pictures."""
         if batch.image is None:
             raise ValueError("diffusiondrive: a batch without images")
-        return self.encoder(batch.image, batch.status)
+        return self.encoder(batch.image, visible_status(self.settings.status, batch.status))
 
     def _decoded(self, at: Tensor, step: Tensor, scene: EncodedScene) -> list[tuple[Tensor, Tensor]]:
         """Plans and logits of every refinement from positions (B, A, 8, 2) in -1 .. 1 at noise step (B,)."""

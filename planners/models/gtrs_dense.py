@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from planners.data.batch import Batch, ImageLayout, Needs
 from planners.models.backbones import build_backbone
 from planners.models.layers import Decoder, LatentFusion, Layer, initialise_as_public
-from planners.models.planner import Planner, TrainingData, evaluating, read_array
+from planners.models.planner import Planner, TrainingData, evaluating, read_array, visible_status
 from planners.models.settings import STRIDES, BackboneSettings, FusionSettings, GtrsDenseSettings, WeightingName
 from tasks.subscores import HALVES
 from tasks.world.arrays import FloatArray
@@ -236,7 +236,7 @@ class GtrsDense(Planner):
         image = batch.image
         if self.training and not self.settings.is_public:
             image = random_shift(image, round(self.settings.image_shift * image.shape[-1]))
-        return self.scorer(trajectories, self.tokens(image), status)
+        return self.scorer(trajectories, self.tokens(image), visible_status(self.settings.status, status))
 
     def _noisy(self, status: Tensor) -> Tensor:
         deviation = status.new_tensor(self.settings.velocity_noise_mps)

@@ -57,7 +57,8 @@ class Ltf(Planner):
         fused = self.fusion(batch.image)
         cells = self.reduce(fused.latent).flatten(2).transpose(1, 2)
         keys = (
-            torch.cat([cells, self.status(visible_status(self.settings.status, batch))[:, None]], 1) + self.key_position
+            torch.cat([cells, self.status(visible_status(self.settings.status, batch.status))[:, None]], 1)
+            + self.key_position
         )
         queries = self.decoder(self.queries.expand(len(batch), -1, -1), keys)
         raw = self.plan_head(queries[:, 0]).float().view(-1, 8, 3)

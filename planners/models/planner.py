@@ -103,16 +103,16 @@ def evaluating(model: nn.Module) -> Iterator[None]:
         model.train(before)
 
 
-def visible_status(which: Status, batch: Batch) -> Tensor:
-    """(B, 8) of `batch.status`, zeros for what is not seen.
+def visible_status(which: Status, status: Tensor) -> Tensor:
+    """(B, 8) of a batch's status, zeros for what is not seen.
 
     Acceleration tells what the log's driver is already doing, bend and brake, and a planner that drives on its own
     errors is told what these are doing: it goes on with them (de Haan et al. 2019, causal confusion).
     """
     if which == "all":
-        return batch.status
+        return status
     known = len(COMMANDS) + 2
-    return torch.cat([batch.status[:, :known], torch.zeros_like(batch.status[:, known:])], -1)
+    return torch.cat([status[:, :known], torch.zeros_like(status[:, known:])], -1)
 
 
 def imitation_l1(plan: Tensor, batch: Batch) -> Tensor:

@@ -78,6 +78,7 @@ class NetworkSettings:
     variant: Variant = "paper"  # public: as the public code, whose checkpoints it takes; small: for two cores
     pretrained: str | None = None  # the picture's backbone: .safetensors, .pth or .pt, published names; null: random
     command: CommandRule = "navsim"  # by which it is told where to go; curvature: as AlpaSim's routes show it
+    status: Status = "all"  # what of the ego's own it sees; speed: no acceleration
     sizes: Sizes | None = constant(None)  # in the place of the variant's
     SIZES: ClassVar[Mapping[str, Sizes]] = {"paper": Sizes(), "public": Sizes()}  # by variant
 
@@ -125,6 +126,7 @@ class EgoMlpSettings:
     hidden: tuple[int, ...] = (512, 512, 512)  # widths of the hidden layers
     plan_from: PlanFrom = "zero"  # what the regressed poses are added to
     command: CommandRule = "navsim"  # as of NetworkSettings
+    status: Status = "all"
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,6 @@ class LtfSettings(NetworkSettings):
         "small": Sizes(LTF_SMALL, width=64, hidden=128, layers=2, heads=4, agents=10, cell_m=1.0),
     }
     plan_from: PlanFrom = "zero"  # what the regressed positions are added to
-    status: Status = "all"  # what of the ego's own it sees; speed: no acceleration
     trajectory_weight: float = constant(10.0)  # the unit that the others are weighed against
     agent_class_weight: float = 10.0
     agent_box_weight: float = 1.0

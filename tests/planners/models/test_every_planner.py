@@ -7,8 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from planners.data.batch import Batch
+from planners.data.batch import Batch, Needs
+from planners.models.baselines import GoStraight
+from planners.models.gtrs_dense import GtrsDense
 from planners.models.planner import Planner
+from planners.models.settings import ConstantVelocitySettings
 from tests.planners.models import test_diffusiondrive, test_ego_mlp, test_gtrs_dense, test_ltf
 
 
@@ -63,6 +66,31 @@ def test_a_plan_is_the_same_every_time_and_whatever_else_is_in_the_batch(case: C
     assert first.shape in ((4, 8, 3), (4, 40, 3)) and first[..., 2].abs().max() <= torch.pi
     alone = torch.cat([model.plan(part) for part in case.batch.parts(4)])
     torch.testing.assert_close(alone, first, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_told_its_speed_alone_a_planner_plans_the_same_however_it_accelerates(name: str) -> None:
+    model, batch = case_of(name)[:2]
+    model.eval()
+    pushed, faster = batch.status.clone(), batch.status.clone()
+    pushed[:, 6:] += 2.0
+    faster[:, 4] += 20.0
+    for status in ("all", "speed"):
+        model.settings = replace(model.settings, status=status)
+        of = model.scores if isinstance(model, GtrsDense) else lambda batch: {"plan": model.plan(batch)}
+        (plan, again, other) = (
+            torch.stack([*of(replace(batch, status=seen)).values()]) for seen in (batch.status, pushed, faster)
+        )
+        assert torch.equal(again, plan) == (status == "speed")
+        assert not torch.equal(other, plan)
+
+
+def test_who_goes_straight_never_stands() -> None:
+    batch = test_ego_mlp.made_batch(Needs(), 2)
+    status = batch.status.clone()
+    status[:, 4:6] = torch.tensor([[0.0, 0.0], [3.0, 4.0]])
+    plan = GoStraight(ConstantVelocitySettings(), {}).plan(replace(batch, status=status))
+    torch.testing.assert_close(plan[:, -1], torch.tensor([[4.0, 0.0, 0.0], [20.0, 0.0, 0.0]]))
 
 
 def test_losses_reach_every_parameter_also_where_nothing_imitates(case: Case) -> None:
