@@ -15,8 +15,7 @@ SOURCES = sorted(
 FOLDERS = ("docs", "deploy", "experiments")
 PAGES = sorted([*ROOT.glob("*.md"), *(page for folder in FOLDERS for page in (ROOT / folder).rglob("*.md"))])
 WRITTEN_BY_A_RUN = {
-    "tables.md": "`planners.study.report` writes it beside its CSVs",
-    "arms.md": "`planners.study.arms` writes it beside its CSVs",
+    "ab.md": "`python -m planners ab` writes it beside its CSVs",
 }
 
 CITED = re.compile(r"(?<![\w/<{])((?:[\w.-]+/)*[\w-]+\.md)\b")

@@ -34,7 +34,7 @@ ROOMS = {
     ),
     "planners": (
         *("data", "models", "training", "published"),
-        *("evaluation", "navsim", "alpasim", "drive", "traffic", "serve", "study", "__main__"),
+        *("evaluation", "navsim", "alpasim", "drive", "traffic", "serve", "ab", "__main__"),
     ),
 }
 MOST_MODULES = 20  # in a room

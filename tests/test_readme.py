@@ -30,6 +30,7 @@ from factory.datasets.town.reader import SyntheticReader
 from factory.run import main as run_main
 from factory.stages.warm import PARTS
 from planners.__main__ import main as planners_main
+from planners.ab.settings import settings_of as ab_settings
 from planners.drive.settings import settings_of as drive_settings
 from planners.evaluation.compare import CompareSettings
 from planners.evaluation.evaluate import settings_of as evaluate_settings
@@ -192,6 +193,8 @@ def test_every_command_is_one_its_program_takes(
             evaluate_settings(arguments)
         case ["python", "-m", "planners", "compare", *arguments]:
             fill(CompareSettings, compose("compare", arguments), "compare")
+        case ["python", "-m", "planners", "ab", *arguments]:
+            ab_settings(arguments)
         case ["python", "-m", "planners", "replay", *arguments]:
             replay_settings(arguments)
         case ["python", "-m", "planners", "drive", *arguments]:

@@ -32,7 +32,16 @@ from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
 log = logging.getLogger(__name__)
 
 HUMAN = "human"
-INDEX_COLUMNS = ("attempt_id", "clip_id", "settings_hash", "stage_versions", "image_source", "psnr", "label_vocabulary")
+INDEX_COLUMNS = (
+    "attempt_id",
+    "clip_id",
+    "log_id",
+    "settings_hash",
+    "stage_versions",
+    "image_source",
+    "psnr",
+    "label_vocabulary",
+)
 OPEN_FILES = 8  # at a time, while their columns are read
 
 Tables = str | tuple[str, ...]
@@ -51,6 +60,7 @@ class DataSettings:
     psnr_max: float | None = None  # [dB] and worse than this
     real_share: float = 1.0  # of the real clips; simulated samples of other clips are left out too
     limit_sim: int | None = None  # as many simulated samples, drawn from those that the rest leaves
+    without_logs: tuple[str, ...] = ()  # ids of logs whose samples are left out, such as those held out
     seed: int = constant(0)  # of the two draws; a smaller share or limit is a part of a larger one
     storage_options: dict[str, str] = field(default_factory=dict)  # of object stores, as deltalake calls them
     pictures: str | None = None  # folder of this machine for decoded pictures, see planners.data.images
@@ -76,6 +86,7 @@ class SampleRows:
 
     attempt_id: NDArray[np.str_]  # (n,)
     clip_id: NDArray[np.str_]
+    log_id: NDArray[np.str_]
     revision: NDArray[np.str_]  # what they were made under: settings and stage versions
     expert: NDArray[np.str_]
     round: ShortInts
@@ -215,6 +226,7 @@ def _index_of(file: SampleFile, number: int, parquet: pq.ParquetFile, table: pa.
     return SampleRows(
         attempt_id=text("attempt_id"),
         clip_id=text("clip_id"),
+        log_id=text("log_id"),
         revision=np.char.add(np.char.add(text("settings_hash"), " "), text("stage_versions")),
         expert=np.full(n, file.expert),
         round=np.full(n, file.round, np.int32),
@@ -240,12 +252,13 @@ def _rows_passing(settings: DataSettings, rows: SampleRows) -> Ints:
         "experts": np.isin(rows.expert, settings.experts) if settings.experts else None,
         "psnr_min": None if settings.psnr_min is None else rows.psnr >= settings.psnr_min,  # NaN: no
         "psnr_max": None if settings.psnr_max is None else rows.psnr < settings.psnr_max,
+        "without_logs": ~np.isin(rows.log_id, settings.without_logs) if settings.without_logs else None,
         "real_share": _of_kept_clips(settings, rows) if settings.real_share < 1.0 else None,
     }
     for name, passes in filters.items():
         if passes is None:
             continue
-        kept &= passes if name == "real_share" else passes | ~sim
+        kept &= passes if name in ("real_share", "without_logs") else passes | ~sim
         for simulated, side in ((False, "real"), (True, "simulated")):
             if (sim == simulated).any() and not (kept & (sim == simulated)).any():
                 raise ValueError(f"data.{name}={getattr(settings, name)} leaves no {side} samples")

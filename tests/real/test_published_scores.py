@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from planners.ab.compare import main
 from planners.evaluation.navsim import read_table
-from planners.study.compare import main
 from tasks.reward.aggregate import COLUMNS, columns_of, means_over
 from tasks.reward.epdms import Scores
 from tasks.subscores import RECORDS

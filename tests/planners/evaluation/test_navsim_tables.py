@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from planners.ab.compare import main
 from planners.evaluation.aggregation import summarise
 from planners.evaluation.evaluate import EvaluateSettings, evaluate
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.navsim import file_name, read_table, score_of_columns, write_tables
 from planners.evaluation.planner_names import find_planners
 from planners.evaluation.score_rows import FrameRow, read_rows
-from planners.study.compare import main
 from tasks.reward.aggregate import COLUMNS, FrameScores
 from tests.planners.small_benchmark import StreetBenchmark
 

@@ -8,11 +8,11 @@ import pyarrow as pa
 import pytest
 
 from factory.store.location import Location, write_shard
+from planners.ab.compare import main
 from planners.drive.work import DRIVES, SCHEMA, open_drives
 from planners.evaluation.bootstrap import Interval
 from planners.evaluation.compare import difference_sentence
 from planners.evaluation.score_rows import write_record, write_rows
-from planners.study.compare import main
 from tests.planners.made_rows import clip_rows
 
 TOWNS = 4

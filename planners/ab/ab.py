@@ -1,0 +1,278 @@
+"""`python -m planners ab`: does what you would add to your real samples make your planner better?
+
+    python -m planners ab                                  the built-in town, in half an hour of two cores
+    python -m planners ab mine.yaml                        your logs: conf/ab.yaml shows the keys
+    python -m planners ab arms.recovery=null 'arms.mine={sim: [runs/mine]}'     an arm out, another in
+    python -m planners ab mine.yaml minutes=25             a part of it; the same command goes on
+    python -m planners ab rows=runs/ab/report              the report again, of its rows; nothing is trained
+
+Every arm learns from the same real samples and what it adds, for equally many optimiser steps, with the same seeds, and
+is scored on towns or logs that it did not learn from: by the two-stage EPDMS and, with drives=, in closed loop. With
+folds= each town or log is held out once. Constant velocity, going straight and PDM-Closed stand beside them.
+
+    out/report/ab.md        the verdict in one sentence, tables by arm and by town or log
+    out/report/ab.svg       the same as a picture
+    out/report/*.parquet    every frame and every drive, of which all of it is made
+
+Exit codes: 0 complete, 2 settings or files that do not fit, 3 a training, evaluation or drive failed, 4 interrupted or
+out of minutes, and the same command goes on.
+"""
+
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from factory.config.arguments import command
+from factory.config.compose import ConfigError, need_run_extra
+from factory.exits import INTERRUPTED, Failed, Stopped
+from factory.graph.own_process import run_command_in_own_process
+from factory.graph.parallel import parallel_map
+from factory.graph.steps import TaskStopped
+from factory.store.location import Location
+from planners.ab.report import BASELINES, write_report
+from planners.ab.rows import DRIVE_SCHEMA, Trained, write_ab_rows
+from planners.ab.settings import AbSettings, Arm, settings_of
+from planners.data.index import Dataset, DataSettings, open_dataset
+from planners.evaluation.benchmark_folder import read_clip_logs
+from planners.evaluation.bootstrap import town_of
+from planners.evaluation.planner_names import find_planner
+from planners.evaluation.score_rows import FrameRow, read_rows
+from planners.training.checkpoint import read_record
+from planners.training.many import (
+    ONE_THREAD,
+    Training,
+    folder_of,
+    is_done,
+    run_process,
+    stop_event,
+    train_all,
+    train_one,
+)
+
+EVALUATIONS, DRIVES, REPORT = "evaluations", "drives", "report"
+UNTRAINED = {"go_straight": "planners.models.baselines:GoStraight"}  # the other baselines are the commands' own bounds
+
+
+def cluster_of(log: str) -> str:
+    """What is held out as a whole: the town of a log, else the log."""
+    return town_of(log) or log
+
+
+def folds_of(settings: AbSettings, logs: Sequence[str]) -> list[frozenset[str]]:
+    """The clusters of each part; one part of all where none are held out in turn. Raises ConfigError."""
+    clusters = sorted({cluster_of(log) for log in logs})
+    if settings.folds is None:
+        return [frozenset(clusters)]
+    n = len(clusters) if settings.folds == "each" else settings.folds
+    if len(clusters) < max(n, 2):
+        raise ConfigError(f"folds={settings.folds}: the benchmark is of {len(clusters)} towns or logs, too few")
+    return [frozenset(clusters[i::n]) for i in range(n)]
+
+
+def check_apart(settings: AbSettings, logs: Sequence[str]) -> None:
+    """Raises ConfigError where an arm learns from what it is scored on."""
+    held = {cluster_of(log) for log in logs}
+    for name, arm in settings.chosen.items():
+        if shared := sorted(held & {cluster_of(log) for log in opened(settings, arm).rows.log_id.tolist()}):
+            raise ConfigError(
+                f"arm {name} learns from {shared[0]}{f' and {len(shared) - 1} more' if shared[1:] else ''}, which the "
+                "benchmark holds: make it of other towns or logs, or give folds=each to hold each out once"
+            )
+
+
+def data_of(settings: AbSettings, arm: Arm) -> DataSettings:
+    """The tables of an arm."""
+    real = [settings.table(name) for name in (*settings.real, *arm.real)]
+    return DataSettings(real=tuple(real), sim=tuple(map(settings.table, arm.sim)), experts=arm.experts)
+
+
+def opened(settings: AbSettings, arm: Arm) -> Dataset:
+    """Its samples. Raises ValueError, FileNotFoundError."""
+    return open_dataset(data_of(settings, arm))
+
+
+def planned(settings: AbSettings, folds: Sequence[frozenset[str]]) -> list[Training]:
+    """Every training, seed by seed. Raises ValueError where a table lacks what an arm asks for."""
+    data = {name: opened(settings, arm) for name, arm in settings.chosen.items()}
+    found = []
+    held_out = [_logs_in(data.values(), fold) if settings.folds else () for fold in folds]
+    limits = [_limits(settings, data, logs) for logs in held_out]
+    for seed in range(settings.seeds):
+        for number, (logs, limit) in enumerate(zip(held_out, limits)):
+            for name, arm in settings.chosen.items():
+                chosen = data_of(settings, arm)
+                tables = {"real": chosen.tables("real"), "sim": chosen.tables("sim"), "experts": chosen.experts}
+                words = [f"data.{key}=[{','.join(value)}]" for key, value in tables.items()]
+                words += [f"data.limit_sim={limit[name]}"] if limit[name] else []
+                words += [f"data.without_logs=[{','.join(logs)}]"] if logs else []
+                for planner, own in settings.planners.items():
+                    first = [*own.split(), *settings.train.split(), *words, *arm.train.split()]
+                    overrides = (*first, f"steps={settings.steps}", f"seed={seed}")
+                    label = f"{planner}-{name}-{seed}" + (f"-{number}" if settings.folds else "")
+                    facts = {"planner": planner, "arm": name, "seed": seed, "fold": number}
+                    found.append(Training(label, overrides, facts, ("arms", seed)))
+    return found
+
+
+def _logs_in(data: Any, fold: frozenset[str]) -> tuple[str, ...]:
+    """Logs of all tables that a fold holds out."""
+    logs = {str(log) for one in data for log in np.unique(one.rows.log_id)}
+    return tuple(sorted(log for log in logs if cluster_of(log) in fold))
+
+
+def _limits(settings: AbSettings, data: Mapping[str, Dataset], held_out: Sequence[str]) -> dict[str, int | None]:
+    """How many simulated samples each arm may take; None: all that it has, or none."""
+    there = {name: int((one.rows.simulated & ~np.isin(one.rows.log_id, held_out)).sum()) for name, one in data.items()}
+    if settings.added == "all":
+        return dict.fromkeys(there)
+    most = min((n for n in there.values() if n), default=0) if settings.added == "fewest" else settings.added
+    return {name: min(n, most) or None for name, n in there.items()}
+
+
+def make_runs(settings: AbSettings) -> None:
+    """Runs of the factory that are not complete yet. Raises Stopped, Failed."""
+    for name, words in settings.runs.items():
+        how = [f"executor={settings.executor}", *settings.overrides_left]
+        _call(settings, "factory", "run", *words.split(), *how, f"out={Path(settings.out) / name}")
+
+
+def _call(settings: AbSettings, *words: str) -> None:
+    """One command of this product in a process of its own. Raises Stopped, Failed."""
+    print(f"python -m {' '.join(words)}", file=sys.stderr)
+    with stop_event(settings.left_s) as stop:
+        code = run_process([sys.executable, "-m", *words], stop.is_set, environment=ONE_THREAD | os.environ)
+        if code == INTERRUPTED or stop.is_set():
+            raise Stopped("the same command goes on")
+    if code:
+        raise Failed(f"python -m {words[0]} {words[1]} ended with exit code {code}")
+
+
+def train(settings: AbSettings, trainings: Sequence[Training]) -> None:
+    """What is not trained yet, here or on the nodes of a cluster. Raises Stopped, Failed."""
+    out = Path(settings.out)
+    if settings.executor == "local":
+        return train_all(trainings, out, settings)
+    left = [one for one in trainings if not is_done(out, one)]
+    try:
+        for label, code in parallel_map(
+            partial(_train_there, out=out), left, "ray", settings.jobs, Location.parse(out)
+        ):
+            if code:
+                raise Failed(f"{label} ended with exit code {code}: see {out / 'trainings' / label / 'train.log'}")
+    except TaskStopped as error:
+        raise Stopped("the same command goes on") from error
+
+
+def _train_there(one: Training, out: Path) -> tuple[str, int]:
+    return one.label, train_one(one, out)
+
+
+def score(settings: AbSettings, trainings: Sequence[Training]) -> None:
+    """Evaluate and drive these. Raises Stopped, Failed."""
+    out = Path(settings.out)
+    named = {**UNTRAINED, **{one.label: one.spec(out) for one in trainings}}
+    planners = f"planners={{{','.join(f'{label}: {chr(39)}{spec}{chr(39)}' for label, spec in named.items())}}}"
+    benchmark = f"benchmark={settings.table(settings.benchmark)}"
+    _call(settings, "planners", "evaluate", benchmark, planners, f"out={out / EVALUATIONS}")
+    if settings.drives:
+        how = [f"executor={settings.executor}", f"workers={settings.at_once}"]
+        _call(settings, "planners", "drive", *settings.drives.split(), *how, planners, f"out={out / DRIVES}")
+
+
+def report(settings: AbSettings, trainings: Sequence[Training], folds: Sequence[frozenset[str]]) -> str:
+    """Keep the rows of these, every clip by who did not learn from it, and write the report; its text."""
+    out = Path(settings.out)
+    logs = read_clip_logs(settings.table(settings.benchmark))
+    digests = {one.label: find_planner(one.spec(out)).digest for one in trainings}
+    trained: dict[str, Trained] = {}
+    frames: dict[str, list[FrameRow]] = {}
+    for one in trainings:
+        who = trained_of(one, out)
+        trained.setdefault(who.label, who)
+        mine = [replace(row, log_id=logs[row.key.clip_id]) for row in read_rows(out / EVALUATIONS / one.label)]
+        fold = folds[one.facts["fold"]]
+        frames.setdefault(who.label, []).extend(row for row in mine if cluster_of(row.log_id) in fold)
+    for name in BASELINES:
+        rows = read_rows(out / EVALUATIONS / name)
+        frames[name] = [replace(row, log_id=logs[row.key.clip_id]) for row in rows]
+    drives = []
+    if settings.drives:
+        wanted: dict[str, list[tuple[str, frozenset[str] | None]]] = {
+            find_planner(UNTRAINED.get(name, name)).digest: [(name, None)] for name in BASELINES
+        }
+        for one in trainings:
+            label = trained_of(one, out).label
+            wanted.setdefault(digests[one.label], []).append((label, folds[one.facts["fold"]]))
+        drives = _drive_rows(out / DRIVES, wanted, settings)
+    asked = {name: getattr(settings, name) for name in ("reference", "claim", "confidence", "steps")}
+    write_ab_rows(out / REPORT, list(trained.values()), asked, frames, drives)
+    return write_report(out / REPORT)
+
+
+def trained_of(one: Training, out: Path) -> Trained:
+    """Under whose label its rows stand, that of all folds of an arm, a planner and a seed; samples of its own fold."""
+    samples = read_record(folder_of(out, one))["samples"]
+    facts = one.facts
+    return Trained(facts["planner"], facts["arm"], facts["seed"], samples["real"], samples["simulated"])
+
+
+def _drive_rows(
+    folder: Path, wanted: Mapping[str, Sequence[tuple[str, frozenset[str] | None]]], settings: AbSettings
+) -> list[dict[str, Any]]:
+    """Of the table of drives, under the labels of who drove; of a fold's planner those of the clips held out."""
+    from planners.drive.work import FACTS, open_drives  # with PyTorch
+
+    found = []
+    for row in open_drives(Location.parse(folder)).read(FACTS).to_pylist():
+        for label, fold in wanted.get(row["planner_digest"], ()):
+            if fold is None or not settings.folds or cluster_of(row["log_id"]) in fold:
+                found.append({name: row.get(name) for name in DRIVE_SCHEMA.names} | {"training": label})
+    return found
+
+
+def experiment(settings: AbSettings) -> None:
+    """All that is missing, seed by seed, and the report of the seeds that are whole. Raises as its parts."""
+    if settings.rows is not None:
+        print(write_report(Path(settings.rows)))
+        return
+    make_runs(settings)
+    logs = list(read_clip_logs(settings.table(settings.benchmark)).values())
+    if settings.folds is None:
+        check_apart(settings, logs)
+    folds = folds_of(settings, logs)
+    done: list[Training] = []
+    stopped = None
+    try:
+        for _, batch in groupby(planned(settings, folds), key=lambda one: one.unit):
+            mine = list(batch)
+            train(settings, mine)
+            score(settings, mine)
+            done += mine
+    except Stopped as error:
+        stopped = error
+    if done:
+        print(report(settings, done, folds))
+    if stopped:
+        raise stopped
+
+
+@command("ab", AbSettings)
+def main(argv: Sequence[str]) -> int | None:
+    """The command. Raises ConfigError, Stopped, Failed."""
+    settings = settings_of(argv)
+    if settings.executor == "ray":
+        need_run_extra("ray")
+        return run_command_in_own_process(_main_on_ray, tuple(argv))
+    experiment(settings)
+    return None
+
+
+def _main_on_ray(argv: Sequence[str]) -> int:
+    return replace(main, does=lambda words: experiment(settings_of(words)))(argv)

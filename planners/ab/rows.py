@@ -1,0 +1,144 @@
+"""The rows that an experiment's report is made of, and of nothing else: a file of frames and one of drives.
+
+frames.parquet has a row for each frame and planner: EPDMS (float32), where the frame starts and where the plan from a
+logged frame ends, which is what follow-ups are weighted by. Frames are the same for all planners, so that their columns
+take next to nothing. drives.parquet has a row for each drive. Who is who stands in the metadata of both.
+"""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from planners.evaluation.aggregation import ClipResult, group_by_clip
+from planners.evaluation.frames import FrameKey
+from planners.evaluation.score_rows import FrameRow
+from tasks.reward.aggregate import COLUMNS, FrameScores
+
+FRAMES, DRIVES = "frames.parquet", "drives.parquet"
+META = b"ab"
+SCORE = COLUMNS.index("score")
+NAMES = ("training", "stage", "log_id", "clip_id", "kind")
+FRAME_SCHEMA = pa.schema(
+    [
+        *((name, pa.string()) for name in NAMES),
+        ("candidate_index", pa.int32()),
+        ("score", pa.float32()),  # EPDMS, 0 .. 1
+        ("score_filtered", pa.float32()),  # null: the same
+        *((name, pa.float64()) for name in ("start_x", "start_y")),  # rear axle of the frame, world [m]
+        *((name, pa.float64()) for name in ("end_x", "end_y")),  # of the plan, world [m]; null for follow-ups
+    ]
+)
+DRIVE_SCHEMA = pa.schema(
+    [
+        *((name, pa.string()) for name in ("training", "log_id", "clip_id", "pictures")),
+        ("start", pa.int32()),  # number of the perturbed start; -1: the log's own
+        ("score", pa.float64()),  # scene score, 0 .. 1
+        ("dist_traveled_m", pa.float64()),
+        ("offroad_or_collision_at_fault", pa.float64()),  # 0 or 1
+    ]
+)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One training of an arm, under whose label rows stand."""
+
+    planner: str
+    arm: str
+    seed: int
+    real: int = 0  # samples
+    simulated: int = 0
+
+    @property
+    def label(self) -> str:
+        """Names it."""
+        return f"{self.planner}-{self.arm}-{self.seed}"
+
+
+@dataclass(frozen=True)
+class AbRows:
+    """What an experiment kept."""
+
+    trained: tuple[Trained, ...]
+    asked: Mapping[str, Any]  # reference, claim, confidence, steps
+    frames: Mapping[str, Sequence[ClipResult]]  # by label, also of bounds; scores alone, no sub-scores
+    drives: Mapping[str, Sequence[Mapping[str, Any]]]
+
+
+def write_ab_rows(
+    folder: Path,
+    trained: Sequence[Trained],
+    asked: Mapping[str, Any],
+    frames: Mapping[str, Sequence[FrameRow]],
+    drives: Sequence[Mapping[str, Any]],
+) -> None:
+    """Both files of an AbRows; drives: rows of DRIVE_SCHEMA."""
+    folder.mkdir(parents=True, exist_ok=True)
+    meta = {META: json.dumps({"trained": [asdict(one) for one in trained], "asked": dict(asked)}).encode()}
+    parts = [pa.Table.from_pylist(_flat_frames(label, rows), FRAME_SCHEMA) for label, rows in frames.items()]
+    _write(pa.concat_tables(parts).replace_schema_metadata(meta), folder / FRAMES)
+    _write(pa.Table.from_pylist(list(drives), DRIVE_SCHEMA).replace_schema_metadata(meta), folder / DRIVES)
+
+
+def _write(table: pa.Table, path: Path) -> None:
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    pq.write_table(table, unfinished, compression="zstd", compression_level=9, write_statistics=False)
+    unfinished.replace(path)
+
+
+def read_ab_rows(folder: Path) -> AbRows:
+    """What `write_ab_rows` wrote. Raises FileNotFoundError, or ValueError for files that are none."""
+    kept = (pq.read_schema(folder / FRAMES).metadata or {}).get(META)
+    if kept is None:
+        raise ValueError(f"{folder / FRAMES}: no rows of `python -m planners ab`")
+    meta = json.loads(kept)
+    by_label: dict[str, list[dict[str, Any]]] = {}
+    for row in pq.read_table(folder / DRIVES).to_pylist():
+        by_label.setdefault(row["training"], []).append(row)
+    trained = tuple(Trained(**one) for one in meta["trained"])
+    return AbRows(trained, meta["asked"], read_frames(folder / FRAMES), by_label)
+
+
+def read_frames(path: Path) -> dict[str, list[ClipResult]]:
+    """Clips by label of such a file of frames. Raises FileNotFoundError, or ValueError for other columns."""
+    table = pq.read_table(path)
+    if table.column_names != FRAME_SCHEMA.names:
+        raise ValueError(f"{path}: no rows of frames: it must have the columns {', '.join(FRAME_SCHEMA.names)}")
+    columns = (table[name].to_numpy(zero_copy_only=False) for name in FRAME_SCHEMA.names)
+    return {
+        str(label): group_by_clip([_frame(*values) for _, *values in rows])
+        for label, rows in groupby(zip(*columns), key=itemgetter(0))
+    }
+
+
+def _flat_frames(label: str, rows: Iterable[FrameRow]) -> list[dict[str, Any]]:
+    ordered = sorted(rows, key=lambda row: (row.key.clip_id, row.stage, row.key.candidate_index, row.key.kind))
+    return [_flat(label, row) for row in ordered]
+
+
+def _flat(label: str, row: FrameRow) -> dict[str, Any]:
+    score, filtered = (np.float32(values[SCORE]) for values in (row.scores.unfiltered, row.scores.filtered))
+    same = score == filtered or np.isnan(filtered)
+    ends = (None, None) if row.stage == "stage_two" else row.end
+    facts = (row.log_id, row.key.clip_id, row.key.kind, row.key.candidate_index)
+    scores = (score, None if same else filtered)
+    return dict(zip(FRAME_SCHEMA.names, (label, row.stage, *facts, *scores, *row.start[:2], *ends[:2])))
+
+
+def _frame(
+    stage: Any, log_id: str, clip_id: str, kind: str, candidate: int, score: float, filtered: float, *places: float
+) -> FrameRow:
+    """As it was scored, with NaN for what the file does not hold."""
+    scores = np.full((2, len(COLUMNS)), np.nan)
+    scores[:, SCORE] = score, score if np.isnan(filtered) else filtered
+    start, end = (np.array([*places[i : i + 2], np.nan]) for i in (0, 2))
+    key = FrameKey(clip_id, kind, int(candidate))
+    return FrameRow(stage, key, FrameScores(*scores), np.nan, start, end, log_id=log_id)
