@@ -10,9 +10,11 @@ Every arm learns from the same real samples and what it adds, for equally many o
 is scored on towns or logs that it did not learn from: by the two-stage EPDMS and, with drives=, in closed loop. With
 folds= each town or log is held out once. Constant velocity, going straight and PDM-Closed stand beside them.
 
-    out/report/ab.md        the verdict in one sentence, tables by arm and by town or log
-    out/report/ab.svg       the same as a picture
-    out/report/*.parquet    every frame and every drive, of which all of it is made
+Into out/report go
+
+    ab.md        the verdict in one sentence, tables by arm and by town or log
+    ab.svg       the same as a picture
+    *.parquet    every frame and every drive, of which all of it is made
 
 Exit codes: 0 complete, 2 settings or files that do not fit, 3 a training, evaluation or drive failed, 4 interrupted or
 out of minutes, and the same command goes on.

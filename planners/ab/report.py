@@ -170,7 +170,7 @@ def verdict(rows: AbRows, held: Sequence[Held]) -> str:
     who = planners[0] if len(planners) == 1 else "all"
     adjusted = holm([one.apart.p for one in held])
     mine = [(one, p) for one, p in zip(held, adjusted) if one.who == claim and one.planner == who]
-    told = [(one, p) for one, p in mine if one.measure.name in ("two-stage EPDMS", ROUTES)]
+    told = [(one, p) for one, p in mine if one.measure.name in ("two-stage EPDMS", SCENES)]
     said = [difference_sentence(one.measure.name, one.apart, one.measure.level, confidence) for one, _ in told]
     many = " and ".join(f"{p:.2g}" for _, p in told)
     seeds = len({one.seed for one in rows.trained})
@@ -237,7 +237,7 @@ def _cluster_tables(rows: AbRows, held: Sequence[Held]) -> list[str]:
     """A cluster a line, an arm a column, of the score and of the routes, over all planners."""
     lines = []
     planner = held[-1].planner
-    for name in ("two-stage EPDMS", ROUTES):
+    for name in ("two-stage EPDMS", SCENES):
         mine = [one for one in held if one.planner == planner and one.measure.name == name]
         if not mine:
             continue

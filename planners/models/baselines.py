@@ -49,7 +49,7 @@ class ConstantVelocity(Planner):
 class GoStraight(ConstantVelocity):
     """The same, never slower than `CREEP_MPS`: a constant velocity that stands never drives again.
 
-    What AlpaSim's SimScale driver does without a plan (NVlabs/alpasim, NAVSIM_MODEL_ADAPTATION.md).
+    What AlpaSim's driver of SimScale's planners does without a plan (NVlabs/alpasim).
     """
 
     name: ClassVar[str] = "planners.models.baselines:GoStraight"
