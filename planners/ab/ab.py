@@ -39,16 +39,15 @@ from factory.graph.parallel import parallel_map
 from factory.graph.steps import TaskStopped
 from factory.store.location import Location
 from planners.ab.report import BASELINES, write_report
-from planners.ab.rows import DRIVE_SCHEMA, Trained, write_ab_rows
+from planners.ab.rows import DRIVE_SCHEMA, Trained, cluster_of, frames_of, write_ab_rows
 from planners.ab.settings import AbSettings, Arm, settings_of
 from planners.data.index import Dataset, DataSettings, open_dataset
 from planners.evaluation.benchmark_folder import read_clip_logs
-from planners.evaluation.bootstrap import town_of
 from planners.evaluation.planner_names import find_planner
-from planners.evaluation.score_rows import FrameRow, read_rows
 from planners.training.checkpoint import read_record
 from planners.training.many import (
     ONE_THREAD,
+    TRAININGS,
     Training,
     folder_of,
     is_done,
@@ -60,11 +59,6 @@ from planners.training.many import (
 
 EVALUATIONS, DRIVES, REPORT = "evaluations", "drives", "report"
 UNTRAINED = {"go_straight": "planners.models.baselines:GoStraight"}  # the other baselines are the commands' own bounds
-
-
-def cluster_of(log: str) -> str:
-    """What is held out as a whole: the town of a log, else the log."""
-    return town_of(log) or log
 
 
 def folds_of(settings: AbSettings, logs: Sequence[str]) -> list[frozenset[str]]:
@@ -119,7 +113,7 @@ def planned(settings: AbSettings, folds: Sequence[frozenset[str]]) -> list[Train
                     overrides = (*first, f"steps={settings.steps}", f"seed={seed}")
                     label = f"{planner}-{name}-{seed}" + (f"-{number}" if settings.folds else "")
                     facts = {"planner": planner, "arm": name, "seed": seed, "fold": number}
-                    found.append(Training(label, overrides, facts, ("arms", seed)))
+                    found.append(Training(label, overrides, facts))
     return found
 
 
@@ -179,7 +173,7 @@ def _train_there(one: Training, out: Path) -> tuple[str, int]:
 def score(settings: AbSettings, trainings: Sequence[Training]) -> None:
     """Evaluate and drive these. Raises Stopped, Failed."""
     out = Path(settings.out)
-    named = {**UNTRAINED, **{one.label: one.spec(out) for one in trainings}}
+    named = {**UNTRAINED, **{one.label: str(folder_of(out, one)) for one in trainings}}
     planners = f"planners={{{','.join(f'{label}: {chr(39)}{spec}{chr(39)}' for label, spec in named.items())}}}"
     benchmark = f"benchmark={settings.table(settings.benchmark)}"
     _call(settings, "planners", "evaluate", benchmark, planners, f"out={out / EVALUATIONS}")
@@ -191,28 +185,22 @@ def score(settings: AbSettings, trainings: Sequence[Training]) -> None:
 def report(settings: AbSettings, trainings: Sequence[Training], folds: Sequence[frozenset[str]]) -> str:
     """Keep the rows of these, every clip by who did not learn from it, and write the report; its text."""
     out = Path(settings.out)
-    logs = read_clip_logs(settings.table(settings.benchmark))
-    digests = {one.label: find_planner(one.spec(out)).digest for one in trainings}
+    held = {one.label: (trained_of(one, out), folds[one.facts["fold"]]) for one in trainings}
     trained: dict[str, Trained] = {}
-    frames: dict[str, list[FrameRow]] = {}
-    for one in trainings:
-        who = trained_of(one, out)
+    for who, _ in held.values():
         trained.setdefault(who.label, who)
-        mine = [replace(row, log_id=logs[row.key.clip_id]) for row in read_rows(out / EVALUATIONS / one.label)]
-        fold = folds[one.facts["fold"]]
-        frames.setdefault(who.label, []).extend(row for row in mine if cluster_of(row.log_id) in fold)
-    for name in BASELINES:
-        rows = read_rows(out / EVALUATIONS / name)
-        frames[name] = [replace(row, log_id=logs[row.key.clip_id]) for row in rows]
+    together = sorted(held, key=lambda label: held[label][0].label)  # the folds of one one behind the other
+    frames = [frames_of(out / EVALUATIONS / label, held[label][0].label, held[label][1]) for label in together]
+    frames += [frames_of(out / EVALUATIONS / name, name) for name in BASELINES]
     drives = []
     if settings.drives:
         wanted: dict[str, list[tuple[str, frozenset[str] | None]]] = {
             find_planner(UNTRAINED.get(name, name)).digest: [(name, None)] for name in BASELINES
         }
-        for one in trainings:
-            label = trained_of(one, out).label
-            wanted.setdefault(digests[one.label], []).append((label, folds[one.facts["fold"]]))
-        drives = _drive_rows(out / DRIVES, wanted, settings)
+        for label, (who, fold) in held.items():
+            digest = find_planner(str(out / TRAININGS / label)).digest
+            wanted.setdefault(digest, []).append((who.label, fold if settings.folds else None))
+        drives = _drive_rows(out / DRIVES, wanted)
     asked = {name: getattr(settings, name) for name in ("reference", "claim", "confidence", "steps")}
     write_ab_rows(out / REPORT, list(trained.values()), asked, frames, drives)
     return write_report(out / REPORT)
@@ -226,7 +214,7 @@ def trained_of(one: Training, out: Path) -> Trained:
 
 
 def _drive_rows(
-    folder: Path, wanted: Mapping[str, Sequence[tuple[str, frozenset[str] | None]]], settings: AbSettings
+    folder: Path, wanted: Mapping[str, Sequence[tuple[str, frozenset[str] | None]]]
 ) -> list[dict[str, Any]]:
     """Of the table of drives, under the labels of who drove; of a fold's planner those of the clips held out."""
     from planners.drive.work import FACTS, open_drives  # with PyTorch
@@ -234,7 +222,7 @@ def _drive_rows(
     found = []
     for row in open_drives(Location.parse(folder)).read(FACTS).to_pylist():
         for label, fold in wanted.get(row["planner_digest"], ()):
-            if fold is None or not settings.folds or cluster_of(row["log_id"]) in fold:
+            if fold is None or cluster_of(row["log_id"]) in fold:
                 found.append({name: row.get(name) for name in DRIVE_SCHEMA.names} | {"training": label})
     return found
 
@@ -252,7 +240,7 @@ def experiment(settings: AbSettings) -> None:
     done: list[Training] = []
     stopped = None
     try:
-        for _, batch in groupby(planned(settings, folds), key=lambda one: one.unit):
+        for _, batch in groupby(planned(settings, folds), key=lambda one: one.facts["seed"]):
             mine = list(batch)
             train(settings, mine)
             score(settings, mine)

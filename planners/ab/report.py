@@ -1,6 +1,6 @@
 """What an experiment comes to, made of its rows alone: a verdict, tables by arm and by cluster, a picture.
 
-`write_report` writes ab.md, differences.csv, clusters.csv and ab.svg. Every arm and every bound is held against the
+`write_report` writes ab.md, differences.csv and ab.svg. Every arm and every bound is held against the
 reference over the same clips and drives, pairs of seeds and planners; intervals are over the largest clusters of which
 there are two (planners/evaluation/bootstrap.py). As there are many differences, each has beside its p the one that Holm
 (1979) adjusts for all of them.
@@ -174,9 +174,10 @@ def verdict(rows: AbRows, held: Sequence[Held]) -> str:
     said = [difference_sentence(one.measure.name, one.apart, one.measure.level, confidence) for one, _ in told]
     many = " and ".join(f"{p:.2g}" for _, p in told)
     seeds = len({one.seed for one in rows.trained})
+    who_learned = f"{', '.join(planners)}, {seeds} seed{'s' * (seeds > 1)}"
     return (
-        f"{claim} against {rows.asked['reference']}, {', '.join(planners)}, {seeds} seeds: {'; '.join(said)}; of "
-        f"{len(held)} differences told here, for which Holm makes p {many}"
+        f"{claim} against {rows.asked['reference']}, {who_learned}: {'; '.join(said)}; of {len(held)} differences told "
+        f"here, for which Holm makes p {many}"
     )
 
 
@@ -186,13 +187,6 @@ def write_report(folder: Path) -> str:
     held = held_against_reference(rows)
     adjusted = holm([one.apart.p for one in held])
     write_csv(folder / "differences.csv", [one.row | {"p_holm": p} for one, p in zip(held, adjusted)])
-    facts = [(one, {"planner": one.planner, "who": one.who, "measure": one.measure.name}) for one in held]
-    each = [
-        {**fact, "level": one.measure.level, "cluster": cluster, "difference": one.measure.scale * value}
-        for one, fact in facts
-        for cluster, value in one.clusters.items()
-    ]
-    write_csv(folder / "clusters.csv", each)
     said = verdict(rows, held)
     text = "\n".join([said, "", *_tables(rows, held), *_cluster_tables(rows, held)])
     (folder / "ab.md").write_text(text + "\n", encoding="utf-8")
@@ -243,7 +237,7 @@ def _cluster_tables(rows: AbRows, held: Sequence[Held]) -> list[str]:
             continue
         body = [
             [cluster, *(f"{one.measure.scale * one.clusters[cluster]:+.1f}" for one in mine)]
-            for cluster in dict.fromkeys(mine[0].measure.clusters)
+            for cluster in sorted(set(mine[0].measure.clusters))
         ]
         lines += [f"## {name} less `{rows.asked['reference']}`'s, by {mine[0].measure.level}", ""]
         lines += markdown_table([mine[0].measure.level, *(f"`{one.who}`" for one in mine)], body)

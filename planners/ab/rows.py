@@ -1,12 +1,11 @@
 """The rows that an experiment's report is made of, and of nothing else: a file of frames and one of drives.
 
-frames.parquet has a row for each frame and planner: EPDMS (float32), where the frame starts and where the plan from a
-logged frame ends, which is what follow-ups are weighted by. Frames are the same for all planners, so that their columns
-take next to nothing. drives.parquet has a row for each drive. Who is who stands in the metadata of both.
+frames.parquet has a row for each frame and planner: EPDMS, where it starts and where the plan from it ends, by which
+follow-ups are weighted. drives.parquet has a row for each drive. Who is who stands in the metadata of both.
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 from operator import itemgetter
@@ -18,12 +17,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from planners.evaluation.aggregation import ClipResult, group_by_clip
+from planners.evaluation.bootstrap import town_of
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow
 from tasks.reward.aggregate import COLUMNS, FrameScores
 
 FRAMES, DRIVES = "frames.parquet", "drives.parquet"
 META = b"ab"
+Row = Mapping[str, Any]  # of drives
 SCORE = COLUMNS.index("score")
 NAMES = ("training", "stage", "log_id", "clip_id", "kind")
 FRAME_SCHEMA = pa.schema(
@@ -31,9 +32,9 @@ FRAME_SCHEMA = pa.schema(
         *((name, pa.string()) for name in NAMES),
         ("candidate_index", pa.int32()),
         ("score", pa.float32()),  # EPDMS, 0 .. 1
-        ("score_filtered", pa.float32()),  # null: the same
+        ("score_filtered", pa.float32()),  # null or NaN: the same
         *((name, pa.float64()) for name in ("start_x", "start_y")),  # rear axle of the frame, world [m]
-        *((name, pa.float64()) for name in ("end_x", "end_y")),  # of the plan, world [m]; null for follow-ups
+        *((name, pa.float64()) for name in ("end_x", "end_y")),  # of the plan, world [m]
     ]
 )
 DRIVE_SCHEMA = pa.schema(
@@ -70,28 +71,38 @@ class AbRows:
     trained: tuple[Trained, ...]
     asked: Mapping[str, Any]  # reference, claim, confidence, steps
     frames: Mapping[str, Sequence[ClipResult]]  # by label, also of bounds; scores alone, no sub-scores
-    drives: Mapping[str, Sequence[Mapping[str, Any]]]
+    drives: Mapping[str, Sequence[Row]]
+
+
+def frames_of(folder: Path, label: str, clusters: Collection[str] | None = None) -> pa.Table:
+    """The frames of one evaluated planner, under another label; clusters: of these towns or logs alone."""
+    table = pq.read_table(folder / FRAMES)
+    if clusters is not None:
+        table = table.filter(pa.array([cluster_of(log) in clusters for log in table["log_id"].to_pylist()]))
+    named = table.append_column("training", pa.array([label] * len(table), pa.string()))
+    return named.select(FRAME_SCHEMA.names).cast(FRAME_SCHEMA)
+
+
+def cluster_of(log: str) -> str:
+    """What is held out as a whole: the town of a log, else the log."""
+    return town_of(log) or log
 
 
 def write_ab_rows(
     folder: Path,
     trained: Sequence[Trained],
     asked: Mapping[str, Any],
-    frames: Mapping[str, Sequence[FrameRow]],
-    drives: Sequence[Mapping[str, Any]],
+    frames: Sequence[pa.Table],
+    drives: Sequence[Row],
 ) -> None:
-    """Both files of an AbRows; drives: rows of DRIVE_SCHEMA."""
+    """Both files of an AbRows; frames: of `frames_of`, one label behind the other; drives: of DRIVE_SCHEMA."""
     folder.mkdir(parents=True, exist_ok=True)
     meta = {META: json.dumps({"trained": [asdict(one) for one in trained], "asked": dict(asked)}).encode()}
-    parts = [pa.Table.from_pylist(_flat_frames(label, rows), FRAME_SCHEMA) for label, rows in frames.items()]
-    _write(pa.concat_tables(parts).replace_schema_metadata(meta), folder / FRAMES)
-    _write(pa.Table.from_pylist(list(drives), DRIVE_SCHEMA).replace_schema_metadata(meta), folder / DRIVES)
-
-
-def _write(table: pa.Table, path: Path) -> None:
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    pq.write_table(table, unfinished, compression="zstd", compression_level=9, write_statistics=False)
-    unfinished.replace(path)
+    tables = {FRAMES: pa.concat_tables(frames), DRIVES: pa.Table.from_pylist(list(drives), DRIVE_SCHEMA)}
+    for name, table in tables.items():
+        unfinished = folder / f".{name}.unfinished"
+        pq.write_table(table.replace_schema_metadata(meta), unfinished, compression="zstd", write_statistics=False)
+        unfinished.replace(folder / name)
 
 
 def read_ab_rows(folder: Path) -> AbRows:
@@ -100,7 +111,7 @@ def read_ab_rows(folder: Path) -> AbRows:
     if kept is None:
         raise ValueError(f"{folder / FRAMES}: no rows of `python -m planners ab`")
     meta = json.loads(kept)
-    by_label: dict[str, list[dict[str, Any]]] = {}
+    by_label: dict[str, list[Row]] = {}
     for row in pq.read_table(folder / DRIVES).to_pylist():
         by_label.setdefault(row["training"], []).append(row)
     trained = tuple(Trained(**one) for one in meta["trained"])
@@ -117,20 +128,6 @@ def read_frames(path: Path) -> dict[str, list[ClipResult]]:
         str(label): group_by_clip([_frame(*values) for _, *values in rows])
         for label, rows in groupby(zip(*columns), key=itemgetter(0))
     }
-
-
-def _flat_frames(label: str, rows: Iterable[FrameRow]) -> list[dict[str, Any]]:
-    ordered = sorted(rows, key=lambda row: (row.key.clip_id, row.stage, row.key.candidate_index, row.key.kind))
-    return [_flat(label, row) for row in ordered]
-
-
-def _flat(label: str, row: FrameRow) -> dict[str, Any]:
-    score, filtered = (np.float32(values[SCORE]) for values in (row.scores.unfiltered, row.scores.filtered))
-    same = score == filtered or np.isnan(filtered)
-    ends = (None, None) if row.stage == "stage_two" else row.end
-    facts = (row.log_id, row.key.clip_id, row.key.kind, row.key.candidate_index)
-    scores = (score, None if same else filtered)
-    return dict(zip(FRAME_SCHEMA.names, (label, row.stage, *facts, *scores, *row.start[:2], *ends[:2])))
 
 
 def _frame(

@@ -61,13 +61,9 @@ class AbSettings(SweepResources):
             raise ValueError(f"claim={self.claim}: is the reference itself; name another arm")
         if odd := [name for name in (*self.arms, *self.planners) if not name.replace("_", "").isalnum()]:
             raise ValueError(f"{odd[0]}: names of arms and planners have letters, digits and _ alone")
-        for name in ("steps", "seeds"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}={getattr(self, name)}: must be at least 1")
-        if isinstance(self.added, int) and self.added < 1:
-            raise ValueError(f"added={self.added}: must be at least 1, fewest or all")
-        if isinstance(self.folds, int) and self.folds < 2:
-            raise ValueError(f"folds={self.folds}: must be at least 2, each, or null")
+        for name, least in {"steps": 1, "seeds": 1, "added": 1, "folds": 2}.items():
+            if isinstance(value := getattr(self, name), int) and value < least:
+                raise ValueError(f"{name}={value}: must be at least {least}")
         if not 0.0 < self.confidence < 1.0:
             raise ValueError(f"confidence={self.confidence}: must lie between 0 and 1")
 

@@ -24,13 +24,9 @@ class JitterSettings:
     back_m: float = 20.0  # along the log after which the label is the log again
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.share <= 1.0:
-            raise ValueError(f"jitter.share={self.share}: must be from 0 to 1")
-        if self.lateral_m < 0.0 or not 0.0 <= self.heading_rad < np.pi / 2.0 or self.back_m <= 0.0:
-            raise ValueError(
-                f"jitter.lateral_m={self.lateral_m}, heading_rad={self.heading_rad}, back_m={self.back_m}: must be at "
-                "least 0, the heading below a right angle, the way back above 0"
-            )
+        turns = 0.0 <= self.heading_rad < np.pi / 2.0
+        if not (0.0 <= self.share <= 1.0 and self.lateral_m >= 0.0 and turns and self.back_m > 0.0):
+            raise ValueError(f"{self}: share from 0 to 1, shift and turn from 0, below a right angle, way back above 0")
 
 
 @dataclass(frozen=True)
@@ -85,10 +81,9 @@ def draw_offset(settings: JitterSettings, seed: int, epoch: int, attempt_id: str
 
 def check_jitter(settings: JitterSettings, needs: Needs) -> None:
     """Raises ValueError for a planner that sees or learns what a shift makes wrong."""
-    wrong = {"sees pictures": needs.image is not None, "learns scores of a vocabulary": needs.labels is not None}
-    for what, is_so in wrong.items():
-        if settings.share and is_so:
-            raise ValueError(
-                f"mix.jitter.share={settings.share}: the planner {what}, which are of the log's own pose: 0 for it, or "
-                "a planner that sees the map, such as ego_mlp_bev"
-            )
+    what = "sees pictures" if needs.image is not None else "learns scores of a vocabulary" if needs.labels else ""
+    if settings.share and what:
+        raise ValueError(
+            f"mix.jitter.share={settings.share}: the planner {what}, which are of the log's own pose: give 0, or a "
+            "planner that sees the map, such as ego_mlp_bev"
+        )

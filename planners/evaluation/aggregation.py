@@ -186,26 +186,6 @@ PAPER: HumanFilter = "unfiltered"  # what is held against the paper's tables
 BOUNDS = ("human", "pdm_closed", "constant_velocity")
 
 
-def stages_shown(human_filter: HumanFilter) -> dict[str, str]:
-    """Stage -> the filter under which it stands in a table of so filtered scores."""
-    return {stage: which for stage, which in MEASURES if which in (human_filter, "none")}
-
-
-def scores_in_percent(clips: Sequence[ClipResult]) -> dict[str, float]:
-    """Of one planner: name_of(stage, filter) -> EPDMS in percent, and its share of uniform fallbacks."""
-    found = {}
-    for line in summary_lines("", summarise_clips(clips)):
-        found[score_column(line.stage, line.human_filter)] = 100.0 * total_score(line.columns)
-        if line.stage == "final":
-            found["uniform_share"] = line.uniform_share
-    return found
-
-
-def score_column(stage: str, human_filter: str) -> str:
-    """Column of a score."""
-    return stage if human_filter == "none" else f"{stage}_{human_filter}"
-
-
 def stage_title(stage: str) -> str:
     """A stage as tables call it."""
     return "follow-ups (plain mean)" if stage == "follow_ups" else stage.replace("_", " ")

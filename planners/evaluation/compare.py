@@ -8,7 +8,6 @@ import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -86,21 +85,15 @@ def is_clear(found: ByLevel) -> bool:
     return all(one.is_clear for one in found.values())
 
 
-def difference_columns(found: ByLevel | None, scale: float = 100.0) -> dict[str, float | str]:
-    """Columns of tables: the difference and its bounds over each of LEVELS, empty where there is none."""
-    row: dict[str, float | str] = {"difference": "" if found is None else scale * found["clip"].difference}
+def difference_columns(found: ByLevel) -> dict[str, float | str]:
+    """Columns of a table: the difference and its bounds over each of LEVELS, empty where there is none."""
+    row: dict[str, float | str] = {"difference": found["clip"].difference}
     for level in LEVELS:
-        one = None if found is None else found.get(level)
+        one = found.get(level)
         known = one is not None and np.isfinite(one.low)
         for name in ("low", "high"):
-            row[name if level == "clip" else f"{name}_{level}"] = scale * getattr(one, name) if known else ""
+            row[name if level == "clip" else f"{name}_{level}"] = getattr(one, name) if known else ""
     return row
-
-
-def is_clear_row(row: Mapping[str, Any]) -> bool:
-    """The same of a row of `row_of`; not where it has none over logs: clips of one log are no sample of any road."""
-    known = [end for end in ("", "_log", "_town") if row.get(f"low{end}", "") != ""]
-    return "_log" in known and all(row[f"low{end}"] > 0.0 or row[f"high{end}"] < 0.0 for end in known)
 
 
 def compare_tables(a: Sequence[str], b: Sequence[str], settings: CompareSettings) -> dict[Measure, ByLevel]:
@@ -170,7 +163,7 @@ def write_csv(path: Path, found: Mapping[Measure, ByLevel]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         for n, (name, by_level) in enumerate(found.items()):
-            row = difference_columns(by_level, scale=1.0)
+            row = difference_columns(by_level)
             if n == 0:
                 table.writerow(["stage", "human_filter", "a", "b", *row])
             table.writerow([*name, by_level["clip"].a, by_level["clip"].b, *row.values()])

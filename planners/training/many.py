@@ -27,17 +27,11 @@ ONE_THREAD = {"OMP_NUM_THREADS": "1"}  # of each process, unless the user says o
 
 @dataclass(frozen=True)
 class Training:
-    """One planner of a sweep: a training, or the ensemble of several."""
+    """One planner of a sweep."""
 
     label: str  # names its folder; unique in the sweep
     overrides: tuple[str, ...] = ()  # of planners.training.train, but `out`
-    facts: Mapping[str, Any] = field(default_factory=dict)  # its columns in the sweep's tables
-    unit: tuple[str, int] = ("", 0)  # part and seed, which are done one after the other
-    members: tuple[str, ...] = ()  # of an ensemble: the labels of its trainings
-
-    def spec(self, out: Path) -> str:
-        """As `python -m planners evaluate` takes it."""
-        return "+".join(str(out / TRAININGS / label) for label in self.members or (self.label,))
+    facts: Mapping[str, Any] = field(default_factory=dict)  # what it is
 
 
 @dataclass(frozen=True)
@@ -79,12 +73,11 @@ def is_done(out: Path, training: Training) -> bool:
 
 
 def train_all(trainings: Sequence[Training], out: Path, resources: SweepResources) -> None:
-    """Train what is not done; ensembles need not be.
+    """Train what is not done.
 
     Raises ValueError for two trainings of one label, Stopped where time ran out or somebody interrupted before all
     were, Failed with what each failed training said last.
     """
-    trainings = [training for training in trainings if not training.members]
     labels = [training.label for training in trainings]
     if twice := sorted({label for label in labels if labels.count(label) > 1}):
         raise ValueError(f"labels {twice} stand for several trainings")

@@ -2,6 +2,7 @@
 
 import csv
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,11 @@ from factory.config.words import ConfigError
 from planners.ab.ab import check_apart, folds_of, main, planned
 from planners.ab.report import holm, write_report
 from planners.ab.rows import Trained, read_ab_rows, read_frames, write_ab_rows
+from planners.ab.rows import frames_of as kept_frames
 from planners.ab.settings import AbSettings, Arm, settings_of
-from planners.evaluation.aggregation import ClipResult, group_by_clip, scores_in_percent
+from planners.evaluation.aggregation import ClipResult, collect_scores, group_by_clip
 from planners.evaluation.compare import CompareSettings, compare
-from planners.evaluation.score_rows import FrameRow
+from planners.evaluation.score_rows import FrameRow, write_rows
 from tests.planners.made_rows import clip_rows
 from tests.planners.samples import sample, write_table
 
@@ -91,6 +93,11 @@ def frames_of(bonus: float) -> list[FrameRow]:
     return found
 
 
+def final_score(clips: Sequence[ClipResult]) -> float:
+    one = collect_scores([clips], "score")["final", "unfiltered"]
+    return float((one.scores * one.weights).sum() / one.weights.sum())
+
+
 def drives_of(label: str, score: float, failed: int = 0) -> list[dict[str, Any]]:
     return [
         {"training": label, "log_id": f"town-{i}-0000-curve", "clip_id": f"clip{2 * i:02}", "pictures": "none"}
@@ -107,8 +114,11 @@ def kept(tmp_path: Path) -> Path:
     frames = {one.label: frames_of(0.12 * (one.arm == "pdm_closed")) for one in trained}
     frames |= {"constant_velocity": frames_of(-0.1), "go_straight": frames_of(-0.1), "pdm_closed": frames_of(0.5)}
     drives = [row for label in frames for row in drives_of(label, 0.8, 2 if "real" in label else 1)]
-    write_ab_rows(tmp_path, trained, ASKED, frames, drives)
-    return tmp_path
+    for label, rows in frames.items():
+        (tmp_path / label).mkdir()
+        write_rows(tmp_path / label, rows)
+    write_ab_rows(tmp_path / "out", trained, ASKED, [kept_frames(tmp_path / label, label) for label in frames], drives)
+    return tmp_path / "out"
 
 
 def test_the_report_is_made_of_rows_alone_and_says_one_verdict(kept: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -121,7 +131,7 @@ def test_the_report_is_made_of_rows_alone_and_says_one_verdict(kept: Path, capsy
     assert "t +3.1 to +10.9" in last and "p 0.031), better; scene score" in last
     assert "no difference told from zero; of 20 differences told here, for which Holm makes p" in last
     made = {path.name: path.read_bytes() for path in kept.iterdir()}
-    assert {"ab.md", "ab.svg", "differences.csv", "clusters.csv", "frames.parquet", "drives.parquet"} == set(made)
+    assert {"ab.md", "ab.svg", "differences.csv", "frames.parquet", "drives.parquet"} == set(made)
     write_report(kept)
     assert {path.name: path.read_bytes() for path in kept.iterdir()} == made
     text = made["ab.md"].decode()
@@ -137,10 +147,10 @@ def test_the_report_is_made_of_rows_alone_and_says_one_verdict(kept: Path, capsy
 def test_rows_come_back(kept: Path) -> None:
     found = read_ab_rows(kept)
     assert [one.label for one in found.trained][:2] == ["bev-real-0", "bev-jitter-0"] and found.asked == ASKED
-    expected = scores_in_percent(group_by_clip(frames_of(0.12)))
-    assert scores_in_percent(found.frames["bev-pdm_closed-1"])["final_unfiltered"] == pytest.approx(
-        expected["final_unfiltered"], abs=1e-4
-    )
+    expected = final_score(group_by_clip(frames_of(0.12)))
+    assert final_score(found.frames["bev-pdm_closed-1"]) == pytest.approx(expected, abs=1e-6)
+    of_a_town = kept_frames(kept.parent / "go_straight", "go_straight", {"town-1"})
+    assert set(of_a_town["clip_id"].to_pylist()) == {"clip02", "clip03"}
     with pytest.raises(ValueError, match=r"no rows of `python -m planners ab`"):
         (kept / "frames.parquet").write_bytes(KEPT.read_bytes())
         read_ab_rows(kept)
@@ -173,4 +183,4 @@ def test_what_the_readme_says_of_simulated_samples_is_what_the_kept_frames_say()
     control = compare(means("pdm_closed5-epochs", "01"), means("logged5-steps", "01"), rules)
     same = control["final", "unfiltered"]["clip"]
     assert f"{100 * same.b:.1f} against {100 * same.a:.1f} (" in readme
-    assert f"constant velocity scores {scores_in_percent(clips['constant_velocity'])['final_unfiltered']:.1f}" in readme
+    assert f"constant velocity scores {100 * final_score(clips['constant_velocity']):.1f}" in readme

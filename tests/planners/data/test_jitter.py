@@ -55,9 +55,9 @@ def test_a_draw_hangs_on_seed_pass_and_sample_alone() -> None:
     assert len(there) / 2000 == pytest.approx(0.5, abs=0.04) and drawn[7] == draw_offset(settings, 0, 0, "7")
     assert draw_offset(JitterSettings(share=1.0), 0, 0, "7") != draw_offset(JitterSettings(share=1.0), 0, 1, "7")
     assert max(abs(one.lateral_m) for one in there) <= 1.0 and max(abs(one.heading_rad) for one in there) <= 0.1
-    with pytest.raises(ValueError, match="share=2"):
+    with pytest.raises(ValueError, match=r"share=2\.0"):
         JitterSettings(share=2.0)
-    with pytest.raises(ValueError, match="back_m=0"):
+    with pytest.raises(ValueError, match=r"back_m=0\.0"):
         JitterSettings(back_m=0.0)
 
 

@@ -20,7 +20,6 @@ from planners.evaluation.compare import (
     comparison_text,
     difference_columns,
     is_clear,
-    is_clear_row,
 )
 from planners.evaluation.score_rows import FrameRow
 from tests.planners.made_rows import clip_rows
@@ -206,8 +205,6 @@ def test_runs_are_compared_over_clips_logs_and_towns() -> None:
     assert not is_clear(of_one_town["final", "unfiltered"])
     assert "only one" in comparison_text(of_one_town, 0.95)
     row = difference_columns(of_one_town["final", "unfiltered"])
-    of_one_log = difference_columns(compare([run(n_clips=2)], [run(0.1, n_clips=2)], SETTINGS)["final", "unfiltered"])
-    assert is_clear_row(row) and float(of_one_log["low"]) > 0.0 and not is_clear_row(of_one_log)
     assert row["low_town"] == row["high_town"] == "" and row["low_log"] != ""
 
 
