@@ -95,18 +95,6 @@ def drive_all(settings: DriveSettings) -> tuple[list[Row], list[FailedDrive]]:
     return asked.rows(table), failed
 
 
-def read_drives(settings: DriveSettings) -> tuple[list[Row], bool]:
-    """The rows that are there of all that were asked for, and whether that is all; nothing is driven.
-
-    Raises ConfigError.
-    """
-    asked = _requested_drives(settings)
-    table = open_drives(asked.work.out)
-    done = set(table)  # of an item's drives, which are committed together, some are there or none
-    whole = all(any(key.drive_id in done for _, key in item.keys) for item in asked.items)
-    return asked.rows(table), whole and not asked.broken
-
-
 def _requested_drives(settings: DriveSettings) -> RequestedDrives:
     from factory.setup.settings import choose_vocabulary, open_reader  # half a second that no refusal waits for
 

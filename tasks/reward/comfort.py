@@ -152,7 +152,6 @@ PAST_PERIOD_STEPS = 5  # the history comes at 2 Hz
 HISTORY_ROWS = 14  # -1.5 .. -0.2 s: the row at -0.1 s is missing in the public metric
 HISTORY_START = -15  # step of the first row
 N_FLAGS = 6
-LONGEST_FILTER = len(JERK_WEIGHTS)  # samples
 _LON, _LAT, _MAGNITUDE, _HEADING, _BEYOND, _SCRATCH_ROWS = range(N_FLAGS, N_FLAGS + 6)
 
 
@@ -244,28 +243,6 @@ def _limited_quantities(scratch: Array) -> None:
     jerk_of(scratch[0], scratch[3])
     yaw_accel_of(heading, scratch[4])
     yaw_rate_of(heading, scratch[5])
-
-
-def comfortable(states: Array) -> Bools:
-    """(T,) whether each instant of a drive (T, 11) of any length keeps the six limits of history comfort.
-
-    Raises ValueError where the drive is shorter than the longest filter, 1.5 s.
-    """
-    if states.ndim != 2 or states.shape[1] != EGO_STATE_SIZE or len(states) < LONGEST_FILTER:
-        raise ValueError(f"states must be (T >= {LONGEST_FILTER}, {EGO_STATE_SIZE}), got {states.shape}")
-    within = np.ones(len(states), dtype=np.bool_)
-    _within_limits(np.ascontiguousarray(states, np.float64), within)
-    return within
-
-
-@kernel
-def _within_limits(states: Array, within: Bools) -> None:
-    scratch = comfort_scratch(len(states))
-    _side_by_side(states.reshape(1, len(states), EGO_STATE_SIZE), 0, scratch)
-    _limited_quantities(scratch)
-    for t in range(len(states)):
-        for f in range(N_FLAGS):
-            within[t] &= LIMITS[f, 0] < scratch[f, t * LANES] and scratch[f, t * LANES] < LIMITS[f, 1]
 
 
 @dataclass(frozen=True)
