@@ -26,7 +26,7 @@ from factory.exits import COMPLETE
 from factory.graph.execute import Execution, execute
 from factory.graph.local import Claims
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
-from factory.graph.steps import AcceptedDrive, BlockReport, PreparedClip, SampleColumns, StopCheck, never_stop
+from factory.graph.steps import AcceptedDrive, BlockReport, PreparedClip, SampleColumns, Spent, StopCheck, never_stop
 from factory.readers.base import ClipRef
 from factory.store.samples import Store
 from tasks.render.splatting.gsplat_backend import own_place
@@ -73,7 +73,7 @@ class VirtualGpuWork(ToyWork):
         with self._gpu(f"fit {began}"):
             time.sleep(self.request.fit_s)
         time.sleep(self.request.finish_s)
-        return BlockReport({"reconstruct": time.time() - began}, from_cache=False, psnr_db=28.0)
+        return BlockReport({"reconstruct": Spent(time.time() - began)}, from_cache=False, psnr_db=28.0)
 
     def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> AcceptedDrive:
         time.sleep(self.request.drive_s)

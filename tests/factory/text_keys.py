@@ -8,7 +8,7 @@ from factory.config.words import FREE, PATHS
 # Last words of the keys whose text names no file: a new key is one of these, or of factory.config.words.PATHS.
 TEXTS = (
     "authors camera clip column country device driver email expert experts full host institution map_location name "
-    "older_than only origin parts policy round sample settings tag team_name version without_logs"
+    "older_than only origin parts policy renderer round sample settings tag team_name version without_logs"
 )
 NO_PATHS = frozenset(TEXTS.split())
 

@@ -111,7 +111,7 @@ def test_settings_are_shown_as_they_are_given(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for door, command, shown in (
-        (planners_main, "drive --cfg planner=human clips.n_clips=3", {"planner": "human", "seconds": 20.0}),
+        (planners_main, "drive --cfg planner=human clips.n_clips=3", {"planner": "human", "seconds": 5.5}),
         (planners_main, "train planner=custom -c job steps=7", {"steps": 7, "seed": 0}),
         (main, "run clips=av2 --cfg rounds=5", {"rounds": 5, "executor": "ray"}),
         (main, "explain --cfg tries=9 traffic=replay", {"clip": "0", "tries": 9, "rounds": 1}),
