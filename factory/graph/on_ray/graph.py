@@ -12,7 +12,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import contextmanager
@@ -222,8 +222,6 @@ LOOK_S = 1.0  # between two looks at whether a cluster lives
 WARMING = {"key": "warm", "what": "compiling kernels", "run": "", "limited": False}
 
 _HELD: dict[str, Any] = {}  # per worker process: the run's Work, fetched once
-_CLIPS: OrderedDict[str, PreparedClip] = OrderedDict()  # likewise: prepared clips by reference, the last one used last
-CLIPS_OPEN = 4  # of them, some MB each in the object store
 
 
 def _recording(metric: Metric) -> Callable[[float, dict[str, str]], None]:
@@ -345,7 +343,7 @@ class RayGraph(Graph):
             while waiting and (self._is_ours or self._flying[draws] < self.parallelism):
                 ticket, step, args = waiting.popleft()
                 supplied = [self._supplied[name] for name in STEPS[step][1]]
-                if ticket.step in self._after_drawing or ticket.step.startswith(ATTEMPT[0]):
+                if ticket.step in self._after_drawing:
                     args = tuple(ResultToFetch(arg) if isinstance(arg, ray.ObjectRef) else arg for arg in args)
                 most = FIT_SHARE if step == "reconstruct" else 1.0
                 gpu = min(self._gpu_share, most) if draws else None
@@ -412,24 +410,10 @@ def _error_kind(error: RayError) -> ErrorKind:
 class ResultToFetch:
     """A result that a task fetches itself: Ray sends a task to the node where most of what it is given lies.
 
-    What follows a picture would go to the node that drew it, and take the cores that the next pictures wait for. And a
-    prepared clip would be opened for every task, its map with it, which takes as long as an attempt.
+    What follows a picture would go to the node that drew it, and take the cores that the next pictures wait for.
     """
 
     reference: Any
-
-    def fetched(self) -> Any:
-        """The result; the prepared clips that were asked for last are kept open, with what was looked up in them."""
-        key = self.reference.hex()
-        if key not in _CLIPS:
-            found = ray.get(self.reference)
-            if not isinstance(found, PreparedClip):
-                return found
-            _CLIPS[key] = found
-            while len(_CLIPS) > CLIPS_OPEN:
-                _CLIPS.popitem(last=False)
-        _CLIPS.move_to_end(key)
-        return _CLIPS[key]
 
 
 def _after_drawing(tasks: Sequence[Sequence[str]]) -> frozenset[str]:
@@ -444,7 +428,7 @@ def _run(step: str, watch: tuple[Path, dict[str, Any]], n_supplied: int, *args: 
     a batch each sample's."""
     began = time.perf_counter()
     supplied = [_cached_work(arg) if isinstance(arg, list) else arg for arg in args[:n_supplied]]
-    given = [arg.fetched() if isinstance(arg, ResultToFetch) else arg for arg in args[n_supplied:]]
+    given = [ray.get(arg.reference) if isinstance(arg, ResultToFetch) else arg for arg in args[n_supplied:]]
     if step == "attempts":
         report, *results = _attempt_batch(watch, *supplied, *given)
     else:
