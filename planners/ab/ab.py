@@ -1,6 +1,6 @@
 """`python -m planners ab`: does what you would add to your real samples make your planner better?
 
-    python -m planners ab                                  the built-in town, in half an hour of two cores
+    python -m planners ab                                  the built-in town, in ten CPU minutes
     python -m planners ab mine.yaml                        your logs: conf/ab.yaml shows the keys
     python -m planners ab arms.recovery=null 'arms.mine={sim: [runs/mine]}'     an arm out, another in
     python -m planners ab mine.yaml minutes=25             a part of it; the same command goes on
