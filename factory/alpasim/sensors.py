@@ -129,7 +129,7 @@ class Sensors:
             rgb = render_through_lens(scene.asset, camera, lens, ego, agents, step, self._backend)
         else:
             size = camera.width, camera.height
-            rgb = render_views(scene.asset, [camera], ego[None], agents, [step], *size, self._backend)[0, 0]
+            rgb = next(render_views(scene.asset, [camera], ego[None], agents, [step], *size, self._backend))[0]
         return self._sensorsim.RGBRenderReturn(image_bytes=encode(rgb))
 
     def _encoding(self, at: str, message: Any) -> Any:

@@ -43,7 +43,7 @@ from tasks.render.scene.movers import agents_at_time
 from tasks.render.scene.sensed import Photo
 from tasks.render.seen import PhotoSights, photo_sights
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
-from tasks.render.views import MAP_RIG, draw_map_views, views_by_instant
+from tasks.render.views import MAP_RIG, draw_map_views, render_views
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentTracks, Camera, Clip, Scene, SensorFile
@@ -192,7 +192,7 @@ class Imaging:
             images = iter(draw_map_views(clip.road_map, *seen))
         else:
             lifted = asset.lifted(agents, clip_offset_s(clip))
-            images = views_by_instant(asset, cameras, poses, lifted, *seen[3:], self.settings.backend)
+            images = render_views(asset, cameras, poses, lifted, *seen[3:], self.settings.backend)
         found = [
             self.image(camera.name, offset * STEP_S, pose, rgb)
             for offset, pose, pictures in zip(offsets, poses, images, strict=True)

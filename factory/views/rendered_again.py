@@ -213,8 +213,8 @@ def shifted_film(
     size = width + 8, height + height % 2 + CAPTION_PX + 4  # H.264 takes even sides
     for file, photo in zip(files, load_photos(files, [camera], width, height)):
         pose, step = file.world_from_ego @ shift, file.time_s / STEP_S
-        drawn = render_views(asset, [camera], pose[None], agents, [step], width, height)
-        shown = (photo.rgb, f"{camera.name}  photo at {file.time_s:.1f} s"), (drawn[0, 0], f"rendered, {side}")
+        (drawn,) = next(render_views(asset, [camera], pose[None], agents, [step], width, height))
+        shown = (photo.rgb, f"{camera.name}  photo at {file.time_s:.1f} s"), (drawn, f"rendered, {side}")
         yield tile_grid([captioned_tile(pixels, caption, size) for pixels, caption in shown], 2)
 
 

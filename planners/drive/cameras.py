@@ -167,7 +167,7 @@ class RenderedCameras:
         known = np.concatenate([self.clip.world_from_ego, *(file.world_from_ego[None] for file in files)])
         poses = pose_on_ground(self.asset.on_road(known), ego_state_at(scene, offset))
         agents = self.asset.lifted(scene.agents, clip_offset_s(self.clip))
-        seen = render_views(self.asset, self.cameras, poses, agents, [step], s.width, s.height, s.backend)[0]
+        seen = next(render_views(self.asset, self.cameras, poses, agents, [step], s.width, s.height, s.backend))
         imaging = Imaging(s, "")
         return [imaging.image(c.name, offset * STEP_S, poses[0], rgb) for c, rgb in zip(self.cameras, seen)]
 

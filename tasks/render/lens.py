@@ -106,5 +106,5 @@ def render_through_lens(
         rgba = cv2.copyMakeBorder(rgba, *beyond, *beside, cv2.BORDER_REPLICATE)
         asset = replace(asset, bodies=(replace(body, rgba=np.asarray(rgba, np.uint8)),))
     wide = Camera(camera.name, lens.width, lens.height, lens.intrinsics, np.zeros(5), camera.ego_from_camera)
-    seen = render_views(asset, [wide], world_from_ego[None], agents, [step], lens.width, lens.height, backend)[0, 0]
+    seen = next(render_views(asset, [wide], world_from_ego[None], agents, [step], lens.width, lens.height, backend))[0]
     return np.asarray(cv2.remap(seen, *lens.maps, cv2.INTER_LINEAR), np.uint8)

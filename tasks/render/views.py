@@ -28,20 +28,6 @@ def render_views(
     width: int,
     height: int,
     backend: Backend = Backend.CPU,
-) -> Bytes:
-    """Images (F, C, height, width, 3) rgb of F instants: `views_by_instant`, all at once."""
-    return np.stack(list(views_by_instant(asset, cameras, world_from_ego, agents, steps, width, height, backend)))
-
-
-def views_by_instant(
-    asset: RenderAsset,
-    cameras: Sequence[Camera],
-    world_from_ego: Array,
-    agents: AgentTracks,
-    steps: Sequence[float],
-    width: int,
-    height: int,
-    backend: Backend = Backend.CPU,
 ) -> Iterator[Bytes]:
     """Images (C, height, width, 3) rgb of one instant after the other; a GPU draws the next ones meanwhile.
 

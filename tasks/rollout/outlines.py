@@ -76,7 +76,7 @@ def strip_ring(line: Array, n: int, half_width: float, ring: Array) -> int:
     """The ring of the strip along n points of a line (2, >= n), and how many corners it has, or UNSURE."""
     count, near = 0, half_width * SAME_CORNER
     bx, by, ex, ey = 0.0, 0.0, 0.0, 0.0
-    for side in range(2):  # left of the line, and left of it again on the way back
+    for side in range(2):  # left of the line, and of the line reversed
         for i in range(n - 1):
             k = i if side == 0 else n - 1 - i
             m = k + 1 - 2 * side

@@ -88,7 +88,7 @@ def in_classic_mode(scene: ServedScene, width: int, aside_m: float) -> str:
     nobody = replace(scene.agents, valid=np.zeros_like(scene.agents.valid))
 
     def drawn(of: RenderAsset) -> Bytes:
-        return render_views(of, rig, looks, nobody, [0.0] * len(looks), width, height)
+        return np.stack([*render_views(of, rig, looks, nobody, [0.0] * len(looks), width, height)])
 
     ours, before, after = drawn(asset), *(drawn(replace(one, screen=CLASSIC)) for one in (asset, made))
     where = f"{width}x{height}, {aside_m:g} m to the left"

@@ -21,7 +21,7 @@ from tasks.render.scene.asset import Exposure, OwnBody, RenderAsset
 from tasks.render.scene.on_device import Device
 from tasks.render.scene.sky import plain_sky
 from tasks.render.settings import Backend, RenderSettings
-from tasks.render.views import views_by_instant
+from tasks.render.views import render_views
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import AgentKind, AgentTracks, Camera
 from tests.bench.bench_render import cloud
@@ -74,7 +74,7 @@ def nothing_is_drawn(**given: Any) -> Any:
 
 def drawn(*asked: Any, **how: Any) -> list[Bytes]:
     """The pictures of all instants, as a sample's are asked for."""
-    return list(views_by_instant(*asked, **how))
+    return list(render_views(*asked, **how))
 
 
 def row(width: int, height: int, gaussians: int, vehicles: int, instants: int, repeats: int) -> None:

@@ -59,7 +59,7 @@ def test_its_poses_are_those_that_pictures_are_drawn_and_traffic_driven_at() -> 
             if stamp == 4_000_000:
                 objects[name] = pose
     found = picture(service, shot(STREET, cameras(service, STREET)["front"], poses[40], 4_000_000, objects))
-    expected = render_views(scene.asset, scene.cameras[:1], scene.on_road[[40]], scene.agents, [40], 96, 64)[0, 0]
+    expected = next(render_views(scene.asset, scene.cameras[:1], scene.on_road[[40]], scene.agents, [40], 96, 64))[0]
     np.testing.assert_array_equal(found, expected)
     there = {name: scene.agents.boxes[40, scene.agents.track_ids.index(name)] for name in objects}
     assert set(objects) == set(scene.agents.track_ids)

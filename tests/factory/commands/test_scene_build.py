@@ -117,7 +117,9 @@ def test_a_sidecar_alone_gives_the_scene_that_a_run_makes_and_a_film_of_it(
         there[:3, 3] += there[:3, 1]  # y is left
         there[:3, :3] = there[:3, :3] @ Rotation.from_euler("z", 8.0, degrees=True).as_matrix()
         rig = built.as_corrected(drive.clip.cameras)
-        drawn = render_views(built, rig, there[None], settled, [files[k].time_s / STEP_S], WIDTH, HEIGHT)[0, 0]
+        drawn = np.stack([*render_views(built, rig, there[None], settled, [files[k].time_s / STEP_S], WIDTH, HEIGHT)])[
+            0, 0
+        ]
         assert psnr(films[1.0][k][1], drawn) > 30.0
     (tmp_path / "elsewhere").mkdir()
     other = tmp_path / "elsewhere" / "cameras.json"

@@ -174,7 +174,7 @@ def pictures() -> dict[str, object]:
     asset = build_asset(photos, sweeps, street.tracks(), AssetSettings(hold_out_every=0))
     front = Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), street.EGO_FROM_CAMERA)
     aside = np.stack([street.ego_pose(1.5, 0.6)])
-    seen = render_views(asset, [front], aside, street.tracks(), [4], street.WIDTH, street.HEIGHT)
+    seen = np.stack([*render_views(asset, [front], aside, street.tracks(), [4], street.WIDTH, street.HEIGHT)])
     clip = street_clip()
     pose = clip.world_from_ego[NOW : NOW + 1] * 1.0
     pose[:, 2, 3] = 0.0

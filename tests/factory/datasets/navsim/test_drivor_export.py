@@ -1,6 +1,5 @@
 """The export for DrivoR, as valeoai/TOAD @ 0110647 loads it: config groups, five rounds, 14 frames."""
 
-import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import pytest
 import yaml
 
 from factory.datasets.navsim.frames import BLACK, CannotExport, ExportSettings, sample_names
+from factory.readers.pickles import load_plain
 from tests.factory.datasets.navsim.navsim_samples import TOKENS, YAWS, exported, pictures, quiet
 from tests.planners.samples import write_table
 
@@ -60,7 +60,7 @@ def test_the_first_four_seconds_are_those_of_the_other_export_and_the_fifth_goes
     write_table(tmp_path / "run", [row])
     quiet(tmp_path / "run", tmp_path / "to")
     (short_log,), (log,) = ((root / f"navsim_logs/{ALL}-0").glob("*.pkl") for root in (tmp_path / "to", drivor))
-    short, long = (pickle.loads(path.read_bytes()) for path in (short_log, log))
+    short, long = (load_plain(path.read_bytes(), str(path)) for path in (short_log, log))
     assert len(long) == 14 and [frame["frame_idx"] for frame in long] == list(range(14))
     for ours, theirs in zip(long, short):
         for key in ("token", "timestamp", "ego2global", "ego_dynamic_state", "can_bus", "anns", "traffic_lights"):
@@ -82,7 +82,7 @@ def test_the_first_four_seconds_are_those_of_the_other_export_and_the_fifth_goes
 def test_the_camera_behind_is_black_and_another_that_it_opens_must_be_there(drivor: Path, tmp_path: Path) -> None:
     blobs = drivor / "sensor_blobs" / f"{ALL}-0"
     (log,) = (drivor / f"navsim_logs/{ALL}-0").glob("*.pkl")
-    cams = pickle.loads(log.read_bytes())[3]["cams"]
+    cams = load_plain(log.read_bytes(), str(log))[3]["cams"]
     assert cams["CAM_B0"]["data_path"] == BLACK
     assert all((blobs / cams[name]["data_path"]).is_file() for name in ("CAM_F0", "CAM_L0", "CAM_R0", "CAM_B0"))
     write_table(

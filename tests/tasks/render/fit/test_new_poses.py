@@ -102,7 +102,7 @@ def rig() -> list[Camera]:
 
 def drawn(asset: RenderAsset, poses: NDArray[np.float64]) -> NDArray[np.uint8]:
     steps = list(range(len(poses)))
-    return render_views(asset, rig(), poses, NOBODY, steps, street.WIDTH, street.HEIGHT)
+    return np.stack([*render_views(asset, rig(), poses, NOBODY, steps, street.WIDTH, street.HEIGHT)])
 
 
 def test_from_a_metre_aside_each_camera_shows_the_street_in_its_own_colours(
@@ -152,7 +152,7 @@ def test_both_cameras_draw_a_white_sky_white(white_sky: WhiteSky) -> None:
     cameras = [replace(camera, ego_from_camera=turned(camera.name)) for camera in rig()]
     poses = np.stack([street.ego_pose(1.0 * k) for k in range(4)])
     steps = [5 * k for k in range(4)]
-    images = render_views(white_sky.stored, cameras, poses, NOBODY, steps, street.WIDTH, street.HEIGHT)
+    images = np.stack([*render_views(white_sky.stored, cameras, poses, NOBODY, steps, street.WIDTH, street.HEIGHT)])
     for c, camera in enumerate(cameras):
         of_sky = images[:, c][:, white_sky.skies[camera.name]]
         assert of_sky.shape[1] > 1000

@@ -32,7 +32,7 @@ def test_depth_is_metres_along_the_axis_and_alpha_says_where_the_street_is(stree
 def test_the_pipeline_s_frames_are_the_same_function_s(street_asset: RenderAsset) -> None:
     rig = [Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), street.EGO_FROM_CAMERA)]
     size = (street.WIDTH, street.HEIGHT)
-    frames = render_views(street_asset, rig, street.ego_pose(3.0)[None], street.tracks(), [8], *size)
+    frames = np.stack([*render_views(street_asset, rig, street.ego_pose(3.0)[None], street.tracks(), [8], *size)])
     drawn = render(street_asset, [FRONT], agents_at_time(street.tracks(), 0.8))[0].rgb
     np.testing.assert_array_equal(frames[0, 0], np.rint(drawn * 255.0).astype(np.uint8))
 

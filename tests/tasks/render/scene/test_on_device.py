@@ -17,7 +17,7 @@ from tasks.render.scene.on_device import Device, finished
 from tasks.render.scene.sky import SkyMap
 from tasks.render.settings import Backend
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
-from tasks.render.views import render_views, views_by_instant
+from tasks.render.views import render_views
 from tasks.world.arrays import F32
 from tasks.world.clip import AgentKind, Camera, Pinhole
 from tests.bench.by_kernels import rasterization
@@ -68,7 +68,8 @@ def test_samples_pictures_are_the_kernels_to_a_step_of_8_bits(rich: RenderAsset)
     ]
     poses = np.stack([street.ego_pose(1.5, 0.6), street.ego_pose(2.5, 0.6)])
     drawn = [
-        render_views(rich, rig, poses, street.tracks(), [4, 9.5], 96, 54, by) for by in (Backend.CPU, Backend.GSPLAT)
+        np.stack([*render_views(rich, rig, poses, street.tracks(), [4, 9.5], 96, 54, by)])
+        for by in (Backend.CPU, Backend.GSPLAT)
     ]
     assert drawn[0].shape == drawn[1].shape == (2, 2, 54, 96, 3)
     apart = np.abs(drawn[0].astype(int) - drawn[1])
@@ -93,7 +94,7 @@ def test_all_instants_are_asked_for_before_the_first_comes_back_alone(
     monkeypatch.setattr(on_device, "cuda", lambda packed: Device("cpu", drawn, packed, fetch))
     rig = [Camera("a", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), turned(0.0))]
     poses = np.stack([street.ego_pose(x, 0.6) for x in (1.5, 2.5, 3.5)])
-    for pictures in views_by_instant(rich, rig, poses, street.tracks(), [4, 9, 14], 96, 54, Backend.GSPLAT):
+    for pictures in render_views(rich, rig, poses, street.tracks(), [4, 9, 14], 96, 54, Backend.GSPLAT):
         told.append(f"encoded {len(pictures)}")
     assert told == ["asked"] * 3 + ["fetched", "encoded 1"] * 3
 

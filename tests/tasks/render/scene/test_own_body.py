@@ -40,11 +40,11 @@ def test_a_new_place_has_the_street_and_the_bonnet_in_front() -> None:
     truth = street.photo(2.5, 0.6, 0.0, with_car=False).rgb
     pose = street.ego_pose(2.5, 0.6)[None]
     size = street.WIDTH, street.HEIGHT
-    told, untold = (render_views(scene(t), [FRONT], pose, NOBODY, [0], *size)[0, 0] for t in (True, False))
+    told, untold = (next(render_views(scene(t), [FRONT], pose, NOBODY, [0], *size))[0] for t in (True, False))
     assert (told[BONNET] == WHITE).all()
     beside = ~BONNET & (np.arange(street.HEIGHT) >= 44)[:, None]
     assert psnr(told[beside], truth[beside]) > psnr(untold[beside], truth[beside]) + 3.0
-    half = render_views(scene(True), [FRONT], pose, NOBODY, [0], 64, 36)[0, 0]
+    half = next(render_views(scene(True), [FRONT], pose, NOBODY, [0], 64, 36))[0]
     assert np.abs(half[30:, 14:50].astype(int) - WHITE).max() <= 1, "at another size too"
 
 

@@ -53,9 +53,9 @@ def test_the_rig_s_views_of_an_instant_are_asked_for_at_once(
     poses, size = np.stack([street.ego_pose(1.5, 0.6), street.ego_pose(2.5, 0.6)]), (64, 36)
     for backend, packed in ((Backend.GSPLAT, True), (Backend.GSPLAT_DENSE, False)):
         asked.clear()
-        pictures = render_views(street_asset, rig, poses, street.tracks(), [4, 9], *size, backend)
+        pictures = np.stack([*render_views(street_asset, rig, poses, street.tracks(), [4, 9], *size, backend)])
         assert asked == [(2, packed), (2, packed)]
-        on_cpu = render_views(street_asset, rig, poses, street.tracks(), [4, 9], *size)
+        on_cpu = np.stack([*render_views(street_asset, rig, poses, street.tracks(), [4, 9], *size)])
         np.testing.assert_allclose(pictures.astype(int), on_cpu, atol=1)
         asked.clear()
         check_drive_pictures(street_asset, rig, poses[:1], street.tracks(), [4], size, GateSettings(), backend)
