@@ -68,7 +68,7 @@ def street(gaussians: int, vehicles: int, rig: Sequence[Camera]) -> tuple[Render
 def nothing_is_drawn(**given: Any) -> Any:
     """`gsplat.rasterization`, of tensors without contents."""
     like = {"device": given["means"].device, "dtype": torch.float32}
-    shape = len(given["Ks"]), given["height"], given["width"]
+    shape = *given["Ks"].shape[:-2], given["height"], given["width"]
     return torch.empty(*shape, 4, **like), torch.empty(*shape, 1, **like), None
 
 

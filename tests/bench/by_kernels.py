@@ -1,5 +1,7 @@
 """The loop over tensors without a GPU: this package's kernels as a function that torch can derive."""
 
+from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -47,6 +49,22 @@ class _Blended(torch.autograd.Function):
         return None, None, None, *tensors
 
 
+def instant_by_instant(one: Callable[..., Any]) -> Callable[..., Any]:
+    """A rasterisation of one scene, of several (F, N, ...) as well, as gsplat's is; the last entry is the first's."""
+
+    @wraps(one)
+    def of_any(**given: Any) -> Any:
+        if given["means"].dim() == 2:
+            return one(**given)
+        tensors = {name: value for name, value in given.items() if isinstance(value, Tensor)}
+        each = [one(**given | {name: v[f] for name, v in tensors.items()}) for f in range(len(given["means"]))]
+        drawn, alpha, meta = zip(*each)
+        return torch.stack(drawn), torch.stack(alpha), meta[0]
+
+    return of_any
+
+
+@instant_by_instant
 def rasterization(**given: Any) -> tuple[Tensor, Tensor, None]:
     """What stands for `gsplat.rasterization` on the CPU: its arguments drawn by `raster.forward`."""
     assert given["near_plane"] == NEAR_M and given["render_mode"] == "RGB+ED"

@@ -24,13 +24,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tasks.render.scene.on_device import Device, gaussians_on, rasterized
+from tasks.render.scene.on_device import Device, gaussians_on, rasterized, repeated
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.project import FITTED
 from tasks.render.splatting.raster import View, forward
 from tasks.render.splatting.tensors import Draw, Eye, SceneTensors, splatted
 from tasks.world.clip import Pinhole
-from tests.bench.by_kernels import by_kernels
+from tests.bench.by_kernels import by_kernels, instant_by_instant
 
 WIDTH, HEIGHT = 33, 25  # no multiples of a tile
 FAINTEST, MOST_OPAQUE, DARK = 1.0 / 255.0, 0.999, 1e-4  # of its kernel: skipped below, capped at, and nothing behind
@@ -40,6 +40,7 @@ ASIDE = ((28.0, 0.0, 6.0), (0.0, 29.0, 20.5), (0.0, 0.0, 1.0))
 Arrays = dict[str, NDArray[Any]]
 
 
+@instant_by_instant
 def rasterization(
     means: Tensor,
     quats: Tensor,
@@ -202,7 +203,7 @@ def answers(draw: Draw, scene: Gaussians, intrinsics: Any, dtype: torch.dtype, d
 def drawn_on(device: Device, scene: Gaussians, intrinsics: Any) -> View:
     """What a device makes of a scene, before black."""
     eye = Pinhole(np.array(intrinsics), pose(), WIDTH, HEIGHT)
-    found = rasterized(device, gaussians_on(device, scene), [eye], FITTED)
+    found = rasterized(device, repeated(gaussians_on(device, scene), 1), [[eye]], FITTED)
     return View(*(device.fetch(picture[0]) for picture in found))
 
 

@@ -1,17 +1,18 @@
 """Scenes that lie on a device of torch's and are drawn and finished there: boxes go there, pictures come back.
 
 The same Gaussians, sky and colours as the kernels draw, within a step of 8 bits, by `gsplat.rasterization` (gsplat
-1.5.3), all cameras of a size at once. Its conventions are those of the CPU rasteriser: quaternions w first,
-world-to-camera matrices with z forward, the centre of pixel (0, 0) at (0.5, 0.5), contributions cut off at 1/255 and
-capped at 0.999 (later versions cap at 0.99). What differs is passed on (near plane, the screen's filter) or below 8
-bits (no more than 1e-4 of the light is dropped instead of 1e-3). Pictures and derivatives are held against gsplat's own
-reference by tests.bench.peer_gsplat. Nothing but render.backend=gsplat loads torch.
+1.5.3), all cameras of a size at once, small pictures of several instants too. Its conventions are those of the CPU
+rasteriser: quaternions w first, world-to-camera matrices with z forward, the centre of pixel (0, 0) at (0.5, 0.5),
+contributions cut off at 1/255 and capped at 0.999 (later versions cap at 0.99). What differs is passed on (near plane,
+the screen's filter) or below 8 bits (no more than 1e-4 of the light is dropped instead of 1e-3). Pictures and
+derivatives are held against gsplat's own reference by tests.bench.peer_gsplat. Nothing but render.backend=gsplat loads
+torch.
 """
 
 import weakref
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from math import pi
 from typing import Any
@@ -71,14 +72,15 @@ def views(device: Device, asset: RenderAsset, instant: Instant) -> list[View]:
     for i, camera in enumerate(instant.cameras):
         by_size[camera.width, camera.height].append(i)
     found: dict[int, View] = {}
-    scene = _composed(device, asset, instant.vehicles)
+    scene = _composed(device, asset, [instant.vehicles])
     for rows in by_size.values():
-        mine, affines = [instant.cameras[i] for i in rows], [instant.affines[i] for i in rows]
-        rgb, depth, alpha = rasterized(device, scene, mine, asset.screen)
-        lit = finished(rgb, alpha, _sky_cells(device, asset.sky), *_cameras(device, mine, affines))
-        for i, *view in zip(rows, *map(device.fetch, (lit, depth, alpha)), strict=True):
+        mine = replace(instant, cameras=[instant.cameras[i] for i in rows], affines=[instant.affines[i] for i in rows])
+        for i, *view in zip(rows, *map(device.fetch, _lit(device, asset, scene, [mine])), strict=True):
             found[i] = View(*view)
     return [found[i] for i in range(len(instant.cameras))]
+
+
+BATCH_PIXELS = 2**23  # drawn in one call, of all cameras of the instants that it takes: 1 GB on the device
 
 
 @torch.inference_mode()
@@ -87,20 +89,37 @@ def pictures(
 ) -> Iterator[Bytes]:
     """(C, H, W, 3) of each instant, whose cameras are of one size, with what each camera sees of its own car.
 
-    Nothing is waited for before the last one was asked for: the device is not idle between instants, and draws on
-    while whoever asked is busy with the first.
+    Small pictures of several instants are drawn in one call. Nothing is waited for before the last one was asked for:
+    the device is not idle between calls, and draws on while whoever asked is busy with the first.
     """
-    drawn = []
-    for instant in instants:
-        rgb, _, alpha = rasterized(device, _composed(device, asset, instant.vehicles), instant.cameras, asset.screen)
-        lit = finished(rgb, alpha, _sky_cells(device, asset.sky), *_cameras(device, instant.cameras, instant.affines))
-        rounded = (lit * 255.0).round_()
-        for picture, body in zip(rounded, bodies, strict=True):
-            if body is not None:
-                over, share = _body(device, body, picture.shape[1], picture.shape[0])
-                picture.mul_(1.0 - share).add_(over * share).round_()
-        drawn.append(rounded.to(torch.uint8))
-    return (np.asarray(device.fetch(of_instant)) for of_instant in drawn)
+    rig = instants[0].cameras if instants else ()
+    at_once = max(1, BATCH_PIXELS // max(1, sum(camera.width * camera.height for camera in rig)))
+    drawn = [_rounded(device, asset, instants[i : i + at_once], bodies) for i in range(0, len(instants), at_once)]
+    return (np.asarray(device.fetch(of_instant)) for batch in drawn for of_instant in batch)
+
+
+def _rounded(
+    device: Device, asset: RenderAsset, instants: Sequence[Instant], bodies: Sequence[OwnBody | None]
+) -> Tensor:
+    """(F, C, H, W, 3) uint8."""
+    scene = _composed(device, asset, [instant.vehicles for instant in instants])
+    lit, _, _ = _lit(device, asset, scene, instants)
+    rounded = (lit * 255.0).round_().unflatten(0, (len(instants), -1))
+    for c, body in enumerate(bodies):
+        if body is not None:
+            over, share = _body(device, body, rounded.shape[3], rounded.shape[2])
+            rounded[:, c].mul_(1.0 - share).add_(over * share).round_()
+    return rounded.to(torch.uint8)
+
+
+def _lit(
+    device: Device, asset: RenderAsset, scene: "GaussianTensors", instants: Sequence[Instant]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Finished pictures, depth and alpha, (F x C, H, W, ...), of instants with as many cameras of one size each."""
+    rgb, depth, alpha = rasterized(device, scene, [instant.cameras for instant in instants], asset.screen)
+    cameras = [camera for instant in instants for camera in instant.cameras]
+    affines = [affine for instant in instants for affine in instant.affines]
+    return finished(rgb, alpha, _sky_cells(device, asset.sky), *_cameras(device, cameras, affines)), depth, alpha
 
 
 # What lies there stays as long as the objects that it was made of, which nobody changes.
@@ -152,17 +171,41 @@ def _body(device: Device, body: OwnBody, width: int, height: int) -> tuple[Tenso
     return made
 
 
-def _composed(device: Device, asset: RenderAsset, vehicles: PlacedAgents) -> GaussianTensors:
-    """As `tasks.render.scene.asset.compose_gaussians` has it."""
-    background = gaussians_on(device, asset.background)
-    if not len(vehicles.track_ids):
-        return background
+UNLIT = Gaussians(
+    means=np.zeros((1, 3), np.float32),
+    quats=np.eye(1, 4, dtype=np.float32),
+    log_scales=np.zeros((1, 3), np.float32),
+    opacities=np.zeros(1, np.float32),
+    colours=np.zeros((1, 3), np.float32),
+)
+
+
+def _composed(device: Device, asset: RenderAsset, crowds: Sequence[PlacedAgents]) -> GaussianTensors:
+    """As `tasks.render.scene.asset.compose_gaussians` has it, of several instants (F, N, ...): where fewer vehicles are
+    there than at others, Gaussians without light stand for the rest."""
+    background = repeated(gaussians_on(device, asset.background), len(crowds))
     nodes = [
-        asset.nodes.get(track_id) or box_gaussians(vehicles.boxes[j, 4:7], vehicles.kinds[j])
-        for j, track_id in enumerate(vehicles.track_ids)
+        asset.nodes.get(track_id) or box_gaussians(crowd.boxes[j, 4:7], crowd.kinds[j])
+        for crowd in crowds
+        for j, track_id in enumerate(crowd.track_ids)
     ]
-    poses = world_from_boxes(vehicles.boxes - np.concatenate([asset.origin, np.zeros(4)]))
-    return _joined([background, *_moved(device, nodes, poses)])
+    if not nodes:
+        return background
+    boxes = np.concatenate([crowd.boxes for crowd in crowds])
+    poses = world_from_boxes(boxes - np.concatenate([asset.origin, np.zeros(4)]))
+    vehicles = _joined([*_moved(device, nodes, poses), gaussians_on(device, UNLIT)], dim=0)
+    ends = np.cumsum([0, *(len(crowd.track_ids) for crowd in crowds)])
+    starts = np.cumsum([0, *(len(node) for node in nodes)])[ends]
+    rows = starts[:-1, None] + np.arange(np.diff(starts).max())
+    rows = torch.as_tensor(np.where(rows < starts[1:, None], rows, starts[-1]), device=device.name)
+    taken = GaussianTensors(*(getattr(vehicles, each.name)[rows] for each in fields(GaussianTensors)))
+    return _joined([background, taken], dim=1)
+
+
+def repeated(part: GaussianTensors, times: int) -> GaussianTensors:
+    """(F, N, ...), which takes no memory of its own."""
+    whole = (getattr(part, each.name) for each in fields(GaussianTensors))
+    return GaussianTensors(*(tensor.expand(times, *tensor.shape) for tensor in whole))
 
 
 def _moved(device: Device, nodes: Sequence[Gaussians], poses: Array) -> list[GaussianTensors]:
@@ -190,49 +233,51 @@ def _turned_light(device: Device, part: GaussianTensors, pose: Array) -> Tensor:
     return (turn[None, :, :, None] * part.sh_rest[:, None]).sum(2)
 
 
-def _joined(parts: Sequence[GaussianTensors]) -> GaussianTensors:
-    """As `gaussians.concatenate` has it."""
-    most = max(part.sh_rest.shape[1] for part in parts)
-    light = [torch.nn.functional.pad(part.sh_rest, (0, 0, 0, most - part.sh_rest.shape[1])) for part in parts]
+def _joined(parts: Sequence[GaussianTensors], dim: int) -> GaussianTensors:
+    """As `gaussians.concatenate` has it, along a dimension."""
+    most = max(part.sh_rest.shape[-2] for part in parts)
+    lacks = [most - part.sh_rest.shape[-2] for part in parts]
+    light = [torch.nn.functional.pad(p.sh_rest, (0, 0, 0, n)) if n else p.sh_rest for p, n in zip(parts, lacks)]
     names = [each.name for each in fields(GaussianTensors) if each.name != "sh_rest"]
-    joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-    return GaussianTensors(**joined, sh_rest=torch.cat(light))
+    joined = {name: torch.cat([getattr(part, name) for part in parts], dim) for name in names}
+    return GaussianTensors(**joined, sh_rest=torch.cat(light, dim))
 
 
 def rasterized(
-    device: Device, scene: GaussianTensors, cameras: Sequence[Pinhole], screen: ScreenFilter
+    device: Device, scene: GaussianTensors, rigs: Sequence[Sequence[Pinhole]], screen: ScreenFilter
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Colours (C, H, W, 3) before black, which may leave [0, 1], depth (C, H, W) [m], 0 where nothing is, and alpha."""
-    width, height = cameras[0].width, cameras[0].height
-    if not len(scene.means):
-        nothing = torch.zeros(len(cameras), height, width, 3, device=device.name)
+    """Colours (F x C, H, W, 3) before black, which may leave [0, 1], depth (F x C, H, W) [m], 0 where nothing is, and
+    alpha, of a `scene` (F, N, ...) and C cameras for each of F instants."""
+    first = rigs[0][0]
+    if not scene.means.shape[1]:
+        nothing = torch.zeros(len(rigs) * len(rigs[0]), first.height, first.width, 3, device=device.name)
         return nothing, nothing[..., 0], nothing[..., 0]
-    seen, covered, _ = device.rasterization(**arguments(device, scene, cameras, screen))
-    alpha = covered[..., 0]
+    seen, covered, _ = device.rasterization(**arguments(device, scene, rigs, screen))
+    seen, alpha = seen.flatten(0, 1), covered[..., 0].flatten(0, 1)
     return seen[..., :3], torch.where(alpha > 0.0, seen[..., 3], 0.0), alpha
 
 
 def arguments(
-    device: Device, scene: GaussianTensors, cameras: Sequence[Pinhole], screen: ScreenFilter = FITTED
+    device: Device, scene: GaussianTensors, rigs: Sequence[Sequence[Pinhole]], screen: ScreenFilter = FITTED
 ) -> dict[str, Any]:
     """What `gsplat.rasterization` is called with: tensors float32 by its names, and plain settings.
 
-    means (N, 3), quats (N, 4), scales (N, 3), opacities (N,), colors (N, 3) or, with sh_degree, coefficients (N, K, 3),
-    viewmats (C, 4, 4) camera from scene, Ks (C, 3, 3). All cameras are of one size.
+    means (F, N, 3), quats (F, N, 4), scales (F, N, 3), opacities (F, N), colors (F, N, 3) or, with sh_degree,
+    coefficients (F, N, K, 3), viewmats (F, C, 4, 4) camera from scene, Ks (F, C, 3, 3). All cameras are of one size.
     """
-    count = scene.sh_rest.shape[1]
+    count = scene.sh_rest.shape[-2]
     colours = scene.colours.clamp(min=0.0)  # as the kernels do; gsplat does it for higher degrees alone
     if count:  # gsplat adds the half again
-        colours = torch.cat([((scene.colours - 0.5) / sh.C0)[:, None], scene.sh_rest], dim=1)
+        colours = torch.cat([((scene.colours - 0.5) / sh.C0)[..., None, :], scene.sh_rest], dim=-2)
     return {
         "means": scene.means,
         "quats": scene.quats,
         "scales": scene.log_scales.exp(),
         "opacities": scene.opacities,
         "colors": colours,
-        "viewmats": device.sent(np.stack([np.linalg.inv(camera.world_from_camera) for camera in cameras])),
-        "Ks": device.sent(np.stack([camera.intrinsics for camera in cameras])),
-    } | plain_arguments(cameras[0].width, cameras[0].height, count, screen, device.packed)
+        "viewmats": device.sent([[np.linalg.inv(camera.world_from_camera) for camera in rig] for rig in rigs]),
+        "Ks": device.sent([[camera.intrinsics for camera in rig] for rig in rigs]),
+    } | plain_arguments(rigs[0][0].width, rigs[0][0].height, count, screen, device.packed)
 
 
 def _cameras(device: Device, cameras: Sequence[Pinhole], affines: Sequence[F32]) -> tuple[Tensor, Tensor, Tensor]:

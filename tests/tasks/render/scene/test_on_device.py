@@ -19,7 +19,7 @@ from tasks.render.settings import Backend
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
 from tasks.render.views import render_views
 from tasks.world.arrays import F32
-from tasks.world.clip import AgentKind, Camera, Pinhole
+from tasks.world.clip import AgentKind, AgentTracks, Camera, Pinhole
 from tests.bench.by_kernels import rasterization
 
 STEP = 1.0 / 255.0
@@ -60,18 +60,32 @@ def turned(degrees: float) -> np.ndarray:
     return mount
 
 
+def two_that_come_and_go() -> AgentTracks:
+    """The street's car, beside it from step 8 on somebody of whom there are no photos, and nobody from step 12 on."""
+    car = street.tracks()
+    boxes = np.concatenate([car.boxes, car.boxes + np.array([0.0, -2.0, 0.0, -2.0, -1.0])], axis=1)
+    twice = {name: np.repeat(getattr(car, name), 2, axis=1) for name in ("velocities", "valid", "center_z")}
+    twice["valid"][:8, 1] = twice["valid"][12:] = False
+    kinds = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN)
+    return replace(
+        car, track_ids=("car", "nobody knows it"), kinds=kinds, boxes=boxes, heights=np.repeat(car.heights, 2), **twice
+    )
+
+
 def test_samples_pictures_are_the_kernels_to_a_step_of_8_bits(rich: RenderAsset) -> None:
-    """Two cameras at two instants, one of which sees its own car; a vehicle with Gaussians of its own drives along."""
+    """Two cameras, one of which sees its own car, at three instants: a vehicle with Gaussians of its own drives along,
+    with another one after a while, and then both are gone."""
     rig = [
         Camera(n, street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), turned(k))
         for n, k in (("a", 0.0), ("b", 170.0))
     ]
-    poses = np.stack([street.ego_pose(1.5, 0.6), street.ego_pose(2.5, 0.6)])
+    poses = np.stack([street.ego_pose(x, 0.6) for x in (1.5, 2.5, 3.0)])
+    both = two_that_come_and_go()
     drawn = [
-        np.stack([*render_views(rich, rig, poses, street.tracks(), [4, 9.5], 96, 54, by)])
+        np.stack([*render_views(rich, rig, poses, both, [4, 9.5, 14], 96, 54, by)])
         for by in (Backend.CPU, Backend.GSPLAT)
     ]
-    assert drawn[0].shape == drawn[1].shape == (2, 2, 54, 96, 3)
+    assert drawn[0].shape == drawn[1].shape == (3, 2, 54, 96, 3)
     apart = np.abs(drawn[0].astype(int) - drawn[1])
     assert apart.max() <= 1 and (apart > 0).mean() < 0.01
     assert (np.abs(drawn[0][:, 1].astype(int) - drawn[0][:, 0]) > 30).mean() > 0.2, "both look at something else"
@@ -92,11 +106,12 @@ def test_all_instants_are_asked_for_before_the_first_comes_back_alone(
         return tensor.numpy()
 
     monkeypatch.setattr(on_device, "cuda", lambda packed: Device("cpu", drawn, packed, fetch))
+    monkeypatch.setattr(on_device, "BATCH_PIXELS", 2 * 96 * 54)
     rig = [Camera("a", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), turned(0.0))]
     poses = np.stack([street.ego_pose(x, 0.6) for x in (1.5, 2.5, 3.5)])
     for pictures in render_views(rich, rig, poses, street.tracks(), [4, 9, 14], 96, 54, Backend.GSPLAT):
         told.append(f"encoded {len(pictures)}")
-    assert told == ["asked"] * 3 + ["fetched", "encoded 1"] * 3
+    assert told == ["asked"] * 2 + ["fetched", "encoded 1"] * 3, "two instants at once, then one"
 
 
 def test_views_of_cameras_of_any_size_in_their_order(rich: RenderAsset) -> None:

@@ -38,14 +38,14 @@ def cloud(n: int, count: int) -> Gaussians:
     )
 
 
-def test_the_rig_s_views_of_an_instant_are_asked_for_at_once(
+def test_the_rig_s_views_of_a_sample_s_instants_are_asked_for_at_once(
     monkeypatch: pytest.MonkeyPatch, street_asset: RenderAsset
 ) -> None:
-    """By pictures of a sample and by the gate; with gsplat_dense each is told not to pack."""
-    asked: list[tuple[int, bool]] = []
+    """By the gate those of one instant; with gsplat_dense each is told not to pack."""
+    asked: list[tuple[int, int, bool]] = []
 
     def counted(**given: Any) -> Any:
-        asked.append((len(given["Ks"]), given["packed"]))
+        asked.append((*given["Ks"].shape[:2], given["packed"]))
         return rasterization(**given)
 
     monkeypatch.setattr(on_device, "cuda", lambda packed: Device("cpu", counted, packed))
@@ -54,12 +54,12 @@ def test_the_rig_s_views_of_an_instant_are_asked_for_at_once(
     for backend, packed in ((Backend.GSPLAT, True), (Backend.GSPLAT_DENSE, False)):
         asked.clear()
         pictures = np.stack([*render_views(street_asset, rig, poses, street.tracks(), [4, 9], *size, backend)])
-        assert asked == [(2, packed), (2, packed)]
+        assert asked == [(2, 2, packed)]
         on_cpu = np.stack([*render_views(street_asset, rig, poses, street.tracks(), [4, 9], *size)])
         np.testing.assert_allclose(pictures.astype(int), on_cpu, atol=1)
         asked.clear()
         check_drive_pictures(street_asset, rig, poses[:1], street.tracks(), [4], size, GateSettings(), backend)
-        assert asked[0] == (2, packed)
+        assert asked[0] == (1, 2, packed)
 
 
 @pytest.mark.parametrize("name", ["torch", "gsplat"])

@@ -13,7 +13,7 @@ import pytest
 import torch
 from packaging.requirements import Requirement
 
-from tasks.render.scene.on_device import Device, arguments, gaussians_on
+from tasks.render.scene.on_device import Device, arguments, gaussians_on, repeated
 from tasks.render.splatting.tensors import Eye, SceneTensors, learned_arguments
 from tasks.world.clip import Pinhole
 from tests.bench.peer_gsplat import (
@@ -58,7 +58,7 @@ def given(packed: bool = True) -> tuple[dict[str, Any], dict[str, Any]]:
     """What the drawing and what the fit call gsplat with, of one scene and camera."""
     scene, intrinsics = SCENES["colours below zero"]
     device, eye = Device("cpu", rasterization, packed), Pinhole(np.array(intrinsics), pose(), WIDTH, HEIGHT)
-    drawing = arguments(device, gaussians_on(device, scene), [eye])
+    drawing = arguments(device, repeated(gaussians_on(device, scene), 1), [[eye]])
     logits = torch.logit(torch.tensor(scene.opacities))
     tensors = (scene.means, scene.quats, scene.log_scales, logits, scene.colours)
     learned = SceneTensors(*map(torch.as_tensor, tensors))
@@ -71,7 +71,7 @@ def test_the_fit_calls_gsplat_as_the_drawing_does() -> None:
     plain = {name: value for name, value in drawing.items() if not isinstance(value, torch.Tensor)}
     assert plain == {name: fitting[name] for name in plain} and len(plain) == 8
     for name in drawing.keys() - plain.keys():
-        np.testing.assert_allclose(fitting[name], drawing[name], rtol=1e-5, atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(fitting[name], drawing[name][0], rtol=1e-5, atol=1e-6, err_msg=name)
 
 
 def test_every_argument_is_one_of_gsplat_s_and_what_is_not_said_has_a_default() -> None:
