@@ -26,8 +26,8 @@ from factory.alpasim.wire import (
     stamp_of,
     write_pose,
 )
-from factory.stages.sensors import encode_jpeg
 from tasks.render.lens import Lens, lens_of, render_through_lens
+from tasks.render.scene.engine import encode_jpeg
 from tasks.render.settings import Backend
 from tasks.render.views import render_views
 from tasks.world.arrays import Array, Bytes

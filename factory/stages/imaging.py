@@ -6,7 +6,6 @@ Photos without lidar give coarse pictures, tagged `photos_only`.
 """
 
 from collections.abc import Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -25,7 +24,7 @@ from factory.stages.assets import (
     scene_path,
 )
 from factory.stages.rows import agent_columns
-from factory.stages.sensors import block_of, choose_cameras, encode_jpeg, files_of_cameras, load_photos
+from factory.stages.sensors import block_of, choose_cameras, files_of_cameras, load_photos
 from tasks.attempt import Judged
 from tasks.perturb import Candidate
 from tasks.render.gate import (
@@ -40,11 +39,12 @@ from tasks.render.gate import (
     likeness_to_photo,
 )
 from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.engine import encode_jpeg, render_jpegs
 from tasks.render.scene.movers import agents_at_time
 from tasks.render.scene.sensed import Photo
 from tasks.render.seen import PhotoSights, photo_sights
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
-from tasks.render.views import MAP_RIG, draw_map_views, render_views
+from tasks.render.views import MAP_RIG, draw_map_views, instants_of_views
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentTracks, Camera, Clip, Scene, SensorFile
@@ -54,7 +54,6 @@ NO_IMAGES: dict[str, object] = {"cameras": None, "images": None, "image_source":
 PHOTOS_ONLY = "photos_only"  # tag: depth is guessed from parallax, markings shear off the photos' path
 LOW_PSNR = "low_psnr"  # tag: held-out photos of the block come out worse than psnr_min
 GATE_STRIDE = 5  # steps of 0.1 s between the pictures that are looked at: 2 Hz
-JPEG_THREADS = 4  # encode beside the drawing of the next instant: 31 CPU ms for eight pictures of 1920x1080
 PHOTO_SLACK_S = 0.06  # a photo belongs to an instant of the 2 Hz grid when it was taken this close to it
 
 
@@ -190,18 +189,18 @@ class Imaging:
         agents = scene.agents.overwritten(scene.step, rollout.agents)
         steps = [scene.step + offset for offset in offsets]
         seen = (cameras, poses, agents, steps, self.settings.width, self.settings.height)
+        images: Sequence[Sequence[Bytes | bytes]]
         if asset is None:
-            images = iter(draw_map_views(clip.road_map, *seen))
+            images = [[*pictures] for pictures in draw_map_views(clip.road_map, *seen)]
         else:
             lifted = asset.lifted(agents, clip_offset_s(clip))
-            images = render_views(asset, cameras, poses, lifted, *seen[3:], self.settings.backend)
-        with ThreadPoolExecutor(JPEG_THREADS) as beside:
-            asked = [
-                beside.submit(self.image, camera.name, offset * STEP_S, pose, rgb)
-                for offset, pose, pictures in zip(offsets, poses, images, strict=True)
-                for camera, rgb in zip(cameras, pictures, strict=True)
-            ]
-        found = [image.result() for image in asked]
+            asked = instants_of_views(asset, cameras, poses, lifted, *seen[3:])
+            images = render_jpegs(asset, *asked, self.settings.jpeg_quality, self.settings.backend)
+        found = [
+            self.image(camera.name, offset * STEP_S, pose, picture)
+            for offset, pose, pictures in zip(offsets, poses, images, strict=True)
+            for camera, picture in zip(cameras, pictures, strict=True)
+        ]
         source = ImageSource.MAP if asset is None else ImageSource.RENDER
         measured: dict[str, object] = {}
         if asset is not None:
@@ -242,13 +241,13 @@ class Imaging:
         ]
         return {"cameras": self.rig(cameras), "images": found, "image_source": str(ImageSource.PHOTO), **higher}
 
-    def image(self, camera: str, time_s: float, pose: Array, rgb: Bytes) -> dict[str, object]:
-        """An entry of the column `images`: `time_s` from now, of the ego at `pose` (4, 4), rgb (H, W, 3)."""
+    def image(self, camera: str, time_s: float, pose: Array, picture: Bytes | bytes) -> dict[str, object]:
+        """An entry of the column `images`: `time_s` from now, of the ego at `pose` (4, 4), rgb (H, W, 3) or a JPEG."""
         return {
             "camera": camera,
             "time_s": float(time_s),
             "ego_pose": pose.ravel(),
-            "jpeg": encode_jpeg(rgb, self.settings.jpeg_quality),
+            "jpeg": picture if isinstance(picture, bytes) else encode_jpeg(picture, self.settings.jpeg_quality),
         }
 
     def rig(self, cameras: Sequence[Camera]) -> list[dict[str, object]]:

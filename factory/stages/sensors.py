@@ -182,15 +182,6 @@ def choose_cameras(rig: Sequence[Camera], names: Sequence[str] | None) -> tuple[
     return tuple(by_name[name] for name in names)
 
 
-def encode_jpeg(image: Bytes, quality: int) -> bytes:
-    """An rgb image (H, W, 3) as JPEG bytes; quality 1..100, colour at half the size each way."""
-    how = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), how)
-    if not done:
-        raise ValueError(f"no JPEG of an image of shape {image.shape}")
-    return data.tobytes()
-
-
 def decode_image(data: bytes, name: str, camera: Camera | None = None) -> Bytes:
     """Encoded bytes (JPEG or PNG) as rgb (H, W, 3). Raises BadClip that names `name`, also where it is not of the size
     that its `camera` takes.

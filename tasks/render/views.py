@@ -7,7 +7,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from tasks.render.scene.asset import Instant, RenderAsset
+from tasks.render.scene.asset import Instant, OwnBody, RenderAsset
 from tasks.render.scene.engine import render_pictures
 from tasks.render.scene.movers import agents_at_time
 from tasks.render.settings import Backend
@@ -37,13 +37,27 @@ def render_views(
     the scene's 0 (`RenderAsset.since`), and before it what it sees of the car that carries it.
     Raises BackendMissing where the backend cannot work on this machine.
     """
+    asked = instants_of_views(asset, cameras, world_from_ego, agents, steps, width, height)
+    return render_pictures(asset, *asked, backend)
+
+
+def instants_of_views(
+    asset: RenderAsset,
+    cameras: Sequence[Camera],
+    world_from_ego: Array,
+    agents: AgentTracks,
+    steps: Sequence[float],
+    width: int,
+    height: int,
+) -> tuple[list[Instant], list[OwnBody | None]]:
+    """What `render_views` draws: one instant a pose, and what each camera sees of its own car."""
     rig, instants = [camera.resized(width, height) for camera in cameras], []
     for pose, step in zip(world_from_ego, steps, strict=True):
         affines = [asset.affine_of(camera.name, step * STEP_S) for camera in cameras]
         there = agents_at_time(agents, step * STEP_S, pose[:2, 3], VISIBLE_M)
         eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, width, height) for c in rig]
         instants.append(Instant(eyes, there, affines))
-    return render_pictures(asset, instants, [asset.own_body(camera.name) for camera in cameras], backend)
+    return instants, [asset.own_body(camera.name) for camera in cameras]
 
 
 def undistorted(image: Bytes, camera: Camera) -> Bytes:

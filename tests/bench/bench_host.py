@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from factory.stages.sensors import encode_jpeg
 from tasks.render.scene import on_device
 from tasks.render.scene.asset import Exposure, OwnBody, RenderAsset
+from tasks.render.scene.engine import encode_jpeg
 from tasks.render.scene.on_device import Device
 from tasks.render.scene.sky import plain_sky
 from tasks.render.settings import Backend, RenderSettings

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.stages.sensors import encode_jpeg, load_photos
+from factory.stages.sensors import load_photos
 from tasks.render.fit.reconstruct import finish_scene, run_iterations
 from tasks.render.fit.start import prepare_fit
 from tasks.render.scene.asset import psnr
-from tasks.render.scene.engine import render
+from tasks.render.scene.engine import encode_jpeg, render
 from tasks.render.scene.movers import PlacedAgents
 from tasks.render.settings import FitSettings
 from tasks.world.clip import Pinhole

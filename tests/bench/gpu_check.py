@@ -20,6 +20,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, TextIO
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -32,10 +33,10 @@ from tasks.render.fit.on_torch import TorchBackend, photo_loss
 from tasks.render.fit.reconstruct import finish_scene, run_iterations
 from tasks.render.fit.start import FitPhoto, FitProblem, PhotoTarget
 from tasks.render.fit.state import BACKGROUND, AdamArray, FitState, logits_of
-from tasks.render.scene.asset import Instant, RenderAsset, psnr
-from tasks.render.scene.engine import SCENE_S_OWN, render, render_pictures
-from tasks.render.scene.movers import NOBODY, SHIFT_SIZE
-from tasks.render.scene.on_device import Device, pictures
+from tasks.render.scene.asset import Instant, OwnBody, RenderAsset, psnr
+from tasks.render.scene.engine import SCENE_S_OWN, encode_jpeg, render, render_pictures
+from tasks.render.scene.movers import NOBODY, SHIFT_SIZE, PlacedAgents
+from tasks.render.scene.on_device import BATCH_PIXELS, Device, jpegs, nvjpeg, pictures
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.render.scene.sky import COLUMNS, ROWS, plain_sky
 from tasks.render.settings import FitSettings
@@ -44,7 +45,7 @@ from tasks.render.splatting.gsplat_backend import BackendMissing, require
 from tasks.render.splatting.raster import forward
 from tasks.render.splatting.tensors import Draw, Eye, SceneTensors, by_gsplat, learned_arguments
 from tasks.world.arrays import Bytes
-from tasks.world.clip import Pinhole
+from tasks.world.clip import AgentKind, Pinhole
 from tests.bench.bench_render import cloud
 from tests.bench.by_kernels import by_kernels
 from tests.bench.by_kernels import rasterization as of_kernel_calls
@@ -53,6 +54,8 @@ from tests.bench.peer_gsplat import SCENES, answers, apart, drawn_on, of_kernels
 CLOSE = 1e-3  # of an array's length: CUDA's exponential is good to 2e-6, and sums come in any order
 BEHIND_A_WALL = 5e-3  # light that a tile drops and gsplat does not
 ALIKE_DB = 55.0  # of two pictures of a scene
+JPEGS_ALIKE_DB = 30.0  # of what is decoded: colours are halved by one encoder and may not be by the other
+QUALITY = 90
 ALIKE = 1  # of 8 bits, two pictures drawn in one call or in several
 RIG, INSTANTS = 8, 4  # cameras, and of a sample's history
 WAYS = ((1, 1, True), (1, 1, False), *((RIG, n, packed) for n in (RIG, 1) for packed in (True, False)))
@@ -92,12 +95,12 @@ class Place:
         """Calls per second, after one that warms up."""
         call()
         self.done()
-        began, n = time.perf_counter(), 0
+        began, n, at_once = time.perf_counter(), 0, CALLS if self.device == "cuda" else 1
         while time.perf_counter() - began < self.least_s:
-            for _ in range(CALLS):
+            for _ in range(at_once):
                 call()
             self.done()
-            n += CALLS
+            n += at_once
         return n / (time.perf_counter() - began)
 
     def peak_mb(self) -> str:
@@ -276,6 +279,61 @@ def views(place: Place, n: int, sizes: Sequence[tuple[int, int]], threads: int) 
     return well
 
 
+def samples(place: Place, n: int, sizes: Sequence[tuple[int, int]]) -> bool:
+    """A sample's instants in as few calls as the engine makes and in one each, and its JPEGs, by the device where it
+    makes them and by one thread of the host. Whether pictures are alike, and JPEGs those of the pictures."""
+    print(
+        "\nA sample of as many instants, with a vehicle that others lack at each second one; JPEGs of its pictures:\n"
+    )
+    print(
+        "| size | calls | apart | samples/s | instant by instant | JPEGs by the host/s | by the device/s | PSNR [dB] |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
+    node = cloud(n // 50)
+    asset, well = RenderAsset(np.zeros(3), cloud(n), {"a": node}, plain_sky(), float("nan")), True
+    device = replace(place.drawing, encode=place.drawing.encode or (nvjpeg() if place.device == "cuda" else None))
+    somebody = PlacedAgents(("a",), (AgentKind.VEHICLE,), np.array([[6.0, 0.0, 0.0, 0.0, 4.0, 2.0, 1.5]]))
+    for width, height in sizes:
+        k = np.array([[0.6 * width, 0.0, width / 2], [0.0, 0.6 * width, height / 2], [0.0, 0.0, 1.0]])
+        cameras = [Pinhole(k, _shifted(0.1 * i), width, height) for i in range(RIG)]
+        own = [SCENE_S_OWN] * RIG
+        sample = [Instant(cameras, somebody if i % 2 else NOBODY, own) for i in range(INSTANTS)]
+        nothing: list[OwnBody | None] = [None] * RIG
+        together = partial(_sample, device, asset, [sample], nothing)
+        apart = partial(_sample, device, asset, [[instant] for instant in sample], nothing)
+        calls = -(-INSTANTS // max(1, BATCH_PIXELS // (RIG * width * height)))
+        off = int(np.abs(together().astype(int) - apart()).max())
+        shown = [*together().reshape(-1, height, width, 3)]
+        host = [encode_jpeg(picture, QUALITY) for picture in shown]
+        row = f"| {width}x{height} | {calls} | {off} | {place.timed(together):.1f} | {place.timed(apart):.1f}"
+        row += f" | {len(shown) * place.timed(partial(_by_host, shown)):.0f}"
+        well &= off <= ALIKE
+        if device.encode is None:
+            print(f"{row} | no torchvision | |", flush=True)
+            continue
+        made = partial(jpegs, device, asset, sample, nothing, QUALITY)
+        there = [jpeg for of_instant in made() for jpeg in of_instant]
+        score = min(psnr(_decoded(a), _decoded(b)) for a, b in zip(there, host, strict=True))
+        well &= score > JPEGS_ALIKE_DB
+        print(f"{row} | {len(shown) * place.timed(made):.0f}, drawn as well | {score:.1f} |", flush=True)
+    return well
+
+
+def _sample(
+    device: Device, asset: RenderAsset, calls: Sequence[Sequence[Instant]], bodies: Sequence[OwnBody | None]
+) -> Bytes:
+    return np.stack([each for call in calls for each in pictures(device, asset, call, bodies)])
+
+
+def _by_host(shown: Sequence[Bytes]) -> None:
+    for picture in shown:
+        encode_jpeg(picture, QUALITY)
+
+
+def _decoded(jpeg: bytes) -> Bytes:
+    return np.asarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), np.uint8)
+
+
 def _by_engine(place: Place, asset: RenderAsset, cameras: Sequence[Pinhole], at_once: int, packed: bool) -> Bytes:
     return np.concatenate(
         [place.engine(asset, cameras[i : i + at_once], packed) for i in range(0, len(cameras), at_once)]
@@ -338,6 +396,7 @@ def checked(options: dict[str, str]) -> int:
     well = parity(place)
     well &= fits(place, *problem_of(n, width, height, threads), settings, threads)
     well &= views(place, n, ((width, height), (4 * width, 4 * height)), threads)
+    well &= samples(place, n, ((width, height), (4 * width, 4 * height)))
     print(f"\n{'all agree' if well else 'NOT ALL AGREE'}; {time.perf_counter() - began:.0f} s")
     return 0 if well else 1
 

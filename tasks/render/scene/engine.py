@@ -7,6 +7,7 @@ photos before they enter a scene (`views.undistorted`), so that images at new po
 """
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -69,6 +70,42 @@ def render_pictures(
 
         return on_device.pictures(gpu(backend), asset, [_in_scene(asset, instant) for instant in instants], bodies)
     return (_pictures_on_cpu(asset, instant, bodies) for instant in instants)
+
+
+JPEG_THREADS = 4
+
+
+def render_jpegs(
+    asset: RenderAsset,
+    instants: Sequence[Instant],
+    bodies: Sequence[OwnBody | None],
+    quality: int,
+    backend: Backend = Backend.CPU,
+) -> list[list[bytes]]:
+    """The pictures of `render_pictures` as JPEGs of a quality from 1 to 100, one a camera, of each instant.
+
+    A GPU makes them where torchvision is installed with nvJPEG, threads do elsewhere, beside the drawing of the next
+    instant. Raises BackendMissing where the backend cannot work on this machine.
+    """
+    if backend.on_gpu and gpu(backend).encode is not None:
+        from tasks.render.scene import on_device
+
+        return on_device.jpegs(gpu(backend), asset, [_in_scene(asset, each) for each in instants], bodies, quality)
+    with ThreadPoolExecutor(JPEG_THREADS) as beside:
+        asked = [
+            [beside.submit(encode_jpeg, picture, quality) for picture in pictures]
+            for pictures in render_pictures(asset, instants, bodies, backend)
+        ]
+    return [[jpeg.result() for jpeg in of_instant] for of_instant in asked]
+
+
+def encode_jpeg(image: Bytes, quality: int) -> bytes:
+    """An rgb image (H, W, 3) as JPEG bytes; quality 1..100, colour at half the size each way."""
+    how = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), how)
+    if not done:
+        raise ValueError(f"no JPEG of an image of shape {image.shape}")
+    return data.tobytes()
 
 
 def _pictures_on_cpu(asset: RenderAsset, instant: Instant, bodies: Sequence[OwnBody | None]) -> Bytes:

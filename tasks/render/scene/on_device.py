@@ -50,6 +50,7 @@ class Device:
     rasterization: Callable[..., tuple[Tensor, Tensor, Any]]  # gsplat's, or what stands for it
     packed: bool = True  # memory follows what is seen, not cameras x Gaussians
     fetch: Callable[[Tensor], NDArray[Any]] = fetched
+    encode: Callable[[list[Tensor], int], list[bytes]] | None = None  # JPEGs of (3, H, W) uint8, by a quality
 
     def sent(self, array: Any) -> Tensor:
         """An array on the device, float32."""
@@ -62,7 +63,20 @@ def cuda(packed: bool) -> Device:
     take_gpu()
     import gsplat
 
-    return Device("cuda", gsplat.rasterization, packed)
+    return Device("cuda", gsplat.rasterization, packed, encode=nvjpeg())
+
+
+def nvjpeg() -> Callable[[list[Tensor], int], list[bytes]] | None:
+    """JPEGs made where pictures lie, by torchvision's `encode_jpeg`; None where it is not installed."""
+    try:
+        from torchvision.io import encode_jpeg
+    except ImportError:
+        return None
+
+    def encode(pictures: list[Tensor], quality: int) -> list[bytes]:
+        return [jpeg.cpu().numpy().tobytes() for jpeg in encode_jpeg(pictures, quality)]
+
+    return encode
 
 
 @torch.inference_mode()
@@ -92,10 +106,32 @@ def pictures(
     Small pictures of several instants are drawn in one call. Nothing is waited for before the last one was asked for:
     the device is not idle between calls, and draws on while whoever asked is busy with the first.
     """
+    drawn = [*_drawn(device, asset, instants, bodies)]
+    return (np.asarray(device.fetch(of_instant)) for batch in drawn for of_instant in batch)
+
+
+@torch.inference_mode()
+def jpegs(
+    device: Device,
+    asset: RenderAsset,
+    instants: Sequence[Instant],
+    bodies: Sequence[OwnBody | None],
+    quality: int,
+) -> list[list[bytes]]:
+    """The same as JPEGs, one a camera, of each instant: nothing else comes back."""
+    assert device.encode is not None
+    drawn = (of_instant for batch in _drawn(device, asset, instants, bodies) for of_instant in batch)
+    return [device.encode([picture.permute(2, 0, 1).contiguous() for picture in each], quality) for each in drawn]
+
+
+def _drawn(
+    device: Device, asset: RenderAsset, instants: Sequence[Instant], bodies: Sequence[OwnBody | None]
+) -> Iterator[Tensor]:
+    """Batches (F, C, H, W, 3) uint8 of as many instants as BATCH_PIXELS lets."""
     rig = instants[0].cameras if instants else ()
     at_once = max(1, BATCH_PIXELS // max(1, sum(camera.width * camera.height for camera in rig)))
-    drawn = [_rounded(device, asset, instants[i : i + at_once], bodies) for i in range(0, len(instants), at_once)]
-    return (np.asarray(device.fetch(of_instant)) for batch in drawn for of_instant in batch)
+    for i in range(0, len(instants), at_once):
+        yield _rounded(device, asset, instants[i : i + at_once], bodies)
 
 
 def _rounded(

@@ -25,11 +25,11 @@ from factory.alpasim.sensors import SERVICE, Sensors
 from factory.alpasim.wire import Fault, Service, start_server
 from factory.config.run import load_config
 from factory.setup.settings import assemble
-from factory.stages.sensors import encode_jpeg
 from factory.store.reader import SampleTable, decode_stored_image
 from factory.store.samples import Store
 from factory.views.rendered_again import agents_in_world
 from tasks.render.scene.asset import psnr
+from tasks.render.scene.engine import encode_jpeg
 from tasks.render.scene.movers import agents_at_time, world_from_boxes
 from tasks.render.views import render_views, undistorted
 from tasks.world.clip import NOW

@@ -17,9 +17,10 @@ from factory.readers.base import BadClip
 from factory.stages import assets
 from factory.stages.assets import Sensing, block_id, block_sensing, load_or_build_scene
 from factory.stages.scene_file import read_dtype
-from factory.stages.sensors import block_of, choose_cameras, decode_image, encode_jpeg, load_sensors
+from factory.stages.sensors import block_of, choose_cameras, decode_image, load_sensors
 from tasks.render.fit import reconstruct
 from tasks.render.scene.build import AssetSettings, psnr
+from tasks.render.scene.engine import encode_jpeg
 from tasks.render.settings import Backend, FitSettings, RenderSettings, SceneDtype, SceneFrom
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.world.clip import CLIP_STEPS, AgentTracks, Camera, Clip, SensorFile

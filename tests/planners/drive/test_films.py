@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factory.stages.sensors import encode_jpeg
 from planners.drive.alpasim_score import logged_rollout, score_drive
 from planners.drive.films import BEV_PX, CAMERA_PX, HOLD, film_frames
 from planners.drive.loop import LoopSettings, drive
+from tasks.render.scene.engine import encode_jpeg
 from tasks.render.settings import ImageSource
 from tasks.world.clip import Scene
 from tests.planners.drive.streets import Steady, car, start_on, street_with

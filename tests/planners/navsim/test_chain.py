@@ -22,13 +22,14 @@ from factory.datasets.navsim.reader import NavsimReader
 from factory.datasets.town.settings import MOUNTS, TownSettings
 from factory.datasets.town.town import write_logs
 from factory.run import main as run
-from factory.stages.sensors import decode_image, encode_jpeg
+from factory.stages.sensors import decode_image
 from factory.store.reader import SampleTable, decode_stored_image
 from planners.evaluation.planning import plan_samples
 from planners.navsim.agent import RemotePlanner, agent_input_arrays
 from planners.navsim.serve import FRONT, AgentPlanner, observation_of
 from planners.training.checkpoint import load_planner, newest_checkpoint
 from planners.training.train import main as train
+from tasks.render.scene.engine import encode_jpeg
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import Clip
 from tasks.world.frames import to_local, to_world

@@ -13,7 +13,8 @@ import pytest
 
 from factory.datasets.av2.reader import AV2Reader, read_cameras
 from factory.readers.base import BadClip, ClipRef
-from factory.stages.sensors import encode_jpeg, load_photos
+from factory.stages.sensors import load_photos
+from tasks.render.scene.engine import encode_jpeg
 from tasks.world.clip import CLIP_STEPS, NOW, AgentKind
 from tasks.world.frames import AX, AY, HEADING, VX, X
 from tasks.world.road_map import LightState

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from factory.stages.sensors import encode_jpeg
+from tasks.render.scene.engine import encode_jpeg
 from tests.factory.datasets.navsim import scene_pickles
 from tests.factory.datasets.navsim.geopackage_writer import ORIGIN, stub_rows, write_root
 from tests.factory.datasets.navsim.logs import NAME, SPEED_MPS, frame

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from factory.datasets.navsim.reader import NavsimReader
-from factory.stages.sensors import encode_jpeg
+from tasks.render.scene.engine import encode_jpeg
 from tests.factory.datasets.navsim.geopackage_writer import CITIES, ORIGIN, stub_rows, write_geopackage
 from tests.factory.datasets.navsim.logs import NAME, SPEED_MPS, frame
 from tests.factory.datasets.navsim.openscene_writer import merged_pcd, write_frames

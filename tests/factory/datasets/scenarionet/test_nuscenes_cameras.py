@@ -14,7 +14,8 @@ from factory.datasets.scenarionet.nuscenes_cameras import import_cameras, on_sce
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import BadClip
 from factory.stages.assets import Sensing, block_sensing
-from factory.stages.sensors import block_of, encode_jpeg, load_sensors
+from factory.stages.sensors import block_of, load_sensors
+from tasks.render.scene.engine import encode_jpeg
 from tasks.render.settings import RenderSettings
 from tests.factory.datasets.scenarionet import scenarionet_scenarios as town
 

@@ -19,9 +19,10 @@ from factory.readers.base import BadClip
 from factory.readers.pictures import file_and_frame, frame_uri, video_frames
 from factory.stages.assets import Sensing, block_id, block_sensing
 from factory.stages.scene_file import read_scene, write_scene
-from factory.stages.sensors import block_of, encode_jpeg, load_photos, load_sensors
+from factory.stages.sensors import block_of, load_photos, load_sensors
 from factory.store.location import ClipCache, Location
 from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.engine import encode_jpeg
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.settings import RenderSettings
 from tasks.render.splatting.gaussians import EMPTY

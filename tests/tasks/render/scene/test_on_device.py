@@ -11,13 +11,13 @@ import torch
 
 from tasks.render.scene import on_device
 from tasks.render.scene.asset import Exposure, OwnBody, RenderAsset
-from tasks.render.scene.engine import render
+from tasks.render.scene.engine import encode_jpeg, render, render_jpegs, render_pictures
 from tasks.render.scene.movers import PlacedAgents, agents_at_time
 from tasks.render.scene.on_device import Device, finished
 from tasks.render.scene.sky import SkyMap
 from tasks.render.settings import Backend
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
-from tasks.render.views import render_views
+from tasks.render.views import instants_of_views, render_views
 from tasks.world.arrays import F32
 from tasks.world.clip import AgentKind, AgentTracks, Camera, Pinhole
 from tests.bench.by_kernels import rasterization
@@ -112,6 +112,32 @@ def test_all_instants_are_asked_for_before_the_first_comes_back_alone(
     for pictures in render_views(rich, rig, poses, street.tracks(), [4, 9, 14], 96, 54, Backend.GSPLAT):
         told.append(f"encoded {len(pictures)}")
     assert told == ["asked"] * 2 + ["fetched", "encoded 1"] * 3, "two instants at once, then one"
+
+
+@pytest.mark.parametrize("by", ["threads", "the device"])
+def test_jpegs_are_those_of_the_pictures_in_their_order(
+    rich: RenderAsset, monkeypatch: pytest.MonkeyPatch, by: str
+) -> None:
+    """A device that makes them has no picture come back."""
+
+    def encode(pictures: list[torch.Tensor], quality: int) -> list[bytes]:
+        assert all(picture.is_contiguous() and picture.dtype == torch.uint8 for picture in pictures)
+        return [encode_jpeg(picture.permute(1, 2, 0).numpy(), quality) for picture in pictures]
+
+    def fetch(tensor: torch.Tensor) -> np.ndarray:
+        raise AssertionError("nothing else is asked for")
+
+    rig = [
+        Camera(n, street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), turned(k))
+        for n, k in (("a", 0.0), ("b", 170.0))
+    ]
+    poses = np.stack([street.ego_pose(x, 0.6) for x in (1.5, 2.5, 3.0)])
+    asked = instants_of_views(rich, rig, poses, two_that_come_and_go(), [4, 9.5, 14], 96, 54)
+    pictures = [*render_pictures(rich, *asked, Backend.GSPLAT)]
+    if by == "the device":
+        monkeypatch.setattr(on_device, "cuda", lambda packed: Device("cpu", rasterization, packed, fetch, encode))
+    jpegs = render_jpegs(rich, *asked, 90, Backend.GSPLAT)
+    assert jpegs == [[encode_jpeg(picture, 90) for picture in of_instant] for of_instant in pictures]
 
 
 def test_views_of_cameras_of_any_size_in_their_order(rich: RenderAsset) -> None:
