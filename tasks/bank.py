@@ -221,6 +221,7 @@ class SceneBank:
         self.folder = Path(folder)
         self._bodies: list[Bytes] = []
         self._place: dict[str, tuple[int, int, int, int]] = {}  # shard, first byte, past the last, CRC-32
+        self.left_out: dict[str, str] = {}  # clip id -> why it has no scene
         heads = sorted(self.folder.glob(HEAD))
         if not heads:
             raise FileNotFoundError(f"{folder}: no {HEAD} in it: write it by factory.readers.bank.write_bank")
@@ -233,6 +234,7 @@ class SceneBank:
             self._bodies.append(np.memmap(body, np.uint8, "r") if ends[-1] else np.empty(0, np.uint8))
             places = zip([shard] * len(ends), ends, ends[1:], head["crc32"])
             self._place.update(zip(head["clip_ids"], places, strict=False))
+            self.left_out.update(head["left_out"])
         self.clip_ids = tuple(self._place)
         self._whole: set[str] = set()  # whose bytes were held against their checksum
 

@@ -2,17 +2,20 @@
 
 import multiprocessing
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from itertools import accumulate
 from pathlib import Path
+from typing import TypeVar
 
 from factory.files import atomic_file
 from factory.readers.base import BadClip, ClipReader, ClipRef
 from tasks.bank import BODY, FORMAT, pack_scene, read_head
 from tasks.caches import Damaged, json_with_checksum
+from tasks.world.clip import Clip
 
+T = TypeVar("T")
 SHARD = 1024  # scenes in a file, some 80 MB; what an interrupted process has to do again at most
 
 
@@ -25,30 +28,37 @@ def write_bank(
     a reader that pickles and a caller's module that may be imported.
     Raises Damaged where the folder holds a bank of other clips.
     """
-    chosen = tuple(reader.index().refs if refs is None else refs)
-    shards = [chosen[first : first + SHARD] for first in range(0, len(chosen), SHARD)]
+    chosen = reader.index().refs if refs is None else refs
+    return write_clips(folder, reader.read, {ref.clip_id: ref for ref in chosen}, processes=processes)
+
+
+def write_clips(
+    folder: str | Path, read: Callable[[T], Clip], wanted: Mapping[str, T], *, processes: int = 1
+) -> dict[str, str]:
+    """The same of clips by their ids; `read` makes one of what stands beside its id, or raises as a reader."""
+    named = list(wanted.items())
+    shards = [dict(named[first : first + SHARD]) for first in range(0, len(named), SHARD)]
     paths = [Path(folder) / f"scenes-{number:05}.json" for number in range(len(shards))]
-    write = partial(_write_shard, reader)
+    write = partial(_write_shard, read)
     if processes == 1:
         return {clip: why for left in map(write, paths, shards) for clip, why in left.items()}
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
         return {clip: why for left in pool.map(write, paths, shards) for clip, why in left.items()}
 
 
-def _write_shard(reader: ClipReader, path: Path, refs: Sequence[ClipRef]) -> dict[str, str]:
-    wanted = {ref.clip_id for ref in refs}
+def _write_shard(read: Callable[[T], Clip], path: Path, wanted: Mapping[str, T]) -> dict[str, str]:
     if path.exists():
         head = read_head(path)
         left: dict[str, str] = head["left_out"]
-        if wanted != {*head["clip_ids"], *left}:
+        if wanted.keys() != {*head["clip_ids"], *left}:
             raise Damaged(f"{path}: a bank of other clips: choose another folder, or remove it")
         return left
     scenes, left_out = dict[str, bytes](), dict[str, str]()
-    for ref in refs:
+    for clip_id, one in wanted.items():
         try:
-            scenes[ref.clip_id] = pack_scene(reader.read(ref))
+            scenes[clip_id] = pack_scene(read(one))
         except (BadClip, ValueError) as error:
-            left_out[ref.clip_id] = str(error)
+            left_out[clip_id] = str(error)
     write_scenes(path, scenes, left_out)
     return left_out
 
