@@ -2,7 +2,7 @@
 
     human, pdm_closed          bounds that know the world: the log's own drive, and the privileged planner
     constant_velocity          needs no training
-    runs/my_training           a training's folder or one of its checkpoints
+    runs/my_training           a training's folder or one of its checkpoints; runs/my_training/best
     runs/a+runs/b              the ensemble of several trainings of gtrs_dense
     mine                       what an installed package offers by that name (docs/extend.md)
     my.module:MyPlanner        a class, or anything called without arguments, of a user's own package
@@ -75,7 +75,7 @@ def _named(spec: str, label: str | None, changed: Mapping[str, Any] | None) -> E
     if spec in UNTRAINED:
         return EvaluatedPlanner(name, spec, partial(_imported, BUILT_IN[spec][0]))
     members = spec.split("+")
-    if all(Path(member).is_dir() for member in members):
+    if all(checkpoint.is_training(Path(member)) for member in members):
         newest = [
             checkpoint.newest_checkpoint(Path(member)) for member in members
         ]  # now: trainings may go on and write others

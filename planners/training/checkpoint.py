@@ -19,7 +19,7 @@ import shutil
 import sys
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,23 +43,22 @@ FOLDER = "checkpoints"
 RECORD, WEIGHTS, ARRAYS, TRAINING = "record.json", "weights.safetensors", "arrays.npz", "training.pt"
 FILES = "files"  # of the record: a checksum of each other file
 KEPT = 2  # the newest ones of a training
-
-
-@dataclass(frozen=True)
-class Keep:
-    """Which checkpoints of a training stay beside the newest ones."""
-
-    every: int = 0  # those of every so many steps; 0: none
-    best: str | None = None  # the one with the least of this, a key of its record's `validation`
+BEST, ENDED = "best", "ended"  # of the record: the best validation so far, why the training ended before its last step
 
 
 def save_checkpoint(
-    out: Path, step: int, planner: Planner, record: Mapping[str, Any], training: Mapping[str, Any], keep: Keep = Keep()
+    out: Path,
+    step: int,
+    planner: Planner,
+    record: Mapping[str, Any],
+    training: Mapping[str, Any],
+    keep_every: int = 0,
+    best: int | None = None,
 ) -> Path:
     """Write checkpoint `step` under `out` and remove those that do not stay; returns its folder.
 
-    record: what is to be known of the training, plain values; the planner's name and settings are added. Raises
-    DiskFull, NotWritable.
+    record: what is to be known of the training, plain values; the planner's name and settings are added. What stays
+    beside the newest: those of every so many steps, and that of the step `best`. Raises DiskFull, NotWritable.
     """
     import torch
     from safetensors.torch import save_file
@@ -79,9 +78,8 @@ def save_checkpoint(
         (unfinished / RECORD).write_text(json_with_checksum({**who, **record, **files}))
         shutil.rmtree(folder, ignore_errors=True)
         os.replace(unfinished, folder)
-    stays = None if keep.best is None else best_checkpoint(out, keep.best)
     for old in checkpoints(out)[:-KEPT]:
-        if old != stays and not (keep.every and int(old.name) % keep.every == 0):
+        if int(old.name) != best and not (keep_every and int(old.name) % keep_every == 0):
             shutil.rmtree(old)
     return folder
 
@@ -96,12 +94,6 @@ def _interned(value: Any) -> Any:
     return value
 
 
-def best_checkpoint(out: Path, measure: str) -> Path | None:
-    """The earliest checkpoint with the least of a measure among those that were validated; None where none was."""
-    measured = {path: read_record(path).get("validation", {}).get(measure) for path in checkpoints(out)}
-    return min((path for path, value in measured.items() if value is not None), key=measured.__getitem__, default=None)
-
-
 def settings_record(settings: Any) -> dict[str, Any]:
     """A planner's settings as a checkpoint keeps them, those that configuration offers."""
     record: dict[str, Any] = json.loads(json.dumps(to_plain(settings)))
@@ -114,13 +106,29 @@ def checkpoints(out: Path) -> list[Path]:
 
 
 def newest_checkpoint(path: Path) -> Path:
-    """The checkpoint that `path` is or whose newest it holds. Raises ConfigError where there is none."""
+    """The checkpoint that `path` is or whose newest it holds, of <training>/best the best. Raises ConfigError where
+    there is none."""
     if (path / RECORD).is_file():
         return path
+    if path.name == BEST and checkpoints(path.parent):
+        return best_checkpoint(path.parent)
     found = checkpoints(path)
     if not found:
         raise ConfigError(f"{path}: no checkpoint here, nor in its folder {FOLDER}: name the folder of a training")
     return found[-1]
+
+
+def best_checkpoint(out: Path) -> Path:
+    """That of a training's best validation. Raises ConfigError where it kept none."""
+    best = read_record(out).get(BEST)
+    if best is None:
+        raise ConfigError(f"{out}: it kept no best checkpoint: train with keep_best=")
+    return out / FOLDER / f"{best['step']:08d}"
+
+
+def is_training(path: Path) -> bool:
+    """Whether it can be the folder of a training, or <training>/best."""
+    return path.is_dir() or (path.name == BEST and (path.parent / FOLDER).is_dir())
 
 
 def read_record(path: Path) -> dict[str, Any]:

@@ -4,10 +4,9 @@ Everything random in a step comes from a seed made of (run seed, step, rank), so
 the loader's position needs to be kept.
 """
 
-import csv
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import chain, count, islice
 from pathlib import Path
 from threading import Event
@@ -23,88 +22,16 @@ from factory.graph.progress import RateBar
 from planners.data.batch import Batch
 from planners.data.loader import Loader
 from planners.models.planner import Planner
-from planners.training.checkpoint import (
-    Keep,
-    best_checkpoint,
-    load_training,
-    load_weights,
-    read_record,
-    save_checkpoint,
-)
+from planners.training.callbacks import BestSoFar, Callback, Curves
+from planners.training.checkpoint import BEST, ENDED, load_training, load_weights, save_checkpoint
 from planners.training.optim import TrainingSettings, build_optimiser, learning_rate, set_rate
 from planners.training.processes import TrainingProcess
-
-# What a training writes of itself: CSV files to compare, TensorBoard to watch.
-
-LOSSES, VALIDATION = "losses.csv", "validation.csv"
-
-
-class Curves:
-    """Writes the curves of one training; rows of steps that will be computed again are dropped first."""
-
-    def __init__(self, out: Path, first_step: int) -> None:
-        """first_step: the step the training begins with; losses of it and later ones are dropped."""
-        from torch.utils.tensorboard import SummaryWriter
-
-        out.mkdir(parents=True, exist_ok=True)
-        self._out = out
-        self._files = {
-            LOSSES: _CsvRows(out / LOSSES, first_step),
-            VALIDATION: _CsvRows(out / VALIDATION, first_step + 1),
-        }
-        self._board = SummaryWriter(str(out / "tensorboard"), purge_step=first_step)
-
-    def loss(self, step: int, rate: float, terms: Mapping[str, float], more: Mapping[str, float] = {}) -> None:
-        """The losses that step `step` began with, and what else is to be known of it."""
-        row = {"total": sum(terms.values()), **terms, "learning_rate": rate, **more}
-        self._write(LOSSES, "loss", step, row)
-
-    def validation(self, step: int, measured: Mapping[str, float], judge: str) -> str:
-        """What the planner was worth after `step` steps, in a line that holds it against the least `judge` so far."""
-        self._write(VALIDATION, "validation", step, measured)
-        with (self._out / VALIDATION).open(newline="", encoding="utf-8") as rows:
-            worth = {int(row["step"]): float(row[judge]) for row in csv.DictReader(rows)}
-        best = min(worth, key=worth.__getitem__)
-        so_far = "the best so far" if best == step else f"best so far: {judge} {worth[best]:.4f} after step {best}"
-        return f"validation after step {step}: {', '.join(f'{k} {v:.4f}' for k, v in measured.items())}; {so_far}"
-
-    def close(self) -> None:
-        """Flush everything."""
-        for rows in self._files.values():
-            rows.file.close()
-        self._board.close()
-
-    def _write(self, name: str, prefix: str, step: int, row: Mapping[str, float]) -> None:
-        self._files[name].write({"step": step, **row})
-        for key, value in row.items():
-            self._board.add_scalar(f"{prefix}/{key}", value, step)
-
-
-class _CsvRows:
-    """A CSV file whose first column is the step; numbers are written so that they read back the same."""
-
-    def __init__(self, path: Path, first_step: int) -> None:
-        kept = []
-        if path.exists():
-            with path.open(newline="", encoding="utf-8") as old:
-                kept = [row for row in csv.DictReader(old) if int(row["step"]) < first_step]
-        self.file = path.open("w", newline="", encoding="utf-8")
-        self._writer: csv.DictWriter[str] | None = None
-        for row in kept:
-            self.write(row)
-
-    def write(self, row: Mapping[str, Any]) -> None:
-        if self._writer is None:
-            self._writer = csv.DictWriter(self.file, list(row))
-            self._writer.writeheader()
-        self._writer.writerow({key: repr(value) if isinstance(value, float) else value for key, value in row.items()})
-        self.file.flush()
-
 
 STATE_VERSION = 1
 Precision = Literal["fp32", "bf16", "fp16"]  # fp16: gradients of a scaled loss, steps that overflow are left out
 AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
 SCALER = "scaler"  # in a checkpoint's training state: the scale of the loss and the steps since it changed
+CALLBACKS, BEST_SO_FAR = "callbacks", "best so far"  # in it: what they keep, by name, and the trainer's own among them
 SCALING = ("loss_scale", "skipped")  # columns of an fp16 training's losses: the scale it had, 1 for a step left out
 
 
@@ -119,7 +46,9 @@ class StepSettings:
     log_every: int = 20  # steps between looks at the losses, which cost a wait for the device
     checkpoint_every: int = 1000
     validate_every: int = 0  # 0: only after the last step
-    keep: Keep = field(default_factory=Keep)  # checkpoints beside the newest
+    keep_every: int = 0  # checkpoints of every so many steps stay beside the newest; 0: none
+    keep_best: str | None = None  # so does that of the best validation by this measure
+    patience: int | None = None  # validations without a better one after which the training ends
 
 
 def total_steps(batches: Loader, training: TrainingSettings, steps: int | None) -> int:
@@ -137,34 +66,41 @@ def fit(
     record: Mapping[str, Any],
     resume_from: Path | None = None,
     validate: Callable[[Planner], dict[str, float]] | None = None,
+    callbacks: Mapping[str, Callback] = {},
 ) -> None:
-    """Train `planner` in place, from a checkpoint where one is given, to the last step.
+    """Train `planner` in place, from a checkpoint where one is given, to the last step or until a callback ends it.
 
-    Writes `losses.csv` (every step), `validation.csv`, TensorBoard events and checkpoints under `out`.
-    Raises Stopped after SIGINT or SIGTERM, with a checkpoint written; FloatingPointError, with the step, where the loss
-    is no number.
+    Writes `losses.csv` (every step), `validation.csv`, TensorBoard events and checkpoints under `out`. validate: called
+    in the first process alone. Raises Stopped after SIGINT or SIGTERM, with a checkpoint written; FloatingPointError,
+    with the step, where the loss is no number.
     """
     planner.to(process.device)
     optimiser = build_optimiser(training, planner)
     scaler = torch.amp.GradScaler(process.device.type, enabled=loop.precision == "fp16")
-    first = 0 if resume_from is None else _resume(resume_from, planner, optimiser, scaler, batches)
+    best = BestSoFar(loop.keep_best, loop.patience)
+    kept = {**callbacks, BEST_SO_FAR: best}
+    first = 0 if resume_from is None else _resume(resume_from, planner, optimiser, scaler, batches, kept)
+    told: list[Callback] = [*kept.values(), *([Curves(out, first)] if process.writes else [])]
     model = _wrapped(planner, process)
     epoch_steps = batches.n_batches(0)
-    curves = Curves(out, first) if process.writes else None
     unlogged: list[Tensor] = []
     names: list[str] = []
 
-    def save(step: int, measured: Mapping[str, float]) -> None:
+    def save(step: int, measured: Mapping[str, float], why: str | None) -> None:
+        """why: the training ends here."""
         if process.writes:
             state = {
                 "version": STATE_VERSION,
                 "step": step,
                 "optimiser": optimiser.state_dict(),
                 "loader": batches.state(),
+                CALLBACKS: {name: one.state() for name, one in kept.items()},
                 **({SCALER: scaler.state_dict()} if scaler.is_enabled() else {}),
             }
-            of_it = {"validation": dict(measured)} if loop.keep.best is not None and measured else {}
-            save_checkpoint(out, step, planner, {**record, **of_it}, state, loop.keep)
+            of_it = {"validation": dict(measured), BEST: best.state(), ENDED: why}
+            stays = best.step if loop.keep_best is not None else None
+            of_it = {key: value for key, value in of_it.items() if value and (key != BEST or stays is not None)}
+            save_checkpoint(out, step, planner, {**record, **of_it}, state, loop.keep_every, stays)
         process.wait()
 
     def log(step: int) -> float:
@@ -180,19 +116,25 @@ def fit(
                 raise FloatingPointError(
                     f"the loss of step {at} is not finite ({parts}): try a smaller learning_rate{other}"
                 )
-            if curves is not None:
-                rate = learning_rate(training, at, loop.steps, epoch_steps)
-                curves.loss(at, rate, terms, dict(zip(SCALING, row[len(names) :])))
+            rate = learning_rate(training, at, loop.steps, epoch_steps)
+            scaling = dict(zip(SCALING, row[len(names) :]))
+            for one in told if process.writes else ():
+                one.on_losses(at, {"total": sum(terms.values()), **terms, "learning_rate": rate, **scaling})
         return float(sum(values[-1][: len(names)]))
 
-    def check(step: int) -> dict[str, float]:
-        if validate is None or curves is None:
-            return {}
+    def check(step: int) -> tuple[dict[str, float], str | None]:
+        """What the planner is worth, and why the training is to end."""
+        if validate is None or not process.writes:
+            return {}, None
         measured = validate(planner)
-        print(curves.validation(step, measured, loop.keep.best or next(iter(measured))), flush=True)
-        return measured
+        whys = [one.on_validation_end(step, planner, measured) for one in told]
+        so_far = "the best so far" if best.step == step else str(best)
+        found = ", ".join(f"{name} {value:.4f}" for name, value in measured.items())
+        print(f"validation after step {step}: {found}; {so_far}", flush=True)
+        return measured, _first_of(whys)
 
-    asked = Event()
+    asked, stopping, ending = Event(), False, False
+    why: str | None = None
     with calling_on_stop_signal(asked.set), RateBar("steps", loop.steps, first, quiet=not process.writes) as counter:
         step, shown = first, "-"  # until the losses are looked at
         epochs = (batches.epoch(epoch) for epoch in count(int(batches.state()["epoch"])))  # from its position on
@@ -203,27 +145,33 @@ def fit(
             names = names or list(terms)
             unlogged.append(torch.stack([*terms.values(), *scaling]))
             step += 1
+            why = _first_of([why, *(one.on_step_end(step, planner, terms) for one in told)])
             looks = step % loop.log_every == 0 or step == loop.steps
-            # Several processes must agree, and ask each other rarely.
-            stopping = process.any_process(asked.is_set()) if process.size == 1 or looks else False
-            saves = (
-                _is_multiple(step, loop.checkpoint_every) or _is_multiple(step, loop.keep.every) or step == loop.steps
-            )
-            saves = saves or stopping
+            if process.size == 1 or looks:  # several processes must agree, and ask each other rarely
+                stopping, ending = process.any_process(asked.is_set()), process.any_process(why is not None)
             measured: dict[str, float] = {}
-            if _is_multiple(step, loop.validate_every) or step == loop.steps:
-                measured = check(step)
-                if loop.keep.best is not None:
-                    saves = process.any_process(saves or _is_best(out, loop.keep.best, measured))
+            saves = _is_multiple(step, loop.checkpoint_every) or _is_multiple(step, loop.keep_every)
+            if _is_multiple(step, loop.validate_every) or step == loop.steps or ending:
+                measured, found_why = check(step)
+                why = why or found_why
+                ending = process.any_process(why is not None)
+                saves = process.any_process(saves or (loop.keep_best is not None and best.step == step))
+            saves = saves or stopping or ending or step == loop.steps
             if looks or saves:  # a checkpoint whose losses are not written would leave a gap after a kill
                 shown = f"{log(step):.4f}"
             counter.show(step, f"loss {shown}")
             if saves:
-                save(step, measured)
-            if stopping and step < loop.steps:
-                raise Stopped(f"stopped after step {step} of {loop.steps}; the same command goes on")
-    if curves is not None:
-        curves.close()
+                save(step, measured, (why or "as another process asked") if ending and step < loop.steps else None)
+            if stopping or ending:
+                break
+    for one in told:
+        one.on_end()
+    if stopping and not ending and step < loop.steps:
+        raise Stopped(f"stopped after step {step} of {loop.steps}; the same command goes on")
+
+
+def _first_of(whys: Sequence[str | None]) -> str | None:
+    return next((why for why in whys if why is not None), None)
 
 
 def _step(
@@ -265,16 +213,13 @@ def _is_multiple(step: int, every: int) -> bool:
     return every > 0 and step % every == 0
 
 
-def _is_best(out: Path, measure: str, measured: Mapping[str, float]) -> bool:
-    """Whether no checkpoint is as good; never in a process that has not measured."""
-    if measure not in measured:
-        return False
-    before = best_checkpoint(out, measure)
-    return before is None or measured[measure] < read_record(before)["validation"][measure]
-
-
 def _resume(
-    folder: Path, planner: Planner, optimiser: torch.optim.Optimizer, scaler: torch.amp.GradScaler, batches: Loader
+    folder: Path,
+    planner: Planner,
+    optimiser: torch.optim.Optimizer,
+    scaler: torch.amp.GradScaler,
+    batches: Loader,
+    callbacks: Mapping[str, Callback],
 ) -> int:
     """The steps that are done."""
     state = load_training(folder)
@@ -286,6 +231,8 @@ def _resume(
     optimiser.load_state_dict(state["optimiser"])
     scaler.load_state_dict(state.get(SCALER, {}))
     batches.resume(state["loader"])
+    for name in callbacks.keys() & state.get(CALLBACKS, {}).keys():
+        callbacks[name].resume(state[CALLBACKS][name])
     return int(state["step"])
 
 

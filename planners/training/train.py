@@ -15,15 +15,16 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from factory.config.arguments import command
-from factory.config.compose import ConfigError, compose, fill
+from factory.config.compose import ConfigError, build, compose, fill
 from factory.config.shapes import GIVE, deep_merge, to_plain
 from factory.graph.own_process import run_command_in_own_process
 from planners.data.index import Dataset, DataSettings, open_data
@@ -31,7 +32,8 @@ from planners.data.loader import Loader
 from planners.data.mix import MixSettings, batches_in
 from planners.models.settings import GtrsDenseSettings, PlannerChoice, settings_class, settings_of
 from planners.training.checkpoint import (
-    Keep,
+    BEST,
+    ENDED,
     best_checkpoint,
     checkpoints,
     load_arrays,
@@ -45,40 +47,21 @@ from planners.training.optim import TrainingSettings
 
 if TYPE_CHECKING:  # PyTorch is imported once the settings and the samples are found to fit
     from planners.models.planner import Planner
+    from planners.training.callbacks import Callback
     from planners.training.processes import TrainingProcess
 
-LARGEST_BATCH = 32
 FURTHER = frozenset({"steps", "processes", "accumulate"})  # what may be another with resume=further
+Every = int | str  # steps, or epochs as 2ep or 0.5ep
 
 
-def make_validation(
-    data: DataSettings, planner: Planner, process: TrainingProcess, workers: int
-) -> Callable[[Planner], dict[str, float]]:
-    """A function that plans for all human samples of the tables `data.val`: ade_m and fde_m, mean and final distance.
-
-    Raises ValueError where the tables are not what the planner needs.
-    """
-    import torch
-
-    where = {name: getattr(data, name) for name in ("storage_options", "pictures", "pictures_gb")}
-    dataset = open_data(DataSettings(real=data.tables("val"), **where))
-    needs = replace(planner.needs, labels=None)
-    size = max(n for n in range(1, LARGEST_BATCH + 1) if len(dataset) % n == 0)  # no sample is left out
-    loader = Loader(dataset, needs, MixSettings(), size, workers=workers)
-
-    def measure(trained: Planner) -> dict[str, float]:
-        trained.eval()
-        distances = []
-        with torch.no_grad():
-            for batch in loader.epoch(0):
-                here = batch.to(process.device)
-                plans = trained.plan(here)
-                labels = here.plan_2hz if plans.shape[1] == here.plan_2hz.shape[1] else here.plan_10hz
-                distances.append((plans[..., :2].float() - labels[..., :2]).norm(dim=-1).cpu())
-        off = torch.cat(distances)
-        return {"ade_m": float(off.mean()), "fde_m": float(off[:, -1].mean())}
-
-    return measure
+def in_steps(every: Every, epoch_steps: int) -> int:
+    """An interval in steps, of epochs that have so many. Raises ValueError for other text."""
+    if isinstance(every, int):
+        return every
+    epochs = float(every.removesuffix("ep")) if every.endswith("ep") else math.nan
+    if not 0.0 < epochs < math.inf:
+        raise ValueError(f"{every}: not epochs, such as 2ep")
+    return max(1, round(epochs * epoch_steps))
 
 
 @dataclass(frozen=True)
@@ -116,24 +99,43 @@ class TrainConfig:
     recompute: bool = False  # backbones over pictures keep no activations: less memory, a forward pass more
     workers: int = 2  # threads that decode
     log_every: int = 20  # steps
-    checkpoint_every: int = 1000  # steps
-    validate_every: int = 0  # steps; 0: after the last one
-    keep_every: int = 0  # steps: checkpoints of their multiples stay; 0: only the newest two
-    keep_best: Literal["ade_m", "fde_m"] | None = None  # the checkpoint with the least of it on data.val stays as well
+    checkpoint_every: Every = 1000  # steps, or epochs as 2ep or 0.5ep
+    validate_every: Every = 0  # the same; 0: after the last step
+    keep_every: Every = 0  # the same: checkpoints of their multiples stay; 0: only the newest two
+    keep_best: Literal["epdms", "ade_m", "fde_m"] | None = None  # the checkpoint that is best by it on data.val stays
+    patience: int | None = None  # validations without a better one by keep_best after which the training ends
+    bank: str | None = None  # folder of scenes that score plans, made there; null: <out>/bank of keep_best=epdms
+    callbacks: dict[str, dict[str, Any]] = field(default_factory=dict)  # planners.training.callbacks.Callback by name
     ray: RaySettings = field(default_factory=RaySettings)
 
     def __post_init__(self) -> None:
-        for name in ("accumulate", "workers", "log_every", "checkpoint_every"):
-            if getattr(self, name) < 1:
+        for name in ("accumulate", "workers", "log_every", "patience"):
+            if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: must be at least 1")
-        if self.keep_every < 0:
-            raise ValueError(f"keep_every={self.keep_every}: must be at least 1, or 0 for none")
+        for name, least in (("checkpoint_every", 1), ("validate_every", 0), ("keep_every", 0)):
+            try:
+                fits = in_steps(getattr(self, name), 1) >= least
+            except ValueError:
+                fits = False
+            if not fits:
+                raise ValueError(f"{name}={getattr(self, name)}: must be steps, at least {least}, or epochs as 2ep")
         if self.keep_best is not None and not (self.data.val and self.validate_every):
             raise ValueError(
                 f"keep_best={self.keep_best}: name data.val, and validate_every, to have some to choose from"
             )
+        if self.patience is not None and self.keep_best is None:
+            raise ValueError(f"patience={self.patience}: name keep_best, by which it is seen whether it gets better")
+        if self.bank is not None and not self.data.val:
+            raise ValueError(f"bank={self.bank}: name data.val, whose plans are scored on its scenes")
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps={self.steps}: must be at least 1, or null for planner.training.epochs")
+
+    @property
+    def bank_folder(self) -> Path | None:
+        """Of the scenes; None: plans are not scored."""
+        if self.bank is None and self.keep_best != "epdms":
+            return None
+        return Path(self.out, "bank") if self.bank is None else Path(self.bank)
 
     @property
     def training(self) -> TrainingSettings:
@@ -203,6 +205,7 @@ def train(config: TrainConfig, process: TrainingProcess, dataset: Dataset | None
     from planners.models.backbones import set_recompute
     from planners.training.fit import StepSettings, fit, total_steps
 
+    callbacks = _callbacks(config)
     cv2.setNumThreads(1)  # pictures are decoded side by side already
     settings = settings_of(config.planner)
     dataset = open_data(config.data, mix=config.mix) if dataset is None else dataset
@@ -229,10 +232,15 @@ def train(config: TrainConfig, process: TrainingProcess, dataset: Dataset | None
         pinned=process.device.type == "cuda",
     )
     steps = total_steps(loader, training, config.steps)
-    check = make_validation(config.data, planner, process, config.workers) if config.data.val else None
     identity = _identity(config, dataset, steps, process)
     resume_from = _checkpoint_to_resume(out, config, identity)
     before = {} if resume_from is None else read_record(resume_from)
+    is_over = ENDED in before and config.resume == "identical"
+    check = None
+    if config.data.val and process.writes and not is_over:
+        from planners.training.validation import make_validation
+
+        check = make_validation(config.data, planner, process.device, config.workers, config.bank_folder)
     backbones = _load_first_weights(planner, config) if resume_from is None else before["backbones"]
     record = {
         "trained": identity,
@@ -249,30 +257,49 @@ def train(config: TrainConfig, process: TrainingProcess, dataset: Dataset | None
     precision = config.precision
     if precision == "auto":
         precision = "bf16" if process.device.type == "cuda" else "fp32"
+    epoch_steps = loader.n_batches(0)
     loop = StepSettings(
         seed=config.seed,
         steps=steps,
         accumulate=config.accumulate,
         precision=precision,
         log_every=config.log_every,
-        checkpoint_every=config.checkpoint_every,
-        validate_every=config.validate_every,
-        keep=Keep(config.keep_every, config.keep_best),
+        checkpoint_every=in_steps(config.checkpoint_every, epoch_steps),
+        validate_every=in_steps(config.validate_every, epoch_steps),
+        keep_every=in_steps(config.keep_every, epoch_steps),
+        keep_best=config.keep_best,
+        patience=config.patience,
     )
     process.wait()  # nobody looks for checkpoints any more
-    fit(planner, loader, training, loop, process, out, record, resume_from, check)
+    if not is_over:
+        fit(planner, loader, training, loop, process, out, record, resume_from, check, callbacks)
     if process.writes:
+        if ENDED in (last := read_record(out)):
+            print(f"ended after step {last['step']} of {steps}: {last[ENDED]}")
         print(f"trained: {newest_checkpoint(out)}")
         if config.keep_best is not None:
-            print(f"least {config.keep_best}: {best_checkpoint(out, config.keep_best)}")
-        print(_next_text(config.out, planner.needs_to_plan.image is not None))
+            print(f"best {config.keep_best}: {best_checkpoint(out)}")
+        best = "" if config.keep_best is None else f"/{BEST}"
+        print(_next_text(config.out, best, planner.needs_to_plan.image is not None))
 
 
-def _next_text(out: str, looks: bool) -> str:
+def _callbacks(config: TrainConfig) -> dict[str, Callback]:
+    """Those that the settings name. Raises ConfigError."""
+    from planners.training.callbacks import Callback
+
+    made = {name: build(spec, f"callbacks.{name}") for name, spec in config.callbacks.items()}
+    for name, one in made.items():
+        if not isinstance(one, Callback):
+            raise ConfigError(f"callbacks.{name}: {type(one).__name__} is no planners.training.callbacks.Callback")
+    return made
+
+
+def _next_text(out: str, best: str, looks: bool) -> str:
     """The commands that say what a trained planner is worth, to be pasted into a shell. looks: whether at pictures."""
+    who = shlex.quote(f"planner={out}{best}")
     blind = "" if looks else " 'clips.settings.cameras=[]' clips.settings.lidar_beams=0"
-    drive = f"drive {shlex.quote(f'planner={out}')} clips.n_clips=6{blind} films=6 {shlex.quote(f'out={out}/drives')}"
-    score = f"evaluate benchmark=runs/hard {shlex.quote(f'planner={out}')}"
+    drive = f"drive {who} clips.n_clips=6{blind} films=6 {shlex.quote(f'out={out}/drives')}"
+    score = f"evaluate benchmark=runs/hard {who}"
     return f"watch it drive: python -m planners {drive}\nscore it: python -m planners {score}"
 
 

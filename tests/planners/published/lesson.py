@@ -22,7 +22,8 @@ from factory.config.compose import ConfigError
 from factory.exits import Stopped
 from planners.data.batch import Batch
 from planners.published.import_planner import import_weights
-from planners.training.fit import LOSSES, StepSettings, fit, step_seed
+from planners.training.callbacks import LOSSES
+from planners.training.fit import StepSettings, fit, step_seed
 from planners.training.optim import FACTOR, TrainingSettings, build_optimiser
 from planners.training.processes import TrainingProcess
 from tasks.world.arrays import Array

@@ -18,17 +18,19 @@ from factory.exits import Stopped
 from planners.data.batch import Batch
 from planners.models.planner import build_planner
 from planners.models.settings import PlannerChoice
+from planners.training.callbacks import LOSSES, VALIDATION, Callback
 from planners.training.checkpoint import (
-    Keep,
+    ENDED,
     best_checkpoint,
     checkpoints,
+    is_training,
     load_planner,
     load_training,
     newest_checkpoint,
     planner_digest,
     read_record,
 )
-from planners.training.fit import LOSSES, VALIDATION, Precision, StepSettings, fit, total_steps
+from planners.training.fit import Precision, StepSettings, fit, total_steps
 from planners.training.optim import TrainingSettings
 from planners.training.processes import TrainingProcess
 from tasks.caches import json_with_checksum
@@ -251,9 +253,9 @@ def test_a_checkpoint_is_the_planner_and_only_the_newest_stay(tmp_path: Path) ->
 
 
 def test_every_nth_checkpoint_stays_beside_the_newest(tmp_path: Path) -> None:
-    train(tmp_path, ToyBatches(20, 4), checkpoint_every=4, keep=Keep(every=5))
+    train(tmp_path, ToyBatches(20, 4), checkpoint_every=4, keep_every=5)
     assert [int(path.name) for path in checkpoints(tmp_path)] == [5, 10, 12, 15]
-    train(tmp_path / "both", ToyBatches(20, 4), checkpoint_every=4, keep=Keep(every=8))
+    train(tmp_path / "both", ToyBatches(20, 4), checkpoint_every=4, keep_every=8)
     assert [int(path.name) for path in checkpoints(tmp_path / "both")] == [8, 12, 15]
 
 
@@ -264,7 +266,7 @@ VALUES = {2: 3.0, 4: 1.0, 6: 2.0, 8: 1.0, 10: 5.0, 12: 4.0, 14: 1.5, 15: 9.0}
 def test_the_best_checkpoint_stays_whatever_interrupts(tmp_path: Path, stop_after: int | None) -> None:
     """Validated every second step: the first with the least value is that of step 4, also where step 8 equals it."""
     at = iter(VALUES.values())
-    keep = {"validate_every": 2, "checkpoint_every": 5, "keep": Keep(best="off_m")}
+    keep = {"validate_every": 2, "checkpoint_every": 5, "keep_best": "off_m"}
 
     def go_on(batches: ToyBatches, resume: Path | None = None) -> None:
         loop = StepSettings(seed=1, steps=15, **keep)  # type: ignore[arg-type]
@@ -277,10 +279,9 @@ def test_the_best_checkpoint_stays_whatever_interrupts(tmp_path: Path, stop_afte
             go_on(Interrupted(20, 4, stop_after))
         go_on(ToyBatches(20, 4), newest_checkpoint(tmp_path))
     assert [int(path.name) for path in checkpoints(tmp_path)] == [4, 10, 15]
-    found = best_checkpoint(tmp_path, "off_m")
-    assert found is not None and found.name == "00000004"
-    assert read_record(found)["validation"] == {"off_m": 1.0}
-    assert best_checkpoint(tmp_path, "another") is None
+    assert best_checkpoint(tmp_path).name == newest_checkpoint(tmp_path / "best").name == "00000004"
+    assert read_record(tmp_path / "best")["validation"] == {"off_m": 1.0}
+    assert is_training(tmp_path / "best") and not is_training(tmp_path / "worst")
 
 
 def test_a_training_killed_behind_its_best_checkpoint_goes_on_from_it_without_a_gap(tmp_path: Path) -> None:
@@ -288,16 +289,115 @@ def test_a_training_killed_behind_its_best_checkpoint_goes_on_from_it_without_a_
         pass
 
     def once(planner: Any) -> dict[str, float]:
-        if best_checkpoint(tmp_path, "weight") is not None:
+        if checkpoints(tmp_path):
             raise Killed
         return measured(planner)
 
-    loop = StepSettings(seed=1, steps=15, validate_every=2, log_every=20, keep=Keep(best="weight"))
+    loop = StepSettings(seed=1, steps=15, validate_every=2, log_every=20, keep_best="weight")
     with pytest.raises(Killed):
         fit(toy(), ToyBatches(20, 4), TRAINING, loop, ALONE, tmp_path, {}, None, once)
     assert newest_checkpoint(tmp_path).name == "00000002"
     train(tmp_path, ToyBatches(20, 4), newest_checkpoint(tmp_path))
     assert [int(row["step"]) for row in rows(tmp_path / LOSSES)] == list(range(15))
+
+
+def in_turn(*values: float) -> Any:
+    """A validation that finds these, one after the other."""
+    at = iter(values)
+    return lambda planner: {"epdms": next(at), "ade_m": 0.0}
+
+
+WORTH = (0.5, 0.7, 0.6, math.nan, 0.7, 0.6, 0.9)  # after steps 2, 4, 6, ...: three without a better one up to step 10
+
+
+@pytest.mark.parametrize("stop_after", [None, 3, 9])
+def test_a_training_that_gets_no_better_ends_at_the_same_step_whatever_interrupts(
+    tmp_path: Path, stop_after: int | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of EPDMS more is better, an equal value is none, nor is no number."""
+    validate = in_turn(*WORTH)
+
+    def go_on(batches: ToyBatches, resume: Path | None = None) -> None:
+        loop = StepSettings(seed=1, steps=15, validate_every=2, keep_best="epdms", patience=3)
+        fit(toy(), batches, TRAINING, loop, ALONE, tmp_path, {}, resume, validate)
+
+    if stop_after is None:
+        go_on(ToyBatches(20, 4))
+    else:
+        with pytest.raises(Stopped):
+            go_on(Interrupted(20, 4, stop_after))
+        go_on(ToyBatches(20, 4), newest_checkpoint(tmp_path))
+    assert [int(row["step"]) for row in rows(tmp_path / VALIDATION)] == [2, 4, 6, 8, 10]
+    assert best_checkpoint(tmp_path).name == "00000004" and newest_checkpoint(tmp_path).name == "00000010"
+    why = read_record(tmp_path)[ENDED]
+    assert why == "3 validations without a better epdms; best so far: epdms 0.7000 after step 4"
+    assert len(rows(tmp_path / LOSSES)) == 10
+
+
+class Watcher(Callback):
+    """Notes what it is told; keeps the mean of the first weights in its state; may end the training."""
+
+    def __init__(self, ends_after: int = 0) -> None:
+        self.ends_after, self.told, self.mean = ends_after, list[str](), torch.zeros(8)
+
+    def on_step_end(self, step: int, planner: Any, losses: Any) -> str | None:
+        self.told.append(f"step {step} of {'+'.join(losses)}")
+        self.mean = 0.9 * self.mean + 0.1 * planner.net[0].weight.detach()[:, 0]
+        return "enough" if step == self.ends_after else None
+
+    def on_losses(self, step: int, row: Any) -> None:
+        self.told.append(f"losses {step}")
+
+    def on_validation_end(self, step: int, planner: Any, measured: Any) -> None:
+        self.told.append(f"validation {step}")
+
+    def on_end(self) -> None:
+        self.told.append("end")
+
+    def state(self) -> dict[str, Any]:
+        return {"mean": self.mean}
+
+    def resume(self, state: Any) -> None:
+        self.mean = state["mean"]
+
+
+def test_a_callback_is_told_of_everything_and_may_end_the_training(tmp_path: Path) -> None:
+    watcher = Watcher(ends_after=3)
+    loop = StepSettings(seed=1, steps=15, validate_every=2, log_every=2)
+    fit(toy(), ToyBatches(20, 4), TRAINING, loop, ALONE, tmp_path, {}, None, measured, {"mine": watcher})
+    step = "of imitation+size"
+    told = [f"step 1 {step}", f"step 2 {step}", "validation 2", "losses 0", "losses 1"]
+    assert watcher.told == [*told, f"step 3 {step}", "validation 3", "losses 2", "end"]
+    assert newest_checkpoint(tmp_path).name == "00000003" and read_record(tmp_path)[ENDED] == "enough"
+
+
+def test_what_a_callback_keeps_is_the_same_after_an_interruption(tmp_path: Path) -> None:
+    means = []
+    for name, batches in (("whole", ToyBatches(20, 4)), ("cut", Interrupted(20, 4, 7))):
+        watcher, out = Watcher(), tmp_path / name
+        fitted = (TRAINING, StepSettings(seed=1, steps=15), ALONE, out, {})
+        try:
+            fit(toy(), batches, *fitted, callbacks={"mine": watcher})
+        except Stopped:
+            watcher = Watcher()
+            fit(toy(), ToyBatches(20, 4), *fitted, newest_checkpoint(out), callbacks={"mine": watcher})
+        means.append(watcher.mean)
+    assert torch.equal(*means)
+
+
+def test_a_training_that_goes_on_may_measure_more(tmp_path: Path) -> None:
+    loop = StepSettings(seed=1, steps=15, validate_every=5)
+    with pytest.raises(Stopped):
+        fit(toy(), Interrupted(20, 4, 7), TRAINING, loop, ALONE, tmp_path, {}, None, measured)
+    more = in_turn(0.5, 0.25)
+
+    def both(planner: Any) -> dict[str, float]:
+        return {**more(planner), **measured(planner)}
+
+    fit(toy(), ToyBatches(20, 4), TRAINING, loop, ALONE, tmp_path, {}, newest_checkpoint(tmp_path), both)
+    found = rows(tmp_path / VALIDATION)
+    assert [(row["step"], row["epdms"]) for row in found] == [("5", ""), ("10", "0.5"), ("15", "0.25")]
+    assert all(row["weight"] for row in found)
 
 
 def test_a_checkpoint_of_another_planner_is_refused_by_name(tmp_path: Path) -> None:

@@ -13,8 +13,9 @@ from torch import Tensor
 from factory.exits import Stopped
 from planners.data.batch import Batch
 from planners.models.planner import Planner
+from planners.training.callbacks import LOSSES
 from planners.training.checkpoint import load_training, newest_checkpoint
-from planners.training.fit import LOSSES, SCALER, StepSettings, fit
+from planners.training.fit import SCALER, StepSettings, fit
 from planners.training.optim import TrainingSettings
 from tests.planners.models import test_gtrs_dense, test_ltf
 from tests.planners.toy import Toy, ToyBatches, ToySettings

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from planners.data.batch import Batch
+from planners.training.callbacks import LOSSES
 from planners.training.checkpoint import WEIGHTS, checkpoints, load_training, newest_checkpoint, read_record
-from planners.training.fit import LOSSES
 from planners.training.train import main
 from tests.planners.samples import sample, write_table
 from tests.planners.toy import Toy, ToySettings

@@ -17,8 +17,8 @@ from factory.run import main as run_factory
 from planners.__main__ import main as planners
 from planners.drive.settings import settings_of as drive_settings
 from planners.evaluation.evaluate import settings_of as evaluate_settings
+from planners.training.callbacks import LOSSES, VALIDATION
 from planners.training.checkpoint import load_planner, newest_checkpoint, read_record
-from planners.training.fit import LOSSES, VALIDATION
 from planners.training.train import main
 from tests.pages import commands
 from tests.planners.samples import sample, write_table
@@ -59,9 +59,9 @@ def test_it_trains_and_says_what_with(table: str, tmp_path: Path, capsys: pytest
     best = "the best so far" if last < first else f"best so far: ade_m {first:.4f} after step 10"
     assert lines[0].endswith("; the best so far") and lines[1].endswith(best)
     watch, score = (shlex.split(line.partition(": ")[2]) for line in said.splitlines()[-2:])
-    assert drive_settings(watch[4:]).planner == evaluate_settings(score[4:]).planner == str(tmp_path)
+    assert drive_settings(watch[4:]).planner == evaluate_settings(score[4:]).planner == str(tmp_path / "best")
     assert "real: 8 samples" in said and "recovery: 16" in said and "18 steps; begins" in said
-    assert f"least ade_m: {tmp_path}" in said
+    assert f"best ade_m: {tmp_path}" in said
     record = read_record(tmp_path)
     assert record["step"] == 18
     assert record["trained"]["mix"]["imitation"] == "real"
@@ -234,6 +234,12 @@ def test_a_training_goes_further_where_it_is_asked_to_and_the_record_says_from_w
         (("accumulate=3",), "does not divide into 1 processes times accumulate=3 parts: 6 does"),
         (("device=cuda",), "device=cuda"),
         (("keep_best=ade_m",), "name data.val"),
+        (("patience=2",), "patience=2: name keep_best"),
+        (("bank=here",), "bank=here: name data.val"),
+        (("validate_every=2 epochs",), "validate_every=2 epochs: must be steps, at least 0, or epochs as 2ep"),
+        (("checkpoint_every=0ep",), "checkpoint_every=0ep: must be"),
+        (("callbacks.mine._target_=tests.planners.toy.Toyy",), "callbacks.mine: "),
+        (("callbacks.mine._target_=tests.planners.toy.ToySettings",), "ToySettings is no planners.training.callbacks"),
         (("init_from=nowhere",), "nowhere: no checkpoint"),
         (("planner=gtrs_dense_small",), "vocabulary"),
     ],

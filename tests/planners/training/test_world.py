@@ -9,7 +9,9 @@ import pytest
 import torch
 import torch.multiprocessing as mp
 
-from planners.training.fit import LOSSES, StepSettings, fit
+from planners.training.callbacks import LOSSES, Callback
+from planners.training.checkpoint import ENDED, best_checkpoint, checkpoints, read_record
+from planners.training.fit import StepSettings, fit
 from planners.training.optim import TrainingSettings
 from planners.training.processes import join_process_group
 from tests.planners.toy import Toy, ToyBatches, ToySettings
@@ -72,3 +74,38 @@ def test_two_processes_compute_what_one_does(tmp_path: Path) -> None:
         return [float(line.split(",")[1]) for line in lines]
 
     torch.testing.assert_close(torch.tensor(totals("two")), torch.tensor(totals("one")), rtol=1e-4, atol=1e-6)
+
+
+WORTH = {2: 0.5, 4: 0.75, 6: 0.5, 8: 0.25, 10: 0.9}
+
+
+def ended_early(rank: int, out: Path) -> None:
+    """By the validation, which is the first process's alone."""
+    with join_process_group("cpu") as world:
+        at = iter(WORTH.values())
+        batches = ToyBatches(20, 4, world.rank, world.size)
+        loop = StepSettings(1, 10, log_every=3, validate_every=2, keep_best="epdms", patience=2)
+        watcher = Counts()
+        fit(
+            *(Toy(ToySettings(), {}), batches, TRAINING, loop, world, out, {}),
+            validate=None if rank else lambda planner: {"epdms": next(at)},
+            callbacks={"mine": watcher},
+        )
+        assert watcher.steps == [1, 2, 3, 4, 5, 6, 7, 8], "in every process"
+
+
+class Counts(Callback):
+    def __init__(self) -> None:
+        self.steps: list[int] = []
+
+    def on_step_end(self, step: int, planner: Any, losses: Any) -> None:
+        self.steps.append(step)
+
+
+@pytest.mark.slow
+def test_two_processes_end_at_the_step_that_one_ends_at(tmp_path: Path) -> None:
+    ended_early(0, tmp_path / "one")
+    in_two(ended_early, tmp_path / "two")
+    for out in (tmp_path / "one", tmp_path / "two"):
+        assert [path.name for path in checkpoints(out)] == ["00000004", "00000008"]
+        assert best_checkpoint(out).name == "00000004" and read_record(out)[ENDED].startswith("2 validations without")
