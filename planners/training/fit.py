@@ -150,15 +150,16 @@ def fit(
             if process.size == 1 or looks:  # several processes must agree, and ask each other rarely
                 stopping, ending = process.any_process(asked.is_set()), process.any_process(why is not None)
             measured: dict[str, float] = {}
-            saves = _is_multiple(step, loop.checkpoint_every) or _is_multiple(step, loop.keep_every)
-            if _is_multiple(step, loop.validate_every) or step == loop.steps or ending:
+            saves = stopping or _is_multiple(step, loop.checkpoint_every) or _is_multiple(step, loop.keep_every)
+            validates = _is_multiple(step, loop.validate_every) or step == loop.steps or ending
+            if looks or saves or validates:  # a checkpoint whose losses are not written would leave a gap after a kill
+                shown = f"{log(step):.4f}"
+            if validates:
                 measured, found_why = check(step)
                 why = why or found_why
                 ending = process.any_process(why is not None)
-                saves = process.any_process(saves or (loop.keep_best is not None and best.step == step))
-            saves = saves or stopping or ending or step == loop.steps
-            if looks or saves:  # a checkpoint whose losses are not written would leave a gap after a kill
-                shown = f"{log(step):.4f}"
+                is_best = loop.keep_best is not None and best.step == step
+                saves = process.any_process(saves or is_best or ending or step == loop.steps)
             counter.show(step, f"loss {shown}")
             if saves:
                 save(step, measured, (why or "as another process asked") if ending and step < loop.steps else None)

@@ -239,7 +239,8 @@ def test_a_loss_that_is_no_number_stops_the_training_with_its_step(tmp_path: Pat
                 yield batch
 
     with pytest.raises(FloatingPointError, match=r"loss of step 2 .*imitation nan"):
-        train(tmp_path, Poisoned(20, 4))
+        train(tmp_path, Poisoned(20, 4), validate_every=3)
+    assert not rows(tmp_path / VALIDATION), "nothing is told of such a planner"
 
 
 def test_a_checkpoint_is_the_planner_and_only_the_newest_stay(tmp_path: Path) -> None:
@@ -366,8 +367,8 @@ def test_a_callback_is_told_of_everything_and_may_end_the_training(tmp_path: Pat
     loop = StepSettings(seed=1, steps=15, validate_every=2, log_every=2)
     fit(toy(), ToyBatches(20, 4), TRAINING, loop, ALONE, tmp_path, {}, None, measured, {"mine": watcher})
     step = "of imitation+size"
-    told = [f"step 1 {step}", f"step 2 {step}", "validation 2", "losses 0", "losses 1"]
-    assert watcher.told == [*told, f"step 3 {step}", "validation 3", "losses 2", "end"]
+    told = [f"step 1 {step}", f"step 2 {step}", "losses 0", "losses 1", "validation 2"]
+    assert watcher.told == [*told, f"step 3 {step}", "losses 2", "validation 3", "end"]
     assert newest_checkpoint(tmp_path).name == "00000003" and read_record(tmp_path)[ENDED] == "enough"
 
 
