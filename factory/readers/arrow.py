@@ -1,6 +1,7 @@
 """Tables of Arrow's file format (IPC, feather), whose columns may be packed."""
 
 import struct
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,29 +57,53 @@ def read_arrow(path: Path, kind: str, rows: bool = True, mapped: bool = False) -
                 data = source.read_buffer()
         else:
             data = pa.py_buffer(path.read_bytes())  # Arrow itself would look at the file 8 times
-        file, stream = pa.ipc.open_file(pa.BufferReader(data)), data.slice(N_MAGIC)  # what is cut off has no footer
+        file = pa.ipc.open_file(pa.BufferReader(data))  # what is cut off has no footer
         if not rows:
             return file.schema.empty_table()
-        n_bytes, n_batches, most = 0, 0, UNPACKED_PER_BYTE * data.size + UNPACKED_BYTES
-        problem = f"unpacks to more than the {most:,} bytes that a file of {data.size:,} may: export it again"
-        too_large = BadClip(str(path), "size", problem)
-        for message in pa.ipc.MessageReader.open_stream(pa.BufferReader(stream)):
-            n_batches += message.type == "record batch"
-            n_bytes += unpacked_bytes(message) if message.type != "schema" else 0
-            if n_bytes > most:
-                raise too_large
-        table = pa.ipc.open_stream(pa.BufferReader(stream)).read_all()
+        table, n_batches = read_stream(data.slice(N_MAGIC), str(path))
         names = table.schema.names  # each is text
         if n_batches != file.num_record_batches or not file.schema.equals(table.schema, check_metadata=True):
             raise ValueError(f"its footer tells of others than its {n_batches} batches and {len(names)} columns")
-        table.validate(full=True)
-        if sum(map(_bytes_of_texts, table.columns)) > most:
-            raise too_large
     except FileNotFoundError as error:
         raise BadClip(str(path), "file", broken_link(path) or "missing") from error
     except (pa.ArrowException, OSError, ValueError, struct.error) as error:  # ValueError also: a name that is no text
         raise BadClip(str(path), "file", f"cannot be read as {kind}, truncated? {error}") from error
     return table
+
+
+def read_stream(stream: "pa.Buffer", name: str) -> tuple["pa.Table", int]:
+    """The table of a stream, checked whole, and of how many batches it is; name: for errors.
+
+    Raises BadClip where it unpacks to too much; pa.ArrowException, OSError, ValueError or struct.error for no stream.
+    """
+    import pyarrow as pa
+
+    n_bytes, n_batches, most = 0, 0, UNPACKED_PER_BYTE * stream.size + UNPACKED_BYTES
+    problem = f"unpacks to more than the {most:,} bytes that a file of {stream.size:,} may: export it again"
+    too_large = BadClip(name, "size", problem)
+    for message in pa.ipc.MessageReader.open_stream(pa.BufferReader(stream)):
+        n_batches += message.type == "record batch"
+        n_bytes += unpacked_bytes(message) if message.type != "schema" else 0
+        if n_bytes > most:
+            raise too_large
+    table = pa.ipc.open_stream(pa.BufferReader(stream)).read_all()
+    table.validate(full=True)
+    if sum(map(_bytes_of_texts, table.columns)) > most:
+        raise too_large
+    return table, n_batches
+
+
+def packed_rows(path: Path, rows: Collection[int]) -> Iterator[tuple[int, "pa.Buffer"]]:
+    """Number and bytes of each row asked for, of the one column of bytes of a file. Raises BadClip."""
+    import pyarrow as pa
+
+    table = read_arrow(path, "an Arrow file", mapped=True)
+    columns = [column for column in table.columns if pa.types.is_binary(column.type)]
+    for row in rows:
+        packed = columns[0][row] if len(columns) == 1 and row < table.num_rows else None
+        if packed is None or not packed.is_valid:
+            raise BadClip(f"{path}#frame={row}", "data", "nothing is packed there")
+        yield row, packed.as_buffer()
 
 
 def _bytes_of_texts(column: "pa.ChunkedArray") -> int:

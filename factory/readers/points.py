@@ -1,10 +1,12 @@
-"""Files of points: binary PCD, nuScenes' rows.
+"""Files of points: binary PCD, nuScenes' rows, what 123D packed.
 
 PCD files are the merged lidar sweeps of nuPlan and OpenScene. A text header of ten keys, then POINTS packed little-
 endian records. Only what nuplan-devkit @ e924167 reads (nuplan/database/utils/pointclouds/pointcloud.py:96-180) is
 read: `DATA binary`, one value a field.
 """
 
+import io
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from factory.readers.arrow import packed_rows, read_stream
 from factory.readers.base import BadClip, bytes_of
 
 KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
@@ -102,3 +105,65 @@ def read_points(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
         raise BadClip(str(path), "points", f"{len(data)} bytes are not rows of {len(COLUMNS)} float32; truncated?")
     rows = np.frombuffer(data, "<f4").reshape(-1, len(COLUMNS))
     return _finite({name: rows[:, COLUMNS.index(name)].copy() for name in columns}, str(path))
+
+
+# Sweeps that 123D packed into its tables, a row each, in one of its codecs: LAZ, or a stream of Arrow with columns x, y
+# and z (kesai-labs/py123d, src/py123d/common/io/lidar, 0.7). Draco names no size before it is unpacked: not read.
+#
+# Of LAZ the header says where things lie (LAS 1.4 R15, tables 3 and 7); x, y and z are the first three numbers of every
+# record, int32 times a scale [m] plus an offset. LASzip's own settings are the VLR 22204 of "laszip encoded".
+
+MAX_LAZ_POINTS, MAX_LAZ_RECORD_BYTES, MAX_LAZ_VLRS = 1 << 22, 128, 100
+AGAIN = "convert again with dataset.log_writer_config.lidar_codec=ipc_zstd"
+
+
+def read_packed_points(path: Path, row: int, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """The named columns (N,) of x, y and z [m], N >= 1, that a row of a table of 123D holds. Raises BadClip."""
+    import pyarrow as pa
+
+    file = f"{path}#frame={row}"
+    ((_, packed),) = packed_rows(path, [row])
+    begin = bytes(memoryview(packed)[:5])
+    try:
+        if begin[:4] == b"LASF":
+            points = dict(zip("xyz", _laz_points(packed.to_pybytes(), file).T))
+        elif begin[:4] == b"\xff\xff\xff\xff":
+            table, _ = read_stream(packed, file)
+            points = {name: table[name].to_numpy() for name in columns}
+        else:
+            codec = "Draco" if begin == b"DRACO" else f"bytes that begin with {begin!r}"
+            raise BadClip(file, "points", f"packed as {codec}, LAZ and Arrow are read: {AGAIN}")
+    except (pa.ArrowException, KeyError, OSError, ValueError, struct.error) as error:
+        raise BadClip(file, "points", f"cannot be unpacked, truncated? {error}") from error
+    if not len(points[columns[0]]):
+        raise BadClip(file, "points", "holds no points")
+    return _finite({name: points[name] for name in columns}, file)
+
+
+def _laz_points(data: bytes, file: str) -> NDArray[np.float64]:
+    """(N, 3) [m]. Raises BadClip; ValueError and struct.error where it is none."""
+    try:
+        import lazrs
+    except ImportError as error:
+        problem = f"packed as LAZ: pip install 'driving-data-factory[py123d]', or {AGAIN}"
+        raise BadClip(file, "points", problem) from error
+
+    at, begins, n_vlrs, _, width = struct.unpack_from("<HIIBH", data, 94)
+    scale, offset = np.reshape(struct.unpack_from("<6d", data, 131), (2, 3))
+    (n_points,) = struct.unpack_from("<Q", data, 247)
+    if n_vlrs > MAX_LAZ_VLRS or n_points > MAX_LAZ_POINTS or not 12 <= width <= MAX_LAZ_RECORD_BYTES:
+        raise ValueError(f"{n_points} points of {width} bytes and {n_vlrs} records of settings")
+    for _ in range(n_vlrs):
+        user, number, length = struct.unpack_from("<16sHH", data, at + 2)
+        settings, at = data[at + 54 : at + 54 + length], at + 54 + length
+        if (user.rstrip(b"\0"), number) == (b"laszip encoded", 22204):
+            break
+    else:
+        raise ValueError("LASzip's settings are missing")
+    records, source = np.zeros((n_points, width), np.uint8), io.BytesIO(data)
+    source.seek(begins)
+    try:
+        lazrs.LasZipDecompressor(source, settings).decompress_many(records.reshape(-1))
+    except lazrs.LazrsError as error:
+        raise ValueError(str(error)) from error
+    return np.asarray(np.ascontiguousarray(records[:, :12]).view("<i4") * scale + offset, np.float64)

@@ -10,10 +10,17 @@ import cv2
 import numpy as np
 
 from factory.files import matching, why_unread
-from factory.readers.arrow import read_feather
+from factory.readers.arrow import packed_rows, read_feather
 from factory.readers.base import BadClip
-from factory.readers.pictures import BadPicture, decode_grey, decode_rgb, file_and_frame, video_frames
-from factory.readers.points import read_pcd, read_points
+from factory.readers.pictures import (
+    BadPicture,
+    decode_grey,
+    decode_rgb,
+    file_and_frame,
+    frame_uri,
+    video_frames,
+)
+from factory.readers.points import read_packed_points, read_pcd, read_points
 from tasks.render.rig.own_body import choose_photos, find_own_body, shrink
 from tasks.render.scene.features import NOTHING_KNOWN, KnownPoints, driven_roads
 from tasks.render.scene.sensed import Photo, Sweep, is_on_ego
@@ -195,7 +202,7 @@ def decode_image(data: bytes, name: str, camera: Camera | None = None) -> Bytes:
 def opened_photos(files: Sequence[SensorFile], cameras: Sequence[Camera]) -> Iterator[tuple[int, Bytes]]:
     """Row and picture of each file of the `cameras`, one in memory at a time, as it was taken but for a fisheye's.
 
-    A video is gone through once. Raises BadClip.
+    A video or a table is gone through once. Raises BadClip.
     """
     took = {camera.name: camera for camera in cameras}
     for row, image in _opened(files, took):
@@ -204,7 +211,7 @@ def opened_photos(files: Sequence[SensorFile], cameras: Sequence[Camera]) -> Ite
 
 
 def _opened(files: Sequence[SensorFile], took: Mapping[str, Camera]) -> Iterator[tuple[int, Bytes]]:
-    filmed: dict[tuple[Path, str], dict[int, int]] = {}  # video and camera -> frame -> row
+    filmed: dict[tuple[Path, str], dict[int, int]] = {}  # video or table, and camera -> frame -> row
     for row, file in enumerate(files):
         path, frame = file_and_frame(file.uri)
         if frame is None:
@@ -216,8 +223,13 @@ def _opened(files: Sequence[SensorFile], took: Mapping[str, Camera]) -> Iterator
         else:
             filmed.setdefault((path, file.sensor), {})[frame] = row
     for (path, sensor), rows in filmed.items():
-        for frame, image in video_frames(path, rows, took[sensor].width, took[sensor].height):
-            yield rows[frame], image
+        camera = took[sensor]
+        if path.suffix == ".arrow":
+            for frame, packed in packed_rows(path, rows):
+                yield rows[frame], decode_image(packed.to_pybytes(), frame_uri(path, frame), camera)
+        else:
+            for frame, image in video_frames(path, rows, camera.width, camera.height):
+                yield rows[frame], image
 
 
 def _photo(file: SensorFile, image: Bytes, camera: Camera, width: int, height: int) -> Photo:
@@ -242,13 +254,19 @@ def _photo(file: SensorFile, image: Bytes, camera: Camera, width: int, height: i
 
 
 def load_sweeps(files: Sequence[SensorFile]) -> tuple[Sweep, ...]:
-    """Sweeps of Argoverse 2 (.feather), OpenScene (.pcd), nuScenes (.bin): points in the ego frame. Raises BadClip."""
+    """Sweeps of Argoverse 2 (.feather), OpenScene (.pcd), nuScenes (.bin), packed by 123D: points in the ego frame.
+
+    Raises BadClip.
+    """
     return tuple(_sweep(file) for file in files)
 
 
 def _sweep(file: SensorFile) -> Sweep:
-    path = Path(file.uri)
-    table = _READ_SWEEP.get(path.suffix, read_feather)(path, XYZ)
+    path, row = file_and_frame(file.uri)
+    if row is None:
+        table = _READ_SWEEP.get(path.suffix, read_feather)(path, XYZ)
+    else:
+        table = read_packed_points(path, row, XYZ)
     points = np.stack([table[name] for name in XYZ], axis=1).astype(np.float32)
     if file.ego_from_sensor is not None:
         turn = file.ego_from_sensor

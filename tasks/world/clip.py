@@ -173,7 +173,7 @@ class SensorFile:
     """One image or lidar sweep of the clip; opened by the factory, never by a task."""
 
     sensor: str  # camera name or lidar name
-    uri: str  # path, of a frame of a video with #frame=<k>
+    uri: str  # path, of a frame of a video or a row of a table with #frame=<k>
     time_s: float  # relative to the clip's start (its first step)
     world_from_ego: Array  # (4, 4) at this time
     ego_from_sensor: Array | None = None  # (4, 4) of a sweep whose points are in its sensor's frame; None: in the ego's

@@ -73,7 +73,7 @@ def _modules(node: ast.AST, at_import: bool) -> Iterator[str]:
     ("package", "extras"),
     [
         ("tasks", ("run", "gpu")),
-        ("factory", ("run", "gpu", "navsim", "alpasim")),
+        ("factory", ("run", "gpu", "navsim", "py123d", "alpasim")),
         ("planners", ("planners", "alpasim")),
     ],
 )
