@@ -14,12 +14,12 @@ class Py123dClips(LogClips):
     """Clips of logs that 123D converted."""
 
     maps_root: str | None = None  # of the maps that logs share; null: `maps` beside `logs`
-    sensor_root: str | None = None  # of the data set that was converted, for its photos; null: clips without
+    sensor_root: str | None = None  # of the data set that was converted, for its files; null: only what is packed
 
     @property
     def photos_alone(self) -> bool:
         """Whether clips may have photos and no lidar."""
-        return self.sensor_root is not None
+        return True
 
 
 READERS = {"Py123dReader": Py123dClips}

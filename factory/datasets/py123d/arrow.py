@@ -38,11 +38,11 @@ class ArrowFile:
         """A column of the modality that the file is named after, without nulls. Raises BadClip."""
         return column_without_nulls(self.path, self.table, f"{self.path.stem}.{name}")
 
-    def stamps_ns(self) -> Ints:
+    def stamps_ns(self, name: str = "timestamp_us") -> Ints:
         """(n,) nanoseconds. Raises BadClip."""
-        column = self.column("timestamp_us")
+        column = self.column(name)
         if not pa.types.is_int64(column.type):
-            raise BadClip(str(self.path), "timestamp_us", f"expected int64, found {column.type}")
+            raise BadClip(str(self.path), name, f"expected int64, found {column.type}")
         return np.asarray(column, np.int64) * US_NS
 
     def rows(self, name: str, width: int, whole: bool = True) -> Array:
@@ -150,13 +150,27 @@ class ConvertedSet:
     own_roadblocks: bool = False  # its lane groups are roadblocks; elsewhere 123D made them from neighbours
     own_intersections: bool = False  # polygons of its own; elsewhere 123D joined connectors
     own_centerlines: bool = True  # else 123D made them from the boundaries, as we do
+    own_sweeps: str | None = None  # suffix of its own files of points, where they are read
+    sweeps_of_sensor: bool = False  # such a file's points are in the lidar's frame, as it ends; else as it begins
 
 
+_WAYMO = "Waymo Open Dataset licence, non-commercial (via 123D)"
 SOURCES = {  # by the data set's name in a log's metadata
-    "av2-sensor": ConvertedSet("CC BY-NC-SA 4.0 (Argoverse 2 via 123D)", own_centerlines=False),
-    "nuplan": ConvertedSet("CC BY-NC-SA 4.0 (nuPlan via 123D)", own_roadblocks=True, own_intersections=True),
-    "nuscenes": ConvertedSet("CC BY-NC-SA 4.0 (nuScenes via 123D)", own_intersections=True),
-    "wod-perception": ConvertedSet("Waymo Open Dataset licence, non-commercial (via 123D)"),
+    "av2-sensor": ConvertedSet("CC BY-NC-SA 4.0 (Argoverse 2 via 123D)", own_centerlines=False, own_sweeps=".feather"),
+    "nuplan": ConvertedSet(
+        "CC BY-NC-SA 4.0 (nuPlan via 123D)", own_roadblocks=True, own_intersections=True, own_sweeps=".pcd"
+    ),
+    "nuscenes": ConvertedSet(
+        "CC BY-NC-SA 4.0 (nuScenes via 123D)", own_intersections=True, own_sweeps=".bin", sweeps_of_sensor=True
+    ),
+    "wod-perception": ConvertedSet(_WAYMO),
+    "wod-motion": ConvertedSet(_WAYMO),
+}
+WITHOUT_LANES = {  # what 123D writes no lanes of
+    "pandaset": "no map",
+    "physical-ai-av": "no map",
+    "ncore": "no map",
+    "kitti360": "surfaces alone",
 }
 
 _CAR, _WALKER, _BICYCLE, _THING = AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.BICYCLE, AgentKind.GENERIC_OBJECT
@@ -181,4 +195,5 @@ KINDS_OF_LABELS: dict[str, tuple[AgentKind, ...]] = {
         *(_THING,) * 4,  # pushable, debris, bicycle rack, animal
     ),
     "WODPerceptionBoxDetectionLabel": (_THING, _CAR, _WALKER, AgentKind.CZONE_SIGN, _BICYCLE),
+    "WODMotionBoxDetectionLabel": (_THING, _CAR, _WALKER, _BICYCLE, _THING),
 }

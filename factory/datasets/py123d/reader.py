@@ -1,8 +1,9 @@
 """Reads what 123D converted as clips, without 123D: what moves, what the sensors recorded, whole logs."""
 
 import hashlib
-from dataclasses import dataclass
-from functools import cached_property
+import logging
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,7 @@ from factory.datasets.py123d.arrow import (
     KINDS_OF_LABELS,
     SOURCES,
     US_NS,
+    WITHOUT_LANES,
     ArrowFile,
     ConvertedSet,
     check_version,
@@ -59,6 +61,7 @@ from factory.readers.logs import (
     files_within,
     route_of_drive,
 )
+from factory.readers.pictures import frame_uri
 from factory.wording import shown
 from tasks.world.arrays import Array, Indices
 from tasks.world.clip import STEP_S, AgentKind, Camera, SensorFile
@@ -67,6 +70,8 @@ from tasks.world.repair.records import Repair
 from tasks.world.repair.road import lights_on_map
 from tasks.world.repair.tracks import MOST
 from tasks.world.road_map import LightState, TrafficLights
+
+log = logging.getLogger(__name__)
 
 # What moves in a log of 123D, at steps of 0.1 s: rear-axle poses, boxes, lights.
 #
@@ -244,32 +249,75 @@ def _max_filled_gap_s(boxes: ArrowFile, frames_s: Array) -> float:
     return FILLED_S if usual_s <= DENSE_S else max(FILLED_S, FILLED_SPACINGS * usual_s)
 
 
-# Cameras of a log of 123D, and where its photos lie.
+# Cameras and lidars of a log of 123D, and where what they took lies.
 #
-# 123D keeps photos by their path under the data set's own sensor root, or packed into its tables. Only files are
-# taken, where `sensor_root` says where they are.
+# 123D keeps a photo or a sweep by its path under the data set's own sensor root, or packed into its table (JPEG, PNG;
+# LAZ, Arrow), or photos as a video beside the table. Files are taken where `sensor_root` says where they are.
 
-CAMERAS = "camera.*.arrow"
+CAMERAS, LIDARS = "camera.*.arrow", "lidar.*.arrow"
 
 
-def recorded_photos(motion: LogMotion, rig: dict[Path, Camera], sensor_root: Path) -> tuple[SensorFile, ...]:
+def recorded_photos(motion: LogMotion, rig: dict[Path, Camera], sensor_root: Path | None) -> tuple[SensorFile, ...]:
     """The log's photos, seconds since its first annotated frame, posed as their tables say.
 
-    Raises BadClip, also for a path that leads out of the root.
+    sensor_root: None: only those that are packed. Raises BadClip, also for a path that leads out of the root.
     """
     out: list[SensorFile] = []
     for path, camera in rig.items():
         file = open_file(path)
-        if not pa.types.is_string(_data_type(file)) or not file.table.num_rows:
-            continue
-        names, times_s = file.column("data").to_pylist(), seconds_since(motion.start_ns, file.stamps_ns())
-        for name in names:
-            if Path(name).is_absolute() or ".." in Path(name).parts:
-                raise BadClip(str(path), "data", f"{shown(name)} is no path under the sensor root")
-        poses = _poses(file, camera, motion, times_s)
-        for i in np.argsort(times_s, kind="stable"):
-            out.append(SensorFile(camera.name, str(sensor_root / names[i]), float(times_s[i]), poses[i]))
+        if uris := _uris(file, sensor_root):
+            times_s = seconds_since(motion.start_ns, file.stamps_ns())
+            poses = _poses(file, camera, motion, times_s)
+            for i in sorted(uris, key=times_s.__getitem__):
+                out.append(SensorFile(camera.name, uris[i], float(times_s[i]), poses[i]))
     return tuple(out)
+
+
+def recorded_sweeps(
+    motion: LogMotion, source: ConvertedSet, sensor_root: Path | None, rear_from_imu: Array
+) -> tuple[SensorFile, ...]:
+    """The log's sweeps, timed and kept as its photos; files only of data sets whose own are read. Raises BadClip."""
+    out: list[SensorFile] = []
+    for path in matching(motion.folder, LIDARS):
+        file = open_file(path)
+        packed = not pa.types.is_string(_data_type(file))
+        if not (uris := _uris(file, sensor_root if source.own_sweeps else None)):
+            continue
+        # packed points are in the IMU's frame
+        mount = rear_from_imu @ _imu_from_lidar(file) if source.sweeps_of_sensor and not packed else rear_from_imu
+        stamps = file.stamps_ns("end_timestamp_us" if source.sweeps_of_sensor else "timestamp_us")
+        times_s = seconds_since(motion.start_ns, stamps)
+        poses = world_from_ego_at(motion, times_s)
+        for i in sorted(uris, key=times_s.__getitem__):
+            if packed or uris[i].endswith(str(source.own_sweeps)):
+                out.append(SensorFile(path.stem, uris[i], float(times_s[i]), poses[i], mount))
+    return tuple(out)
+
+
+def _imu_from_lidar(file: ArrowFile) -> Array:
+    """(4, 4) of the only lidar of the table. Raises BadClip."""
+    lidars = [one for one in file.metadata.values() if isinstance(one, dict)]  # by number, where they were merged
+    if len(lidars) > 1:
+        raise BadClip(str(file.path), "metadata", f"of {len(lidars)} lidars, one was expected")
+    told = replace(file, metadata=lidars[0]) if lidars else file
+    return pose_matrices(file.path, told.vector("lidar_to_imu_se3", 7)[None])[0]
+
+
+def _uris(file: ArrowFile, sensor_root: Path | None) -> dict[int, str]:
+    """Row -> where its photo or sweep is; none of files without a root. Raises BadClip."""
+    kind, column = _data_type(file), file.table[f"{file.path.stem}.data"]
+    rows = np.flatnonzero(np.asarray(column.is_valid())).tolist()
+    if pa.types.is_binary(kind):
+        return {row: frame_uri(file.path, row) for row in rows}
+    if pa.types.is_int32(kind):
+        return {row: frame_uri(file.path.with_suffix(".mp4"), column[row].as_py()) for row in rows}
+    if not pa.types.is_string(kind):
+        raise BadClip(str(file.path), "data", f"{kind} is neither a path nor packed")
+    names = {row: column[row].as_py() for row in rows} if sensor_root else {}
+    for name in names.values():
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise BadClip(str(file.path), "data", f"{shown(name)} is no path under the sensor root")
+    return {row: f"{sensor_root}/{name}" for row, name in names.items()}
 
 
 def _camera(file: ArrowFile, rear_from_imu: Array) -> Camera:
@@ -310,11 +358,12 @@ SYNC, MAP = "sync.arrow", "map.arrow"
 
 @dataclass(frozen=True)
 class Py123dLog(WholeLog):
-    """One log, whole, with its rig and where its photos lie; their times count from its first step."""
+    """One log, whole, with its rig and where photos and sweeps lie; their times count from its first step."""
 
     motion: LogMotion
     cameras: tuple[Camera, ...]
     images: tuple[SensorFile, ...]
+    sweeps: tuple[SensorFile, ...]
 
 
 class Py123dReader(LogReader[Py123dLog]):
@@ -333,7 +382,7 @@ class Py123dReader(LogReader[Py123dLog]):
         sensor_root: str | Path | None = Py123dClips.sensor_root,
         **windows: Any,
     ) -> None:
-        """maps_root: None: `maps` beside `logs`; sensor_root: of the data set itself, None: no photos.
+        """maps_root: None: `maps` beside `logs`; sensor_root: of the data set itself, None: only what is packed.
 
         windows: as of LogReader. Raises ValueError.
         """
@@ -357,12 +406,13 @@ class Py123dReader(LogReader[Py123dLog]):
     def drive(self, path: Path) -> LoggedDrive | str:
         """Ego and agents of the log in this folder; or what it lacks. Raises BadClip."""
         header = read_header(path)
+        name = header.value("dataset", str)
+        if name in WITHOUT_LANES:
+            return f"123D writes {WITHOUT_LANES[name]} of {name}, and drives need lanes: convert another data set"
         converted_set_of(header)
         for name in (EGO, BOXES):
             if not is_named(path / name):
                 return f"no {name}"
-        if header.metadata.get("map_metadata") is None:
-            return "converted without a map"
         self._map_file(header)
         return logged_drive(read_motion(path))
 
@@ -381,8 +431,10 @@ class Py123dReader(LogReader[Py123dLog]):
         mount = open_file(path / EGO, rows=False).vector("rear_axle_to_imu_se3", 7)
         rear_from_imu = np.linalg.inv(pose_matrices(path / EGO, mount[None])[0])
         tables = {table: open_file(table, rows=False) for table in matching(path, CAMERAS)}
-        pinholes = {table: file for table, file in tables.items() if file.value("camera_model", str) == "pinhole"}
-        rig = {table: _camera(file, rear_from_imu) for table, file in pinholes.items()}  # without fisheyes
+        models = {table: file.value("camera_model", str) for table, file in tables.items()}
+        rig = {table: _camera(tables[table], rear_from_imu) for table, model in models.items() if model == "pinhole"}
+        others = [f"{table.stem} ({model})" for table, model in models.items() if table not in rig]
+        _warn_left_out(path, ", ".join(others))
         split = header.value("split", str).rpartition("_")[2]  # <data set>_<split>
         return Py123dLog(
             file=str(path),
@@ -393,7 +445,8 @@ class Py123dReader(LogReader[Py123dLog]):
             route=route_of_drive(around.road_map, driven, str(map_path), "lanes"),
             lights=lights,
             cameras=tuple(rig.values()),
-            images=recorded_photos(motion, rig, self.sensor_root) if self.sensor_root else (),
+            images=recorded_photos(motion, rig, self.sensor_root),
+            sweeps=recorded_sweeps(motion, source, self.sensor_root, rear_from_imu),
             licence=source.licence,
             content_digest=content_digest(header, map_path),
             split=split if split in SPLITS else None,
@@ -412,41 +465,35 @@ class Py123dReader(LogReader[Py123dLog]):
     def world(self, path: Path) -> str | None:
         """The map that the log shares with others; None where it has one of its own. Raises BadClip."""
         header = read_header(path)
-        shares = not header.metadata["map_metadata"].get("map_is_per_log")
-        return self._map_file(header).stem if shares else None
+        path = self._map_file(header)
+        return None if path.parent == header.path.parent else path.stem
 
     def block(self, ref: ClipRef) -> str | None:
         """The block that the clip is rendered from; None where there are no photos."""
-        tables = [] if self.sensor_root is None else matching(self.path_of(ref), CAMERAS)
-        if not any(pa.types.is_string(_data_type(open_file(path, rows=False))) for path in tables):  # of files' names
-            return None
-        return self.block_name(ref)
+        kinds = (_data_type(open_file(path, rows=False)) for path in matching(self.path_of(ref), CAMERAS))
+        return self.block_name(ref) if any(self.sensor_root or not pa.types.is_string(kind) for kind in kinds) else None
 
     def recorded(self, log: Py123dLog, start: int, stop: int) -> WindowSensors:
         """Poses, rig and photos of a window, and the block that it is rendered from."""
         poses = world_from_ego_at(log.motion, step_times(start, stop))
-        if not log.images:
-            return WindowSensors(poses, log.cameras)
-        block = block_of_log(log, log.images, (), self.block_steps(start))
-        return WindowSensors(poses, log.cameras, files_within(log.images, start, stop), (), block)
+        sensed = files_within(log.images, start, stop), files_within(log.sweeps, start, stop)
+        block = block_of_log(log, log.images, log.sweeps, self.block_steps(start)) if log.images else None
+        return WindowSensors(poses, log.cameras, *sensed, block)
 
     def _map_file(self, header: ArrowFile) -> Path:
-        """The log's map, in its folder or among the maps of its data set. Raises BadClip where it is not there."""
-        folder = header.path.parent
-        about = header.metadata.get("map_metadata")
-        if not isinstance(about, dict) or not isinstance(about.get("dataset"), str):
-            raise BadClip(str(header.path), "metadata.map_metadata", "missing, or names no data set")
-        if about.get("map_is_per_log"):
-            paths = [folder / MAP]
-        else:
-            name = f"{about['dataset']}_{about.get('location')}.arrow"
+        """The log's map, in its folder or among the maps of its data set, as 123D itself looks. Raises BadClip."""
+        folder, dataset, location = header.path.parent, header.value("dataset", str), header.metadata.get("location")
+        paths = [folder / MAP]
+        if isinstance(location, str):
+            name = f"{dataset}_{location}.arrow"
             if Path(name).name != name:
-                raise BadClip(str(header.path), "metadata.map_metadata", f"names an impossible file {shown(name)}")
+                raise BadClip(str(header.path), "metadata.location", f"names an impossible file {shown(name)}")
             roots = [self.maps_root] if self.maps_root else [parent / "maps" for parent in folder.parents[1:4]]
-            paths = [root / about["dataset"] / name for root in roots]
+            paths += [root / dataset / name for root in roots]
         found = next((path for path in paths if is_named(path)), None)
         if found is None:
-            raise BadClip(str(paths[0]), "file", "the log's map is missing: convert it too, or give clips.maps_root")
+            tried = " and ".join(map(str, paths[:2]))
+            raise BadClip(str(folder), "map", f"missing, looked for {tried}: convert it too, or give clips.maps_root")
         return found
 
 
@@ -476,6 +523,12 @@ def converted_set_of(header: ArrowFile) -> ConvertedSet:
     return SOURCES[name]
 
 
+@cache
+def _warn_left_out(folder: Path, cameras: str) -> None:
+    if cameras:
+        log.warning("%s: left out, only pinhole cameras are read: %s", folder, cameras)
+
+
 def content_digest(header: ArrowFile, path: Path) -> str:
     """sha256 over what a clip is computed from: poses, boxes, lights, map, calibration; not pixels and points."""
     folder = header.path.parent
@@ -483,6 +536,6 @@ def content_digest(header: ArrowFile, path: Path) -> str:
     for file in (folder / EGO, folder / BOXES, folder / LIGHTS, path):
         if file.exists():
             digest.update(f"{file.name}\x1f{file_digest(file)}\x1f".encode())
-    for file in matching(folder, CAMERAS):
+    for file in (*matching(folder, CAMERAS), *matching(folder, LIDARS)):
         digest.update(f"{file.name}\x1f{sorted(open_file(file, rows=False).metadata.items())!r}\x1f".encode())
     return digest.hexdigest()

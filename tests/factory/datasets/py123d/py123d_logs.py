@@ -30,7 +30,9 @@ LABELS = {  # of AV2SensorBoxDetectionLabel, those that appear in the tests' log
     "REGULAR_VEHICLE": 18,
 }
 STATUS = {"GREEN": 0, "YELLOW": 1, "RED": 2}
+STORED = {str: pa.string(), bytes: pa.binary(), int: pa.int32()}
 IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+TELL_OF_MAP = ("av2-sensor", "nuplan")  # whose parsers of 0.6 and 0.7 say in a log which map is its own
 LANE, LANE_GROUP, INTERSECTION, CROSSWALK, CARPARK, GENERIC_DRIVABLE = 0, 1, 2, 3, 5, 6
 
 
@@ -83,7 +85,7 @@ def convert(log: Path, root: Path, made: Made | None = None, objects: Sequence[M
     write(
         folder / "sync.arrow",
         {"sync.timestamp_us": pa.array([0])},
-        {**header, "version": made.version, "map_metadata": told},
+        {**header, "version": made.version, "map_metadata": told if made.dataset in TELL_OF_MAP else None},
     )
     shared = root / "maps" / made.dataset / f"{made.dataset}_{made.location}.arrow"
     path = folder / "map.arrow" if made.map_is_per_log else shared
@@ -276,9 +278,17 @@ def _write_cameras(folder: Path, log: Path) -> None:
 
 
 def write_camera(
-    folder: Path, number: int, stamps_us: Sequence[int], data: Sequence[str], pose: Any = None, **changed: Any
-) -> None:
-    """The table of a camera and its photos, a small one that looks ahead but for what is `changed`; pose: of all."""
+    folder: Path,
+    number: int,
+    stamps_us: Sequence[int],
+    data: Sequence[str] | Sequence[bytes] | Sequence[int],
+    pose: Any = None,
+    **changed: Any,
+) -> Path:
+    """The table of a camera and its photos, a small one that looks ahead but for what is `changed`; pose: of all.
+
+    data: paths, pictures in bytes, or frames of the video beside it.
+    """
     key, n = f"camera.pcam_{number}", len(data)
     told = {
         "camera_model": "pinhole",
@@ -293,11 +303,30 @@ def write_camera(
     }
     columns = {
         f"{key}.timestamp_us": pa.array(stamps_us, pa.int64()),
-        f"{key}.data": pa.array(data, pa.string()),
+        f"{key}.data": pa.array(data, STORED[type(data[0])] if data else pa.string()),
         f"{key}.camera_to_global_se3": pa.array([pose] * n, pa.list_(pa.float64(), 7)),
         f"{key}.exposure_factor": pa.nulls(n, pa.float32()),
     }
     write(folder / f"{key}.arrow", columns, told | changed)
+    return folder / f"{key}.arrow"
+
+
+def write_lidar(
+    folder: Path, stamps_us: Sequence[int], data: Sequence[str] | Sequence[bytes | None], turn_us: int = 100_000
+) -> Path:
+    """The table of a merged lidar 1.8 m above the IMU; data: paths, or points in bytes."""
+    key = "lidar.lidar_merged"
+    packed = {} if isinstance(data[0], str) else {f"{key}.kwargs": None}
+    columns = {
+        f"{key}.timestamp_us": pa.array(stamps_us, pa.int64()),
+        f"{key}.end_timestamp_us": pa.array(np.asarray(stamps_us) + turn_us, pa.int64()),
+        f"{key}.data": pa.array(data, STORED[type(data[0])]),
+        f"{key}.kwargs": pa.nulls(len(data), pa.string()),
+    }
+    top = {"lidar_name": "top", "lidar_id": 2, "lidar_to_imu_se3": [0.9, 0.0, 1.8, 1.0, 0.0, 0.0, 0.0]}
+    kept = {name: column for name, column in columns.items() if name not in packed}
+    write(folder / f"{key}.arrow", kept, {"2": top | {"segmentation_label_class": None}})
+    return folder / f"{key}.arrow"
 
 
 def _columns(path: Path) -> dict[str, Any]:

@@ -304,6 +304,7 @@ def test_every_label_of_123d_has_a_kind() -> None:
         "NuPlanBoxDetectionLabel": 7,
         "NuScenesBoxDetectionLabel": 23,
         "WODPerceptionBoxDetectionLabel": 5,
+        "WODMotionBoxDetectionLabel": 5,
     }
     nuscenes = KINDS_OF_LABELS["NuScenesBoxDetectionLabel"]
     names = ["VEHICLE", "BICYCLE", "PEDESTRIAN", "TRAFFIC_CONE", "BARRIER", "GENERIC_OBJECT"]
