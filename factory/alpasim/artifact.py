@@ -1,7 +1,7 @@
 """A served scene as the file by which AlpaSim's runtime lists scenes: a `.usdz`, a zip, without anything to draw.
 
 Of what NVlabs/alpasim 9177bd0 reads of one (src/utils/alpasim_utils/artifact.py, scenario.py): the ego's and the
-tracks' poses in `local`, when cameras took their pictures, the ego's box. There is no map, which it does without.
+tracks' poses in `local`, when cameras took their pictures, the ego's box, the map, whose frame is `local` as well.
 """
 
 import io
@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factory import __version__
+from factory.alpasim.opendrive import opendrive
 from factory.alpasim.scenes import Scenes, ServedScene
 from factory.alpasim.wire import Fault
 from factory.files import atomic_file
@@ -42,6 +43,7 @@ def usdz(scene_id: str, scene: ServedScene) -> bytes:
     world_to_local[:3, 3] = -scene.origin
     rig = {
         "world_to_nre": {"matrix": world_to_local.tolist()},
+        "T_world_base": np.eye(4).tolist(),  # the map names no place on earth, so it is taken as it stands
         "camera_calibrations": {camera.name: {"logical_sensor_name": camera.name} for camera in scene.cameras},
         "rig_trajectories": [
             {
@@ -65,15 +67,16 @@ def usdz(scene_id: str, scene: ServedScene) -> bytes:
         "logger": {},
         "time_range": {"start": 0.0, "end": 1e-6 * stamps[-1]},
     }
-    files = {
-        "metadata.yaml": metadata,  # JSON is YAML
-        "rig_trajectories.json": rig,
-        "sequence_tracks.json": {scene_id: _tracks(scene)},
+    files: dict[str, str | bytes] = {
+        "metadata.yaml": json.dumps(metadata),  # JSON is YAML
+        "rig_trajectories.json": json.dumps(rig),
+        "sequence_tracks.json": json.dumps({scene_id: _tracks(scene)}),
+        "map.xodr": opendrive(scene.clip.road_map, scene.origin),
     }
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as packed:
         for name, content in files.items():
-            packed.writestr(zipfile.ZipInfo(name, WRITTEN), json.dumps(content))
+            packed.writestr(zipfile.ZipInfo(name, WRITTEN), content)
     return buffer.getvalue()
 
 

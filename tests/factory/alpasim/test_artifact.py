@@ -15,6 +15,7 @@ pytest.importorskip("carla_driver_interface", reason='the contract needs pip ins
 from scipy.spatial.transform import Rotation
 
 from factory.alpasim.artifact import EGO_HEIGHT_M, usdz, write_artifacts
+from factory.alpasim.opendrive import opendrive
 from factory.alpasim.sensors import Sensors
 from factory.alpasim.traffic import END_US, Traffic
 from tasks.render.views import render_views
@@ -44,6 +45,10 @@ def test_its_poses_are_those_that_pictures_are_drawn_and_traffic_driven_at() -> 
     np.testing.assert_allclose(poses[0, :3, 3], 0.0, atol=1e-12)
     np.testing.assert_allclose(poses[:, :3, 3], scene.on_road[:, :3, 3] - scene.origin, atol=1e-9)
     np.testing.assert_allclose(np.linalg.inv(rig["world_to_nre"]["matrix"])[:3, 3], scene.origin)
+    assert np.array_equal(rig["T_world_base"], np.eye(4)), "the map stands in `local`"
+    with zipfile.ZipFile(io.BytesIO(usdz(STREET, scene))) as packed:
+        assert scene.clip is not None
+        assert packed.read("map.xodr") == opendrive(scene.clip.road_map, scene.origin)
     assert [row["logical_sensor_name"] for row in rig["camera_calibrations"].values()] == ["front", "bent"]
     for frames in one["cameras_frame_timestamps_us"].values():
         assert frames[0] == [0, 17_000] and frames[-1][1] < END_US and len(frames) == 19
