@@ -18,7 +18,7 @@ from tasks.caches import Damaged, parse_json_with_checksum
 from tasks.experts.pdm_closed import plan_for
 from tasks.kernels.compiled import kernel
 from tasks.kernels.threads import run_in_chunks
-from tasks.reward.areas import Grid, RedLanes, assembled, touched_cells, window_around
+from tasks.reward.areas import RedLanes
 from tasks.reward.centerline import line_through
 from tasks.reward.collisions import CIRCUMRADIUS, obstacles_of, with_index
 from tasks.reward.comfort import HISTORY_ROWS, N_FLAGS
@@ -34,6 +34,7 @@ from tasks.reward.epdms import (
     score,
     score_all,
 )
+from tasks.reward.map_index import Grid, assembled, touched_cells, window_around
 from tasks.reward.packing import MOST, packed, unpacked
 from tasks.rollout.lqr import follow
 from tasks.subscores import LABELLED, OF_ONE_PLAN

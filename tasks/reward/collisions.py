@@ -11,8 +11,9 @@ import numpy as np
 from numba.extending import register_jitable
 
 from tasks.kernels.compiled import hidden_kernel, inlined, kernel
-from tasks.reward.areas import MapIndex, Places, in_intersection
+from tasks.reward.areas import Places, in_intersection
 from tasks.reward.centerline import OFF_LANE, Body
+from tasks.reward.map_index import MapIndex
 from tasks.world.arrays import Array, Bools, Bytes, ShortInts
 from tasks.world.clip import HORIZON_STEPS
 from tasks.world.frames import HALF_LENGTH, HALF_WIDTH, HEADING, X, Y

@@ -14,12 +14,10 @@ from tasks.kernels.compiled import hidden_kernel, inlined, kernel, read_only
 from tasks.reward.areas import (
     N_POINTS,
     NEVER_RED,
-    MapIndex,
     Places,
     RedLanes,
     empty_places,
     first_red,
-    index_map,
     index_red_lanes,
     set_area_flags,
 )
@@ -50,6 +48,7 @@ from tasks.reward.collisions import (
     with_index,
 )
 from tasks.reward.comfort import LANES, N_FLAGS, comfort_scratch, first_uncomfortable_steps, interpolated_history
+from tasks.reward.map_index import MapIndex, index_map
 from tasks.subscores import (
     EC_WEIGHT,
     INDEX,

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tasks.kernels.compiled import kernel
-from tasks.reward.areas import N_POINTS, MapIndex, empty_places, in_intersection, index_map, set_area_flags
+from tasks.reward.areas import N_POINTS, empty_places, in_intersection, set_area_flags
 from tasks.reward.centerline import (
     CENTER_IN_INTERSECTION,
     MULTIPLE_LANES,
@@ -17,6 +17,7 @@ from tasks.reward.centerline import (
     empty_body,
     place_body,
 )
+from tasks.reward.map_index import MapIndex, index_map
 from tasks.world.frames import HEADING, PACIFICA, Vehicle, X, Y, ego_boxes
 from tasks.world.road_map import MapLayer, MapPolygon
 from tests.tasks.reward.slow.areas import EgoAreas, ego_areas

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tasks.kernels.compiled import inner_kernel
-from tasks.reward.areas import MapIndex, Places, empty_places, index_map
+from tasks.reward.areas import Places, empty_places
 from tasks.reward.centerline import MULTIPLE_LANES, NON_DRIVABLE, Body, empty_body, instants_of, place_body
 from tasks.reward.collisions import (
     Looks,
@@ -21,6 +21,7 @@ from tasks.reward.collisions import (
     set_looks,
     with_index,
 )
+from tasks.reward.map_index import MapIndex, index_map
 from tasks.world.frames import HEADING, PACIFICA, VX, VY, X, Y, box_corners, ego_boxes, to_world, touching
 from tasks.world.road_map import MapLayer, MapPolygon
 from tests.tasks.reward.slow import collisions as slow

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from tasks.reward.areas import index_map
 from tasks.reward.epdms import Scores, human_filtered, relative_progress, score, score_with_ec, select_rows
+from tasks.reward.map_index import index_map
 from tasks.rollout.lqr import track
 from tasks.world.clip import AgentKind
 from tasks.world.frames import to_world

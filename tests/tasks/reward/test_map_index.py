@@ -7,17 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tasks.kernels.compiled import kernel
-from tasks.reward.areas import (
-    DRIVABLE,
-    INTERSECTION,
-    LANE,
-    ON_ROUTE,
-    MapIndex,
-    Places,
-    empty_places,
-    find_regions,
-    index_map,
-)
+from tasks.reward.areas import Places, empty_places, find_regions
+from tasks.reward.map_index import DRIVABLE, INTERSECTION, LANE, ON_ROUTE, MapIndex, index_map
 from tasks.world.road_map import MapLayer, MapPolygon
 from tests.tasks.reward.small_maps import small_maps
 
