@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import factory.run
 from factory.config.arguments import GIVEN_ALONE, POSITIONAL, RUN_SETTINGS, Refused, command, request_keys
-from factory.config.datasets import data_sets
+from factory.config.datasets import words_of
 from factory.config.run import RunConfig
 from factory.config.words import did_you_mean, parse_command_line
 
@@ -142,9 +142,6 @@ def warm(request: WarmRequest) -> None:
     if unknown := sorted(set(request.parts) - PARTS.keys()):
         raise Refused(f"no part {', '.join(unknown)}; there are {', '.join(PARTS)}")
     try:
-        compile_kernels(list(request.parts) or ["judge", "plan", "drive", "fit", "rig"])
+        compile_kernels(request.parts or ("judge", "plan", "drive", "fit", "rig", *words_of("KERNELS")))
     except NotReady as error:
         raise Refused(str(error)) from error
-    if not request.parts:
-        for data_set in data_sets().values():
-            getattr(data_set, "compile_kernels", lambda: None)()

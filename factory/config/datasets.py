@@ -5,13 +5,13 @@ The package of a folder is light, and says what there is by these names, each of
     READERS             class in its module `reader` -> dataclass of the settings of `clips`
     READS               names that people give to its logs, in small letters; the settings for them, and their page
     camera_names        settings of clips -> names of the rig, before a log is read; ValueError where there is no log
-    compile_kernels     what `python -m factory warm` compiles beside the kernels of runs
 
 and by these words -> `module:function`, which is imported when the word is used:
 
     IMPORTS, SIDECARS   of `python -m factory import`: it writes samples, or sidecars of photos
     EXPORTS             of `python -m factory export`: it writes all samples
     DRIVES              of `python -m factory scene`: it reads a drive that is known by its photos alone
+    KERNELS             of `python -m factory warm`: it enters what the data set alone compiles
     BENCHMARKS          of `python -m planners evaluate benchmark=`: it makes the folder
 """
 

@@ -227,6 +227,13 @@ def write_town(out: Path, n_clips: int, seed: int, settings: TownSettings, threa
     return write_logs(out, range(-(-n_clips // WINDOWS_PER_LOG)), seed, settings, threads)
 
 
+def paint_smallest() -> None:
+    """Writes the smallest log of a town into a folder that is thrown away, by which every kernel is entered."""
+    settings = TownSettings(cameras=("ring_front_center",), width=16, height=16, lidar_beams=1, lidar_azimuths=8)
+    with tempfile.TemporaryDirectory() as folder:
+        write_town(Path(folder), 1, 0, settings, threads=1)
+
+
 def write_logs(out: Path, indices: Collection[int], seed: int, settings: TownSettings, threads: int = 2) -> list[Path]:
     """Writes these logs of the seed under `out`; a log's bytes depend on its index, not on the others.
 

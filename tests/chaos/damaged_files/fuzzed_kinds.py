@@ -20,9 +20,9 @@ from factory.datasets.town.reader import SyntheticReader
 from factory.datasets.town.settings import TownSettings
 from factory.readers.base import BadClip
 from factory.setup.vocabulary import load_recovery_table, load_vocabulary, save_recovery_table, save_vocabulary
+from factory.stages.entries import tiny_clip
 from factory.stages.scene_file import BadScene, read_scene, write_scene
 from factory.stages.sensors import decode_image, load_sweeps
-from factory.stages.warm import tiny_clip
 from factory.store.episodes import Message, check_episode, episode_bytes
 from factory.store.location import BadCacheFile, decode_tree, encode_tree
 from factory.views.scene_files import background_bytes, read_splats

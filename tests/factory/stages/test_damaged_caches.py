@@ -17,8 +17,9 @@ from factory.graph.steps import PrepareReport, cache_key, prepare
 from factory.setup.settings import _recovery_table
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table, save_vocabulary
 from factory.stages.assets import RIG_SUFFIX, _resumed, _write_rig_file, damaged_blocks, read_rig_file
+from factory.stages.entries import tiny_clip
 from factory.stages.scene_file import BadScene, read_scene, write_scene
-from factory.stages.warm import _is_compiled, part_marker, tiny_clip
+from factory.stages.warm import _is_compiled, part_marker
 from factory.store.location import BadCacheFile, Location, SceneFiles, encode_tree
 from tasks.caches import (
     SEAL_BYTES,

@@ -83,7 +83,7 @@ sys.path.insert(0, {tests!r})
 from printed_street import CAMERAS, photographed
 
 from factory.stages.assets import load_or_build_scene
-from factory.stages.warm import tiny_clip
+from factory.stages.entries import tiny_clip
 from tasks.render.settings import FitSettings
 from tasks.render.settings import RenderSettings
 
@@ -153,6 +153,17 @@ def test_a_run_without_images_needs_no_renderer_and_arrays_out_of_ray_s_store_no
     before, after = run_with_these(["judge", "plan", "drive"], tmp_path, *TOWN, *BLIND, towns, "workers=1")
     assert after == before
     assert not any(name.startswith("tasks/render/") for name in after)
+
+
+def test_warming_that_finds_all_compiled_imports_none_of_what_enters_it() -> None:
+    """The command's second time is some 0.6 s: the marker files tell, and the files that they list are there."""
+    compile_kernels(["judge", "plan", "town"])
+    assert "factory/datasets/town/raster/rasterise" in part_marker("town").read_text(errors="replace")
+    told = "from factory.__main__ import main; assert main({!r}) == 0; import sys; print(*sys.modules)"
+    command = [sys.executable, "-c", told.format(["warm", "judge", "plan", "town"])]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
+    assert done.returncode == 0 and not done.stderr, done.stderr
+    assert not {"shapely", "cv2", "factory.stages.entries"} & set(done.stdout.split())
 
 
 def test_gsplat_is_built_before_any_task_where_a_run_draws_with_it(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import street
 
-from factory.stages.warm import compile_render_kernels
+from factory.stages.entries import enter_render
 from tasks.render.scene import depth, movers, stereo, surfels
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.build import AssetSettings, build_asset
@@ -111,7 +111,7 @@ def test_no_photos_no_scene() -> None:
 
 
 def test_the_smallest_scene_reaches_every_kernel_of_the_room() -> None:
-    compile_render_kernels()
+    enter_render()
     modules = (depth, movers, project, raster, stereo, surfels)
     kernels = [value for module in modules for value in vars(module).values() if hasattr(value, "signatures")]
     assert len(kernels) > 10
@@ -121,6 +121,6 @@ def test_the_smallest_scene_reaches_every_kernel_of_the_room() -> None:
         "_semi_global_matching",
         "_confirm",
         "_stand_on",
-    }  # which fits alone call: factory.stages.warm has theirs
+    }  # which fits alone call: factory.stages.entries has theirs
     entries = [kernel for kernel in kernels if not kernel.targetoptions.get("forceinline")]
     assert {kernel.__name__ for kernel in entries if not kernel.signatures} <= parts
