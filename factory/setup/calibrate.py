@@ -4,15 +4,14 @@ And in what its set-up differs from the paper's, to which conf/preset/paper.yaml
 """
 
 import os
-import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, cast
 
 from factory.config.run import RunConfig, load_config
 from factory.graph.plan import candidate_order
-from factory.graph.steps import SampleColumns, run_attempt
+from factory.graph.steps import SampleColumns, Spent, run_attempt
 from factory.readers.base import ClipRef
 from factory.setup.settings import Run
 from factory.store.location import encode_tree
@@ -84,9 +83,14 @@ class Calibration:
     row_bytes: int = 0
     cache_bytes: int = 0  # of prepared clips
     pictures: int = 0  # in samples, drawn
-    seconds: Counter[str] = field(default_factory=Counter)
-    fits: dict[str, float] = field(default_factory=dict)  # seconds by block that was not in the cache
+    seconds: dict[str, Spent] = field(default_factory=lambda: defaultdict(Spent))  # by stage
+    fits: list[Spent] = field(default_factory=list)  # of blocks that were not in the cache
     notes: list[str] = field(default_factory=list)
+
+    def spend(self, seconds: Mapping[str, Spent]) -> None:
+        """Stage -> what it took, once more."""
+        for stage, spent in seconds.items():
+            self.seconds[stage] += spent
 
 
 def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
@@ -99,9 +103,9 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
         if ref in run.index.broken:
             sums.notes.append(f"{ref.log_id}: {run.index.broken[ref]}")
             continue
-        block, began = run.work.block(ref), time.perf_counter()
+        block, began = run.work.block(ref), Spent.now()
         if block is not None and not run.work.reconstruct(ref, 1).from_cache:
-            sums.fits[block] = time.perf_counter() - began
+            sums.fits.append(Spent.now() - began)
         prepared = run.work.prepare(ref)
         sums.clips += 1
         if isinstance(prepared, Rejected):
@@ -109,14 +113,14 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
             continue
         sums.candidates += len(prepared.candidates)
         sums.cache_bytes += len(encode_tree(prepared))
-        sums.seconds.update({stage: spent.wall_s for stage, spent in prepared.seconds.items()})
+        sums.spend(prepared.seconds)
         for expert in run.config.experts:
             once = run.work.once(expert)
             wanted = 1 if once else run.config.rounds
             for candidate in candidate_order(once, len(prepared.candidates)):
                 result = run_attempt(run.work, prepared, candidate, expert)
                 sums.attempts += 1
-                sums.seconds.update({stage: spent.wall_s for stage, spent in result.seconds.items()})
+                sums.spend(result.seconds)
                 if isinstance(result, SampleColumns):
                     sums.accepted += 1
                     if result.row.get("image_source") == ImageSource.RENDER:
@@ -131,16 +135,24 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
 
 def estimate_run_size(run: Run, refs: Sequence[ClipRef]) -> str:
     """The expected size of the whole run as a text: what its clips take is extrapolated by clips, what their blocks
-    take by blocks."""
+    take by blocks.
+
+    By CPU seconds, which other work on the machine leaves as they are; by the clock where a GPU is waited for.
+    """
     sums = measure(run, refs)
     if sums.clips == 0:
         return "\n".join(["nothing could be measured:", *sums.notes])
     factor, settings = len(refs) / sums.clips, run.config.render
-    hours = {stage: seconds * factor / 3600.0 for stage, seconds in sums.seconds.items()}
-    each = {stage: f"{seconds / sums.clips:.2f} a clip" for stage, seconds in sums.seconds.items()}
+
+    def seconds(stage: str, spent: Spent) -> float:
+        return spent.wall_s if run.work.draws_on_gpu and stage in ("reconstruct", "render") else spent.cpu_s
+
+    taken = {stage: seconds(stage, spent) for stage, spent in sums.seconds.items()}
+    hours = {stage: spent_s * factor / 3600.0 for stage, spent_s in taken.items()}
+    each = {stage: f"{spent_s / sums.clips:.2f} a clip" for stage, spent_s in taken.items()}
     blocks = {run.work.block(ref) for ref in refs} - {None}
     if sums.fits:
-        fit_s = sum(sums.fits.values()) / len(sums.fits)
+        fit_s = seconds("reconstruct", sum(sums.fits, Spent())) / len(sums.fits)
         hours = {"reconstruct": fit_s * len(blocks) / 3600.0} | hours
         each["reconstruct"] = f"{fit_s:.1f} a block"
     elif blocks:
@@ -151,7 +163,7 @@ def estimate_run_size(run: Run, refs: Sequence[ClipRef]) -> str:
     lines = [
         f"measured on {sums.clips} clips: {sums.candidates / sums.clips:.1f} candidates a clip, "
         f"{sums.accepted} of {sums.attempts} attempts accepted",
-        f"  {'stage':<12}{'seconds':>16}{'core-hours':>12}",
+        f"  {'stage':<12}{'CPU seconds':>16}{'core-hours':>12}",
         *(f"  {stage:<12}{each[stage]:>16}{spent:>12.2f}" for stage, spent in hours.items()),
         f"expected for {of}: {made}, {gb}, {sum(hours.values()):.2f} core-hours",
         _time_line(run, hours, machines_of(run)),

@@ -10,13 +10,16 @@ from ray.cluster_utils import Cluster
 from factory.__main__ import main as factory
 from factory.config.run import load_config
 from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
+from factory.graph.steps import Spent
 from factory.pipeline import FactoryWork
-from factory.setup.calibrate import Machines, _time_line, estimate_run_size
+from factory.setup import calibrate
+from factory.setup.calibrate import Calibration, Machines, _time_line, estimate_run_size
 from factory.setup.settings import assemble
 from tasks.render.fit import on_torch, reconstruct
 from tasks.render.fit.on_torch import TorchBackend
 from tasks.render.scene import on_device
 from tasks.render.scene.on_device import Device
+from tasks.render.settings import RenderSettings
 from tasks.render.splatting import gsplat_backend
 from tests.bench.by_kernels import by_kernels, rasterization
 from tests.planners.navsim.test_chain import RENDERED, write_navsim
@@ -44,6 +47,22 @@ def test_a_fit_is_counted_for_each_block_and_not_again_once_it_is_there(tmp_path
     again = estimate_run_size(run, run.refs)
     assert "a block" not in again and "blocks take is not counted" in again
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").glob("**/*.parquet"))
+
+
+@pytest.mark.parametrize(
+    ("on_gpu", "hours"), [(False, {"render": "1.00", "reward": "2.00"}), (True, {"render": "4.00", "reward": "2.00"})]
+)
+def test_a_busy_machine_makes_a_plan_no_dearer_but_a_gpu_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch, on_gpu: bool, hours: dict[str, str]
+) -> None:
+    spent = {"render": Spent(wall_s=14400.0, cpu_s=3600.0), "reward": Spent(wall_s=14400.0, cpu_s=7200.0)}
+    monkeypatch.setattr(calibrate, "measure", lambda run, refs: Calibration(clips=1, attempts=1, seconds=spent))
+    monkeypatch.setattr(calibrate, "machines_of", lambda run: Machines("here", 2, 1, 64.0))
+    work = SimpleNamespace(block=lambda ref: None, draws_on_gpu=on_gpu)
+    config = SimpleNamespace(render=RenderSettings(), workers=None, gpu_share=0.1)
+    said = estimate_run_size(SimpleNamespace(work=work, config=config), [None])  # type: ignore[arg-type, list-item]
+    told = dict(re.findall(r"  (\w+) +[0-9.]+ a clip +([0-9.]+)\n", said))
+    assert told == hours
 
 
 def test_gpus_hold_a_run_up_where_the_cores_are_done_sooner() -> None:
