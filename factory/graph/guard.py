@@ -27,7 +27,8 @@ from typing import IO, Any
 TICK_S = 0.25
 SHOWN_S = 10.0  # at work for so long, a task is told of, and again every so often
 STACK_S = 0.5  # for the watched process to write where it stands
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # as in factory.exits
+STOPS = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP})  # as in factory.exits
+SIGNALS = bytes({*range(32)} - {ord("\n")})  # bytes that are no text of a task
 ASKED_S, KILLED_S = 15.0, 25.0  # after the first of them: a second one, the end
 MEMORY_SHARE = 0.9  # of the machine's that one process may hold, where there is no other limit
 STACK_LINES = 30
@@ -97,7 +98,7 @@ def main(pid: int, folder: Path, stack: Path, alone: bool) -> None:
     """Watch a process until it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     task: dict[str, Any] = {}
-    told, began, shown, asked, again = b"", 0.0, 0.0, 0.0, False
+    told, began, shown, looked, asked, again = b"", 0.0, 0.0, 0.0, 0.0, False
     while True:
         ready, _, _ = select.select([0], [], [], TICK_S if task or asked else None)
         now = time.monotonic()
@@ -105,15 +106,18 @@ def main(pid: int, folder: Path, stack: Path, alone: bool) -> None:
             data = os.read(0, 65536)
             if not data:
                 break
-            if asked == 0.0 and any(byte in STOPS for byte in data):
+            if asked == 0.0 and not STOPS.isdisjoint(data):
                 asked = now
-            *lines, told = (told + bytes(byte for byte in data if byte >= 32 or byte == 10)).split(b"\n")
+            *lines, told = (told + data.translate(None, SIGNALS)).split(b"\n")
             for line in lines:
-                if task:
+                if shown > began:
                     (folder / f"{task['key']}{WORK}").unlink(missing_ok=True)
                 task = json.loads(line) if line else task
                 began, shown = now, now
-        if task and (why := _limit_exceeded(task, now - began, resident_gb(pid))):
+        why = ""
+        if task and now - looked >= TICK_S:  # not at every short task that begins or ends
+            looked, why = now, _limit_exceeded(task, now - began, resident_gb(pid))
+        if why:
             os.kill(pid, signal.SIGUSR1)  # it writes the calls that it is in
             time.sleep(STACK_S)
             calls = "\n".join(stack.read_text(errors="replace").strip().splitlines()[:STACK_LINES])
