@@ -390,12 +390,10 @@ class RunDriver:
         self._machine_failures = 0
         self._uncached = ""  # why the first could not be kept
         self._tally = RunCounts()
-        self._wanted = {
-            (clip.ref.clip_id, walk.expert): max(0, (1 if walk.once else rounds) - walk.n_found)
-            for clip in plan.todo
-            for walk in clip.walks
-        }
-        self._forecast = RunForecast(Workload(), Workload(left=sum(self._wanted.values())))
+        walks = [walk for clip in plan.todo for walk in clip.walks]
+        for walk in walks:
+            walk.wanted = max(0, (1 if walk.once else rounds) - walk.n_found)
+        self._forecast = RunForecast(Workload(), Workload(left=sum(walk.wanted for walk in walks)))
 
     def stop(self) -> None:
         """Begin nothing more; what is in flight is finished and committed."""
@@ -569,7 +567,7 @@ class RunDriver:
         self._tally.failed += clip.failed
         self._tally.clips += 1
         for walk in clip.walks:
-            self._forecast_settled(clip, walk)
+            self._forecast_settled(walk)
 
     def _start_walks(self, clip: ClipPlan, prepared: Any) -> None:
         self._walks_left[clip.ref.clip_id] = len(clip.walks)
@@ -603,16 +601,15 @@ class RunDriver:
             ticket = self._graph.submit("attempt", stages, so_far, trial.stamp)
         self._trying[ticket] = trial
 
-    def _forecast_settled(self, clip: ClipPlan, walk: WalkState, n: int | None = None) -> None:
+    def _forecast_settled(self, walk: WalkState, n: int | None = None) -> None:
         """`n` of the samples that the walk was to make are behind it, None: all, made or not."""
-        key = clip.ref.clip_id, walk.expert
-        n = self._wanted[key] if n is None else min(n, self._wanted[key])
-        self._wanted[key] -= n
+        n = walk.wanted if n is None else min(n, walk.wanted)
+        walk.wanted -= n
         self._forecast.samples.finish(n)
 
     def _end_walk(self, clip: ClipPlan, walk: WalkState, step: Step) -> None:
         if not isinstance(step, Try):
-            self._forecast_settled(clip, walk)
+            self._forecast_settled(walk)
         if walk.needs_exhausted_row(step):
             assert isinstance(step, Exhausted)
             stamp = self._records.stamp(clip.ref, walk.expert, Try(step.n_tried, -1))
@@ -664,7 +661,7 @@ class RunDriver:
             row = PendingRow(result, report.n_bytes, (stamp.round, stamp.expert), report.licence)
             self._store_or_hold(clip, walk, rows=[row], replaced=replaced)
             self._tally.accepted += 1
-            self._forecast_settled(clip, walk, 1)
+            self._forecast_settled(walk, 1)
             self._metrics.record_accepted(stamp.expert, stamp.round)
         else:
             what = report if isinstance(report, Failure) else report.rejected

@@ -262,14 +262,14 @@ class _Run:
 
     def close(self) -> RunSummary:
         """How the run ended, as last_run.json keeps it too."""
-        ended = self._ended
+        ended, driver = self._ended, self._driver
+        ended.executed, ended.seconds, ended.notes = driver.executed, driver.seconds, driver.notes
+        del driver, self._driver, self._plan  # perhaps millions of walks, before the tables are counted
         try:
             ended.funnel = funnel_of(self._store, [ref.clip_id for ref in self._refs])
             ended.counts = _attempt_counts(ended.funnel, self._experts)
         except (OSError, DeltaError) as error:
             self._end_broken(ended.message or f"{one_line(error)}; {AGAIN}")
-        driver = self._driver
-        ended.executed, ended.seconds, ended.notes = driver.executed, driver.seconds, driver.notes
         try:
             killed = self._store.newest_run().goes_on  # behind its last commit
             if ended.began_ms or ended.exit_code or killed:

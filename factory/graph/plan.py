@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 from factory.graph.steps import HUMAN_CANDIDATE, Failure, PreparedClip
@@ -132,25 +132,29 @@ Policy = Callable[[PastAttempt], bool]
 CLIP_CANDIDATE = HUMAN_CANDIDATE  # of a row about the clip as a whole (its expert is empty)
 
 
-@dataclass
+@dataclass(slots=True)
 class WalkState:
-    """One (clip, expert) on its way."""
+    """One (clip, expert) on its way; of a large run there are millions."""
 
     expert: str
     once: bool  # tried once, on the log itself
     load_known: Callable[[], dict[int, PastAttempt]]  # what the tables say of it
     stale: frozenset[str] = frozenset()  # redo: attempt_ids whose rows this walk replaces as a whole
     n_found: int = 0  # samples that were there when the run began
+    wanted: int = 0  # samples that the run is still to make, or to find that it cannot
     one_by_one: bool = False  # a task that was to make several of its attempts died
+    _known: dict[int, PastAttempt] | None = None
 
-    @cached_property
+    @property
     def known(self) -> dict[int, PastAttempt]:
         """Candidate -> what became of it; unpacked when it is asked for, and until it is put away."""
-        return self.load_known()
+        if self._known is None:
+            self._known = self.load_known()
+        return self._known
 
     def forget(self) -> None:
         """The tables tell it again; of walks that are not at work nothing is kept."""
-        self.__dict__.pop("known", None)
+        self._known = None
 
     def step(self, n_candidates: int, rounds: int, may_retry: Policy) -> Step:
         return next_step(self.once, n_candidates, rounds, self.known, may_retry)
@@ -160,7 +164,7 @@ class WalkState:
         return isinstance(step, Exhausted) and step.n_tried not in self.known
 
 
-@dataclass
+@dataclass(slots=True)
 class ClipPlan:
     """One clip on its way."""
 

@@ -201,7 +201,7 @@ def retry_broken_listing(ask: Callable[[], T]) -> T:
 
 # In which file each key of a table stands: sorted arrays, some 20 bytes a key, and what changed since beside them.
 
-MERGED_AT = 20_000  # changes, or an eighth of all keys where that is more: then they are sorted in
+MERGED_AT = 20_000  # changes, or 1/32 of all keys where that is more: then they are sorted in
 
 
 class KeyIndex:
@@ -216,7 +216,9 @@ class KeyIndex:
             self._paths.append(path)
         self._number_of = {path: number for number, path in enumerate(self._paths)}
         self._changed: dict[str, int | None] = {}
-        self._sort(np.concatenate(keys), np.concatenate(numbers))
+        every = np.concatenate(keys)
+        order = np.argsort(every, kind="stable")
+        self._keys, self._file = every[order], np.concatenate(numbers)[order]
 
     def __len__(self) -> int:
         return len(self.keys())
@@ -245,31 +247,35 @@ class KeyIndex:
                 self._number_of[path] = len(self._paths)
                 self._paths.append(path)
             self._changed[key] = self._number_of[path]
-        if len(self._changed) > max(MERGED_AT, len(self._keys) // 8):
+        if len(self._changed) > max(MERGED_AT, len(self._keys) // 32):
             self._merge()
 
     def _numbers_of(self, asked: Sequence[str]) -> list[int | None]:
         if not len(self._keys) or not asked:
             return [None] * len(asked)
-        encoded = [key.encode() for key in asked]
+        at, there = self._places([key.encode() for key in asked])
+        return [number if found else None for number, found in zip(self._file[at].tolist(), there.tolist())]
+
+    def _places(self, encoded: Sequence[bytes]) -> tuple[Ints, NDArray[np.bool_]]:
+        """Where keys stand among the sorted ones, of which there are some, and whether they do."""
         wanted = np.array(encoded, self._keys.dtype)  # of longer ones the beginning
         at = np.minimum(np.searchsorted(self._keys, wanted), len(self._keys) - 1)
         there = (self._keys[at] == wanted) & (np.fromiter(map(len, encoded), int) <= self._keys.itemsize)
-        return [number if found else None for number, found in zip(self._file[at].tolist(), there.tolist())]
+        return at, there
 
     def _merge(self) -> None:
-        stays = np.ones(len(self._keys), bool)
-        changed = [encoded for key in self._changed if len(encoded := key.encode()) <= self._keys.itemsize]
-        if len(self._keys) and changed:
-            stays = ~np.isin(self._keys, np.array(changed, self._keys.dtype), kind="sort")
-        added = [(key.encode(), number) for key, number in self._changed.items() if number is not None]
+        """By inserting: sorting them all anew would take their memory three times more."""
+        changed = sorted((key.encode(), -1 if number is None else number) for key, number in self._changed.items())
         self._changed = {}
-        keys = np.concatenate([self._keys[stays], np.array([key for key, _ in added], np.bytes_)])
-        self._sort(keys, np.concatenate([self._file[stays], np.array([number for _, number in added], np.int32)]))
-
-    def _sort(self, keys: Bytes, numbers: np.ndarray) -> None:
-        order = np.argsort(keys, kind="stable")
-        self._keys, self._file = keys[order], numbers[order]
+        keys, numbers = np.array([key for key, _ in changed]), np.array([number for _, number in changed], np.int32)
+        if len(self._keys):
+            at, there = self._places([key for key, _ in changed])
+            if there.any():
+                self._keys, self._file = np.delete(self._keys, at[there]), np.delete(self._file, at[there])
+        keys, numbers = keys[numbers >= 0], numbers[numbers >= 0]
+        self._keys = self._keys.astype(np.promote_types(self._keys.dtype, keys.dtype), copy=False)
+        at = np.searchsorted(self._keys, keys)
+        self._keys, self._file = np.insert(self._keys, at, keys), np.insert(self._file, at, numbers)
 
 
 APP_ID = "driving-data-factory"
