@@ -6,6 +6,7 @@ Stamps count from a scene's first instant, which is 0. `local` has the world's a
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -68,8 +69,9 @@ def scene_of_drive(drive: PhotoDrive, asset: RenderAsset) -> ServedScene:
 class Scenes:
     """All that are served, by their ids; read when they are first asked for."""
 
-    def __init__(self, loaders: Mapping[str, Callable[[], ServedScene]]) -> None:
-        self._loaders = dict(loaders)
+    def __init__(self, loaders: Mapping[str, Callable[[], ServedScene]], digest: str = "") -> None:
+        """digest: of what the scenes are, where their ids do not say it."""
+        self._loaders, self.digest = dict(loaders), digest
         self._load = lru_cache(KEPT)(lambda scene_id: self._loaders[scene_id]())
 
     @property
@@ -91,10 +93,11 @@ def scenes_of_run(store: Store) -> Scenes:
     """Of the clips that samples were rendered of, by their ids, those whose scenes and prepared clips are kept."""
     rows = store.samples.read(["clip_id", "asset_digest"]).to_pylist()
     paths = scene_files(scene_folder(store))
-    drawn_from = {row["clip_id"]: paths[row["asset_digest"]] for row in rows if row["asset_digest"] in paths}
+    assets = {row["clip_id"]: row["asset_digest"] for row in rows if row["asset_digest"] in paths}
     prepared = store.candidates.read(["clip_id", "prepare_digest"]).to_pylist()
-    digests = {row["clip_id"]: row["prepare_digest"] for row in prepared if row["clip_id"] in drawn_from}
-    return Scenes({name: partial(_load, store, name, digest, drawn_from[name]) for name, digest in digests.items()})
+    digests = {row["clip_id"]: row["prepare_digest"] for row in prepared if row["clip_id"] in assets}
+    loaders = {name: partial(_load, store, name, digest, paths[assets[name]]) for name, digest in digests.items()}
+    return Scenes(loaders, sha256(repr(sorted(assets.items())).encode()).hexdigest()[:16])
 
 
 def _load(store: Store, clip_id: str, prepare_digest: str, path: Path) -> ServedScene:

@@ -67,7 +67,7 @@ class Sensors:
 
     def _get_version(self, _: Any) -> Any:
         version = f"driving-data-factory {__version__} scenes"
-        return self._common.VersionId(version_id=version, grpc_api_version=self._api)
+        return self._common.VersionId(version_id=version, git_hash=self._scenes.digest, grpc_api_version=self._api)
 
     def _get_scenes(self, _: Any) -> Any:
         return self._common.AvailableScenesReturn(scene_ids=self._scenes.ids)

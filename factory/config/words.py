@@ -19,8 +19,8 @@ HOME = re.compile(r"(?<=[\[{,: ])~[^\s,:\[\]{}'\"]*")  # a path in a list or map
 FILES = (  # last words of the keys that name files and folders
     "--config-dir -cd a anchors b bank benchmark cache cache_dir cameras check checkpoint data drives file files "
     "inference_vocabulary init_from label_vocabulary like logs made maps maps_root masks navsim_python out own_body "
-    "pictures planner planners pretrained real rewards root scene_filter scene_filters sensor_root sensors sim split "
-    "starts table to transforms usdz val vocabularies vocabulary"
+    "pictures planner planners pretrained real renderer rewards root scene_filter scene_filters sensor_root sensors "
+    "sim split starts table to transforms usdz val vocabularies vocabulary"
 )
 PATHS = frozenset(FILES.split())
 FREE = ("clips.", "expert.", "planner.settings.")  # groups whose keys may be a plug-in's

@@ -1,4 +1,5 @@
-"""The cameras of a drive as a renderer shows them by AlpaSim's `SensorsimService`, such as `factory scene serve`.
+"""The cameras of a drive as a renderer shows them by AlpaSim's `SensorsimService`, such as `factory scene serve`, or
+the same service in this process.
 
 Its scene is the clip's, by its id; `local` and stamps are those of factory.alpasim.scenes. Pictures are asked for
 without the lenses' distortion, one of each camera, of now.
@@ -6,22 +7,44 @@ without the lenses' distortion, one of each camera, of now.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from factory.alpasim.sensors import camera_of
-from factory.alpasim.wire import pose_of, write_pose
+from factory.alpasim.scenes import scenes_of_run
+from factory.alpasim.sensors import SERVICE, Sensors, camera_of
+from factory.alpasim.wire import Fault, pose_of, write_pose
 from factory.stages.imaging import Imaging
 from factory.stages.sensors import choose_cameras
+from factory.views.status import open_store
 from planners.alpasim.session import STEP_US
 from planners.drive.cameras import Images, ego_state_at
-from planners.drive.contract import Ask, messages
+from planners.drive.contract import Ask, ask_over_the_wire, messages
 from tasks.render.scene.movers import agents_at_time, world_from_boxes
-from tasks.render.settings import ImageSource, RenderSettings
+from tasks.render.settings import Backend, ImageSource, RenderSettings
 from tasks.world.clip import CLIP_STEPS, STEP_S, Camera, Clip, Scene
 from tasks.world.frames import pose_on_ground
+
+
+@lru_cache(maxsize=8)
+def cached_renderer(named: str, backend: Backend = Backend.CPU) -> Ask:
+    """Questions to the renderer at host:port, or to that of a run's folder in this process: the same bytes either way.
+
+    Raises ConfigError, and Refused for a folder that is no run's; an answer's fault is a ValueError.
+    """
+    if not Path(named).is_dir():
+        return ask_over_the_wire(named, "renderer", SERVICE)
+    service = Sensors(scenes_of_run(open_store(named)), backend).service
+
+    def ask(method: str, request: bytes) -> bytes:
+        try:
+            return service.answer(method, request)
+        except Fault as fault:
+            raise ValueError(f"renderer={named}: {method}: {fault.status} {fault}") from fault
+
+    return ask
 
 
 @dataclass(frozen=True)

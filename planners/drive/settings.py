@@ -27,7 +27,7 @@ class DriveSettings:
     bounds: bool = True  # human, pdm_closed and constant_velocity too
     settings: dict[str, Any] = field(default_factory=dict)  # of planning, changed in all trained planners
     pictures: tuple[Pictures, ...] = ("truth",)  # of planners that look: truth: the town's painter; engine: scenes
-    renderer: str | None = None  # host:port of a renderer of AlpaSim's, for pictures=[renderer]
+    renderer: str | None = None  # of pictures=[renderer]: host:port of AlpaSim's, or a run, whose scenes are drawn here
     logged: bool = True  # drive from the log at T
     perturbed: int = 0  # drive from so many candidates of each clip too, at T+H
     seconds: float = 5.5  # of the log, that are driven
@@ -59,7 +59,7 @@ class DriveSettings:
         if len(set(self.pictures)) < len(self.pictures) or not self.pictures:
             raise ValueError(f"pictures={list(self.pictures)}: each kind once, at least one")
         if ("renderer" in self.pictures) != (self.renderer is not None):
-            raise ValueError("renderer=host:port goes with pictures=[renderer], and that with it")
+            raise ValueError("renderer=host:port, or a run, goes with pictures=[renderer], and that with it")
         if not 0.0 < self.confidence < 1.0:
             raise ValueError(f"confidence={self.confidence}: must lie between 0 and 1")
 

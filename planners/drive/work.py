@@ -11,7 +11,6 @@ from typing import Any
 
 import pyarrow as pa
 
-from factory.alpasim.sensors import SERVICE
 from factory.readers.base import BadClip, ClipReader, ClipRef, painter_of, read_clip
 from factory.store.location import Location, write_shard
 from factory.store.schema import TableSpec, canonical_json, schema_of
@@ -30,7 +29,7 @@ from planners.drive.contract import (
 )
 from planners.drive.films import Rig, write_film
 from planners.drive.loop import DRIVE_VERSION, ClosedLoopDrive, drive
-from planners.drive.renderer import ServedCameras
+from planners.drive.renderer import ServedCameras, cached_renderer
 from planners.drive.settings import DriveSettings, Pictures
 from planners.drive.starts import LOGGED, DriveStart, extend_clip, logged_start, perturbed_starts
 from planners.evaluation.planner_names import EvaluatedPlanner, find_planner
@@ -193,7 +192,7 @@ class DriveWork:
         if pictures != "none":
             found["render"] = asdict(s.render)
         if pictures == "renderer":
-            found["renderer"] = version_of(_renderer(s.renderer))[1]
+            found["renderer"] = version_of(self._renderer)[1]
         return found
 
     def __call__(self, item: DriveItem) -> list[DriveRow | FailedDrive]:
@@ -247,12 +246,18 @@ class DriveWork:
             cache_dir = self.settings.cache or cache_folder(self.out.uri)
             return open_rendered_cameras(clip, self.settings.render, cache_dir)
         if pictures == "renderer":
-            return ServedCameras(clip, self.settings.render, _renderer(self.settings.renderer))
+            return ServedCameras(clip, self.settings.render, self._renderer)
         if pictures == "truth":
             painter = painter_of(self.reader)
             assert painter is not None, "pictures=truth goes with a reader that has a painter"
             return PaintedCameras(clip, self.settings.render, painter)
         return NoCameras()
+
+    @property
+    def _renderer(self) -> Ask:
+        s = self.settings
+        assert s.renderer is not None, "settings without it are refused"
+        return cached_renderer(s.renderer, s.render.backend)
 
     def _peer(self, who: DrivingPlanner) -> Peer:
         s = self.settings
@@ -292,12 +297,6 @@ class DriveWork:
             ego_states=tuple(map(tuple, made.ego_states.tolist())),
             plans=tuple(map(tuple, made.plans.reshape(len(made.plans), -1).tolist())),
         )
-
-
-@lru_cache(maxsize=8)
-def _renderer(address: str | None) -> Ask:
-    assert address is not None, "settings without it are refused"
-    return ask_over_the_wire(address, "renderer", SERVICE)
 
 
 @lru_cache(maxsize=8)

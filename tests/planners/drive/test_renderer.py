@@ -20,7 +20,6 @@ from factory.alpasim.sensors import Sensors
 from factory.datasets.av2.reader import AV2Reader
 from factory.exits import BAD_CONFIG, COMPLETE
 from factory.store.samples import Store
-from planners.drive import work
 from planners.drive.cameras import RenderedCameras
 from planners.drive.drive import main
 from planners.drive.renderer import ServedCameras
@@ -53,9 +52,7 @@ def words(small_town: Path, out: Path, *more: str) -> list[str]:
 
 
 @pytest.mark.slow
-def test_three_processes_drive_as_one_to_the_bit(
-    run: Store, small_town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_three_processes_drive_as_one_to_the_bit(run: Store, small_town: Path, tmp_path: Path) -> None:
     torch.set_num_threads(1)  # in all three: a plan's rounding depends on it
     spec = saved(made("ltf_small", command="curvature"), tmp_path / "ltf")
     with (
@@ -64,13 +61,11 @@ def test_three_processes_drive_as_one_to_the_bit(
     ):
         asked = words(small_town, tmp_path / "three", f"driver={driver}", f"renderer={renderer}")
         assert main(asked) == COMPLETE
-        service = Sensors(scenes_of_run(run)).service
-        monkeypatch.setattr(work, "_renderer", lambda _: service.answer)
-        assert main(words(small_town, tmp_path / "one", f"planner={spec}", "renderer=here")) == COMPLETE
-        monkeypatch.undo()
+        here = f"planner={spec}", f"renderer={run.location.uri}"
+        assert main(words(small_town, tmp_path / "one", *here)) == COMPLETE
     (three,), (one,) = rows(tmp_path / "three"), rows(tmp_path / "one")
     assert three["pictures"] == "renderer" and len(three["plans"]) == 4  # type: ignore[arg-type]
-    apart = {"drive_id", "planner", "planner_digest", "settings"}
+    apart = {"drive_id", "planner", "planner_digest"}
     assert {k: str(v) for k, v in three.items() if k not in apart} == {
         k: str(v) for k, v in one.items() if k not in apart
     }
@@ -102,4 +97,4 @@ def test_a_renderer_that_is_not_there_is_told_and_one_without_its_pictures_refus
     assert main(words(small_town, tmp_path, looks, "renderer=127.0.0.1:9")) == BAD_CONFIG
     assert "renderer=127.0.0.1:9: get_version: " in capsys.readouterr().err
     assert main(words(small_town, tmp_path, looks)) == BAD_CONFIG
-    assert "renderer=host:port goes with pictures=[renderer]" in capsys.readouterr().err
+    assert "renderer=host:port, or a run, goes with pictures=[renderer]" in capsys.readouterr().err
