@@ -3,6 +3,7 @@
 Stamps count from a scene's first instant, which is 0. `local` has the world's axes, its zero where the ego was then.
 """
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -90,18 +91,29 @@ class Scenes:
 
 
 def scenes_of_run(store: Store) -> Scenes:
-    """Of the clips that samples were rendered of, by their ids, those whose scenes and prepared clips are kept."""
+    """Of prepared clips, by their ids: in the scene that their samples were drawn from, else in the only one that is
+    kept of their log, as where no drive was accepted."""
     rows = store.samples.read(["clip_id", "asset_digest"]).to_pylist()
-    paths = scene_files(scene_folder(store))
-    assets = {row["clip_id"]: row["asset_digest"] for row in rows if row["asset_digest"] in paths}
-    prepared = store.candidates.read(["clip_id", "prepare_digest"]).to_pylist()
-    digests = {row["clip_id"]: row["prepare_digest"] for row in prepared if row["clip_id"] in assets}
-    loaders = {name: partial(_load, store, name, digest, paths[assets[name]]) for name, digest in digests.items()}
-    return Scenes(loaders, sha256(repr(sorted(assets.items())).encode()).hexdigest()[:16])
+    kept = scene_files(scene_folder(store))
+    of_log = defaultdict[tuple[str, str] | None, list[str]](list)
+    for digest, scene in kept.items():
+        of_log[scene.log].append(digest)
+    drawn_from = {row["clip_id"]: [row["asset_digest"]] for row in rows if row["asset_digest"] in kept}
+    loaders, made_of = dict[str, Callable[[], ServedScene]](), list[tuple[str, str]]()
+    for row in store.candidates.read(["clip_id", "dataset", "log_id", "prepare_digest"]).to_pylist():
+        name = row["clip_id"]
+        scenes = drawn_from.get(name) or of_log[row["dataset"], row["log_id"]]
+        if len(scenes) == 1:
+            loaders[name] = partial(_load, store, name, row["prepare_digest"], kept[scenes[0]].path)
+            made_of.append((name, scenes[0]))
+    return Scenes(loaders, sha256(repr(sorted(made_of)).encode()).hexdigest()[:16])
 
 
 def _load(store: Store, clip_id: str, prepare_digest: str, path: Path) -> ServedScene:
     clip = prepared_clip(store, clip_id, prepare_digest)
     if clip is None:
         raise BadScene(f"the prepared clip is no more in {store.cache.location.uri}; run again with the same command")
-    return scene_of_clip(clip, read_scene(path))
+    asset = read_scene(path)
+    if asset.block is not None and not asset.block.start_s <= clip.start_s + 1e-6 <= asset.block.end_s:
+        raise BadScene(f"{path}: of another part of the log than the clip, whose scene is not kept")
+    return scene_of_clip(clip, asset)

@@ -579,7 +579,7 @@ def _serve_scenes(request: SceneRequest) -> None:
         served = scene_of_drive(_drive_of_scene(request, asset, sidecar), asset)
         scenes = Scenes({asset.digest: lambda: served})
     if not scenes.ids:
-        raise ValueError(f"{request.files[0]}: no clip's scene is kept there: it has no rendered sample, or no cache")
+        raise ValueError(f"{request.files[0]}: no clip's scene is kept there: none was built, or the cache is gone")
     services = [Sensors(scenes, backend, request.pinhole or False).service, Traffic(scenes, traffic).service]
     print(f"{len(scenes.ids)} scenes, such as {scenes.ids[0]}", flush=True)
     if request.usdz is not None:

@@ -23,7 +23,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -107,20 +107,30 @@ def find_scene(folder: Path, digest: str) -> RenderAsset | None:
 
     Raises BadScene for a file whose header names the digest and whose content is another.
     """
-    path = scene_files(folder).get(digest)
-    return None if path is None else read_scene(path)
+    kept = scene_files(folder).get(digest)
+    return None if kept is None else read_scene(kept.path)
 
 
-def scene_files(folder: Path) -> dict[str, Path]:
+@dataclass(frozen=True)
+class KeptScene:
+    """A block's scene in a cache folder, by its header alone."""
+
+    path: Path
+    log: tuple[str, str] | None  # data set and id of the log that it is of
+
+
+def scene_files(folder: Path) -> dict[str, KeptScene]:
     """The blocks' scenes in a cache folder by the digests that their headers name."""
-    found: dict[str, Path] = {}
+    found: dict[str, KeptScene] = {}
     for path in sorted(folder.glob(f"block-*{SUFFIX}")):
         try:
             with safe_open(path, framework="numpy") as file:
-                digest = json.loads((file.metadata() or {}).get(KEY, "{}")).get("digest")
-        except (SafetensorError, OSError, ValueError, AttributeError):
+                header = json.loads((file.metadata() or {}).get(KEY, "{}"))
+            digest, block = header.get("digest"), header.get("block")
+            log = None if block is None else (str(block["dataset"]), str(block["log_id"]))
+        except (SafetensorError, OSError, ValueError, AttributeError, TypeError, KeyError):
             continue  # of another scene, as far as anyone can tell: whoever needs that one builds it again
-        found.setdefault(digest, path)
+        found.setdefault(digest, KeptScene(path, log))
     return found
 
 

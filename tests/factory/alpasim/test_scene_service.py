@@ -1,6 +1,7 @@
 """Scenes behind AlpaSim's renderer contract: what is answered is what a run draws of the same instant."""
 
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -328,6 +329,13 @@ def run(small_town: Path, tmp_path_factory: pytest.TempPathFactory) -> Store:
     made, store = assemble(config), Store(folder)
     executed(made.work, made.index.refs[:1], made.config.experts, 1, store)
     return store
+
+
+def test_a_clip_without_samples_is_served_in_the_scene_of_its_log(run: Store, tmp_path: Path) -> None:
+    shutil.copytree(run.location.uri, tmp_path / "none", ignore=shutil.ignore_patterns("samples"))
+    (name,), without = scenes_of_run(run).ids, scenes_of_run(Store(tmp_path / "none"))
+    assert without.ids == [name] and without.digest == scenes_of_run(run).digest
+    assert without.find("scene_id", name).asset.digest == scenes_of_run(run).find("scene_id", name).asset.digest
 
 
 def test_a_run_s_sample_asked_for_again_comes_out_as_it_is_stored(run: Store) -> None:
