@@ -22,8 +22,9 @@ out of minutes, and the same command goes on.
 
 import os
 import sys
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -128,8 +129,10 @@ def _limits(settings: AbSettings, data: Mapping[str, Dataset], held_out: Sequenc
     there = {name: int((one.rows.simulated & ~np.isin(one.rows.log_id, held_out)).sum()) for name, one in data.items()}
     if settings.added == "all":
         return dict.fromkeys(there)
-    most = min((n for n in there.values() if n), default=0) if settings.added == "fewest" else settings.added
-    return {name: min(n, most) or None for name, n in there.items()}
+    own = {name: arm.added for name, arm in settings.chosen.items()}
+    most = min((n for name, n in there.items() if n and own[name] is None), default=0)
+    most = most if settings.added == "fewest" else settings.added
+    return {name: min(n, own[name] or most) or None for name, n in there.items()}
 
 
 def make_runs(settings: AbSettings) -> None:
@@ -170,28 +173,60 @@ def _train_there(one: Training, out: Path) -> tuple[str, int]:
     return one.label, train_one(one, out)
 
 
-def score(settings: AbSettings, trainings: Sequence[Training]) -> None:
-    """Evaluate and drive these. Raises Stopped, Failed."""
+@dataclass(frozen=True)
+class Part:
+    """What one fold is scored on of one benchmark."""
+
+    benchmark: int  # place in the settings
+    fold: int
+    logs: tuple[str, ...]
+
+    def folder(self, out: Path) -> Path:
+        """Of the evaluated planners."""
+        return out / EVALUATIONS / f"{self.benchmark}-{self.fold}"
+
+
+def parts_of(folds: Sequence[frozenset[str]], logs: Sequence[Sequence[str]]) -> list[Part]:
+    """Every fold's logs of every benchmark, whose logs are given, where it has any."""
+    return [
+        Part(place, number, held)
+        for number, fold in enumerate(folds)
+        for place, there in enumerate(logs)
+        if (held := tuple(sorted({log for log in there if cluster_of(log) in fold})))
+    ]
+
+
+def score(settings: AbSettings, trainings: Sequence[Training], parts: Sequence[Part]) -> None:
+    """Evaluate and drive these, each where it did not learn. Raises Stopped, Failed."""
     out = Path(settings.out)
-    named = {**UNTRAINED, **{one.label: str(folder_of(out, one)) for one in trainings}}
-    planners = f"planners={{{','.join(f'{label}: {chr(39)}{spec}{chr(39)}' for label, spec in named.items())}}}"
-    benchmark = f"benchmark={settings.table(settings.benchmark)}"
-    _call(settings, "planners", "evaluate", benchmark, planners, f"out={out / EVALUATIONS}")
-    if settings.drives:
-        how = [f"executor={settings.executor}", f"workers={settings.at_once}"]
-        _call(settings, "planners", "drive", *settings.drives.split(), *how, planners, f"out={out / DRIVES}")
+    for part in parts:
+        mine = {one.label: str(folder_of(out, one)) for one in trainings if one.facts["fold"] == part.fold}
+        named = ",".join(f"{label}: '{spec}'" for label, spec in {**UNTRAINED, **mine}.items())
+        words = [f"planners={{{named}}}", *([f"only_logs=[{','.join(part.logs)}]"] if settings.folds else [])]
+        benchmark = f"benchmark={settings.table(settings.benchmark[part.benchmark])}"
+        _call(settings, "planners", "evaluate", benchmark, *words, "tables=false", f"out={part.folder(out)}")
+        if settings.drives:
+            how = [f"executor={settings.executor}", f"workers={settings.at_once}", f"out={out / DRIVES}"]
+            _call(settings, "planners", "drive", *settings.drives[part.benchmark].split(), *how, *words)
 
 
-def report(settings: AbSettings, trainings: Sequence[Training], folds: Sequence[frozenset[str]]) -> str:
+def report(
+    settings: AbSettings, trainings: Sequence[Training], folds: Sequence[frozenset[str]], parts: Sequence[Part]
+) -> str:
     """Keep the rows of these, every clip by who did not learn from it, and write the report; its text."""
     out = Path(settings.out)
     held = {one.label: (trained_of(one, out), folds[one.facts["fold"]]) for one in trainings}
     trained: dict[str, Trained] = {}
     for who, _ in held.values():
         trained.setdefault(who.label, who)
-    together = sorted(held, key=lambda label: held[label][0].label)  # the folds of one one behind the other
-    frames = [frames_of(out / EVALUATIONS / label, held[label][0].label, held[label][1]) for label in together]
-    frames += [frames_of(out / EVALUATIONS / name, name) for name in BASELINES]
+    together = sorted(trainings, key=lambda one: held[one.label][0].label)  # the folds of one one behind the other
+    frames = [
+        frames_of(part.folder(out) / one.label, held[one.label][0].label)
+        for one in together
+        for part in parts
+        if part.fold == one.facts["fold"]
+    ]
+    frames += [frames_of(part.folder(out) / name, name) for name in BASELINES for part in parts]
     drives = []
     if settings.drives:
         wanted: dict[str, list[tuple[str, frozenset[str] | None]]] = {
@@ -233,22 +268,32 @@ def experiment(settings: AbSettings) -> None:
         print(write_report(Path(settings.rows)))
         return
     make_runs(settings)
-    logs = list(read_clip_logs(settings.table(settings.benchmark)).values())
+    by_benchmark = [list(read_clip_logs(settings.table(name)).values()) for name in settings.benchmark]
+    logs = [log for there in by_benchmark for log in there]
     if settings.folds is None:
         check_apart(settings, logs)
     folds = folds_of(settings, logs)
+    parts = parts_of(folds, by_benchmark)
+    wanted = planned(settings, folds)
+    print(
+        f"{settings.seeds} seeds of {len(wanted) // settings.seeds} trainings, {settings.steps} steps each; told "
+        f"of {len(logs)} clips in {len(parts)} parts",
+        file=sys.stderr,
+    )
     done: list[Training] = []
     stopped = None
     try:
-        for _, batch in groupby(planned(settings, folds), key=lambda one: one.facts["seed"]):
-            mine = list(batch)
+        for seed, batch in groupby(wanted, key=lambda one: one.facts["seed"]):
+            mine, began = list(batch), time.monotonic()
             train(settings, mine)
-            score(settings, mine)
+            score(settings, mine, parts)
             done += mine
+            took = (time.monotonic() - began) / 60.0
+            print(f"seed {seed}: {took:.1f} minutes; {settings.seeds - seed - 1} more are to come", file=sys.stderr)
     except Stopped as error:
         stopped = error
     if done:
-        print(report(settings, done, folds))
+        print(report(settings, done, folds, parts))
     if stopped:
         raise stopped
 

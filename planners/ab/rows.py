@@ -5,7 +5,7 @@ follow-ups are weighted. drives.parquet has a row for each drive. Who is who sta
 """
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 from operator import itemgetter
@@ -74,11 +74,9 @@ class AbRows:
     drives: Mapping[str, Sequence[Row]]
 
 
-def frames_of(folder: Path, label: str, clusters: Collection[str] | None = None) -> pa.Table:
-    """The frames of one evaluated planner, under another label; clusters: of these towns or logs alone."""
+def frames_of(folder: Path, label: str) -> pa.Table:
+    """The frames of one evaluated planner, under another label."""
     table = pq.read_table(folder / FRAMES)
-    if clusters is not None:
-        table = table.filter(pa.array([cluster_of(log) in clusters for log in table["log_id"].to_pylist()]))
     named = table.append_column("training", pa.array([label] * len(table), pa.string()))
     return named.select(FRAME_SCHEMA.names).cast(FRAME_SCHEMA)
 

@@ -22,11 +22,14 @@ class Arm:
     real: tuple[str, ...] = ()  # further tables of real samples
     sim: tuple[str, ...] = ()  # tables of simulated ones
     experts: tuple[str, ...] = ()  # whose samples of these; none: everybody's
+    added: int | None = None  # simulated samples, where they are not as many as the other arms'
     train: str = ""  # further settings of `python -m planners train`
 
     def __post_init__(self) -> None:
         if self.experts and not self.sim:
             raise ValueError(f"experts={list(self.experts)}: of which tables? name them under sim")
+        if self.added is not None and (self.added < 1 or not self.sim):
+            raise ValueError(f"added={self.added}: must be at least 1, of the tables under sim")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +38,7 @@ class AbSettings(SweepResources):
 
     out: str  # folder; the same command on it goes on
     real: tuple[str, ...]  # tables whose real samples every arm learns from; names of runs, folders or URLs
-    benchmark: str  # of held-out clips, that factory.run preset=hard_benchmark made; a name of runs or a folder
+    benchmark: tuple[str, ...]  # of held-out clips, by factory.run preset=hard_benchmark; names of runs or folders
     planners: dict[str, str]  # name -> settings of `planners train`, planner=... first
     arms: dict[str, Arm | None]  # name -> what it adds; null takes an arm out
     reference: str = "real"  # the arm that all others are held against
@@ -47,7 +50,7 @@ class AbSettings(SweepResources):
     seeds: int = 2
     added: int | Literal["fewest", "all"] = "fewest"  # simulated samples to each arm: as many as every arm has
     folds: int | Literal["each"] | None = None  # parts of the towns or logs, each held out once; null: already apart
-    drives: str | None = None  # settings of `planners drive`; null: the benchmark alone
+    drives: tuple[str, ...] = ()  # settings of `planners drive`, one for each benchmark; none: no drives
     rows: str | None = None  # folder of an earlier report, made again from its rows; nothing is trained
     executor: Literal["local", "ray"] = "local"
     confidence: float = 0.95
@@ -64,6 +67,10 @@ class AbSettings(SweepResources):
         for name, least in {"steps": 1, "seeds": 1, "added": 1, "folds": 2}.items():
             if isinstance(value := getattr(self, name), int) and value < least:
                 raise ValueError(f"{name}={value}: must be at least {least}")
+        if not self.benchmark or (self.drives and len(self.drives) != len(self.benchmark)):
+            raise ValueError(
+                f"{len(self.drives)} drives for {len(self.benchmark)} benchmarks: give one for each, or none"
+            )
         if not 0.0 < self.confidence < 1.0:
             raise ValueError(f"confidence={self.confidence}: must lie between 0 and 1")
 

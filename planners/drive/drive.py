@@ -112,7 +112,8 @@ def _requested_drives(settings: DriveSettings) -> RequestedDrives:
             raise ConfigError(str(error)) from error
     out = Location.parse(settings.out)
     work = DriveWork(reader, choose_vocabulary(settings.vocabulary), settings, out)
-    items = list(_items(work, index.refs[: settings.limit], planners))
+    refs = [ref for ref in index.refs if not settings.only_logs or ref.log_id in settings.only_logs]
+    items = list(_items(work, refs[: settings.limit], planners))
     return RequestedDrives(work, items, index.broken, [who.label for who, _ in planners])
 
 

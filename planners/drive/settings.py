@@ -37,6 +37,7 @@ class DriveSettings:
     executor: Literal["local", "ray"] = "local"
     workers: int | None = None  # processes; null: one here, every core on Ray
     limit: int | None = None  # the first so many clips only
+    only_logs: tuple[str, ...] = ()  # ids of logs, whose clips alone; none: of all
     seed: int = 0  # of the perturbations
     device: str = "cpu"  # or cuda
     confidence: float = 0.95  # of the intervals

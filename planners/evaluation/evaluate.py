@@ -107,6 +107,7 @@ class EvaluateSettings:
     planners_at_once: int = 8  # in memory, planning from one reading of the samples
     device: str = "cpu"  # or cuda
     limit: int | None = None  # the first so many clips only
+    only_logs: tuple[str, ...] = ()  # ids of logs, whose clips alone; none: of all
     check: str | None = None  # of navtest: NAVSIM's own rows of the same planner (.csv, .csv.gz); writes check.html
     navsim_python: str | None = None  # of NAVSIM's environment, whose solver the check tries; null: this one
     tables: bool = True  # summary.csv of all planners; false where others follow into the same out
@@ -139,11 +140,13 @@ def evaluate(
     Raises ConfigError where a planner cannot plan from this benchmark, before any is planned.
     """
     out = Path(settings.out)
-    keys = _keys(benchmark, settings.limit)
-    n_clips = len({key.clip_id for key in keys})
+    keys = _keys(benchmark, settings)
+    clips: dict[str, Any] = {"clips": len({key.clip_id for key in keys})}
+    if settings.only_logs:
+        clips["only_logs"] = list(settings.only_logs)
     shared = {
         "benchmark_digest": benchmark.digest,
-        "clips": n_clips,
+        **clips,
         "rules": json.loads(json.dumps(_told(settings.rules))),  # as it comes back from a file
         "stage_versions": stage_versions(),
     }
@@ -153,7 +156,7 @@ def evaluate(
     for one in waiting:
         (out / one.label).mkdir(parents=True, exist_ok=True)
     planning = [
-        (one, out / one.label, {"planner_digest": one.digest, "benchmark_digest": benchmark.digest, "clips": n_clips})
+        (one, out / one.label, {"planner_digest": one.digest, "benchmark_digest": benchmark.digest, **clips})
         for one in waiting
         if one.load is not None
     ]
@@ -192,9 +195,14 @@ def check_needs(benchmark: BenchmarkFolder, keys: Sequence[FrameKey], who: Seque
             )
 
 
-def _keys(benchmark: BenchmarkFolder, limit: int | None) -> list[FrameKey]:
-    clips = list(dict.fromkeys(key.clip_id for key in benchmark.keys))[:limit]
-    return [key for key in benchmark.keys if key.clip_id in set(clips)]
+def _keys(benchmark: BenchmarkFolder, settings: EvaluateSettings) -> list[FrameKey]:
+    """The frames that settings choose. Raises ConfigError where there are none."""
+    clips = dict.fromkeys(key.clip_id for key in benchmark.keys)
+    logs = set(settings.only_logs)
+    chosen = set([clip for clip in clips if not logs or benchmark.log_of(clip) in logs][: settings.limit])
+    if not chosen:
+        raise ConfigError(f"only_logs={settings.only_logs[0]}: no clip of benchmark={benchmark.path} is of it")
+    return [key for key in benchmark.keys if key.clip_id in chosen]
 
 
 def _score_clips(

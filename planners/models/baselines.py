@@ -115,8 +115,20 @@ class EgoMlpBev(EgoMlp):
 
     def features(self, batch: Batch) -> Tensor:
         assert batch.bev is not None
-        told = self.classes(batch.bev.int())  # (B, T, rows, columns, classes)
-        x = told.permute(0, 1, 4, 2, 3).flatten(1, 2)
-        for convolve in self.convolutions:
+        x = self._seen(batch.bev)
+        for convolve in self.convolutions[1:]:
             x = F.relu(convolve(x))
         return torch.cat([visible_status(self.settings.status, batch.status), F.relu(self.fold(x.flatten(1)))], -1)
+
+    def _seen(self, bev: Tensor) -> Tensor:
+        """The first convolution of the classes' vectors (B, T, rows, columns), its weights multiplied by these.
+
+        One-hot classes need no gradient then, which for vectors at every cell would be half of a step's time.
+        """
+        first = self.convolutions[0]
+        assert isinstance(first, nn.Conv2d)
+        by_time = first.weight.unflatten(1, (bev.shape[1], -1))
+        weights = torch.einsum("otcij,kc->otkij", by_time, self.classes.weight).flatten(1, 2)
+        hot = bev.new_zeros((*bev.shape[:2], len(BevClass), *bev.shape[2:]), dtype=weights.dtype)
+        hot.scatter_(2, bev.long().unsqueeze(2), 1.0)
+        return F.relu(F.conv2d(hot.flatten(1, 2), weights, first.bias, stride=2, padding=1))

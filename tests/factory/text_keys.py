@@ -8,8 +8,8 @@ from factory.config.words import FREE, PATHS
 # Last words of the keys whose text names no file: a new key is one of these, or of factory.config.words.PATHS.
 TEXTS = (
     "authors camera checkpoint_every clip column country device driver email expert experts full host institution "
-    "keep_every map_location name older_than only origin parts policy round sample settings tag team_name "
-    "validate_every version without_logs"
+    "keep_every map_location name older_than only only_logs origin parts policy round sample settings tag "
+    "team_name validate_every version without_logs"
 )
 NO_PATHS = frozenset(TEXTS.split())
 
