@@ -113,6 +113,8 @@ def _requested_drives(settings: DriveSettings) -> RequestedDrives:
     out = Location.parse(settings.out)
     work = DriveWork(reader, choose_vocabulary(settings.vocabulary), settings, out)
     refs = [ref for ref in index.refs if not settings.only_logs or ref.log_id in settings.only_logs]
+    if settings.only_logs and not refs:
+        raise ConfigError(f"only_logs={settings.only_logs[0]}: none of the {len(index.refs)} clips is of it")
     items = list(_items(work, refs[: settings.limit], planners))
     return RequestedDrives(work, items, index.broken, [who.label for who, _ in planners])
 

@@ -110,6 +110,13 @@ def test_other_settings_are_other_drives(towns: Path, tmp_path: Path) -> None:
     assert len(rows(tmp_path)) == n_before + 1
 
 
+def test_of_some_logs_alone(towns: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words(towns, tmp_path, "only_logs=[town-1-0001-curve]")) == BAD_CONFIG
+    assert "only_logs=town-1-0001-curve: none of the 2 clips is of it" in capsys.readouterr().err
+    log = command._requested_drives(settings_of(words(towns, tmp_path))).items[0].ref.log_id
+    assert len(command._requested_drives(settings_of(words(towns, tmp_path, f"only_logs=[{log}]"))).items) == 2
+
+
 def test_a_row_holds_the_drive(towns: Path, tmp_path: Path) -> None:
     assert main(words(towns, tmp_path, "limit=1")) == COMPLETE
     (row,) = rows(tmp_path)

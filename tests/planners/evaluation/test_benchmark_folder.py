@@ -45,7 +45,7 @@ def test_the_command_scores_a_benchmark_on_disk(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     planners = "planners=[human,pdm_closed]"
-    assert main([f"benchmark={folder}", planners, "bounds=false", f"out={tmp_path}", "limit=1"]) == 0
+    assert main([f"benchmark={folder}", planners, "bounds=false", f"out={tmp_path}", "only_logs=[log-a]"]) == 0
     assert "pdm_closed" in capsys.readouterr().out
     rows = read_rows(tmp_path / "pdm_closed")
     assert {row.key.clip_id for row in rows} == {"a"} and len(rows) == 7
@@ -57,6 +57,8 @@ def test_the_command_scores_a_benchmark_on_disk(
         np.testing.assert_allclose(stored.scores.filtered, kept.scores.filtered)
         assert stored.tags == kept.tags
         assert stored.log_id == kept.log_id == "log-a"
+    assert main([f"benchmark={folder}", planners, f"out={tmp_path}", "only_logs=[log-c]"]) == 2
+    assert "only_logs=log-c: no clip of benchmark=" in capsys.readouterr().err
 
 
 def test_its_digest_is_that_of_its_content(folder: Path, tmp_path: Path) -> None:
