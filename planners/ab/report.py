@@ -1,9 +1,9 @@
 """What an experiment comes to, made of its rows alone: a verdict, tables by arm and by cluster, a picture.
 
-`write_report` writes ab.md, differences.csv and ab.svg. Every arm and every bound is held against the
-reference over the same clips and drives, pairs of seeds and planners; intervals are over the largest clusters of which
-there are two (planners/evaluation/bootstrap.py). As there are many differences, each has beside its p the one that Holm
-(1979) adjusts for all of them.
+`write_report` writes ab.md, differences.csv and ab.svg. Every arm and every bound is held against the reference, and
+against the arm that is claimed, over the same clips and drives, pairs of seeds and planners; intervals are over the
+largest clusters of which there are two (planners/evaluation/bootstrap.py). As there are many differences, each has
+beside its p the one that Holm (1979) adjusts for all of them.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -62,10 +62,11 @@ class Measured:
 
 @dataclass(frozen=True)
 class Held:
-    """An arm or a bound beside the reference, in one measure."""
+    """An arm or a bound beside another arm, in one measure."""
 
     planner: str  # all: the mean of all planners
     who: str
+    against: str  # the reference or the claimed arm
     measure: Measured
     apart: Interval
     clusters: Mapping[str, float]  # difference in each
@@ -78,7 +79,7 @@ class Held:
         ends = {
             f"{end}{name}": scale * span[i] for name, span in spans.items() for i, end in enumerate(("low", "high"))
         }
-        facts = {"planner": self.planner, "who": self.who, "measure": self.measure.name}
+        facts = {"planner": self.planner, "who": self.who, "against": self.against, "measure": self.measure.name}
         means = {"mean": scale * one.b, "reference": scale * one.a, "difference": scale * one.difference}
         return {**facts, **means, **ends, "p": one.p, "level": self.measure.level, "clusters": one.n}
 
@@ -137,8 +138,8 @@ def _coarsest(clips: Sequence[str], logs: Sequence[str]) -> tuple[str, tuple[str
     return several[-1], known[several[-1]]
 
 
-def held_against_reference(rows: AbRows) -> list[Held]:
-    """Every arm and every bound, by planner and over all planners."""
+def all_held(rows: AbRows) -> list[Held]:
+    """Every arm and every bound against the reference, then against the claimed arm; by planner and over all."""
     found = []
     planners = list(dict.fromkeys(one.planner for one in rows.trained))
     for measure in measures_of(rows):
@@ -146,10 +147,13 @@ def held_against_reference(rows: AbRows) -> list[Held]:
             mine = [one for one in rows.trained if planner in (one.planner, "all")]
             sides = {arm: [one.label for one in mine if one.arm == arm] for arm in dict.fromkeys(o.arm for o in mine)}
             sides |= {f"({name})": [name] for name in BASELINES if name in measure.values}
-            reference = sides.pop(rows.asked["reference"])
-            for who, labels in sides.items():
-                apart = measure.difference(labels, reference, rows.asked["confidence"])
-                found.append(Held(planner, who, measure, apart, measure.by_cluster(labels, reference)))
+            for against in (rows.asked["reference"], rows.asked["claim"]):
+                other = sides[against]
+                sides = {who: labels for who, labels in sides.items() if who != rows.asked["reference"]}
+                for who, labels in sides.items():
+                    if who != against:
+                        apart = measure.difference(labels, other, rows.asked["confidence"])
+                        found.append(Held(planner, who, against, measure, apart, measure.by_cluster(labels, other)))
     return found
 
 
@@ -169,7 +173,7 @@ def verdict(rows: AbRows, held: Sequence[Held]) -> str:
     planners = list(dict.fromkeys(one.planner for one in rows.trained))
     who = planners[0] if len(planners) == 1 else "all"
     adjusted = holm([one.apart.p for one in held])
-    mine = [(one, p) for one, p in zip(held, adjusted) if one.who == claim and one.planner == who]
+    mine = [(one, p) for one, p in zip(held, adjusted) if one.who == claim and one.planner == who]  # of the reference
     told = [(one, p) for one, p in mine if one.measure.name in ("two-stage EPDMS", SCENES)]
     said = [difference_sentence(one.measure.name, one.apart, one.measure.level, confidence) for one, _ in told]
     many = " and ".join(f"{p:.2g}" for _, p in told)
@@ -184,7 +188,7 @@ def verdict(rows: AbRows, held: Sequence[Held]) -> str:
 def write_report(folder: Path) -> str:
     """Of a folder of `write_ab_rows`; its text. Raises FileNotFoundError, ValueError."""
     rows = read_ab_rows(folder)
-    held = held_against_reference(rows)
+    held = all_held(rows)
     adjusted = holm([one.apart.p for one in held])
     write_csv(folder / "differences.csv", [one.row | {"p_holm": p} for one, p in zip(held, adjusted)])
     said = verdict(rows, held)
@@ -195,26 +199,26 @@ def write_report(folder: Path) -> str:
 
 
 def _tables(rows: AbRows, held: Sequence[Held]) -> list[str]:
-    """Of each planner: an arm a line, a measure a column."""
-    reference, percent = rows.asked["reference"], f"{100 * rows.asked['confidence']:g} %"
+    """Of each planner, against the reference and against the claimed arm: an arm a line, a measure a column."""
+    percent = f"{100 * rows.asked['confidence']:g} %"
     said = (
-        f"{rows.asked['steps']} steps each. In brackets: the difference from `{reference}`, its {percent} interval "
+        f"{rows.asked['steps']} steps each. In brackets: the difference from the first line, its {percent} interval "
         "over whole clusters, the widest of Student's t, the bootstrap with seeds and, below 20 clusters, the wild "
         "cluster bootstrap, p of sign flips; bold where zero lies outside of each. Scores and routes in percent."
     )
     lines = [*wrap(said, 120), ""]
     samples = {one.arm: f"{one.real} + {one.simulated}" for one in rows.trained}
-    for planner in dict.fromkeys(one.planner for one in held):
-        mine = [one for one in held if one.planner == planner]
+    for planner, against in dict.fromkeys((one.planner, one.against) for one in held):
+        mine = [one for one in held if (one.planner, one.against) == (planner, against)]
         measures = list({one.measure.name: one.measure for one in mine}.values())
         at = {(one.who, one.measure.name): one for one in mine}
         of_it = {one.measure.name: f"{one.measure.scale * one.apart.a:.1f}" for one in mine}
-        body = [[f"`{reference}`", samples[reference], *of_it.values()]]
+        body = [[f"`{against}`", samples[against], *of_it.values()]]
         for who in dict.fromkeys(one.who for one in mine):
             cells = [_cell(at.get((who, measure.name))) for measure in measures]
             body.append([f"`{who}`", samples.get(who, ""), *cells])
         heads = [f"{m.name}, {len(set(m.clusters))} {m.level}s" for m in measures]
-        lines += [f"## {planner}", "", *markdown_table(["arm", "real + simulated", *heads], body)]
+        lines += [f"## {planner}, against `{against}`", "", *markdown_table(["arm", "real + simulated", *heads], body)]
     return lines
 
 
@@ -233,6 +237,7 @@ def _cluster_tables(rows: AbRows, held: Sequence[Held]) -> list[str]:
     planner = held[-1].planner
     for name in ("two-stage EPDMS", SCENES):
         mine = [one for one in held if one.planner == planner and one.measure.name == name]
+        mine = [one for one in mine if one.against == rows.asked["reference"]]
         if not mine:
             continue
         body = [
@@ -255,7 +260,8 @@ LINE, LEFT, WIDE = 24, 190, 420  # pixels of the picture
 def picture(rows: AbRows, held: Sequence[Held]) -> str:
     """An SVG: of each arm the differences in clusters as dots, the mean as a bar across, its interval as a line."""
     planner = held[-1].planner
-    mine = [one for one in held if one.planner == planner and one.measure.scale == 100.0]
+    of_reference = [one for one in held if one.against == rows.asked["reference"]]
+    mine = [one for one in of_reference if one.planner == planner and one.measure.scale == 100.0]
     parts, y = [], LINE
     for name in dict.fromkeys(one.measure.name for one in mine):
         of = [one for one in mine if one.measure.name == name]

@@ -135,13 +135,17 @@ def test_the_report_is_made_of_rows_alone_and_says_one_verdict(kept: Path, capsy
         "pdm_closed against real, bev, 2 seeds: two-stage EPDMS 37.0 against 30.0, +7.0 (95 % over 6"
     )
     assert "t +3.1 to +10.9" in last and "p 0.031), better; scene score" in last
-    assert "no difference told from zero; of 20 differences told here, for which Holm makes p" in last
+    assert "no difference told from zero; of 36 differences told here, for which Holm makes p" in last
     made = {path.name: path.read_bytes() for path in kept.iterdir()}
     assert {"ab.md", "ab.svg", "differences.csv", "frames.parquet", "drives.parquet"} == set(made)
     write_report(kept)
     assert {path.name: path.read_bytes() for path in kept.iterdir()} == made
     text = made["ab.md"].decode()
-    assert "| `pdm_closed` | 30 + 9 | 37.0 (**+7.0**:" in text and "| `(go_straight)` |" in text
+    assert (
+        "| `pdm_closed` | 30 + 9 | 37.0 (**+7.0**:" in text
+        and "| `jitter` | 30 + 0 | 30.0 (**-7.0**:" in text
+        and "| `(go_straight)` |" in text
+    )
     assert "| town-5 | +0.0 | +12.0 |" in text
     rows = list(csv.DictReader((kept / "differences.csv").open()))
     jitter = next(row for row in rows if (row["who"], row["measure"]) == ("jitter", "two-stage EPDMS"))
