@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from planners.evaluation.aggregation import ClipResult, group_by_clip
@@ -75,8 +76,16 @@ class AbRows:
 
 
 def frames_of(folder: Path, label: str) -> pa.Table:
-    """The frames of one evaluated planner, under another label."""
+    """The frames of one evaluated planner, under another label, without what decides nothing.
+
+    That is where plans from follow-ups end, most of the file's bytes, and filtered scores that are the score.
+    """
     table = pq.read_table(folder / FRAMES)
+    follow_up = pc.equal(table["stage"], "stage_two")
+    same = pc.equal(table["score"], table["score_filtered"])
+    for name, unneeded in {"end_x": follow_up, "end_y": follow_up, "score_filtered": same}.items():
+        kept = pc.if_else(unneeded, None, table[name])
+        table = table.set_column(table.column_names.index(name), name, kept)
     named = table.append_column("training", pa.array([label] * len(table), pa.string()))
     return named.select(FRAME_SCHEMA.names).cast(FRAME_SCHEMA)
 
