@@ -187,4 +187,4 @@ def test_what_the_readme_says_of_simulated_samples_is_what_the_kept_frames_say()
     row = f"| {100 * final.a:.1f} | {100 * final.b:.1f} | {100 * final.difference:+.1f} ({low} to {high}) |"
     assert row in readme, row
     assert not final.is_clear, "zero lies inside"
-    assert f"{100 * final_score(clips['constant_velocity']):.1f} in the study" in readme
+    assert f"{100 * final_score(clips['constant_velocity']):.1f} in the study, whose" in readme
