@@ -50,7 +50,7 @@ PLACE, SIZES, EGO, HISTORY, LINE_X, LINE_Y, POINT_X, POINT_Y, EDGE_FROM, EDGE_TO
 EDGE_KIND, BOUNDED, PLAYING, BOXES, STOPPED, COLLISION, RED_TIMES, RED_BOUNDS, RED_FIRST, RED_EDGES = range(10, N_PARTS)
 ORDERS = (0, 0, 0, 0, 2, 2, 2, 2, 1, 1, 1, 0, 0, 2, 1, 1, 1, 0, 0, 1)  # of packing
 N_PLACE, N_SIZES, N_LAYERS, BOX = 4, 4, 4, 5  # columns of PLACE and SIZES; parts that a region plays; numbers of a box
-FORMAT = 1
+FORMAT = 2
 
 
 def pack_scene(clip: Clip) -> bytes:
@@ -213,7 +213,8 @@ class BankScores:
 
 
 class SceneBank:
-    """Scenes by clip id, to score plans on; what `factory.readers.bank.write_bank` wrote. Pickles, and may be forked.
+    """Scenes by clip id, or by NAVSIM's token of the frame at T, to score plans on; what
+    `factory.readers.bank.write_bank` wrote. Pickles, and may be forked.
 
     Raises FileNotFoundError where there are none, Damaged for a head or a body that is not as it was written.
     """
@@ -223,6 +224,7 @@ class SceneBank:
         self._bodies: list[Bytes] = []
         self._place: dict[str, tuple[int, int, int, int]] = {}  # shard, first byte, past the last, CRC-32
         self.left_out: dict[str, str] = {}  # clip id -> why it has no scene
+        self.tokens: dict[str, str] = {}  # of the log's frames at T -> clip id
         heads = sorted(self.folder.glob(HEAD))
         if not heads:
             raise FileNotFoundError(f"{folder}: no {HEAD} in it: write it by factory.readers.bank.write_bank")
@@ -236,6 +238,7 @@ class SceneBank:
             places = zip([shard] * len(ends), ends, ends[1:], head["crc32"])
             self._place.update(zip(head["clip_ids"], places, strict=False))
             self.left_out.update(head["left_out"])
+            self.tokens.update(head["tokens"])
         self.clip_ids = tuple(self._place)
         self._whole: set[str] = set()  # whose bytes were held against their checksum
 
@@ -291,6 +294,7 @@ class SceneBank:
         return BankScores(subscores, scores)
 
     def _bytes_of(self, clip_id: str) -> Bytes:
+        clip_id = self.tokens.get(clip_id, clip_id)
         if clip_id not in self._place:
             raise KeyError(f"{self.folder}: no scene {clip_id!r} among its {len(self):,}")
         shard, first, last, crc = self._place[clip_id]
@@ -303,7 +307,7 @@ class SceneBank:
 
 
 def read_head(path: Path) -> dict[str, Any]:
-    """A shard's head: format, clip_ids, ends (first 0), crc32, left_out. Raises Damaged naming the file."""
+    """A shard's head: format, clip_ids, ends (first 0), crc32, left_out, tokens. Raises Damaged naming the file."""
     try:
         head = parse_json_with_checksum(path.read_bytes())
     except Damaged as error:

@@ -53,18 +53,27 @@ def _write_shard(read: Callable[[T], Clip], path: Path, wanted: Mapping[str, T])
         if wanted.keys() != {*head["clip_ids"], *left}:
             raise Damaged(f"{path}: a bank of other clips: choose another folder, or remove it")
         return left
-    scenes, left_out = dict[str, bytes](), dict[str, str]()
+    scenes, left_out, tokens = dict[str, bytes](), dict[str, str](), dict[str, str]()
     for clip_id, one in wanted.items():
         try:
-            scenes[clip_id] = pack_scene(read(one))
+            clip = read(one)
+            scenes[clip_id] = pack_scene(clip)
         except (BadClip, ValueError) as error:
             left_out[clip_id] = str(error)
-    write_scenes(path, scenes, left_out)
+        else:
+            if clip.frame_tokens is not None:
+                tokens[clip.frame_tokens[0]] = clip_id
+    write_scenes(path, scenes, left_out, tokens)
     return left_out
 
 
-def write_scenes(path: Path, scenes: Mapping[str, bytes], left_out: Mapping[str, str]) -> None:
-    """A shard of packed scenes by clip id: the head `scenes-<number>.json`, and the bytes beside it."""
+def write_scenes(
+    path: Path, scenes: Mapping[str, bytes], left_out: Mapping[str, str], tokens: Mapping[str, str] | None = None
+) -> None:
+    """A shard of packed scenes by clip id: the head `scenes-<number>.json`, and the bytes beside it.
+
+    tokens: the log's own name of a scene's frame at T -> clip id.
+    """
     ends = [*accumulate(map(len, scenes.values()), initial=0)]
     head = {
         "format": FORMAT,
@@ -72,6 +81,7 @@ def write_scenes(path: Path, scenes: Mapping[str, bytes], left_out: Mapping[str,
         "ends": ends,
         "crc32": [zlib.crc32(data) for data in scenes.values()],
         "left_out": dict(left_out),
+        "tokens": dict(tokens or {}),
     }
     with atomic_file(path.with_suffix(BODY), ends[-1]) as draft, draft.open("wb") as file:
         file.writelines(scenes.values())

@@ -4,6 +4,7 @@ The native clip is thinned to 2 Hz and brought back by the slow twin; what thinn
 """
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from factory.datasets.navsim.log import read_frames
 from factory.datasets.navsim.reader import LICENCE, NavsimReader
 from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import write_logs
+from factory.readers.bank import write_bank
+from tasks.bank import SceneBank
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW, Clip
 from tasks.world.road_map import CenterlineFinder, LightState, RoadMap, driving_command
@@ -149,3 +152,20 @@ def _by_place(clip: Clip) -> list[np.ndarray]:
 def _red(clip: Clip) -> dict[str, list[int]]:
     red = clip.lights.states == LightState.RED
     return {lane: np.flatnonzero(red[:, i]).tolist() for i, lane in enumerate(clip.lights.lane_ids) if red[:, i].any()}
+
+
+def test_a_bank_of_navsim_s_logs_answers_by_token(towns: Towns, tmp_path: Path) -> None:
+    """As NAVSIM's users name a scene: the frame at T."""
+    refs = towns.navsim.index().refs[:2]
+    assert write_bank(tmp_path, towns.navsim, refs) == {}
+    clips, bank = [towns.navsim.read(ref) for ref in refs], SceneBank(tmp_path)
+    tokens = [clip.frame_tokens[0] for clip in clips if clip.frame_tokens]
+    assert bank.tokens == {token: ref.clip_id for token, ref in zip(tokens, refs, strict=True)}
+    plans = np.zeros((2, 3, 8, 3))
+    plans[..., 0] = np.arange(1, 9) * np.array([[[1.0], [2.0], [3.0]]])
+    found = bank.score(tokens, plans)
+    for clip, mine, scores in zip(clips, plans, found.score, strict=True):
+        np.testing.assert_array_equal(scores, score_trajectories(clip, mine).pdm_score)
+    np.testing.assert_array_equal(found.score, bank.score(bank.clip_ids, plans).score)
+    with pytest.raises(KeyError, match="no scene 'another'"):
+        bank.score(["another"], plans[:1])
