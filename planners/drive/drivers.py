@@ -80,11 +80,10 @@ class PlannerDriver:
 
 
 def make_driver(one: EvaluatedPlanner, pdm: PdmSettings, device: str = "cpu") -> Driver:
-    """The driver that an evaluated planner is, its weights read."""
+    """The driver that an evaluated planner is, its weights read. Raises ConfigError for plans of a submission."""
     if one.privileged is human_plans:
         return HumanDriver()
     if one.privileged is pdm_plans:
         return PdmClosedDriver(pdm)
-    assert one.load is not None
-    made = one.load()
+    made = one.made()
     return PlannerDriver(made.to(device) if hasattr(made, "to") else made, device)

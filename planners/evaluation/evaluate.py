@@ -158,7 +158,7 @@ def evaluate(
     planning = [
         (one, out / one.label, {"planner_digest": one.digest, "benchmark_digest": benchmark.digest, **clips})
         for one in waiting
-        if one.load is not None
+        if one.privileged is None
     ]
     plans = all_plans(benchmark, keys, planning, settings.batch_size, settings.planners_at_once, settings.device)
     if waiting:

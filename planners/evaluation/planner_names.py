@@ -4,6 +4,7 @@
     constant_velocity          needs no training
     runs/my_training           a training's folder or one of its checkpoints; runs/my_training/best
     runs/a+runs/b              the ensemble of several trainings of gtrs_dense
+    submission.pkl             the plans of any agent of NAVSIM, as its script for submissions wrote them
     mine                       what an installed package offers by that name (docs/extend.md)
     my.module:MyPlanner        a class, or anything called without arguments, of a user's own package
 
@@ -29,12 +30,14 @@ from factory.config.compose import ConfigError, compose
 from factory.config.plugins import import_object, plugin_named, plugins_by_name
 from factory.config.shapes import required_keys
 from factory.config.words import did_you_mean, expand_home
+from factory.readers.base import BadClip
 from planners.data.batch import Needs
 from planners.evaluation.benchmark_folder import how_to_make
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.scoring import Plans, PreparedFrame, human_plans, pdm_plans
 from planners.models.settings import BUILT_IN, OWN, PlannerChoice
 from planners.training import checkpoint
+from tasks.world.arrays import Array
 
 if TYPE_CHECKING:
     from planners.models.gtrs_dense import Ensemble
@@ -52,9 +55,24 @@ class EvaluatedPlanner:
 
     label: str  # names its folder and its rows
     digest: str  # the same digest plans the same
-    load: Callable[[], Any] | None = None  # with one of the faces above; None: privileged
+    load: Callable[[], Any] | None = None  # with one of the faces above; None: privileged or submitted
+    submitted: Mapping[str, Array] | None = None  # plans (40, 3) by NAVSIM's tokens, and nobody to ask for others
     privileged: Privileged | None = None
     spec: str = ""  # that named it
+
+    def made(self) -> Any:
+        """Who plans. Raises ConfigError where there are plans alone."""
+        if self.load is None:
+            raise ConfigError(f"planner={self.spec} plans nothing but what it holds: planners evaluate scores that")
+        return self.load()
+
+    def plans_of(self, tokens: Mapping[FrameKey, str], keys: Sequence[FrameKey]) -> dict[FrameKey, Array]:
+        """What it holds of these frames. Raises ConfigError for one that it lacks."""
+        assert self.submitted is not None
+        if lacking := [key for key in keys if tokens.get(key) not in self.submitted]:
+            named = f"token {tokens[lacking[0]]}" if lacking[0] in tokens else f"{lacking[0]}, which has no token"
+            raise ConfigError(f"planner={self.spec}: no plan for {len(lacking)} of {len(keys)} frames, such as {named}")
+        return {key: self.submitted[tokens[key]] for key in keys}
 
 
 def find_planner(spec: str, label: str | None = None, changed: Mapping[str, Any] | None = None) -> EvaluatedPlanner:
@@ -82,6 +100,8 @@ def _named(spec: str, label: str | None, changed: Mapping[str, Any] | None) -> E
         parts = [*map(checkpoint.planner_digest, newest), *([json.dumps(changed, sort_keys=True)] if changed else [])]
         digest = parts[0] if len(parts) == 1 else hashlib.sha256(" ".join(parts).encode()).hexdigest()[:16]
         return EvaluatedPlanner(name, digest, partial(_trained, newest, changed))
+    if spec.endswith(".pkl") and Path(spec).is_file():
+        return _submission(name, Path(spec))
     if ":" in spec:
         return _plugged(name, spec)
     known = [*PRIVILEGED, *UNTRAINED, *plugins_by_name("planner")]
@@ -92,6 +112,16 @@ def _named(spec: str, label: str | None, changed: Mapping[str, Any] | None) -> E
         f"planner={spec}: neither a folder nor one of {listed}{did_you_mean(spec, known)}; "
         "or name a class, my.module:MyPlanner"
     )
+
+
+def _submission(label: str, path: Path) -> EvaluatedPlanner:
+    from planners.navsim.submission import read_submission
+
+    try:
+        plans = read_submission(path)
+    except BadClip as error:
+        raise ConfigError(str(error)) from error
+    return EvaluatedPlanner(label, hashlib.sha256(path.read_bytes()).hexdigest()[:16], submitted=plans)
 
 
 def _plugged(label: str, spec: str) -> EvaluatedPlanner:

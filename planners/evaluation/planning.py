@@ -128,10 +128,12 @@ def all_plans(
     waiting = []
     for one, folder, identity in who:
         stored = read_plans(folder, identity)
-        if stored is None:
-            waiting.append((one, folder, identity))
-        else:
+        if stored is not None:
             plans[one.label] = stored
+        elif one.submitted is not None:
+            plans[one.label] = one.plans_of(benchmark.tokens, keys)
+        else:
+            waiting.append((one, folder, identity))
     for first in range(0, len(waiting), at_once):
         group = waiting[first : first + at_once]
         found = _planned(benchmark, keys, [one for one, _, _ in group], batch_size, device)
@@ -172,8 +174,7 @@ def _planned(
 def _loaded(one: EvaluatedPlanner, device: str) -> Any:
     from torch import nn
 
-    assert one.load is not None
-    made = one.load()
+    made = one.made()
     return made.to(device) if isinstance(made, nn.Module) else made
 
 

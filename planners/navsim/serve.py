@@ -78,9 +78,9 @@ def load_for_agent(
     except (RuntimeError, AssertionError) as error:  # the latter of a PyTorch without CUDA
         raise ConfigError(f"device={device}: {one_line(error)}") from error
     who = find_planner(planner, changed=changed)
-    if who.load is None:
+    if who.privileged is not None:
         raise ConfigError(f"planner={planner} plans from the log itself, which {shown_by} shows no agent")
-    made = who.load()
+    made = who.made()
     asked = needs_of(made)
     if asked is None:
         raise ConfigError(f"planner={planner} takes samples; for {shown_by} it must take batches (plan(batch), needs)")

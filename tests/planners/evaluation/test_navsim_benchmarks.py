@@ -8,11 +8,18 @@ import numpy as np
 import pytest
 import yaml
 
+from factory.config.compose import ConfigError
 from factory.datasets.navsim.commands import IN_DEVKIT
+from planners.drive.drivers import make_driver
+from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.evaluate import main
 from planners.evaluation.navsim import LONG, read_table, score_of_columns
 from planners.evaluation.navsim_check import solver_line
+from planners.evaluation.planner_names import find_planner
+from planners.evaluation.planning import read_plans
+from planners.navsim.submit import submission_bytes
 from tasks.reward.aggregate import COLUMNS
+from tasks.settings import PdmSettings
 from tasks.subscores import OF_ONE_PLAN
 from tests.factory.datasets.navsim.navsim_town import NOW, TOKENS, frames_of, write_installation
 
@@ -69,6 +76,37 @@ def test_navhard_and_navtest_are_one_command_each_and_made_once(
         monkeypatch.setenv("OPENSCENE_DATA_ROOT", str(root))
         assert main([word for word in words(root, name, out) if not word.startswith("data=")]) == 0
         assert "left out" not in capsys.readouterr().out
+
+
+def test_the_plans_that_an_agent_of_navsim_s_submitted_are_scored_as_the_agent(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of both stages, without asking it; a submission that lacks a scene is refused by the scene's token."""
+    assert main(words(root, "navhard", tmp_path)) == 0
+    tokens = BenchmarkFolder(str(tmp_path / "made" / "navhard")).tokens
+    made = read_plans(tmp_path / "out" / "constant_velocity")
+    assert made is not None
+    plans = {tokens[key]: plan[4::5].astype(np.float32) for key, plan in made.items()}
+    second = {token: plans.pop(token) for token in TOKENS}
+    submission = tmp_path / "submission.pkl"
+    submission.write_bytes(submission_bytes({}, plans, second))
+    asked = [word for word in words(root, "navhard", tmp_path) if not word.startswith("planner=")]
+    assert main([*asked, "planners={submitted: " + str(submission) + "}"]) == 0
+    mine, theirs = (
+        read_table(tmp_path / "out" / who / "navsim_filtered.csv") for who in ("constant_velocity", "submitted")
+    )
+    for stage in ("logged", "follow_ups"):
+        here, there = getattr(mine, stage), getattr(theirs, stage)
+        assert here.keys() == there.keys() and here
+        for token in here:  # float32 poses of the submission
+            np.testing.assert_allclose(here[token], there[token], atol=1e-5)
+    capsys.readouterr()
+    lacking = min(second)
+    submission.write_bytes(submission_bytes({}, plans, {t: plan for t, plan in second.items() if t != lacking}))
+    assert main([*asked, f"planner={submission}"]) == 2
+    assert f"no plan for 1 of {len(made)} frames, such as token {lacking}" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="plans nothing but what it holds"):
+        make_driver(find_planner(str(submission)), PdmSettings())
 
 
 def test_a_benchmark_of_other_files_is_not_taken_for_this_one(
