@@ -115,7 +115,7 @@ def _named(spec: str, label: str | None, changed: Mapping[str, Any] | None) -> E
 
 
 def _submission(label: str, path: Path) -> EvaluatedPlanner:
-    from planners.navsim.submission import read_submission
+    from planners.evaluation.submission import read_submission
 
     try:
         plans = read_submission(path)

@@ -25,6 +25,7 @@ from factory.readers.base import BadClip
 from factory.stages.sensors import decode_image
 from factory.wording import one_line
 from planners.data.batch import one_hot_command
+from planners.evaluation.submission import SAMPLING, TRAJECTORY
 from planners.navsim.agent import HISTORY
 from planners.navsim.serve import AgentObservation, AgentPlanner, CameraObservation
 from tasks.kernels.compiled import write_whole
@@ -174,10 +175,7 @@ class Trajectory:
     trajectory_sampling: TrajectorySampling
 
 
-PUBLIC_NAMES: Mapping[type, str] = {
-    Trajectory: "navsim.common.dataclasses Trajectory",
-    TrajectorySampling: "nuplan.planning.simulation.trajectory.trajectory_sampling TrajectorySampling",
-}
+PUBLIC_NAMES: Mapping[type, str] = {Trajectory: TRAJECTORY, TrajectorySampling: SAMPLING}
 
 
 def submission_bytes(

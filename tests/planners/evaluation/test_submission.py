@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from factory.readers.base import BadClip
-from planners.navsim.submission import read_submission
+from planners.evaluation.submission import read_submission
 
 
 @dataclass

@@ -12,11 +12,12 @@ import numpy as np
 
 from factory.readers.base import BadClip
 from factory.readers.pickles import Record, load_records
-from planners.navsim.submit import PUBLIC_NAMES
 from tasks.trajectories import COARSE_STEPS, at_ten_hz
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS
 
+TRAJECTORY = "navsim.common.dataclasses Trajectory"
+SAMPLING = "nuplan.planning.simulation.trajectory.trajectory_sampling TrajectorySampling"
 STAGES = ("predictions", "first_stage_predictions", "second_stage_predictions")
 STEPS = {0.5: COARSE_STEPS, 0.1: HORIZON_STEPS}  # poses of 4 s by the seconds between them
 
@@ -26,7 +27,7 @@ def read_submission(path: Path) -> dict[str, Array]:
 
     Of longer plans the first 4 s. Raises BadClip that names file and token.
     """
-    content = load_records(path.read_bytes(), str(path), PUBLIC_NAMES.values())
+    content = load_records(path.read_bytes(), str(path), (TRAJECTORY, SAMPLING))
     stages = content if isinstance(content, dict) else {}
     found = [stages[name] for name in STAGES if name in stages]
     if not found:
