@@ -192,7 +192,8 @@ def write_report(folder: Path) -> str:
     adjusted = holm([one.apart.p for one in held])
     write_csv(folder / "differences.csv", [one.row | {"p_holm": p} for one, p in zip(held, adjusted)])
     said = verdict(rows, held)
-    text = "\n".join([said, "", *_tables(rows, held), *_cluster_tables(rows, held)])
+    wrapped = [part for line in said.splitlines() for part in wrap(line, 120)]
+    text = "\n".join([*wrapped, "", *_tables(rows, held), *_cluster_tables(rows, held)])
     (folder / "ab.md").write_text(text + "\n", encoding="utf-8")
     (folder / "ab.svg").write_text(picture(rows, held), encoding="utf-8")
     return f"{text}\nlook at {folder / 'ab.md'} and ab.svg\n{said}"

@@ -72,7 +72,7 @@ def fit(
 
     Writes `losses.csv` (every step), `validation.csv`, TensorBoard events and checkpoints under `out`. validate: called
     in the first process alone. Raises Stopped after SIGINT or SIGTERM, with a checkpoint written; FloatingPointError,
-    with the step, where the loss is no number.
+    with the step, where the loss is NaN or infinite.
     """
     planner.to(process.device)
     optimiser = build_optimiser(training, planner)

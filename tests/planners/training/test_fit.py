@@ -315,7 +315,7 @@ WORTH = (0.5, 0.4, 0.7, 0.6, math.nan, 0.7, 0.9)  # after steps 2, 4, ...: three
 def test_a_training_that_gets_no_better_ends_at_the_same_step_whatever_interrupts(
     tmp_path: Path, stop_after: int | None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of EPDMS more is better, an equal value is none, nor is no number."""
+    """Of EPDMS more is better, an equal value is none, nor is NaN."""
     validate = in_turn(*WORTH)
 
     def go_on(batches: ToyBatches, resume: Path | None = None) -> None:
