@@ -70,7 +70,7 @@ def test_plans_of_both_eras_and_rates_are_at_10_hz_for_4_s(tmp_path: Path, proto
 
 class Runs:
     def __reduce__(self) -> Any:
-        return print, ("this ran",)
+        return exec, ("print('this ran')",)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ class Runs:
         ({"predictions": [{"t": plan(8, 0.4)}]}, "token t.*0.4 s apart"),
         ({"predictions": [{"t": plan(8, 0.5, np.nan)}]}, "token t.*not finite"),
         ({"predictions": [{"t": np.zeros((8, 3))}]}, "token t.*no Trajectory"),
-        ({"predictions": [{"t": Runs()}]}, "refused global builtins.print"),
+        ({"predictions": [{"t": Runs()}]}, "refused global builtins.exec"),
     ],
 )
 def test_what_holds_no_plans_is_refused_by_file_and_token(
