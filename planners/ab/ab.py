@@ -21,6 +21,8 @@ out of minutes, and the same command goes on.
 """
 
 import os
+import resource
+import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -39,6 +41,7 @@ from factory.graph.own_process import run_command_in_own_process
 from factory.graph.parallel import parallel_map
 from factory.graph.steps import TaskStopped
 from factory.store.location import Location
+from factory.wording import time_text
 from planners.ab.report import BASELINES, write_report
 from planners.ab.rows import DRIVE_SCHEMA, Trained, cluster_of, frames_of, write_ab_rows
 from planners.ab.settings import AbSettings, Arm, settings_of
@@ -58,7 +61,7 @@ from planners.training.many import (
     train_one,
 )
 
-EVALUATIONS, DRIVES, REPORT = "evaluations", "drives", "report"
+EVALUATIONS, DRIVES, REPORT, TOLD = "evaluations", "drives", "report", "commands.log"
 UNTRAINED = {"go_straight": "planners.models.baselines:GoStraight"}  # the other baselines are the commands' own bounds
 
 
@@ -143,10 +146,14 @@ def make_runs(settings: AbSettings) -> None:
 
 
 def _call(settings: AbSettings, *words: str) -> None:
-    """One command of this product in a process of its own. Raises Stopped, Failed."""
-    print(f"python -m {' '.join(words)}", file=sys.stderr)
-    with stop_event(settings.left_s) as stop:
-        code = run_process([sys.executable, "-m", *words], stop.is_set, environment=ONE_THREAD | os.environ)
+    """One command of this product in a process of its own; its tables go into a file. Raises Stopped, Failed."""
+    told = Path(settings.out) / TOLD
+    told.parent.mkdir(parents=True, exist_ok=True)
+    print(f"python -m {' '.join(words[:2])}: see {told}", file=sys.stderr)
+    with stop_event(settings.left_s) as stop, told.open("a") as file:
+        print(f"\n$ {shlex.join(('python', '-m', *words))}", file=file, flush=True)
+        command = [sys.executable, "-m", *words]
+        code = run_process(command, stop.is_set, file, environment=ONE_THREAD | os.environ)
         if code == INTERRUPTED or stop.is_set():
             raise Stopped("the same command goes on")
     if code:
@@ -196,7 +203,9 @@ def parts_of(folds: Sequence[frozenset[str]], logs: Sequence[Sequence[str]]) -> 
     ]
 
 
-def score(settings: AbSettings, trainings: Sequence[Training], parts: Sequence[Part]) -> None:
+def score(
+    settings: AbSettings, trainings: Sequence[Training], parts: Sequence[Part], executor: str | None = None
+) -> None:
     """Evaluate and drive these, each where it did not learn. Raises Stopped, Failed."""
     out = Path(settings.out)
     for part in parts:
@@ -206,8 +215,39 @@ def score(settings: AbSettings, trainings: Sequence[Training], parts: Sequence[P
         benchmark = f"benchmark={settings.table(settings.benchmark[part.benchmark])}"
         _call(settings, "planners", "evaluate", benchmark, *words, "tables=false", f"out={part.folder(out)}")
         if settings.drives:
-            how = [f"executor={settings.executor}", f"workers={settings.at_once}", f"out={out / DRIVES}"]
+            how = [f"executor={executor or settings.executor}", f"workers={settings.at_once}", f"out={out / DRIVES}"]
             _call(settings, "planners", "drive", *settings.drives[part.benchmark].split(), *how, *words)
+
+
+def cost_ahead(settings: AbSettings, trainings: Sequence[Training], parts: Sequence[Part]) -> str:
+    """What those to come will cost, by the first of each planner, which this makes and scores, here also on Ray.
+
+    Too much rather than too little: those of a seed start their evaluation and their drives together.
+    Raises Stopped, Failed.
+    """
+    out, total_s, told = Path(settings.out), 0.0, list[str]()
+    left = [one for one in trainings if not is_done(out, one)]
+    score(settings, [], parts, "local")  # baselines, which are driven once for all
+    for name in settings.planners:
+        if mine := [one for one in left if one.facts["planner"] == name]:
+            began_s = _spent_s()
+            train_all(mine[:1], out, settings)
+            trained_s = _spent_s()
+            score(settings, mine[:1], [part for part in parts if part.fold == mine[0].facts["fold"]], "local")
+            each_s = trained_s - began_s, _spent_s() - trained_s
+            told.append(f"{len(mine) - 1} of {name}, {each_s[0]:.0f} CPU s to train and {each_s[1]:.0f} to score each")
+            total_s += (len(mine) - 1) * sum(each_s)
+    return (
+        f"still to train: {'; '.join(told) or 'none'}: at most {time_text(total_s)} of CPU, "
+        f"{time_text(total_s / settings.at_once)} at {settings.at_once} at once (less: arms.<name>=null or seeds=; "
+        "in parts: minutes=)"
+    )
+
+
+def _spent_s() -> float:
+    """CPU seconds of all processes that were waited for."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return children.ru_utime + children.ru_stime
 
 
 def report(
@@ -283,13 +323,14 @@ def experiment(settings: AbSettings) -> None:
     done: list[Training] = []
     stopped = None
     try:
+        print(cost_ahead(settings, wanted, parts), file=sys.stderr)
         for seed, batch in groupby(wanted, key=lambda one: one.facts["seed"]):
             mine, began = list(batch), time.monotonic()
             train(settings, mine)
             score(settings, mine, parts)
             done += mine
-            took = (time.monotonic() - began) / 60.0
-            print(f"seed {seed}: {took:.1f} minutes; {settings.seeds - seed - 1} more are to come", file=sys.stderr)
+            took = time_text(time.monotonic() - began)
+            print(f"seed {seed}: {took}; {settings.seeds - seed - 1} more are to come", file=sys.stderr)
     except Stopped as error:
         stopped = error
     if done:

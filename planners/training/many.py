@@ -110,7 +110,7 @@ def train_one(training: Training, out: Path, stop: Callable[[], bool] = lambda: 
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "planners", "train", *training.overrides, f"out={folder}"]
     with (folder / LOG).open("w") as log:
-        code = run_process(command, stop, log, ONE_THREAD | os.environ)
+        code = run_process(command, stop, log, log, ONE_THREAD | os.environ)
     if stop() and code == -signal.SIGTERM:  # it had not begun yet
         return INTERRUPTED
     if code == 0:
@@ -121,14 +121,17 @@ def train_one(training: Training, out: Path, stop: Callable[[], bool] = lambda: 
 def run_process(
     command: Sequence[str],
     stop: Callable[[], bool],
-    log: TextIO | None = None,
+    stdout: TextIO | None = None,
+    stderr: TextIO | None = None,
     environment: Mapping[str, str] | None = None,
 ) -> int:
     """Of a process, which is asked to end as soon as `stop` says so, and then waited for.
 
     Its session is its own: what a terminal sends reaches it through `stop` alone, and once.
     """
-    child = subprocess.Popen(command, stdout=log, stderr=log, env=environment, start_new_session=True)  # noqa: S603
+    child = subprocess.Popen(  # noqa: S603
+        command, stdout=stdout, stderr=stderr, env=environment, start_new_session=True
+    )
     asked = False
     while True:
         try:

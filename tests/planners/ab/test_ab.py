@@ -1,6 +1,7 @@
 """What arms learn from, what is held out, and what the report makes of rows that are made up."""
 
 import csv
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,6 +22,7 @@ from planners.evaluation.compare import CompareSettings, compare
 from planners.evaluation.score_rows import FrameRow, write_rows
 from tests.planners.made_rows import clip_rows
 from tests.planners.samples import sample, write_table
+from tests.planners.small_benchmark import write_benchmark_folder
 
 ROOT = Path(__file__).parents[3]
 KEPT = ROOT / "experiments" / "study" / "frames" / "towns.parquet"
@@ -87,6 +89,30 @@ def test_arms_come_and_go_on_the_command_line(tmp_path: Path) -> None:
             settings_of([word])
     (tmp_path / "mine.yaml").write_text("[1]")
     assert main([str(tmp_path / "mine.yaml")]) == main([str(tmp_path / "none.yaml")]) == 2
+
+
+def test_an_experiment_says_its_cost_by_its_first_training_and_goes_on(
+    table: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_benchmark_folder(table / "b")
+    file = table / "mine.yaml"
+    file.write_text(
+        f"{{out: {table}/out, real: [{table}/t], benchmark: [{table}/b], planners: {{mlp: planner=ego_mlp_small}}, "
+        f"train: planner.training.batch_size=2 workers=1, steps: 2, seeds: 1, "
+        f"arms: {{real: {{}}, pdm_closed: {{sim: [{table}/t], experts: [pdm_closed]}}}}}}"
+    )
+    assert main([str(file), "minutes=0.0001"]) == 4, "nothing was begun"
+    assert main([str(file)]) == 0
+    ahead = re.search(
+        r"still to train: 1 of mlp, (\d+) CPU s to train and (\d+) to score each: at most (\d+) s of CPU",
+        (told := capsys.readouterr()).err,
+    )
+    assert ahead and 0 < int(ahead[3]) <= int(ahead[1]) + int(ahead[2]) + 1
+    assert "pdm_closed against real, mlp, 1 seed: two-stage EPDMS" in told.out.splitlines()[-1]
+    assert "follow_ups is the plain mean" in (table / "out" / "commands.log").read_text(), "the commands' own tables"
+    assert main([str(file)]) == 0
+    again = capsys.readouterr()
+    assert "still to train: none" in again.err and again.out == told.out
 
 
 def frames_of(bonus: float) -> list[FrameRow]:
