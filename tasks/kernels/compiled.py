@@ -132,6 +132,7 @@ class KernelCache:
     def __init__(self, function: Callable[..., Any]) -> None:
         code = function.__code__
         self._source = Path(code.co_filename).resolve()
+        self._module = function.__module__  # what is kept names it, and one file may be loaded under two names
         self._name = f"{function.__qualname__.replace('<locals>.', '')}-{code.co_firstlineno}"
         # Of a function inside another one, what it takes from there is compiled in.
         cells = [cell.cell_contents for cell in function.__closure__ or ()]
@@ -143,7 +144,7 @@ class KernelCache:
         if any(self._source.is_relative_to(_ROOT / package) for package in _PACKAGES):
             return str(cache_dir() / self._source.relative_to(_ROOT).with_suffix(""))
         content = hashlib.sha256(self._source.read_bytes()).hexdigest()[:16]
-        return str(cache_dir() / "elsewhere" / f"{self._source.stem}-{content}")
+        return str(cache_dir() / "elsewhere" / f"{self._module}-{content}")
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """The form compiled for `signature`; None where there is none."""

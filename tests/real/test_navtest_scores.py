@@ -15,7 +15,15 @@ from tasks.subscores import OF_ONE_PLAN, RECORDS, TOTAL_WEIGHT, multiplier_produ
 from tests.tasks.rollout.test_profiles import fitted
 
 LONG_NAME = {record.name: record.long_name for record in RECORDS}
+HOW = ("stock", "fallback")
 BY_200_DIGITS_MPS = 12.533835468245853
+
+
+def published(shared_root: Path, name: str) -> list[dict[str, str]]:
+    """The rows of every token, and their average last."""
+    path = shared_root / "reference" / "navtest_scores" / f"{name}_reactive.csv.gz"
+    with gzip.open(path, "rt", newline="") as file:
+        return list(csv.DictReader(file))
 
 
 @pytest.mark.parametrize(
@@ -28,8 +36,7 @@ BY_200_DIGITS_MPS = 12.533835468245853
     ],
 )
 def test_every_token_s_score_is_the_formula_of_its_own_columns(shared_root: Path, name: str, mean: float) -> None:
-    with gzip.open(shared_root / "reference" / "navtest_scores" / f"{name}_reactive.csv.gz", "rt", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = published(shared_root, name)
     *tokens, average = rows
     assert len(tokens) == 12_146 and not average["frame_type"]
     columns = {name: np.array([float(row[LONG_NAME[name]]) for row in rows]) for name in OF_ONE_PLAN}
@@ -38,6 +45,15 @@ def test_every_token_s_score_is_the_formula_of_its_own_columns(shared_root: Path
     np.testing.assert_allclose(ours[:-1], scores[:-1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(scores[:-1].mean(), scores[-1], rtol=0, atol=1e-12)
     assert scores[-1] == pytest.approx(mean, abs=5e-5)
+
+
+def test_the_lost_speed_costs_collisions_and_never_the_road(shared_root: Path) -> None:
+    stock, cured = ({row["token"]: row for row in published(shared_root, f"human_replay_{how}")[:-1]} for how in HOW)
+    lost = {
+        name: sum(float(stock[token][LONG_NAME[name]]) == 0.0 < float(cured[token][LONG_NAME[name]]) for token in stock)
+        for name in ("nc", "dac")
+    }
+    assert stock.keys() == cured.keys() and lost == {"nc": 944, "dac": 0}
 
 
 def test_the_speed_that_navsim_s_solver_loses_is_found(shared_root: Path) -> None:

@@ -100,7 +100,7 @@ def squared(x):
     return x * x
 """
 CALL_IT = """
-from tasks.squares import squared
+from {module} import squared
 assert squared({argument}) == 9
 print(sum(squared.stats.cache_hits.values()), sum(squared.stats.cache_misses.values()))
 """
@@ -116,10 +116,10 @@ def copy_with_one_kernel(folder: Path) -> Path:
     return folder
 
 
-def calling(project: Path, argument: str, **environment: str) -> "subprocess.Popen[str]":
-    env = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"} | environment
-    env |= {"PYTHONPATH": str(project)}
-    command = [sys.executable, "-c", CALL_IT.format(argument=argument)]
+def calling(project: Path, argument: str, module: str = "tasks.squares", **environment: str) -> "subprocess.Popen[str]":
+    env = {key: value for key, value in os.environ.items() if key not in ("NUMBA_CACHE_DIR", "PYTHONPATH")}
+    env |= {"PYTHONPATH": str(project)} | environment
+    command = [sys.executable, "-c", CALL_IT.format(argument=argument, module=module)]
     return subprocess.Popen(command, env=env, cwd=project, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
@@ -138,6 +138,19 @@ def test_a_copy_of_the_project_elsewhere_compiles_nothing_again(tmp_path: Path, 
     with (second / "tasks" / "squares.py").open("a") as file:
         file.write("LIMIT = 3.0\n")
     assert hits_and_misses(second, **where) == "0 1"
+
+
+@pytest.mark.slow
+def test_a_user_s_kernel_whose_file_goes_by_two_names_is_found_under_each(tmp_path: Path) -> None:
+    """What is kept names its module, which the next process need not be able to import."""
+    project, where = copy_with_one_kernel(tmp_path / "project"), {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    (project / "mine").mkdir()
+    (project / "mine" / "cubes.py").write_text(SQUARED)
+    folders = {"mine.cubes": project, "cubes": project / "mine"}  # by name, what it is imported from
+    for found in ("0 1", "1 0"):
+        for module, folder in folders.items():
+            path = os.pathsep.join(map(str, dict.fromkeys((folder, project))))
+            assert hits_and_misses(project, module=module, PYTHONPATH=path, **where) == found
 
 
 @pytest.mark.slow
