@@ -1,7 +1,7 @@
 """The public evaluation's reactive traffic, to the letter: `traffic=navsim` (docs/reward.md 5)."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -122,6 +122,7 @@ def _point(line: shapely.LineString, at: float) -> tuple[float, float]:
 
 SNAP_M = 3.0  # idm_snap_threshold
 STANDS_BELOW_MPS = 0.1
+MOST_SHAPES = 4096  # kept of a scene, some 2 kB each
 WIDER = 1.05  # than half of what is as wide: GEOS simplifies a line before it widens it
 
 
@@ -162,6 +163,9 @@ class NavsimAgents:
     staying_bodies: NDArray[np.object_]  # (F,) their boxes
     staying_touch: Bools  # (F, F) whether two of them touch
     staying_meet: Bools  # (F, A) whether an agent can ever touch one; False: surely not
+    # What GEOS made of somebody in a place, by how often it was simplified: whom the ego does not disturb is in the
+    # same places around the next one.
+    shapes: dict[tuple[float, ...], dict[int, shapely.Geometry]] = field(default_factory=dict, compare=False)
 
 
 @dataclass(frozen=True)
@@ -661,7 +665,6 @@ class _AskedOfGeos:
 
     def __init__(self, agents: NavsimAgents, now: Driving, headway_s: float) -> None:
         self.agents, self.now, self.headway_s = agents, now, headway_s
-        self._stages: dict[int, tuple[tuple[float, ...], list[shapely.Geometry]]] = {}  # and what the first was made of
 
     def leader_and_gap(self, k: int, away: Array) -> tuple[int, float]:
         """Whose footprint in the strip ahead of agent k is the nearest to its own, or NOBODY; and how far that is [m].
@@ -696,16 +699,21 @@ class _AskedOfGeos:
         if self.now.firm[j]:
             return shapely.polygons(self.now.ring[j, :2, : self.now.corners[j]].T + self.agents.drivers.origin)
         at_start = self.now.made_at[j] == 0
-        key = (at_start, *self.now.box[j], self.now.speed[j])
-        if j not in self._stages or self._stages[j][0] != key:
-            self._stages[j] = key, [self._footprint(j, at_start)]
-        stages = self._stages[j][1]
-        times = int(self.now.looks[0] - self.now.made_at[j])
-        while len(stages) <= times and (len(stages) < 2 or stages[-1] is not stages[-2]):
-            simpler = shapely.simplify(stages[-1], SIMPLE_M, preserve_topology=True)
-            fewer = shapely.get_num_coordinates(simpler) < shapely.get_num_coordinates(stages[-1])
-            stages.append(simpler if fewer else stages[-1])
-        return stages[min(times, len(stages) - 1)]
+        at = *self.now.box[j].tolist(), self.now.progress[j] if j < len(self.agents.driven) else 0.0, self.now.speed[j]
+        key = (j, at_start, *map(float, at))
+        if key not in (shapes := self.agents.shapes):
+            if len(shapes) >= MOST_SHAPES:
+                shapes.clear()
+            shapes[key] = {0: self._footprint(j, at_start)}
+        made, looks = shapes[key], int(self.now.looks[0] - self.now.made_at[j])
+        for times in range(1, looks + 1):
+            if times not in made:
+                simpler = shapely.simplify(made[times - 1], SIMPLE_M, preserve_topology=True)
+                fewer = shapely.get_num_coordinates(simpler) < shapely.get_num_coordinates(made[times - 1])
+                made[times] = simpler if fewer else made[times - 1]
+            if made[times] is made[times - 1]:
+                return made[times]
+        return made[looks]
 
     def _footprint(self, j: int, at_start: bool) -> shapely.Geometry:
         """The body and the strip that is covered in the next headway; of the ego, and of all at first, the body."""

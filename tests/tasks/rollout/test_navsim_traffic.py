@@ -76,6 +76,16 @@ def test_geos_is_asked_about_fewer_than_half_of_the_looks() -> None:
     assert 0 < asked < 0.5 * looks, (asked, looks)
 
 
+def test_what_geos_made_around_one_ego_changes_nothing_around_the_next() -> None:
+    for one, _ in recorded():
+        egos = [one.ego_states + np.pad([shift, 0.0], (0, 9)) for shift in (0.0, 3.0, -5.0)]
+        shared = prepare_traffic(one.scene, NAVSIM)
+        for states in (*egos, egos[0]):
+            alone, again = (roll_out(of, states).agents for of in (prepare_traffic(one.scene, NAVSIM), shared))
+            assert again.boxes.tobytes() == alone.boxes.tobytes() and np.array_equal(again.valid, alone.valid)
+        assert shared.navsim is not None and shared.navsim.shapes
+
+
 def test_far_from_the_map_s_origin_the_traffic_is_the_same() -> None:
     """Where numbers are rounded to 5e-10 m, as in the public maps."""
     one, far = crowd(worlds.fork(), 3, (5, 12)), np.array([664430.0, 3997650.0])
