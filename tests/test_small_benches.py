@@ -1,4 +1,4 @@
-"""Benches of a run and its tables, at their smallest: they run, and print the rows that docs/capacity.md quotes."""
+"""Benches at their smallest: they run, and print the rows that README and docs quote."""
 
 from pathlib import Path
 
@@ -23,6 +23,13 @@ def test_a_run_of_waiting_stages_is_made_and_then_found(capsys: pytest.CaptureFi
     head, row = (line.split() for line in capsys.readouterr().out.splitlines()[-2:])
     assert head[:3] == ["nodes", "found", "attempts"]
     assert row[:2] == ["1", "0"] and int(row[2]) >= 40
+
+
+def test_a_driver_keeps_simulated_nodes_at_work(capsys: pytest.CaptureFixture[str]) -> None:
+    how = bench_scale.Request(nodes="1,2", cpus=2, attempts=80, wait_ms=500, row_kb=0, simulated=True)
+    bench_scale.main(how)
+    rates = [float(line.split()[3]) for line in capsys.readouterr().out.splitlines() if line.startswith("    ")][-2:]
+    assert 2.0 < rates[0] <= 4.4 and 1.5 < rates[1] / rates[0] < 2.3
 
 
 def test_a_run_s_parts_come_to_its_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -89,6 +89,26 @@ def test_a_reader_s_clips_get_the_scores_of_trajectories(tmp_path: Path) -> None
         write_bank(tmp_path / "bank", reader, refs[:1])
 
 
+def test_processes_write_the_shards_of_one_and_go_on_after_an_interruption(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("factory.readers.bank.SHARD", 1)
+    for log in ("one", "two", "three"):
+        write_log(tmp_path / "logs" / log)
+    reader = CsvReader(tmp_path / "logs")
+    refs = reader.index().refs
+    alone, together = tmp_path / "alone", tmp_path / "together"
+    assert write_bank(alone, reader, refs) == write_bank(together, reader, refs, processes=2) == {}
+    whole = {path.name: path.read_bytes() for path in alone.iterdir()}
+    assert whole == {path.name: path.read_bytes() for path in together.iterdir()} and len(whole) == 2 * len(refs)
+    kept = (together / "scenes-00000.json").stat().st_mtime_ns
+    (together / "scenes-00001.json").unlink()  # killed before the head, which is written last
+    (together / "scenes-00001.bank").write_bytes(b"half")
+    write_bank(together, reader, refs, processes=2)
+    assert whole == {path.name: path.read_bytes() for path in together.iterdir()}
+    assert kept == (together / "scenes-00000.json").stat().st_mtime_ns, "what was whole is not written again"
+
+
 def test_what_is_no_drive_or_no_scene_is_refused_by_name(bank: SceneBank) -> None:
     poses = np.zeros((1, 2, 8, 3))
     assert bank.score(["3"], poses[:, :0]).score.shape == (1, 0)
