@@ -1,10 +1,27 @@
 """Benches at their smallest: they run, and print the rows that README and docs quote."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
+import torch
 
-from tests.bench import bench_run, bench_scale, bench_store
+from factory.datasets.town.settings import TownSettings
+from factory.datasets.town.town import write_logs
+from tests.bench import (
+    bench_bank,
+    bench_decoding,
+    bench_planner_steps,
+    bench_render,
+    bench_reward,
+    bench_rollout,
+    bench_run,
+    bench_scale,
+    bench_store,
+    bench_traffic,
+)
+from tests.tasks.rollout.test_navsim_traffic import recorded
 
 pytestmark = pytest.mark.slow
 
@@ -40,3 +57,39 @@ def test_a_run_s_parts_come_to_its_whole(tmp_path: Path, capsys: pytest.CaptureF
     cost = {name.strip(): float(cpu_s) for name, cpu_s in rows}
     parts = cost["imports"] + cost["start-up"] + cost["tasks and tables"] + cost["end"]
     assert parts == pytest.approx(cost["whole"], abs=0.03) and cost["again"] > 0.0
+
+
+STEPS_OF = partial(bench_planner_steps.main, ["gtrs_dense_public"], torch.device("cpu"), 1, 1, 8, 0.3, True)
+
+
+@pytest.mark.parametrize(
+    ("bench", "rows", "says"),
+    [
+        pytest.param(lambda at: bench_bank.main(at, (4,), 2000, 1), 1, "2,000 scenes opened", id="bank"),
+        pytest.param(lambda at: bench_decoding.main(2, 1, 3, 128, 32), 5, "a kept picture: 0.01 MB", id="decoding"),
+        pytest.param(lambda at: STEPS_OF(), 3, "`gtrs_dense_public` | H100 SXM", id="planner_steps"),
+        pytest.param(lambda at: bench_render.main(None, 1, 500, 1), 2, "| seeded | 500 |", id="render"),
+        pytest.param(lambda at: bench_reward.main(at, (2,)), 1, "| synthetic town | 2 |", id="reward"),
+        pytest.param(lambda at: rollout_of_a_town(at), 4, "| idm |", id="rollout"),
+    ],
+)
+def test_a_bench_prints_its_rows(
+    bench: Callable[[Path], None], rows: int, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench(tmp_path)
+    printed = capsys.readouterr().out
+    lines = [line for line in printed.splitlines() if line.startswith("| ")]
+    heads = printed.count("\n|---")
+    assert len(lines) - heads >= rows and says in printed, printed
+
+
+def rollout_of_a_town(folder: Path) -> None:
+    write_logs(folder, range(1), 0, TownSettings(cameras=(), lidar_beams=0))
+    bench_rollout.main(folder)
+
+
+def test_the_bench_of_traffic_finds_no_difference_from_a_recorded_answer() -> None:
+    one, answer = next(recorded())
+    theirs = {name.removeprefix("public_"): values for name, values in answer.items()} | {"seconds": 1.0}
+    cells = bench_traffic.line(one, theirs).split(" | ")
+    assert float(cells[3]) < 1e-9 and float(cells[4]) < 1e-9 and cells[5] == "0"

@@ -12,6 +12,7 @@ PEER=<python of an environment with the packages navsim and nuplan-devkit> also 
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.readers.bank import write_scenes
-from tasks.bank import HEAD, SceneBank, pack_prepared
+from tasks.bank import BODY, FORMAT, HEAD, SceneBank, pack_prepared
 from tasks.caches import json_with_checksum
 from tasks.reward.epdms import score
 from tasks.rollout.lqr import track
@@ -32,18 +33,19 @@ from tests.bench.timing import least_and_median_cpu_ms, memory_mb
 from tests.real.reference_scenes import SCENES, loader
 
 B, SIZES, MANY, IN_SHARD, STEPS = 64, (16, 64, 256), 100_000, 1024, 3
+TOGETHER = 64  # plans of a scene in memory, threads and training
 Plans = NDArray[np.float64]
 
 
-def main(root: Path) -> None:
-    """Prints one table, then lines."""
+def main(root: Path, sizes: Sequence[int] = SIZES, many: int = MANY, steps: int = STEPS) -> None:
+    """Prints one table, a row for each of `sizes` plans a scene, then lines: of `steps` of training, `many` scenes."""
     has_recorded = (root / "reference").is_dir()
     if not has_recorded:
         print(f"no recorded scenes at {root}: a synthetic one instead", file=sys.stderr)
     scenes = {name: recorded_scene(root, name) for name in SCENES} if has_recorded else {"town": town_scene()}
+    most = max(*sizes, TOGETHER)
     proposals = {
-        name: loader(root).proposals(name, SIZES[-1]) if has_recorded else kinematic_trajectories(SIZES[-1], 0)
-        for name in scenes
+        name: loader(root).proposals(name, most) if has_recorded else kinematic_trajectories(most, 0) for name in scenes
     }
     with tempfile.TemporaryDirectory() as folder:
         bank = bank_of(scenes, Path(folder))
@@ -53,15 +55,15 @@ def main(root: Path) -> None:
         print("| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
         for name, scene in scenes.items():
             same = recorded_are(bank, name, proposals[name], root) if has_recorded else "-"
-            for p in SIZES:
+            for p in sizes:
                 print(
                     f"| {name} | {bank.n_bytes(name) / 1e3:.0f} "
                     + timed(bank, name, scene, proposals[name][:p], same, peer)
                 )
         print_memory_and_threads(bank, proposals)
-        print_training(bank, proposals)
+        print_training(bank, proposals, steps)
     with tempfile.TemporaryDirectory() as folder:
-        print_opening(Path(folder))
+        print_opening(Path(folder), many)
 
 
 def bank_of(scenes: dict[str, BenchScene], folder: Path) -> SceneBank:
@@ -111,7 +113,7 @@ def batch_of(bank: SceneBank, proposals: dict[str, Plans], p: int) -> tuple[list
 
 def print_memory_and_threads(bank: SceneBank, proposals: dict[str, Plans]) -> None:
     """What a call of 64 x 64 plans adds to the process, and its wall time by threads."""
-    ids, plans = batch_of(bank, proposals, 64)
+    ids, plans = batch_of(bank, proposals, TOGETHER)
     bank.score(ids, plans)
     before = memory_mb("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew here
@@ -127,23 +129,23 @@ def print_memory_and_threads(bank: SceneBank, proposals: dict[str, Plans]) -> No
         print(f"{threads} thread(s): {1e3 * np.median(times):.1f} ms, {1.0 / each_s:,.0f} plans/s")
 
 
-def print_opening(folder: Path) -> None:
+def print_opening(folder: Path, many: int) -> None:
     """How long a bank takes to be opened whose bodies are holes of the right size."""
-    for number, first in enumerate(range(0, MANY, IN_SHARD)):
-        n = min(IN_SHARD, MANY - first)
-        head = {"format": 1, "clip_ids": [f"{first + i:016x}" for i in range(n)], "crc32": [2**31] * n, "left_out": {}}
-        head["ends"] = [85_000 * i for i in range(n + 1)]
+    for number, first in enumerate(range(0, many, IN_SHARD)):
+        n = min(IN_SHARD, many - first)
+        ids, ends = [f"{first + i:016x}" for i in range(n)], [85_000 * i for i in range(n + 1)]
+        head = {"format": FORMAT, "clip_ids": ids, "ends": ends, "crc32": [2**31] * n, "left_out": {}, "tokens": {}}
         path = folder / HEAD.replace("*", f"{number:05}")
         path.write_text(json_with_checksum(head))
-        with path.with_suffix(".bank").open("wb") as body:
-            body.truncate(85_000 * n)
+        with path.with_suffix(BODY).open("wb") as body:
+            body.truncate(ends[-1])
     begun, before = time.perf_counter(), memory_mb("VmRSS")
     bank = SceneBank(folder)
     seconds = time.perf_counter() - begun
     print(f"{len(bank):,} scenes opened in {seconds:.2f} s, {memory_mb('VmRSS') - before:.0f} MB")
 
 
-def print_training(bank: SceneBank, proposals: dict[str, Plans]) -> None:
+def print_training(bank: SceneBank, proposals: dict[str, Plans], steps: int) -> None:
     """Steps of 64 scenes x 64 proposals with the reward of the step's own proposals and without, in turns.
 
     CPU time, and what of it the reward's call took: other programs' load moves whole steps by more than that.
@@ -153,7 +155,7 @@ def print_training(bank: SceneBank, proposals: dict[str, Plans]) -> None:
     class Head(torch.nn.Module):
         def __init__(self) -> None:
             super().__init__()
-            self.queries = torch.nn.Parameter(torch.randn(64, 256))
+            self.queries = torch.nn.Parameter(torch.randn(TOGETHER, 256))
             self.plan, self.judge = (decoder() for _ in range(2))
             self.to_poses, self.to_scores = torch.nn.Linear(256, 24), torch.nn.Linear(256, 8)
             self.from_poses = torch.nn.Linear(24, 256)
@@ -170,7 +172,7 @@ def print_training(bank: SceneBank, proposals: dict[str, Plans]) -> None:
     torch.manual_seed(0)
     planner = Head()
     optimizer = torch.optim.AdamW(planner.parameters(), 1e-4)
-    ids, plans = batch_of(bank, proposals, 64)
+    ids, plans = batch_of(bank, proposals, TOGETHER)
     anchors, tokens = torch.from_numpy(plans).float(), torch.randn(B, 64, 256)
 
     def step(with_reward: bool) -> tuple[float, float]:
@@ -188,7 +190,7 @@ def print_training(bank: SceneBank, proposals: dict[str, Plans]) -> None:
         return time.process_time() - begun, took
 
     step(True)
-    turns = [(step(False), step(True)) for _ in range(STEPS)]
+    turns = [(step(False), step(True)) for _ in range(steps)]
     without, (with_it, reward) = (min(times) for times in zip(*turns))
     size = sum(p.numel() for p in planner.parameters()) / 1e6
     print(f"a head of {size:.1f} M, CPU s of a step: without {without[0]:.2f}, with the reward {with_it:.2f}, ", end="")

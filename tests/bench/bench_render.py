@@ -21,7 +21,7 @@ from tests.bench.timing import cpu_milliseconds, milliseconds
 WIDTH, HEIGHT = 480, 270
 INTRINSICS = np.array([[0.6 * WIDTH, 0.0, WIDTH / 2], [0.0, 0.6 * WIDTH, HEIGHT / 2], [0.0, 0.0, 1.0]])
 SIGMA_PX = 2.155  # gives 3.6 tiles per Gaussian
-REPEATS = 15
+REPEATS, IN_CLOUD = 15, 100_000
 BLACK = np.zeros(3, np.float32)
 EYE_M = 1.6
 
@@ -62,7 +62,7 @@ def street_view(scene: Path) -> tuple[Gaussians, NDArray[np.float64]]:
     return street, best
 
 
-def row(name: str, scene: Gaussians, camera: NDArray[np.float64], threads: int) -> None:
+def row(name: str, scene: Gaussians, camera: NDArray[np.float64], threads: int, repeats: int) -> None:
     """Prints the scene's two lines of the table, there and there and back."""
     view = (scene, INTRINSICS, camera, WIDTH, HEIGHT, BLACK, threads)
     record = forward(*view)
@@ -72,17 +72,17 @@ def row(name: str, scene: Gaussians, camera: NDArray[np.float64], threads: int) 
         ("and backward", lambda: backward(forward(*view), scene, upstream, threads=threads)),
     ]
     for what, call in calls:
-        times = f"{milliseconds(call, REPEATS):.0f} | {cpu_milliseconds(call, REPEATS):.0f}"
+        times = f"{milliseconds(call, repeats):.0f} | {cpu_milliseconds(call, repeats):.0f}"
         print(f"| {name} | {len(scene):,} | {len(record.splats.index):,} | {what} | {times} |", flush=True)
 
 
-def main(scene: Path | None = None, threads: int = 2) -> None:
+def main(scene: Path | None = None, threads: int = 2, in_cloud: int = IN_CLOUD, repeats: int = REPEATS) -> None:
     """Prints the table; the second row only where a scene file is given."""
     print(f"\nrasteriser, {WIDTH}x{HEIGHT}, {threads} threads, load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     print("\n| scene | Gaussians | in view | what | ms | CPU ms |\n|---|---|---|---|---|---|")
-    row("seeded", cloud(100_000), np.eye(4), threads)
+    row("seeded", cloud(in_cloud), np.eye(4), threads, repeats)
     if scene is not None:
-        row(scene.stem, *street_view(scene), threads)
+        row(scene.stem, *street_view(scene), threads, repeats)
 
 
 if __name__ == "__main__":

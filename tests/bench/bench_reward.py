@@ -12,6 +12,7 @@ trajectories in turns with ours and says whether the scores are equal; without i
 
 import multiprocessing
 import sys
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -127,7 +128,7 @@ def town_row(k: int, peer: str | None) -> Row:
     return measured(town_scene(), kinematic_trajectories(k, 0), peer)
 
 
-def main(root: Path) -> None:
+def main(root: Path, sizes: Sequence[int] = SIZES) -> None:
     """Prints the table, row by row."""
     peer = peer_python()
     columns = [
@@ -147,11 +148,11 @@ def main(root: Path) -> None:
     with ProcessPoolExecutor(1, mp_context=context, max_tasks_per_child=1) as pool:
         if (root / "reference").is_dir():
             rows = [
-                (name, k, (recorded_row, root, name, k, peer)) for k in SIZES for name in SCENES if _recorded(name, k)
+                (name, k, (recorded_row, root, name, k, peer)) for k in sizes for name in SCENES if _recorded(name, k)
             ]
         else:
             print(f"no recorded scenes at {root}: a synthetic one instead", file=sys.stderr)
-            rows = [("synthetic town", k, (town_row, k, peer)) for k in SIZES]
+            rows = [("synthetic town", k, (town_row, k, peer)) for k in sizes]
         for name, k, job in rows:
             row: Row = pool.submit(*job).result()
             least, median = (1e3 * (a + b) / k for a, b in zip(row.simulate_ms, row.score_ms))
