@@ -57,6 +57,7 @@ def test_a_run_s_parts_come_to_its_whole(tmp_path: Path, capsys: pytest.CaptureF
     cost = {name.strip(): float(cpu_s) for name, cpu_s in rows}
     parts = cost["imports"] + cost["start-up"] + cost["tasks and tables"] + cost["end"]
     assert parts == pytest.approx(cost["whole"], abs=0.03) and cost["again"] > 0.0
+    assert cost[bench_run.SAMPLES] == pytest.approx(3600.0 / cost["whole"], rel=0.01)  # of the clip's one sample
 
 
 STEPS_OF = partial(bench_planner_steps.main, ["gtrs_dense_public"], torch.device("cpu"), 1, 1, 8, 0.3, True)

@@ -3,10 +3,12 @@
     python -m tests.bench.bench_run [turns=3] [other=<checkout>] clips=av2 clips.root=<logs> ... render=none
 
 The other words are those of `factory.run`, without `out` and `executor`. CPU seconds of the cheapest of the turns; with
-`other` the two take turns, and their rows are held against each other, column by column.
+`other` the two take turns, and their rows are held against each other, column by column. A checkout from before stages
+counted CPU seconds has none by stage.
 """
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -19,17 +21,19 @@ from deltalake import DeltaTable
 
 TOWN = ["clips=synthetic", "rounds=3", "render=none"]  # where no run is named
 HERE = Path(__file__).resolve().parents[2]
-Costs = dict[str, float]  # CPU seconds by part
+SAMPLES = "samples per core-hour"
+Costs = dict[str, float]  # CPU seconds by part, and SAMPLES
 
 
 def measured(tree: Path, words: Sequence[str], out: Path) -> Costs:
     """A run of the checkout `tree`, and the same command again. Raises SystemExit with the run's last words."""
     first, again = (_costs_of(tree, [*words, f"out={out}"]) for _ in range(2))
-    stages = json.loads((out / "last_run.json").read_text())["seconds"]
-    parts = {f"  {stage}": times.get("cpu_seconds", times["seconds"]) for stage, times in stages.items()}
+    last = json.loads((out / "last_run.json").read_text())
+    parts = {f"  {stage}": times.get("cpu_seconds", math.nan) for stage, times in last["seconds"].items()}
     cost = {part: first[part] for part in ("imports", "start-up", "tasks and tables")} | parts
     cost["  no stage's"] = first["tasks and tables"] - sum(parts.values())
-    return cost | {"end": first["end"], "whole": sum(first.values()), "again": sum(again.values())}
+    cost |= {"end": first["end"], "whole": sum(first.values()), "again": sum(again.values())}
+    return cost | {SAMPLES: 3600.0 * last["counts"]["accepted"] / cost["whole"]}
 
 
 def _costs_of(tree: Path, words: Sequence[str]) -> Costs:
@@ -75,7 +79,8 @@ def main(options: Sequence[str]) -> None:
     print(f"| CPU s | {' | '.join(['here', 'other'][: len(trees)])} |\n|---|{'---|' * len(trees)}")
     least = [min(costs, key=lambda cost: cost["whole"]) for costs in turns]
     for part in least[0]:
-        print(f"| {part} | {' | '.join(f'{costs[part]:.2f}' for costs in least)} |")
+        digits = 0 if part == SAMPLES else 2
+        print(f"| {part} | {' | '.join(f'{costs[part]:.{digits}f}' for costs in least)} |")
 
 
 if __name__ == "__main__":

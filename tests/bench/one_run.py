@@ -6,7 +6,7 @@ Its last line is JSON: CPU seconds of this process and those it waited for.
 import json
 import resource
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 
@@ -23,11 +23,14 @@ def main(words: Sequence[str]) -> None:
     from factory.graph import execute, local
 
     at = {"imports": cpu_s()}
-    begun, executed = local.LocalGraph.submit, execute.execute
+    executed = execute.execute
 
-    def first_task(graph: Any, *given: Any) -> Any:
-        at.setdefault("start-up", cpu_s())
-        return begun(graph, *given)
+    def noting_the_first(begun: Callable[..., Any]) -> Callable[..., Any]:
+        def submit(graph: Any, *given: Any) -> Any:
+            at.setdefault("start-up", cpu_s())
+            return begun(graph, *given)
+
+        return submit
 
     def timed(*given: Any, **named: Any) -> Any:
         summary = executed(*given, **named)
@@ -35,7 +38,9 @@ def main(words: Sequence[str]) -> None:
         at["tasks and tables"] = cpu_s()
         return summary
 
-    local.LocalGraph.submit, execute.execute = first_task, timed  # type: ignore[method-assign]
+    for graph in (local.LocalGraph, local.IsolatedGraph):
+        graph.submit = noting_the_first(graph.submit)  # type: ignore[method-assign]
+    execute.execute = timed
     if code := factory.run.main([*words, "executor=local"]):
         raise SystemExit(code)
     at["end"] = cpu_s()
