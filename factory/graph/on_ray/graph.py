@@ -90,19 +90,15 @@ def join_or_start_cluster(workers: int | None) -> bool:
     named = os.environ.get("RAY_ADDRESS", "")
     environment = WORKER_ENV | {name: os.environ[name] for name in FORWARDED_ENV if name in os.environ}
     where = "auto" if named else "local"
-    own: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if where == "local" else {}
+    own = {"num_cpus": workers, "include_dashboard": False}
+    given: dict[str, Any] = {"runtime_env": {"env_vars": environment}} if named else own
     if where == "local":  # Ray warns that a cluster of our own asks for a token, as it should
         logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
     check_address_answers(named)
     try:
-        with terminal_signals_blocked(signal.SIGHUP):  # Ray keeps SIGINT from its processes itself
-            ray.init(
-                address=where,
-                runtime_env={"env_vars": environment},
-                log_to_driver=False,
-                logging_level=logging.WARNING,
-                **own,
-            )
+        # Ray keeps SIGINT from its processes itself.
+        with terminal_signals_blocked(signal.SIGHUP), _with_environment({} if named else environment):
+            ray.init(address=where, log_to_driver=False, logging_level=logging.WARNING, **given)
     except Exception as error:  # Ray has none of its own for what keeps it from beginning
         if where == "local":
             ray.shutdown()
@@ -116,6 +112,22 @@ def join_or_start_cluster(workers: int | None) -> bool:
             raise
         raise ConnectionError(no_cluster_text(named, error)) from error
     return where == "local"
+
+
+@contextmanager
+def _with_environment(values: Mapping[str, str]) -> Iterator[None]:
+    """This process's, while a cluster begins that hands it on: of a runtime_env, the workers that Ray begins ahead of
+    any task are of no use to tasks."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 @contextmanager
