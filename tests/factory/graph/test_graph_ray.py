@@ -49,10 +49,13 @@ def two_cpus() -> Iterator[None]:
     ],
 )
 def test_a_cluster_of_our_own_starts_without_a_warning_and_asks_for_a_token(begun: str, tmp_path: Path) -> None:
-    code = f"import os; {begun}; print(os.environ['RAY_AUTH_MODE']); m.ray.shutdown()"
-    env = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")} | {"HOME": str(tmp_path)}
+    threads = "os.environ.get('OMP_NUM_THREADS')"  # a worker's, whose core is one, and not this process's
+    in_worker = f"m.ray.get(m.ray.remote(lambda: {threads}).remote())"
+    code = f"import os; {begun}; print(os.environ['RAY_AUTH_MODE'], {in_worker}, {threads}); m.ray.shutdown()"
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "OMP_"))}
+    env = kept | {"HOME": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "token\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "token 1 None\n", "")
 
 
 def test_a_cluster_that_does_not_answer_is_named_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
