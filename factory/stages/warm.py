@@ -129,6 +129,7 @@ def _is_compiled(name: str) -> bool:
 
 def _compile_part(name: str, enough: Event) -> None:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    environment["NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING"] = "1"  # of what was tried in vain, never shown
     command = [sys.executable, "-m", "factory.stages.warm", name]
     if enough.is_set():
         raise RuntimeError(f"compiling the kernels of {name} was not begun")

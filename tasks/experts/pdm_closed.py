@@ -17,7 +17,7 @@ import shapely
 import shapely.ops
 
 from tasks.experts.protocol import Plan, RunContext
-from tasks.kernels.compiled import kernel
+from tasks.kernels.compiled import hidden_kernel, kernel
 from tasks.reward.epdms import Scores, prepare, score
 from tasks.rollout.corridor import least_and_largest
 from tasks.rollout.lqr import track
@@ -375,7 +375,7 @@ def lead_progress(paths: DrivePaths, swept: Corridors, things: LeadCandidates) -
     return out
 
 
-@kernel
+@hidden_kernel
 def _in_corridor(
     swept: Corridors, path: int, things: LeadCandidates, m: int, sample: int, squares: Array
 ) -> tuple[bool, float]:
@@ -398,7 +398,7 @@ def _in_corridor(
     return _ring_touches(swept, path, ring_x, ring_y, (radius + ROUNDING_M) ** 2, squares), clearance
 
 
-@kernel
+@hidden_kernel
 def _ring_touches(swept: Corridors, path: int, x: Array, y: Array, limit: float, squares: Array) -> bool:
     """Whether a ring has a point in common with a path's corridor, edge by edge.
 
@@ -417,7 +417,7 @@ def _ring_touches(swept: Corridors, path: int, x: Array, y: Array, limit: float,
     return corridor_in_ring or _edges_around(swept, path, x[0], y[0], squares)
 
 
-@kernel
+@hidden_kernel
 def _edges_around(swept: Corridors, path: int, x: float, y: float, squares: Array) -> bool:
     """Whether (x, y) is in a path's corridor, by the even-odd rule; fills the squared distance to each edge [m2]."""
     first, stop = swept.first[path], swept.first[path + 1]
@@ -553,7 +553,7 @@ def _drive(
     return poses, motion, leads
 
 
-@kernel
+@hidden_kernel
 def write_lead(
     paths: DrivePaths,
     path: int,
@@ -576,7 +576,7 @@ def write_lead(
         lead[1] = things.speed[thing] * math.cos(things.heading[thing] - heading)
 
 
-@kernel
+@hidden_kernel
 def nearest_lead(
     things: LeadCandidates, ahead_m: Array, sample: int, progress: float, footprint: Array
 ) -> tuple[float, int]:
@@ -599,7 +599,7 @@ def nearest_lead(
     return nearest, found
 
 
-@kernel
+@hidden_kernel
 def set_footprint(pose: Array, out: Array) -> None:
     """Corners (2, 4) x, y of the ego's body, its rear axle at `pose` (3,)."""
     c, s = math.cos(pose[2]), math.sin(pose[2])

@@ -155,7 +155,7 @@ def with_index(obstacles: Obstacles) -> Obstacles:
     return Obstacles(boxes, is_stopped, collision_score, obstacles.spans, axes, Cells(starts, items))
 
 
-@kernel
+@hidden_kernel
 def _register(box: Box, t: int, item: int, fill: bool, starts: ShortInts, items: ShortInts) -> None:
     """Count an object in, or write it into, the cells that come within the ego's circumradius of its box at step t."""
     margin = CIRCUMRADIUS + ROUNDING_M
@@ -221,11 +221,12 @@ def obstacles_of_tracks(
             if valid[t, i] and column[i] >= 0:
                 for c in range(5):
                     met[t, column[i], c] = boxes[t, i, c]
-    kept = np.flatnonzero(column >= 0)
-    is_stopped, score = np.empty(n_kept, np.bool_), collision_score[kept]
-    for k in range(n_kept):
-        vx, vy = velocities[first_seen[kept[k]], kept[k]]
-        is_stopped[k] = score[k] > 0.0 or np.hypot(vx, vy) <= STOPPED_SPEED_MPS
+    is_stopped, score = np.empty(n_kept, np.bool_), np.empty(n_kept)
+    for i in range(valid.shape[1]):
+        if column[i] >= 0:
+            vx, vy = velocities[first_seen[i], i]
+            score[column[i]] = collision_score[i]
+            is_stopped[column[i]] = collision_score[i] > 0.0 or np.hypot(vx, vy) <= STOPPED_SPEED_MPS
     return obstacles_of(met, is_stopped, score)
 
 
@@ -400,7 +401,7 @@ def first_contacts(
     return nc, hit, violated
 
 
-@kernel
+@hidden_kernel
 def _looked_at(body: Body) -> tuple[float, float, float, float]:
     """Least x, y, most x, y [m] of the places of a placed body that both rules look at."""
     ahead = max(TTC_STEPS) * 0.1
@@ -413,7 +414,7 @@ def _looked_at(body: Body) -> tuple[float, float, float, float]:
     return least_x, least_y, most_x, most_y
 
 
-@kernel
+@hidden_kernel
 def _at_fault(ego: Box, rear_x: float, rear_y: float, speed: float, off_lane: bool, other: Box, stopped: bool) -> bool:
     """Whether the ego, its rear axle at (rear_x, rear_y) [m], is to blame for touching another box."""
     if speed <= STOPPED_EGO_MPS:
@@ -427,7 +428,7 @@ def _at_fault(ego: Box, rear_x: float, rear_y: float, speed: float, off_lane: bo
     return off_lane or touching(Box(front_x, front_y, ego.heading, ego.cos, ego.sin, 0.0, ego.width), other)
 
 
-@kernel
+@hidden_kernel
 def _angle_to(x: float, y: float, heading: float, other: Box) -> float:
     """Angle [rad] between a heading [rad] and the ray from (x, y) [m] to the centroid of a box.
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba.extending import register_jitable
 
-from tasks.kernels.compiled import kernel
+from tasks.kernels.compiled import hidden_kernel, kernel
 from tasks.reward.centerline import as_states
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import STEP_S
@@ -215,7 +215,7 @@ def first_uncomfortable_steps(
         first[k] = math.inf if which == 0 else float(step)
 
 
-@kernel
+@hidden_kernel
 def _side_by_side(states: Array, start: int, scratch: Array) -> None:
     """What the limited quantities are made of, from states (K, T, 11), into the rows of the series from `start` on."""
     lon, lat, magnitude, heading = scratch[_LON], scratch[_LAT], scratch[_MAGNITUDE], scratch[_HEADING]
@@ -231,7 +231,7 @@ def _side_by_side(states: Array, start: int, scratch: Array) -> None:
             heading[i] = states[k, t, HEADING]
 
 
-@kernel
+@hidden_kernel
 def _limited_quantities(scratch: Array) -> None:
     """The limited quantities, the first rows of scratch, of what `_side_by_side` put into the others."""
     lon, lat, magnitude, heading = scratch[_LON], scratch[_LAT], scratch[_MAGNITUDE], scratch[_HEADING]
@@ -280,7 +280,7 @@ def _motion_rms(now: Array, previous: Array, shift: int, rms: Array) -> None:
                 rms[k, f] = math.sqrt(total / n)
 
 
-@kernel
+@hidden_kernel
 def _motions(states: Array, first: int, start: int, raw: Array, out: Array) -> None:
     """Acceleration, jerk, yaw rate, yaw acceleration (4, T * LANES) of states[first:, start : start + T]; raw: scratch.
 

@@ -325,7 +325,7 @@ def judge_one(
         out.scores[row, k] = 1.0 if out.fails[row, k] == math.inf else 0.0
 
 
-@kernel
+@hidden_kernel
 def _spread_flags(flags: Bytes, out: Bools) -> None:
     for t in range(len(flags)):
         out[t, 0] = flags[t] & MULTIPLE_LANES != 0
@@ -333,7 +333,7 @@ def _spread_flags(flags: Bytes, out: Bools) -> None:
         out[t, 2] = flags[t] & ONCOMING != 0
 
 
-@kernel
+@hidden_kernel
 def _first_with(flags: Bytes, bit: int) -> float:
     for t in range(len(flags)):
         if flags[t] & bit:

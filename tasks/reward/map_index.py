@@ -185,7 +185,7 @@ def window_around(grid: Grid, low_x: float, low_y: float, high_x: float, high_y:
 
 @kernel
 def changes_along_rows(edges: Array, bounded: Bits, grid: Grid) -> tuple[Ints, Bits]:
-    """cell << 32 | edge wherever an edge passes between the middles of a cell and of the one on its left, sorted.
+    """cell << 32 | edge wherever an edge passes between the middles of a cell and of the one on its left.
 
     And the set of regions (rows, W) at the middle of each row's first cell.
     """
@@ -207,10 +207,10 @@ def changes_along_rows(edges: Array, bounded: Bits, grid: Grid) -> tuple[Ints, B
                     n += 1
             row += 1
             y = cell_middle(grid.low_y, grid.cell_m, row + grid.first_row)
-    return np.sort(found[:n]), at_start
+    return found[:n], at_start
 
 
-@kernel
+@hidden_kernel
 def _first_right_of(ax: float, ay: float, bx: float, by: float, y: float, grid: Grid) -> int:
     """The first column whose middle at height y is on the right of an edge that passes that height."""
     rises = by > ay
@@ -267,7 +267,7 @@ def _columns(u: float, v: float, du: float, dv: float, row: int) -> tuple[int, i
     return int(min(one, other) - SLACK_CELLS), int(max(one, other) + SLACK_CELLS) + 1
 
 
-@kernel
+@hidden_kernel
 def _most_cells(edges: Array, cell_m: float) -> int:
     """A bound on the cells that edges touch: a flat edge between two rows touches both all along."""
     n = 0
@@ -338,7 +338,7 @@ def index_map(polygons: Sequence[MapPolygon], route_lane_ids: frozenset[str]) ->
 def assembled(grid: Grid, touched: Ints, edges: Array, bounded: Bits, playing: Bits, n_lane_words: int) -> MapIndex:
     """The index of the edges within a grid or a window of it, which all points that are looked up lie in."""
     changes, at_start = changes_along_rows(edges, bounded, grid)
-    cells, crossed, entry, sets = _arranged(changes, at_start, touched, bounded, grid.n_columns)
+    cells, crossed, entry, sets = _arranged(np.sort(changes), at_start, touched, bounded, grid.n_columns)
     parts = _parts_of(sets, playing)
     return MapIndex(
         grid.low_x,
@@ -590,7 +590,7 @@ def _first_crossing(edges: Array, bounded: Bits, crossed: ShortInts, entry: Shor
     return -1, -1
 
 
-@kernel
+@hidden_kernel
 def _splits_clearly(edges: Array, line: int, edge: int) -> bool:
     """Whether a line has the ends of an edge on either side, neither of them within rounding."""
     ax, ay, bx, by = edges[line]

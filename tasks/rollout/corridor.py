@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tasks.kernels.compiled import inner_kernel, kernel
+from tasks.kernels.compiled import hidden_kernel, inner_kernel, kernel
 from tasks.world.arrays import Array, Bytes, Ints
 from tasks.world.geometry import nearest_on_edge, wrapped
 
@@ -38,7 +38,7 @@ def interpolated(x: float, at: Array, values: Array) -> float:
     return slope * (x - at[low]) + values[low]
 
 
-@inner_kernel
+@hidden_kernel
 def least_and_largest(values: Array) -> tuple[float, float]:
     """Least and largest of values (P,); a fraction of what numpy's own two take to compile."""
     low, high = np.inf, -np.inf
@@ -176,7 +176,7 @@ def stretch_rectangles(xy: Array, heading: Array) -> Array:
     return out
 
 
-@inner_kernel
+@hidden_kernel
 def corridor_between(
     stretches: Array, length: float, m: int, begin: float, end: float, offset: float, turn: float, half_width: float
 ) -> CorridorAhead:
@@ -208,7 +208,7 @@ def corridor_between(
     return CorridorAhead(x, y, ux, uy, half_u, half_v, first, last, offset, turn, half_width)
 
 
-@inner_kernel
+@hidden_kernel
 def near_corridor(view: CorridorAhead, x: float, y: float, radius: float) -> bool:
     """Can something within `radius` of (x, y) be in the corridor? False: surely not."""
     dx, dy = x - view.x, y - view.y
@@ -218,7 +218,7 @@ def near_corridor(view: CorridorAhead, x: float, y: float, radius: float) -> boo
     )  # fmt: skip
 
 
-@inner_kernel
+@hidden_kernel
 def may_meet(stretches: Array, m: int, view: CorridorAhead, box: Box, radius: float) -> bool:
     """Can a box, `radius` around it, be in the corridor? False: surely not."""
     if view.last < view.first:
@@ -277,7 +277,7 @@ class Way(NamedTuple):
     half_width: float  # [m] of the corridor it needs
 
 
-@inner_kernel
+@hidden_kernel
 def fade(travelled: float, length: float) -> tuple[float, float]:
     """(value, slope) of a smooth step from 1 down to 0 over `length`."""
     u = travelled / length
@@ -287,7 +287,7 @@ def fade(travelled: float, length: float) -> tuple[float, float]:
     return 1.0 - u * u * u * (10.0 + u * (6.0 * u - 15.0)), -30.0 * u * u * (1.0 - u) * (1.0 - u) / length
 
 
-@inner_kernel
+@hidden_kernel
 def _point_on_path(paths: Paths, m: int, s: float) -> tuple[float, float, float]:
     """x, y, heading of path m at path length s, straight on past its ends."""
     last = paths.heading.shape[1] - 1
@@ -347,7 +347,7 @@ def boxes_overlap(a: Box, b: Box) -> bool:
     return not (_axis_separates(a, b, dx, dy, c, s) or _axis_separates(b, a, dx, dy, c, s))
 
 
-@inner_kernel
+@hidden_kernel
 def _axis_separates(box: Box, other: Box, dx: float, dy: float, c: float, s: float) -> bool:
     """Does an axis of `box` separate it from one whose centre is at +-(dx, dy), turned by |cos| = c, |sin| = s?"""
     along = dx * math.cos(box[2]) + dy * math.sin(box[2])
@@ -358,7 +358,7 @@ def _axis_separates(box: Box, other: Box, dx: float, dy: float, c: float, s: flo
     )  # fmt: skip
 
 
-@inner_kernel
+@hidden_kernel
 def _widened(
     low: float, high: float, half_width: float, u0: float, w0: float, u1: float, w1: float
 ) -> tuple[float, float]:
@@ -372,7 +372,7 @@ def _widened(
     return low, high
 
 
-@inner_kernel
+@hidden_kernel
 def _range_in_strip(box: Box, x: float, y: float, heading: float, half_width: float) -> tuple[float, float]:
     """Nearest and farthest distance along `heading` of what a box has inside the strip |across| <= half_width."""
     c, s = math.cos(heading), math.sin(heading)
@@ -392,7 +392,7 @@ def _range_in_strip(box: Box, x: float, y: float, heading: float, half_width: fl
     return _widened(low, high, half_width, du, dw, au, aw)
 
 
-@inner_kernel
+@hidden_kernel
 def corridor_ahead(paths: Paths, way: Way, blend_length: float, lookahead: float) -> CorridorAhead:
     """Where the corridor ahead of a body is."""
     keep, _ = fade(way.travelled + way.front, blend_length)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tasks.kernels.compiled import inner_kernel, kernel
+from tasks.kernels.compiled import hidden_kernel, inner_kernel, kernel
 from tasks.rollout.corridor import (
     CLOSED_IF_STOPPABLE,
     OPEN,
@@ -196,7 +196,7 @@ def empty_motion(n_rows: int, n: int) -> Motion:
     )  # fmt: skip
 
 
-@inner_kernel
+@hidden_kernel
 def moves_off_log(mode: int) -> bool:
     """Is one in that mode where the simulation has it?"""
     return mode in (DRIVEN, TOWED)
@@ -209,24 +209,24 @@ CORRIDOR_MARGIN_M = 0.1  # beside the body, each side
 ENTER_CLEARANCE_M = 30.0  # of the ego's centre from where a vehicle enters
 
 
-@inner_kernel
+@hidden_kernel
 def nearest_point_index(paths: Paths, s: float) -> int:
     """Index of the path's point nearest to path length s."""
     return min(max(round(s / PATH_SPACING_M), 0), paths.heading.shape[1] - 1)
 
 
-@inner_kernel
+@hidden_kernel
 def box_of(boxes: Array, t: int, i: int) -> Box:
     return boxes[t, i, 0], boxes[t, i, 1], boxes[t, i, 2], boxes[t, i, 3], boxes[t, i, 4]
 
 
-@inner_kernel
+@hidden_kernel
 def forward_speed(rows: RolloutRows, t: int, i: int) -> float:
     h = rows.boxes[t, i, 2]
     return rows.velocities[t, i, 0] * math.cos(h) + rows.velocities[t, i, 1] * math.sin(h)
 
 
-@inner_kernel
+@hidden_kernel
 def project_onto_path(
     paths: Paths, m: int, rows: RolloutRows, t: int, i: int, driver: IdmDriver
 ) -> tuple[float, float, float, float]:
@@ -236,7 +236,7 @@ def project_onto_path(
     return s, left, turn, max(0.0, forward_speed(rows, t, i))
 
 
-@inner_kernel
+@hidden_kernel
 def path_to_join(roles: Roles, paths: Paths, rows: RolloutRows, t: int, i: int, clock: int) -> int:
     """The path on which agent i, replayed, switches to IDM by itself: its own, once it is due and on it; or -1."""
     m = roles.path[i]
@@ -246,14 +246,14 @@ def path_to_join(roles: Roles, paths: Paths, rows: RolloutRows, t: int, i: int, 
     return m if abs(left) <= LARGEST_OFFSET_M else -1
 
 
-@inner_kernel
+@hidden_kernel
 def way_along(rows: RolloutRows, t: int, i: int, m: int, s: float, travelled: float, offset: float, turn: float) -> Way:
     """Agent i, as big as in row t, on its way along path m."""
     front, half_width = 0.5 * rows.boxes[t, i, 3], 0.5 * rows.boxes[t, i, 4] + CORRIDOR_MARGIN_M
     return Way(m, s, travelled, offset, turn, front, half_width)
 
 
-@inner_kernel
+@hidden_kernel
 def gap_to(
     paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int, way: Way, view: CorridorAhead, j: int
 ) -> tuple[float, float]:
@@ -267,7 +267,7 @@ def gap_to(
     return np.inf, 0.0
 
 
-@inner_kernel
+@hidden_kernel
 def must_brake(roles: Roles, paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int, mode: Ints) -> bool:
     """Does a driven one ask agent i, on its logged path, for more than the comfortable deceleration?"""
     m = roles.logged_path[i]
@@ -294,7 +294,7 @@ def must_brake(roles: Roles, paths: Paths, driver: IdmDriver, rows: RolloutRows,
     return False
 
 
-@inner_kernel
+@hidden_kernel
 def road_acceleration(paths: Paths, driver: IdmDriver, t: int, m: int, s: float, speed: float, length: float) -> float:
     """[m/s2] of one driven at path length s of path m, for the road alone: its target speed and its stop lines."""
     free = free_acceleration(speed, paths.target_speed[m, nearest_point_index(paths, s)], driver)
@@ -305,7 +305,7 @@ def road_acceleration(paths: Paths, driver: IdmDriver, t: int, m: int, s: float,
     return accel
 
 
-@inner_kernel
+@hidden_kernel
 def acceleration_for_others(
     roles: Roles, paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int, way: Way, speed: float,
     accel: float, yielding: Yielding | None,
@@ -336,7 +336,7 @@ def acceleration_for_others(
     return accel
 
 
-@inner_kernel
+@hidden_kernel
 def touches_driven(boxes: Array, k: int, i: int, rows: RolloutRows, t: int, mode: Ints) -> bool:
     """Does agent i at boxes[k, i] share area with a driven one in row t?"""
     box = box_of(boxes, k, i)
@@ -377,7 +377,7 @@ def is_clear(
     return True
 
 
-@inner_kernel
+@hidden_kernel
 def far_from_ego(roles: Roles, log_boxes: Array, k: int, i: int, rows: RolloutRows, t: int) -> bool:
     """May agent i appear as in step k of its log, as far as its distance to the ego in row t lets it?"""
     ego = rows.boxes.shape[1] - 1

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tasks.kernels.compiled import inner_kernel, kernel
+from tasks.kernels.compiled import hidden_kernel, kernel
 from tasks.rollout.corridor import (
     CLOSED,
     CLOSED_IF_STOPPABLE,
@@ -659,7 +659,7 @@ def _been(scene: Scene, i: int, stop: int) -> Array:
     return poses
 
 
-@inner_kernel
+@hidden_kernel
 def point_behind(
     boxes: Array, valid: Bools, first: int, t: int, since: int, trails: Array, i: int, away: float
 ) -> tuple[float, float]:
@@ -690,7 +690,7 @@ def point_behind(
     return x + left * back_x, y + left * back_y
 
 
-@inner_kernel
+@hidden_kernel
 def _pose_behind(
     boxes: Array, valid: Bools, first: int, t: int, since: int, trails: Array, i: int, away: float
 ) -> tuple[float, float, float]:
@@ -702,7 +702,7 @@ def _pose_behind(
     return x, y, math.atan2(front_y - rear_y, front_x - rear_x)
 
 
-@inner_kernel
+@hidden_kernel
 def hitch(boxes: Array, valid: Bools, first: int, t: int, trails: Array, i: int) -> tuple[float, float, float]:
     """(path length behind agent `first` [m], offset to the left [m], turn [rad]) of agent i, coupled in row t."""
     away = math.hypot(boxes[t, i, 0] - boxes[t, first, 0], boxes[t, i, 1] - boxes[t, first, 1])
@@ -714,13 +714,13 @@ def hitch(boxes: Array, valid: Bools, first: int, t: int, trails: Array, i: int)
     return away, left, wrapped(boxes[t, i, 2] - h)
 
 
-@inner_kernel
+@hidden_kernel
 def faster_than_first(speed: float, hardest: float) -> float:
     """[m/s] above the first part's, below 0: slower, a step later, at `hardest` [m/s2]."""
     return math.copysign(max(abs(speed) - hardest * STEP_S, 0.0), speed)
 
 
-@inner_kernel
+@hidden_kernel
 def towed_pose(
     boxes: Array, valid: Bools, first: int, t: int, since: int, trails: Array, i: int,
     away: float, offset: float, turn: float, travelled: float, blend_length: float,

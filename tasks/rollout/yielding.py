@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tasks.kernels.compiled import inner_kernel, kernel
+from tasks.kernels.compiled import hidden_kernel, inner_kernel, kernel
 from tasks.rollout.corridor import CELLS, CLOSED, PATH_SPACING_M, Paths, boxes_overlap, project_on_path
 from tasks.rollout.idm import (
     DRIVEN,
@@ -66,7 +66,7 @@ def schedules(
     return at, speed, last
 
 
-@inner_kernel
+@hidden_kernel
 def _logged_speeds(boxes: Array, velocities: Array, valid: Bools, i: int, speed: Array) -> int:
     """Fill the forward speeds (S,) [m/s] of track i, 0 where it stands; returns its last step, or -1."""
     n, before, last = len(valid), -1, -1
@@ -121,7 +121,7 @@ def turns_as_logged(paths: Paths, boxes: Array, valid: Bools, owner: Ints, ancho
     return out
 
 
-@inner_kernel
+@hidden_kernel
 def body_turn_at(yielding: Yielding, m: int, s: float) -> float:
     """[rad] of a body at path length s of path m against it."""
     last = yielding.turned.shape[1] - 1
@@ -130,7 +130,7 @@ def body_turn_at(yielding: Yielding, m: int, s: float) -> float:
     return yielding.turned[m, k] + (cell - k) * (yielding.turned[m, k + 1] - yielding.turned[m, k])
 
 
-@inner_kernel
+@hidden_kernel
 def _first_step_at(yielding: Yielding, m: int, s: float) -> float:
     """When the log of path m comes to path length s, in steps; inf: never; 0 where it is beyond from the start."""
     n = yielding.at.shape[1]
@@ -150,7 +150,7 @@ def _first_step_at(yielding: Yielding, m: int, s: float) -> float:
     return low - 1 + (s - a) / (b - a)
 
 
-@inner_kernel
+@hidden_kernel
 def log_moment(yielding: Yielding, m: int, s: float, step: int) -> float:
     """The moment of its log [steps] that a driver at path length s of path m is in, at `step`."""
     n = yielding.at.shape[1]
@@ -162,7 +162,7 @@ def log_moment(yielding: Yielding, m: int, s: float, step: int) -> float:
     return min(_first_step_at(yielding, m, s + ON_TIME_M), n - 1.0)
 
 
-@inner_kernel
+@hidden_kernel
 def log_speed_at(yielding: Yielding, m: int, moment: float) -> float:
     """[m/s] of the log of path m at a moment [steps]."""
     last = yielding.speed.shape[1] - 1
@@ -171,7 +171,7 @@ def log_speed_at(yielding: Yielding, m: int, moment: float) -> float:
     return yielding.speed[m, k] + f * (yielding.speed[m, min(k + 1, last)] - yielding.speed[m, k])
 
 
-@inner_kernel
+@hidden_kernel
 def seconds_to(yielding: Yielding, m: int, s: float, speed: float, step: int, to: float, accel_max: float) -> float:
     """[s] that a driver at path length s of path m, if nobody holds it up, takes to path length `to`."""
     if to <= s:
@@ -184,7 +184,7 @@ def seconds_to(yielding: Yielding, m: int, s: float, speed: float, step: int, to
     return max(planned, alone)
 
 
-@inner_kernel
+@hidden_kernel
 def intended_acceleration(
     yielding: Yielding, paths: Paths, driver: IdmDriver, m: int, s: float, speed: float,
     start: int, t: int, nose: float,
@@ -202,7 +202,7 @@ def intended_acceleration(
     return _as_logged(yielding, paths, driver, m, s, speed, start + t)
 
 
-@inner_kernel
+@hidden_kernel
 def _as_logged(yielding: Yielding, paths: Paths, driver: IdmDriver, m: int, s: float, speed: float, step: int) -> float:
     moment = log_moment(yielding, m, s, step)
     wanted, then = log_speed_at(yielding, m, moment), log_speed_at(yielding, m, moment + 1.0)
@@ -295,8 +295,11 @@ def find_zones(
 @kernel
 def _grown(who: Ints, where: Array, size: int) -> tuple[Ints, Array]:
     more_who, more_where = np.empty((size, 3), np.int64), np.empty((size, 4))
-    more_who[: len(who)] = who
-    more_where[: len(where)] = where
+    for i in range(len(who)):  # element by element: numba takes seconds to compile the copy of a slice
+        for c in range(3):
+            more_who[i, c] = who[i, c]
+        for c in range(4):
+            more_where[i, c] = where[i, c]
     return more_who, more_where
 
 
@@ -343,7 +346,7 @@ def _crossing(
     return np.inf, np.inf, np.inf, np.inf, np.inf
 
 
-@inner_kernel
+@hidden_kernel
 def _zone(
     paths: Paths, m: int, low: float, high: float, o: int, first: float, last: float
 ) -> tuple[float, float, float, float, float]:
@@ -355,7 +358,7 @@ def _zone(
     return low - half, high + half, first - half, last + half, ends
 
 
-@inner_kernel
+@hidden_kernel
 def _stretches_near(paths: Paths, m: int, a: int, o: int, b: int, reach: float) -> bool:
     """May cells of stretch a of path m and of stretch b of path o be within `reach` of each other?"""
     a, b = min(a, paths.stretches.shape[1] - 1), min(b, paths.stretches.shape[1] - 1)
@@ -365,7 +368,7 @@ def _stretches_near(paths: Paths, m: int, a: int, o: int, b: int, reach: float) 
     return dx * dx + dy * dy <= far * far
 
 
-@inner_kernel
+@hidden_kernel
 def _cells_overlap(paths: Paths, m: int, a: int, m_half: float, o: int, b: int, o_half: float, reach: float) -> bool:
     """Does the cell around point a of path m share area with that around point b of path o?"""
     dx, dy = paths.xy[o, b, 0] - paths.xy[m, a, 0], paths.xy[o, b, 1] - paths.xy[m, a, 1]
@@ -376,7 +379,7 @@ def _cells_overlap(paths: Paths, m: int, a: int, m_half: float, o: int, b: int, 
     return boxes_overlap(one, other)
 
 
-@inner_kernel
+@hidden_kernel
 def _disc_around(log: AgentStates, j: int, clock: int, n_steps: int) -> tuple[float, float, float]:
     """Centre and radius [m] of a disc around track j from step `clock` on; radius < 0: it is not there."""
     low_x, high_x, low_y, high_y, body = np.inf, -np.inf, np.inf, -np.inf, 0.0
@@ -581,7 +584,7 @@ SHORTEST_M = 0.1
 FASTER_MPS = 1.0  # than its schedule
 
 
-@inner_kernel
+@hidden_kernel
 def cannot_stop_before(speed: float, ahead: float, driver: IdmDriver) -> bool:
     """Could one only stop before a zone that begins `ahead` [m] of its nose by braking harder than half of what tyres
     can?"""
@@ -590,7 +593,7 @@ def cannot_stop_before(speed: float, ahead: float, driver: IdmDriver) -> bool:
     return speed * speed > driver.emergency_decel * max(ahead, SHORTEST_M)
 
 
-@inner_kernel
+@hidden_kernel
 def yielding_acceleration(
     yielding: Yielding, driver: IdmDriver, start: int, t: int, i: int,
     m: int, s: float, speed: float, rows: RolloutRows, mode: Ints, motion: Motion, accel: float,
@@ -638,7 +641,7 @@ def yielding_acceleration(
     return accel
 
 
-@inner_kernel
+@hidden_kernel
 def may_enter(
     yielding: Yielding, driver: IdmDriver, m: int, k: int, t: int, log: AgentStates, i: int,
     rows: RolloutRows, mode: Ints, motion: Motion,
