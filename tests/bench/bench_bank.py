@@ -32,7 +32,7 @@ from tests.bench.peer import SAME, BenchScene, beside, peer_python
 from tests.bench.timing import least_and_median_cpu_ms, memory_mb
 from tests.real.reference_scenes import SCENES, loader
 
-B, SIZES, MANY, IN_SHARD, STEPS = 64, (16, 64, 256), 100_000, 1024, 3
+B, SIZES, MANY, IN_SHARD, STEPS = 64, (16, 64, 256), 100_000, 1024, 12
 TOGETHER = 64  # plans of a scene in memory, threads and training
 Plans = NDArray[np.float64]
 
@@ -148,7 +148,7 @@ def print_opening(folder: Path, many: int) -> None:
 def print_training(bank: SceneBank, proposals: dict[str, Plans], steps: int) -> None:
     """Steps of 64 scenes x 64 proposals with the reward of the step's own proposals and without, in turns.
 
-    CPU time, and what of it the reward's call took: other programs' load moves whole steps by more than that.
+    The loop is docs/bank.md's. Other programs' load moves steps by more than the reward's call, which is told too.
     """
     import torch
 
@@ -175,26 +175,31 @@ def print_training(bank: SceneBank, proposals: dict[str, Plans], steps: int) -> 
     ids, plans = batch_of(bank, proposals, TOGETHER)
     anchors, tokens = torch.from_numpy(plans).float(), torch.randn(B, 64, 256)
 
-    def step(with_reward: bool) -> tuple[float, float]:
-        begun = time.process_time()
+    def step(with_reward: bool) -> tuple[float, float, float]:
+        begun, wall = time.process_time(), time.perf_counter()
         found, logits = planner(tokens, anchors)
-        wanted, asked = torch.ones_like(logits), time.process_time()
+        wanted, asked = torch.ones_like(logits), time.perf_counter()
         if with_reward:
             wanted = torch.from_numpy(bank.score(ids, found.detach().numpy()).subscores).float()
-        took = time.process_time() - asked
+        took = time.perf_counter() - asked
         loss = torch.nn.functional.binary_cross_entropy_with_logits(logits, wanted)
         loss = loss + torch.nn.functional.l1_loss(found, anchors)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        return time.process_time() - begun, took
+        return time.perf_counter() - wall, time.process_time() - begun, took
 
     step(True)
-    turns = [(step(False), step(True)) for _ in range(steps)]
-    without, (with_it, reward) = (min(times) for times in zip(*turns))
-    size = sum(p.numel() for p in planner.parameters()) / 1e6
-    print(f"a head of {size:.1f} M, CPU s of a step: without {without[0]:.2f}, with the reward {with_it:.2f}, ", end="")
-    print(f"of which its call {reward:.3f}")
+    orders = ((False, True) if i % 2 else (True, False) for i in range(steps))  # what came before weighs on both alike
+    turns = [{with_reward: step(with_reward) for with_reward in order} for order in orders]
+    without, with_it = (np.array([turn[with_reward] for turn in turns]) for with_reward in (False, True))
+    size, threads = sum(p.numel() for p in planner.parameters()) / 1e6, torch.get_num_threads()
+    print(f"a head of {size:.1f} M, {len(turns)} steps of each in turns, {threads} threads, medians:")
+    for i, what in enumerate(("wall", "CPU")):
+        alone, both, speed = without[:, i], with_it[:, i], np.quantile(without[:, i] / with_it[:, i], (0.5, 0.25, 0.75))
+        print(f"{what} s: {np.median(alone):.2f}, with the reward {np.median(both):.2f}; speed with it ", end="")
+        print("{:.0%} of that without (quartiles {:.0%} to {:.0%})".format(*speed))
+    print(f"the reward's call: {1e3 * np.median(with_it[:, 2]):.0f} ms of wall time")
 
 
 if __name__ == "__main__":
