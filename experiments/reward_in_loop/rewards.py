@@ -1,0 +1,55 @@
+"""What the planners of this folder have in common: the trunk's settings, and the bank by the ids of a batch."""
+
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from planners.data.batch import Batch, BevLayout
+from planners.data.index import DataSettings, open_data
+from planners.models.settings import EgoMlpBevSettings
+from planners.training.validation import open_bank
+from tasks.bank import SceneBank
+from tasks.subscores import OF_ONE_PLAN
+
+
+@dataclass(frozen=True)
+class TrunkSettings(EgoMlpBevSettings):
+    """Those of conf/planner/ego_mlp_bev_small.yaml, and where the reward is."""
+
+    hidden: tuple[int, ...] = (128, 128)
+    features: int = 128
+    plan_from: str = "constant_velocity"
+    status: str = "speed"
+    bev: BevLayout = field(
+        default_factory=lambda: BevLayout(ahead_m=40.0, behind_m=8.0, side_m=24.0, cell_m=1.0, times_s=(-1.0, 0.0))
+    )
+    table: str = ""  # whose real samples are trained on
+    bank: str = ""  # folder of their scenes, written where it is not there
+
+
+@cache
+def _opened(table: str, bank: str) -> tuple[SceneBank, dict[str, str]]:
+    dataset = open_data(DataSettings(real=(table,)))
+    rows = dataset.rows
+    return open_bank(Path(bank), dataset), dict(zip(rows.attempt_id.tolist(), rows.clip_id.tolist()))
+
+
+def scored(settings: TrunkSettings, batch: Batch, plans: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of plans (B, P, 8, 3): scores (B, P), sub-scores (B, P, 8), and (B,) whether the sample's scene can be scored.
+
+    Zeros where it cannot; a moved sample (jitter) would be scored from the wrong place, so there are none here.
+    """
+    bank, clips = _opened(settings.table, settings.bank)
+    there = torch.tensor([clips[name] in bank.clip_ids for name in batch.attempt_ids])
+    found = bank.score(
+        [clips[name] for name, known in zip(batch.attempt_ids, there) if known],
+        np.asarray(plans.detach()[there], np.float64),
+        threads=1,
+    )
+    scores, subscores = plans.new_zeros(plans.shape[:2]), plans.new_zeros((*plans.shape[:2], len(OF_ONE_PLAN)))
+    scores[there], subscores[there] = torch.from_numpy(found.score).float(), torch.from_numpy(found.subscores).float()
+    return scores, subscores, there
