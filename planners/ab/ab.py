@@ -50,7 +50,7 @@ from planners.evaluation.benchmark_folder import read_clip_logs
 from planners.evaluation.planner_names import find_planner
 from planners.training.checkpoint import read_record
 from planners.training.many import (
-    ONE_THREAD,
+    ALONE,
     TRAININGS,
     Training,
     folder_of,
@@ -153,7 +153,7 @@ def _call(settings: AbSettings, *words: str) -> None:
     with stop_event(settings.left_s) as stop, told.open("a") as file:
         print(f"\n$ {shlex.join(('python', '-m', *words))}", file=file, flush=True)
         command = [sys.executable, "-m", *words]
-        code = run_process(command, stop.is_set, file, environment=ONE_THREAD | os.environ)
+        code = run_process(command, stop.is_set, file, environment=ALONE | os.environ)
         if code == INTERRUPTED or stop.is_set():
             raise Stopped("the same command goes on")
     if code:

@@ -391,13 +391,13 @@ def first_contacts(
                 if _at_fault(ego, rear_x, rear_y, body.speed[t], off_lane, other, stopped):
                     nc, hit = min(nc, obstacles.collision_score[item]), min(hit, float(t))
                 else:
-                    looks.asking[item] &= ~NC
+                    looks.asking[item] &= TTC
             if looks.asking[item] & asks & TTC:
                 angle = _angle_to(rear_x, rear_y, ego.heading, other)  # the ego as it is now
                 beside = not angle > BEHIND_RAD and (off_lane or in_intersection(map_index, rear_x, rear_y, places))
                 if angle < AHEAD_RAD or beside:
                     violated, asks = float(t), asks & NC
-                looks.asking[item] &= ~TTC
+                looks.asking[item] &= NC
     return nc, hit, violated
 
 

@@ -23,7 +23,7 @@ ADDED = {  # file -> where, and what is put before it: a record; its rule, a row
     "tasks/reward/epdms.py": {
         "_WHOLES = ": 'SL = LABELLED.index("sl")\n',
         "    for row in _WHOLES:": "    out.fails[SL, k] = _first_above(states, 15.0)\n",
-        "@kernel\ndef _first_with(": """@kernel
+        "@hidden_kernel\ndef _first_with(": """@kernel
 def _first_above(states: Array, speed_mps: float) -> float:
     for t in range(len(states)):
         if math.hypot(states[t, 3], states[t, 4]) > speed_mps:
