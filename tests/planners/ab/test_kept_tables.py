@@ -10,7 +10,7 @@ from planners.ab.report import write_report
 
 ROOT = Path(__file__).parents[3]
 KEPT = ROOT / "experiments" / "ab"
-PARTS = ("towns", "acceleration", "drives")
+PARTS = ("towns", "acceleration", "drives", "looking")
 
 
 def differences(part: str, against: str = "real") -> dict[tuple[str, str], dict[str, str]]:
@@ -33,7 +33,7 @@ def shown(row: dict[str, str], *names: str) -> list[str]:
     return [f"{float(row[name]):+.1f}" for name in names]
 
 
-@pytest.mark.parametrize("part", ["towns", "drives"])
+@pytest.mark.parametrize("part", ["towns", "drives", "looking"])
 def test_the_readme_says_the_difference_with_its_widest_interval(part: str) -> None:
     readme = " ".join((ROOT / "README.md").read_text().split())
     for measure in ("two-stage EPDMS", "scene score"):
