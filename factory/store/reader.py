@@ -13,7 +13,7 @@ files they stand in; `iterate` goes file by file instead, which is what a pass o
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -194,9 +194,14 @@ def image_of(sample: Mapping[str, Any], camera: str, time_s: float) -> Bytes:
 
     Raises KeyError where the sample has no such image, ValueError where it cannot be decoded.
     """
+    return decode_stored_image(stored_image(sample, camera, time_s))
+
+
+def stored_image(sample: Mapping[str, Any], camera: str, time_s: float) -> Mapping[str, Any]:
+    """As `image_of`, not decoded: one of the column `images`. Raises KeyError as it does."""
     for image in sample["images"] or ():
         if image["camera"] == camera and abs(image["time_s"] - time_s) <= TIME_TOLERANCE_S:
-            return decode_stored_image(image)
+            return cast(Mapping[str, Any], image)
     have = sorted({(i["camera"], round(float(i["time_s"]), 3)) for i in sample["images"] or ()})
     raise KeyError(f"no image of camera {camera!r} at {time_s} s; there are {have}, source {sample['image_source']}")
 

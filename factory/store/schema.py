@@ -5,7 +5,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pyarrow as pa
@@ -176,7 +176,9 @@ def _structs(column: Column, values: Sequence[object], where: str) -> pa.Array:
 def _read(column: Column, shape: tuple[Size, ...], value: pa.Scalar) -> object:
     if column.dtype == "struct":
         if shape:
-            return [_read(column, shape[1:], entry) for entry in value]
+            members = [_read_all(member, value.values.field(member.name)) for member in column.members]
+            names = [member.name for member in column.members]
+            return [dict(zip(names, entry)) for entry in zip(*members, strict=True)]
         return {member.name: _read(member, member.shape, value[member.name]) for member in column.members}
     if not shape or column.dtype in ("string", "binary"):
         return value.as_py()
@@ -190,6 +192,15 @@ def _read(column: Column, shape: tuple[Size, ...], value: pa.Scalar) -> object:
     if -1 in sizes:
         sizes[0] = len(value)
     return array.reshape(sizes)
+
+
+def _read_all(column: Column, values: pa.Array) -> Sequence[object]:
+    """Of every entry of a list of structs one member: a scalar of Arrow for each would take ten times as long."""
+    if not column.shape and column.dtype != "struct":
+        return cast(list[object], values.to_pylist())
+    if column.dtype in ("struct", "string", "binary") or len(column.shape) > 1 or isinstance(column.shape[0], str):
+        return [_read(column, column.shape, value) for value in values]
+    return list(values.flatten().to_numpy(zero_copy_only=False).reshape(-1, *column.shape))
 
 
 def schema_of(row: type) -> pa.Schema:

@@ -40,7 +40,7 @@ import simplejpeg
 
 from factory.files import locked
 from factory.readers.pictures import jpeg_size
-from factory.store.reader import TIME_TOLERANCE_S
+from factory.store.reader import TIME_TOLERANCE_S, decode_stored_image
 from planners.data.batch import ImageLayout
 from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import front_camera
@@ -118,6 +118,16 @@ def _decode_jpeg(jpeg: Bytes, size: tuple[int, int]) -> Bytes:
     if pixels.shape[:2] != size:
         raise ValueError(f"an image of {columns} x {rows} was decoded to {pixels.shape[1]} x {pixels.shape[0]}")
     return pixels
+
+
+def decode_alone(image: Mapping[str, Any]) -> Bytes:
+    """The pixels (height, width, 3) of one of a sample's images, as `factory.store.reader.decode_stored_image` has
+    them and raises; what this decoder does not take is left to that one."""
+    try:
+        jpeg_size(image["jpeg"])
+        return np.asarray(simplejpeg.decode_jpeg(image["jpeg"], "RGB"), np.uint8)
+    except ValueError:
+        return decode_stored_image(image)
 
 
 def stitch_pixels(images: Sequence[Bytes], layout: ImageLayout, out: Bytes) -> None:
