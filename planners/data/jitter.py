@@ -71,6 +71,8 @@ class Offset:
 
 def draw_offset(settings: JitterSettings, seed: int, epoch: int, attempt_id: str) -> Offset | None:
     """Of one sample in one pass, by nothing else; None: it stays where it is."""
+    if settings.share == 0.0:
+        return None
     key = hashlib.sha256(f"{seed}\x1f{epoch}\x1f{attempt_id}".encode()).digest()
     rng = np.random.default_rng(int.from_bytes(key[:8], "little"))
     if rng.random() >= settings.share:

@@ -83,7 +83,7 @@ def visible_parts(problem: FitProblem, owner: ShortInts, off: F32, photo: Photo)
     shifts = interpolate_knots(off.reshape(len(boxes), problem.tracks.n_knots, SHIFT_SIZE), photo.time_s)
     boxes = shift_boxes(boxes, shifts)
     frames = world_from_boxes(boxes)
-    for j in np.flatnonzero(valid & _in_view(boxes, photo)):
+    for j in np.flatnonzero(valid & boxes_in_view(boxes, photo)):
         first, last = np.searchsorted(owner, [j, j + 1])
         if first < last:
             parts.append(OwnedGaussians(n, np.arange(first, last), frames[j], int(j), shifts[j]))
@@ -105,7 +105,7 @@ def box_gradient(part: OwnedGaussians, means: Any, quats: Any, d_means: Any, d_q
     return d_means.sum(0), turn
 
 
-def _in_view(boxes: Array, photo: Photo) -> Bools:
+def boxes_in_view(boxes: Array, photo: Photo) -> Bools:
     """Whether a ball around each box (N, 7) reaches into the photo's pyramid: (N,)."""
     radius = 0.5 * np.linalg.norm(boxes[:, 4:], axis=1) + VIEW_MARGIN_M
     height, width = photo.rgb.shape[:2]
@@ -180,9 +180,12 @@ class CpuBackend:
         scene, parts = compose_scene(problem, state, state.learned["boxes"].values, shot.photo)
         seen, sky = draw_with_sky(state, scene, shot.photo, camera, self.threads)
         colours = state.learned["exposure"].values[row]
-        picture = apply_exposure(seen.view.rgb, colours)
+        aligned = settings.exposure_rate > 0.0  # else all rows are zero, and stay so
+        picture = apply_exposure(seen.view.rgb, colours) if aligned else seen.view.rgb
         loss, d_picture = photo_loss(picture, compared.target, settings.ssim_weight)
-        d_rgb, d_colours = apply_exposure_gradient(seen.view.rgb, colours, d_picture)
+        d_rgb, d_colours = d_picture, np.zeros_like(colours)
+        if aligned:
+            d_rgb, d_colours = apply_exposure_gradient(seen.view.rgb, colours, d_picture)
         d_alpha = None
         if settings.opaque_weight > 0.0:
             through, d_alpha = opaque_loss(seen.view.alpha, compared.ground, settings.opaque_weight)

@@ -159,7 +159,7 @@ def exposure_matrix(row: F32) -> tuple[F32, F32]:
 def apply_exposure(rgb: F32, row: F32) -> F32:
     """A picture (H, W, 3) as the photo with exposure `row` (12,) would show it."""
     matrix, offset = exposure_matrix(row)
-    return np.asarray(rgb @ matrix.T + offset, np.float32)
+    return np.asarray((rgb.reshape(-1, 3) @ matrix.T + offset).reshape(rgb.shape), np.float32)
 
 
 def invert_exposure(row: F32) -> F32:
@@ -188,8 +188,8 @@ def apply_exposure_gradient(rgb: F32, row: F32, d_exposed: F32) -> tuple[F32, F3
     """Gradients by rgb (H, W, 3) and by the row (12,)."""
     matrix, _ = exposure_matrix(row)
     flat = d_exposed.reshape(-1, 3)
-    d_row = np.concatenate([(flat.T @ rgb.reshape(-1, 3)).ravel(), flat.sum(axis=0)])
-    return np.asarray(d_exposed @ matrix, np.float32), d_row.astype(np.float32)
+    d_row = np.concatenate([(flat.T @ rgb.reshape(-1, 3)).ravel(), flat.T @ np.ones(len(flat), np.float32)])
+    return np.asarray((flat @ matrix).reshape(rgb.shape), np.float32), d_row.astype(np.float32)
 
 
 def estimate_exposures(photos: Sequence[Photo], seen: Sequence[PhotoDepth], points: Array) -> F32:
@@ -286,7 +286,7 @@ def rigid_motion(row: FloatArray) -> Array:
 
 def corrected_pose(scene_from_camera: Array, row: FloatArray) -> Array:
     """The pose (4, 4) of a camera whose points move by `row` (6,)."""
-    return np.asarray(scene_from_camera @ np.linalg.inv(rigid_motion(row)))
+    return np.asarray(scene_from_camera @ np.linalg.inv(rigid_motion(row))) if row.any() else scene_from_camera
 
 
 def interpolate_in_time(times: FloatArray, rows: F32, time_s: float) -> F32:

@@ -6,7 +6,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from tasks.kernels.compiled import kernel
+from tasks.kernels.compiled import numpy_division_kernel
 from tasks.world.arrays import F32, Bools, Bytes
 
 WINDOW, SIGMA = 11, 1.5  # pixels, as in the paper
@@ -39,64 +39,50 @@ def _blur(image: F32) -> F32:
 
 def ssim(rgb: F32, target: Target) -> tuple[float, F32]:
     """Mean structural similarity over weighted pixels and channels, and its gradient (H, W, 3)."""
-    back = np.empty((*rgb.shape[:2], 9), np.float32)
+    share = _share(target)
+    square, cross = _blur(rgb * rgb), _blur(rgb * target.rgb)
+    mean = _blur(rgb)
+    similar = _similarity(mean, square, cross, target.mean, target.variance, share)
+    by_mean, by_square, by_cross = _blur(mean), _blur(square), _blur(cross)
+    return float((share * similar).sum()), by_mean + np.float32(2.0) * rgb * by_square + target.rgb * by_cross
+
+
+def similarity(rgb: F32, target: Target) -> F32:
+    """Structural similarity of each pixel and channel (H, W, 3)."""
+    windowed = _blur(rgb), _blur(rgb * rgb), _blur(rgb * target.rgb)
+    return np.asarray(_similarity(*windowed, target.mean, target.variance, np.zeros_like(rgb)), np.float32)
+
+
+def _share(target: Target) -> F32:
+    """Of each pixel and channel (H, W, 3) in a mean over those that are weighted."""
     share = target.weight / np.float32(3.0 * max(float(target.weight.sum()), 1.0))
-    total = _similarity(_blur(_products(rgb, target.rgb)), target.mean, target.variance, share, back)
-    return total, _chain_to_picture(_blur(back), rgb, target.rgb)
+    return np.repeat(share, 3).reshape(target.rgb.shape)
 
 
-@kernel
-def _products(x: Any, y: Any) -> Any:
-    """x, x^2, xy (H, W, 9), the three channels of each together."""
-    out = np.empty((x.shape[0], x.shape[1], 9), np.float32)
-    for i in range(x.shape[0]):
-        for j in range(x.shape[1]):
-            for c in range(3):
-                a, b = x[i, j, c], y[i, j, c]
-                out[i, j, c], out[i, j, c + 3], out[i, j, c + 6] = a, a * a, a * b
-    return out
-
-
-@kernel
-def _similarity(blurred: Any, mean: Any, variance: Any, share: Any, back: Any) -> float:
-    """Sum of share times similarity; fills its derivatives by `blurred` (H, W, 9), the windowed `_products`."""
-    total = 0.0
-    for i in range(blurred.shape[0]):
-        for j in range(blurred.shape[1]):
-            for c in range(3):
-                mu_x, mu_y = blurred[i, j, c], mean[i, j, c]
-                cross = blurred[i, j, c + 6] - mu_x * mu_y
-                spread = blurred[i, j, c + 3] - mu_x * mu_x + variance[i, j, c]
-                a1, a2 = 2.0 * mu_x * mu_y + C1, 2.0 * cross + C2
-                b1, b2 = mu_x * mu_x + mu_y * mu_y + C1, spread + C2
-                value, s = a1 * a2 / (b1 * b2), share[i, j]
-                by_xx = -s * value / b2
-                by_mean = 2.0 * s * (mu_y * (a2 - a1) / (b1 * b2) - mu_x * value / b1) - 2.0 * mu_x * by_xx
-                back[i, j, c], back[i, j, c + 3], back[i, j, c + 6] = by_mean, by_xx, 2.0 * s * a1 / (b1 * b2)
-                total += s * value
-    return total
-
-
-@kernel
-def _chain_to_picture(back: Any, x: Any, y: Any) -> Any:
-    """Derivatives by x (H, W, 3), from those by x, x^2 and xy (H, W, 9)."""
-    out = np.empty_like(x)
-    for i in range(x.shape[0]):
-        for j in range(x.shape[1]):
-            for c in range(3):
-                out[i, j, c] = back[i, j, c] + 2.0 * x[i, j, c] * back[i, j, c + 3] + y[i, j, c] * back[i, j, c + 6]
+@numpy_division_kernel
+def _similarity(mean: Any, square: Any, cross: Any, target_mean: Any, target_variance: Any, share: Any) -> Any:
+    """Similarity of windowed x, x^2 and xy, which become the derivatives by them of the sum of share times it."""
+    out = np.empty_like(mean)
+    x, xx, xy, to = mean.ravel(), square.ravel(), cross.ravel(), out.ravel()
+    y, yy, s = target_mean.ravel(), target_variance.ravel(), share.ravel()
+    for i in range(x.size):
+        a1, b1 = 2.0 * x[i] * y[i] + C1, x[i] * x[i] + y[i] * y[i] + C1
+        a2, b2 = 2.0 * (xy[i] - x[i] * y[i]) + C2, xx[i] - x[i] * x[i] + yy[i] + C2
+        by_1, by_2 = 1.0 / b1, 1.0 / b2
+        value = a1 * by_1 * a2 * by_2
+        by_square = -s[i] * value * by_2
+        by_mean = 2.0 * s[i] * (y[i] * (a2 - a1) * by_1 * by_2 - x[i] * value * by_1) - 2.0 * x[i] * by_square
+        x[i], xx[i], xy[i], to[i] = by_mean, by_square, 2.0 * s[i] * a1 * by_1 * by_2, value
     return out
 
 
 def photo_loss(rgb: F32, target: Target, ssim_weight: float) -> tuple[float, F32]:
     """(1 - w) L1 + w (1 - SSIM) of a picture (H, W, 3), and its gradient (H, W, 3)."""
-    share = target.weight[..., None] / np.float32(3.0 * max(float(target.weight.sum()), 1.0))
-    off = rgb - target.rgb
-    loss = (1.0 - ssim_weight) * float((share * np.abs(off)).sum())
-    gradient = np.float32(1.0 - ssim_weight) * share * np.sign(off)
+    share, off = np.float32(1.0 - ssim_weight) * _share(target), rgb - target.rgb
+    loss, gradient = float((share * np.abs(off)).sum()), share * np.sign(off)
     if ssim_weight > 0.0:
-        similarity, by_rgb = ssim(rgb, target)
-        loss += ssim_weight * (1.0 - similarity)
+        alike, by_rgb = ssim(rgb, target)
+        loss += ssim_weight * (1.0 - alike)
         gradient -= np.float32(ssim_weight) * by_rgb
     return loss, gradient
 

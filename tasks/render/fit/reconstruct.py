@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tasks.render.fit.backend import CpuBackend, Derivatives, FitBackend
+from tasks.render.fit.backend import CpuBackend, Derivatives, FitBackend, boxes_in_view
 from tasks.render.fit.corrections import (
     apply_exposure,
     chain_exposures,
@@ -16,7 +16,7 @@ from tasks.render.fit.corrections import (
     invert_exposure,
     mean_exposure,
 )
-from tasks.render.fit.losses import Target, ssim
+from tasks.render.fit.losses import Target, similarity
 from tasks.render.fit.start import FitPhoto, FitProblem
 from tasks.render.fit.state import (
     BACKGROUND,
@@ -73,13 +73,13 @@ def measure_photo(
     boxes, valid = boxes_at_photo(asset, problem, photo)
     vehicles = boxes[[j for j in np.flatnonzero(valid) if problem.tracks.kinds[j] == AgentKind.VEHICLE]]
     classes = pixel_classes(photo, vehicles, problem.road)
-    found = [_class_quality(name, picture, target, inside) for name, inside in classes.items()]
-    counted = target.weight > 0.0
+    alike, counted = similarity(picture, target), target.weight > 0.0
+    found = [_class_quality(name, picture, target, alike, inside & counted) for name, inside in classes.items()]
     return ViewQuality(
         photo.camera,
         photo.time_s,
         psnr(picture[counted], target.rgb[counted]) if counted.any() else float("nan"),
-        ssim(picture, target)[0],
+        float(alike[counted].mean()) if counted.any() else 0.0,
         held_out=True,
         away_m=distance_to_nearest_m(photo, [other.photo for other in problem.train]),
         classes=tuple(of for of in found if of is not None),
@@ -123,12 +123,14 @@ def pixel_classes(photo: Photo, vehicles: Array, road: Road | None) -> dict[str,
 
 def rays_meet_road(road: Road, eye: Array, rays: Array) -> Bools:
     """Which rays (M, 3) from `eye` (3,) go below the known road within ROAD_M, not where it is unknown."""
-    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    unit, lengths = rays / np.linalg.norm(rays, axis=1, keepdims=True), np.geomspace(RAY_FROM_M, ROAD_M, STEPS)
     over, found = np.zeros(len(rays), bool), np.zeros(len(rays), bool)
-    for length in np.geomspace(RAY_FROM_M, ROAD_M, STEPS):
-        height = height_above_road((eye + length * unit).astype(np.float32), road)
-        found |= over & (height <= 0.0)
-        over = ~found & (height > 0.0)
+    down = np.flatnonzero(unit[:, 2] * ROAD_M < np.nanmax(road.heights) - eye[2])  # others stay above all of it
+    for length in lengths:
+        height = height_above_road((eye + length * unit[down]).astype(np.float32), road)
+        found[down] = over[down] & (height <= 0.0)
+        over[down] = height > 0.0
+        down = down[~found[down]]
     return found
 
 
@@ -140,12 +142,12 @@ def distance_to_nearest_m(photo: Photo, others: Sequence[Photo]) -> float:
     return float(np.linalg.norm(places, axis=1).min(initial=np.inf))
 
 
-def _class_quality(name: str, picture: F32, target: Target, inside: Bools) -> ClassQuality | None:
-    counted = inside & (target.weight > 0.0)
+def _class_quality(name: str, picture: F32, target: Target, alike: F32, counted: Bools) -> ClassQuality | None:
     if counted.sum() < LEAST_PIXELS:
         return None
-    of = Target(target.rgb, target.mean, target.variance, counted.astype(np.float32))
-    return ClassQuality(name, float(counted.mean()), psnr(picture[counted], target.rgb[counted]), ssim(picture, of)[0])
+    return ClassQuality(
+        name, float(counted.mean()), psnr(picture[counted], target.rgb[counted]), float(alike[counted].mean())
+    )
 
 
 # Gaussians of the street that hang before a vehicle which drives: they explain a photo or two, and hide it elsewhere.
@@ -199,7 +201,7 @@ def find_floaters(problem: FitProblem, held: LearnedState) -> Ints:
 
 
 def _body_views(problem: FitProblem, held: LearnedState) -> dict[int, BodyView]:
-    """Of those photos that are near a vehicle which drives, by their rows."""
+    """Of those photos that may show a vehicle which drives, by their rows."""
     tracks, views = problem.tracks, dict[int, BodyView]()
     off = held.learned["boxes"].values.reshape(len(tracks.ids), tracks.n_knots, SHIFT_SIZE)
     for i, shot in enumerate(problem.train):
@@ -207,6 +209,7 @@ def _body_views(problem: FitProblem, held: LearnedState) -> dict[int, BodyView]:
         boxes = shift_boxes(boxes, interpolate_knots(off, shot.photo.time_s))
         pose = _learned_pose(shot, held, i)
         bodies, drives = bodies_near(boxes, valid, tracks, pose[:3, 3])
+        drives = drives & boxes_in_view(bodies, shot.photo)
         if drives.any():
             height, width = shot.photo.rgb.shape[:2]
             views[i] = BodyView(pose, shot.photo.intrinsics, height, width, bodies, drives)

@@ -3,13 +3,14 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from tasks.kernels.compiled import kernel
+from tasks.kernels.compiled import kernel, numpy_division_kernel
 from tasks.render.scene.body import BEFORE_M, BodyView, distance_before_bodies
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians, rotations_of
@@ -41,10 +42,8 @@ class AdamArray:
     def step(self, rows: Ints, gradient: F32, rate: float, scale: F32 | None = None) -> None:
         """Moves `rows` (M,), none twice, against `gradient` (M, C) by `rate`, times `scale` (M,) where given."""
         sizes = np.ones(len(rows), np.float32) if scale is None else scale
-        self.steps[rows] += 1
-        counts = np.arange(self.steps.max(initial=0) + 1)
-        unbiased = np.stack([1.0 - BETA1**counts, 1.0 - BETA2**counts], axis=1)
-        adam_step(self.values, self.first, self.second, self.steps, rows, gradient, rate, sizes, unbiased)
+        unbiased = _unbiased(int(self.steps.max(initial=0) + 1).bit_length())
+        adam_step(self.values, self.first, self.second, self.steps, rows, gradient, np.float32(rate), sizes, unbiased)
 
     def take(self, rows: Ints) -> "AdamArray":
         """The rows (M,), moments and all."""
@@ -55,22 +54,30 @@ class AdamArray:
         self.first[rows], self.second[rows], self.steps[rows] = 0.0, 0.0, 0
 
 
-@kernel
+@cache
+def _unbiased(bits: int) -> F32:
+    """(2^bits, 2) by the count of steps: what m and the root of v are multiplied by to lose their start's bias."""
+    counts = np.maximum(np.arange(2**bits), 1)
+    return np.stack([1.0 / (1.0 - BETA1**counts), 1.0 / np.sqrt(1.0 - BETA2**counts)], axis=1).astype(np.float32)
+
+
+@numpy_division_kernel
 def adam_step(
-    values: Any, first: Any, second: Any, steps: Any, rows: Any, gradient: Any, rate: float, sizes: Any, unbiased: Any
+    values: Any, first: Any, second: Any, steps: Any, rows: Any, gradient: Any, rate: Any, sizes: Any, unbiased: Any
 ) -> None:
     """One step of `AdamArray`, in place: x -= rate size m / (sqrt(v) + eps), m and v without their start's bias."""
+    keep1, keep2 = np.float32(BETA1), np.float32(BETA2)
+    take1, take2, least = np.float32(1.0 - BETA1), np.float32(1.0 - BETA2), np.float32(EPSILON)
     for k in range(rows.shape[0]):
         i = rows[k]
-        size = rate * sizes[k] / unbiased[steps[i], 0]
-        unbiased2 = unbiased[steps[i], 1]
+        steps[i] += 1
+        size, root = rate * sizes[k] * unbiased[steps[i], 0], unbiased[steps[i], 1]
         for c in range(values.shape[1]):
-            g = float(gradient[k, c])
-            m = BETA1 * first[i, c] + (1.0 - BETA1) * g
-            v = BETA2 * second[i, c] + (1.0 - BETA2) * g * g
-            first[i, c] = m
-            second[i, c] = v
-            values[i, c] -= size * m / (math.sqrt(v / unbiased2) + EPSILON)
+            g = gradient[k, c]
+            m = keep1 * first[i, c] + take1 * g
+            v = keep2 * second[i, c] + take2 * g * g
+            first[i, c], second[i, c] = m, v
+            values[i, c] -= size * m / (np.sqrt(v) * root + least)
 
 
 # The road as lidar knows it: a smooth height field, and Gaussians that lie flat on it.
@@ -109,17 +116,19 @@ def fit_road(points: Array, eyes: Array) -> Road | None:
     Around each few metres of the way a plane is fitted to what lies below the cameras, and fitted again to what is
     near it; points near any plane make the height field.
     """
-    on_road = np.zeros(len(points), bool)
+    on_road, order = np.zeros(len(points), bool), np.argsort(points[:, 0])
     for eye in _spaced(eyes):
-        away = np.linalg.norm(points[:, :2] - eye[:2], axis=1)
-        below = eye[2] - points[:, 2]
-        use = np.flatnonzero((away < PLANE_REACH_M) & (below > BELOW_M[0]) & (below < BELOW_M[1]))
-        plane = _plane(points[use], eye)
+        reach = eye[0] + np.array([-1.0, 1.0]) * max(PLANE_REACH_M, BESIDE_M)
+        rows = np.sort(order[slice(*np.searchsorted(points[:, 0], reach, sorter=order))])  # of most streets a few
+        around = points[rows]
+        away = np.linalg.norm(around[:, :2] - eye[:2], axis=1)
+        below = eye[2] - around[:, 2]
+        plane = _plane(around[(away < PLANE_REACH_M) & (below > BELOW_M[0]) & (below < BELOW_M[1])], eye)
         if plane is None:
             continue
-        near = away < BESIDE_M
-        off = points[near, 2] - np.column_stack([points[near, :2] - eye[:2], np.ones(near.sum())]) @ plane
-        on_road[np.flatnonzero(near)[np.abs(off) < NEAR_PLANE_M]] = True
+        near = np.flatnonzero(away < BESIDE_M)
+        off = around[near, 2] - np.column_stack([around[near, :2] - eye[:2], np.ones(len(near))]) @ plane
+        on_road[rows[near[np.abs(off) < NEAR_PLANE_M]]] = True
     if on_road.sum() < LEAST_POINTS:
         return None
     return _height_field(points[on_road])

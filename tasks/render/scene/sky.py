@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from tasks.kernels.compiled import inlined, kernel
+from tasks.kernels.compiled import inlined, kernel, numpy_division_kernel
 from tasks.kernels.threads import run_in_chunks
 from tasks.world.arrays import F32, Array, Bools, ShortInts
 
@@ -47,15 +47,15 @@ def _place(k: Any, turn: Any, column: Any, row: Any) -> Any:
     return v, u
 
 
-@kernel
+@numpy_division_kernel
 def _find(k: Any, turn: Any, corners: Any, shares: Any, first: int, last: int) -> None:
     for row in range(first, last):
         for column in range(corners.shape[1]):
             v, u = _place(k, turn, column, row)
             v0, u0 = min(max(int(np.floor(v)), 0), ROWS - 2), int(np.floor(u))
             corners[row, column, 0] = v0
-            corners[row, column, 1] = u0 % COLUMNS
-            corners[row, column, 2] = (u0 + 1) % COLUMNS
+            corners[row, column, 1] = u0 & (COLUMNS - 1)
+            corners[row, column, 2] = (u0 + 1) & (COLUMNS - 1)
             shares[row, column, 0] = u - u0
             shares[row, column, 1] = min(max(v - v0, 0.0), 1.0)
 
