@@ -38,7 +38,7 @@ def interpolated(x: float, at: Array, values: Array) -> float:
     return slope * (x - at[low]) + values[low]
 
 
-@hidden_kernel
+@inner_kernel
 def least_and_largest(values: Array) -> tuple[float, float]:
     """Least and largest of values (P,); a fraction of what numpy's own two take to compile."""
     low, high = np.inf, -np.inf

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from tasks.kernels.compiled import hidden_kernel, inlined, kernel
+from tasks.kernels.compiled import inlined, kernel
 from tasks.world.arrays import Array
 
 
@@ -29,7 +29,7 @@ def nearest_on_edge(dx: float, dy: float, ex: float, ey: float, along: float) ->
     return fraction, rx * rx + ry * ry
 
 
-@hidden_kernel
+@kernel
 def to_segment(px: float, py: float, ax: float, ay: float, bx: float, by: float) -> tuple[float, float]:
     """Distance [m] from a point to the segment a-b, and the fraction 0..1 of it at which it is nearest."""
     ex, ey = bx - ax, by - ay
@@ -42,7 +42,7 @@ def to_segment(px: float, py: float, ax: float, ay: float, bx: float, by: float)
     return abs(((ay - py) * ex - (ax - px) * ey) / square) * math.sqrt(square), fraction
 
 
-@hidden_kernel
+@kernel
 def segments_touch(ax: float, ay: float, bx: float, by: float, cx: float, cy: float, dx: float, dy: float) -> bool:
     """Whether the segments a-b and c-d have a point in common, ends included."""
     if max(ax, bx) < min(cx, dx) or max(cx, dx) < min(ax, bx) or max(ay, by) < min(cy, dy) or max(cy, dy) < min(ay, by):
@@ -55,7 +55,7 @@ def segments_touch(ax: float, ay: float, bx: float, by: float, cx: float, cy: fl
     return not apart
 
 
-@hidden_kernel
+@kernel
 def ring_contains(x: Array, y: Array, px: float, py: float) -> bool:
     """Whether (px, py) is inside the ring, by the even-odd rule; on the ring itself it may be either."""
     inside = False
