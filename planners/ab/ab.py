@@ -41,6 +41,7 @@ from factory.graph.own_process import run_command_in_own_process
 from factory.graph.parallel import parallel_map
 from factory.graph.steps import TaskStopped
 from factory.store.location import Location
+from factory.store.samples import FACTS
 from factory.wording import time_text
 from planners.ab.report import BASELINES, write_report
 from planners.ab.rows import DRIVE_SCHEMA, Trained, cluster_of, frames_of, write_ab_rows
@@ -138,6 +139,22 @@ def _limits(settings: AbSettings, data: Mapping[str, Dataset], held_out: Sequenc
     return {name: min(n, own[name] or most) or None for name, n in there.items()}
 
 
+def runs_ahead(settings: AbSettings) -> str:
+    """What the factory's runs that are not there yet will take, by three clips of each, and how much is to train then.
+
+    Nothing is made, but the blocks of these clips where they are rendered. Raises Stopped, Failed.
+    """
+    out, told = Path(settings.out), list[str]()
+    for name, words in settings.runs.items():
+        if not (out / name / FACTS).is_file():
+            said = _call(settings, "factory", "plan", *words.split(), f"out={out / name}").splitlines()
+            told += [f"{name}: {line}" for line in said if line.startswith("expected for")]
+    n = settings.seeds * len(settings.chosen) * len(settings.planners)
+    each = f", for each of {settings.folds} parts" if settings.folds else ""
+    told.append(f"then {n} trainings of {settings.steps} steps{each}: the first says what they cost")
+    return "\n".join(["to be made:", *told])
+
+
 def make_runs(settings: AbSettings) -> None:
     """Runs of the factory that are not complete yet. Raises Stopped, Failed."""
     for name, words in settings.runs.items():
@@ -145,19 +162,23 @@ def make_runs(settings: AbSettings) -> None:
         _call(settings, "factory", "run", *words.split(), *how, f"out={Path(settings.out) / name}")
 
 
-def _call(settings: AbSettings, *words: str) -> None:
-    """One command of this product in a process of its own; its tables go into a file. Raises Stopped, Failed."""
+def _call(settings: AbSettings, *words: str) -> str:
+    """What one command of this product says, in a process of its own, into a file. Raises Stopped, Failed."""
     told = Path(settings.out) / TOLD
     told.parent.mkdir(parents=True, exist_ok=True)
     print(f"python -m {' '.join(words[:2])}: see {told}", file=sys.stderr)
-    with stop_event(settings.left_s) as stop, told.open("a") as file:
+    with stop_event(settings.left_s) as stop, told.open("a+") as file:
         print(f"\n$ {shlex.join(('python', '-m', *words))}", file=file, flush=True)
+        begins = file.tell()
         command = [sys.executable, "-m", *words]
         code = run_process(command, stop.is_set, file, environment=ALONE | os.environ)
         if code == INTERRUPTED or stop.is_set():
             raise Stopped("the same command goes on")
+        file.seek(begins)
+        said = file.read()
     if code:
         raise Failed(f"python -m {words[0]} {words[1]} ended with exit code {code}")
+    return said
 
 
 def train(settings: AbSettings, trainings: Sequence[Training]) -> None:
@@ -307,6 +328,7 @@ def experiment(settings: AbSettings) -> None:
     if settings.rows is not None:
         print(write_report(Path(settings.rows)))
         return
+    print(runs_ahead(settings), file=sys.stderr)
     make_runs(settings)
     by_benchmark = [list(read_clip_logs(settings.table(name)).values()) for name in settings.benchmark]
     logs = [log for there in by_benchmark for log in there]

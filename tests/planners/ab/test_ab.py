@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from factory.config.words import ConfigError
-from planners.ab.ab import Part, check_apart, folds_of, main, parts_of, planned
+from planners.ab.ab import Part, check_apart, folds_of, main, parts_of, planned, runs_ahead
 from planners.ab.report import holm, write_report
 from planners.ab.rows import Trained, read_ab_rows, read_frames, write_ab_rows
 from planners.ab.rows import frames_of as kept_frames
@@ -113,6 +113,16 @@ def test_an_experiment_says_its_cost_by_its_first_training_and_goes_on(
     assert main([str(file)]) == 0
     again = capsys.readouterr()
     assert "still to train: none" in again.err and again.out == told.out
+
+
+def test_what_the_runs_will_take_is_said_before_any_is_made(tmp_path: Path) -> None:
+    town = "clips=synthetic_towns clips.n_towns=1 clips.settings.cameras=[] clips.settings.lidar_beams=0 render=none"
+    (tmp_path / "done").mkdir()
+    (tmp_path / "done" / "report.json").write_text("{}")  # of a run that came to its end
+    expected, then = runs_ahead(settings(tmp_path, runs={"t": town, "done": town}, folds=3)).splitlines()[1:]
+    assert re.fullmatch(r"t: expected for 9 clips: \d+ attempts, .* core-hours", expected)
+    assert then == "then 6 trainings of 1500 steps, for each of 3 parts: the first says what they cost"
+    assert not (tmp_path / "t").exists(), "nothing is made"
 
 
 def frames_of(bonus: float) -> list[FrameRow]:
