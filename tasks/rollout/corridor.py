@@ -184,7 +184,7 @@ def corridor_between(
 
     offset, turn: the largest lateral offset and turn the body has to its path in there; half_width: of the corridor.
     """
-    if begin < 0.0 or end > length:  # beyond the path's ends there are no stretches
+    if not (begin >= 0.0 and end <= length):  # beyond the path's ends there are no stretches
         return CorridorAhead(0.0, 0.0, 1.0, 0.0, np.inf, np.inf, 0, -1, offset, turn, half_width)
     first, last = int(begin / STRETCH_M), min(int(end / STRETCH_M), stretches.shape[1] - 1)
     x, y = stretches[m, first, 0], stretches[m, first, 1]

@@ -249,7 +249,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
         first_part=first_part,
         trails=trails_behind(scene, first_part, {towed: front for front, towed in pairs}),
     )
-    yields = settings.yields and settings.mode == "idm"
+    yields = keeps_intent(settings)
     paths = stack_paths(
         scene, found, logged_ways, settings.target_speed_mps, settings.decel_max, logged_stops=not yields
     )
@@ -286,13 +286,13 @@ def _answer(traffic: TrafficScene, ego_states: Array, steps: int) -> tuple[Agent
     start, n_rows = traffic.scene.step, len(ego_states)
     window = _extend_tracks(traffic.scene.agents, start + n_rows).window(start, start + n_rows)
     if traffic.navsim is not None:
-        return roll_out_navsim(traffic.navsim, _driver(traffic.settings), window, ego_states)
+        return roll_out_navsim(traffic.navsim, idm_driver(traffic.settings), window, ego_states)
     if traffic.roles is None or traffic.paths is None or len(window) == 0:
         return window, np.zeros(len(window), dtype=bool)
     n, policy = len(window), traffic.settings.policy
     if policy is None:
         yielding = None if traffic.yielding is None else Yielding(*_writable(traffic.yielding))
-        rows, motion = drive(*_kernel_inputs(traffic, window), *_ego_boxes(ego_states), yielding)
+        rows, motion = drive(*_kernel_inputs(traffic, window), *boxes_and_velocities(ego_states), yielding)
     else:
         rows, motion = _drive_by_policy(policy_named(policy), traffic, window, ego_states)
     return replace(window, **{name: getattr(rows, name)[:, :n].copy() for name in PER_STEP}), motion.was_driven[steps]
@@ -304,11 +304,11 @@ def _drive_by_policy(
     """As `traffic.drive`, by a policy. Raises BadPolicy where it answers no states."""
     scene = traffic.scene
     start, log, now, roles, paths, driver = _kernel_inputs(traffic, window)
-    rows, motion = initial_rows(now, roles, *_ego_boxes(ego_states))
+    rows, motion = initial_rows(now, roles, *boxes_and_velocities(ego_states))
     past = _agent_states(scene.agents.window(start - SEEN_ROWS + 1, start + 1))
     boxes, velocities = (
         np.concatenate([agents, of_ego[:, None]], axis=1)
-        for agents, of_ego in zip((past.boxes, past.velocities), _ego_boxes(scene.ego_history[-SEEN_ROWS:]))
+        for agents, of_ego in zip((past.boxes, past.velocities), boxes_and_velocities(scene.ego_history[-SEEN_ROWS:]))
     )
     valid = np.concatenate([past.valid, np.ones((SEEN_ROWS, 1), bool)], axis=1)
     for t in range(len(rows.boxes) - 1):
@@ -364,8 +364,15 @@ def _check_states(ego_states: Array, n_rows: int) -> None:
         raise ValueError(f"ego_states are not finite or above {LARGEST:g}: leave the ego out")
 
 
-def _driver(settings: TrafficSettings) -> IdmDriver:
-    return IdmDriver(*(getattr(settings, name) for name in IdmDriver._fields))
+def idm_driver(settings: TrafficSettings) -> IdmDriver:
+    """What the kernels know of the settings."""
+    driver = IdmDriver(*(getattr(settings, name) for name in IdmDriver._fields))
+    return driver._replace(headway_s=min(driver.headway_s, SHORTEST_HEADWAY_S)) if keeps_intent(settings) else driver
+
+
+def keeps_intent(settings: TrafficSettings) -> bool:
+    """Whether drivers mean to do what their log does, and give way."""
+    return settings.yields and settings.mode == "idm"
 
 
 def _kernel_inputs(
@@ -377,20 +384,17 @@ def _kernel_inputs(
     if window.n_steps > len(paths.line_state):  # lights and stops stay as the last step knows them
         more = window.n_steps - len(paths.line_state)
         paths = paths._replace(line_state=np.concatenate([paths.line_state, np.repeat(paths.line_state[-1:], more, 0)]))
-    driver = _driver(traffic.settings)
-    if traffic.yielding is not None:
-        driver = driver._replace(headway_s=min(driver.headway_s, SHORTEST_HEADWAY_S))
     return (
         start,
         _agent_states(_extend_tracks(traffic.scene.clip.agents, start + window.n_steps)),
         _agent_states(window.window(0, 1)),
         Roles(*_writable(traffic.roles)),
         Paths(*_writable(paths)),
-        driver,
+        idm_driver(traffic.settings),
     )
 
 
-def _ego_boxes(ego_states: Array) -> tuple[Array, Array]:
+def boxes_and_velocities(ego_states: Array) -> tuple[Array, Array]:
     """Boxes (..., 5) about the true centre and world velocities (..., 2) of egos with states (..., 11)."""
     heading = ego_states[..., HEADING]
     cos, sin = np.cos(heading), np.sin(heading)
