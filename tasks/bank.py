@@ -14,13 +14,14 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.bank_traffic import unpack_traffic
 from tasks.caches import Damaged, parse_json_with_checksum
 from tasks.experts.pdm_closed import plan_for
-from tasks.kernels.compiled import kernel
+from tasks.kernels.compiled import kernel, read_only
 from tasks.kernels.threads import run_in_chunks
 from tasks.reward.areas import RedLanes
 from tasks.reward.centerline import line_through
-from tasks.reward.collisions import CIRCUMRADIUS, obstacles_of, with_index
+from tasks.reward.collisions import CIRCUMRADIUS, obstacles_of, obstacles_of_tracks, with_index
 from tasks.reward.comfort import HISTORY_ROWS, N_FLAGS
 from tasks.reward.epdms import (
     INDEX_FROM_ROWS,
@@ -30,16 +31,21 @@ from tasks.reward.epdms import (
     PDM_SCORE,
     PreparedScene,
     RuleContext,
+    add_up,
     prepare_scene,
     score,
     score_all,
 )
 from tasks.reward.map_index import Grid, assembled, touched_cells, window_around
 from tasks.reward.packing import MOST, packed, unpacked
+from tasks.rollout.corridor import Paths
+from tasks.rollout.idm import AgentStates, IdmDriver, Roles, Yielding
 from tasks.rollout.lqr import follow
+from tasks.rollout.simulate import boxes_and_velocities, drive, idm_driver
+from tasks.settings import TrafficSettings
 from tasks.subscores import LABELLED, OF_ONE_PLAN
 from tasks.trajectories import COARSE_STEPS, at_ten_hz, interpolated
-from tasks.world.arrays import Array, Bytes
+from tasks.world.arrays import Array, Bytes, Ints
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, scene_of_clip
 from tasks.world.frames import EGO_STATE_SIZE, LARGEST, PACIFICA, REAR_AXLE_TO_CENTER, X, Y
 
@@ -109,12 +115,76 @@ BEYOND_M = REAR_AXLE_TO_CENTER + CIRCUMRADIUS + 1.0  # no part of the body is th
 def _score_packed(data: Bytes, poses: Array, in_batch: bool, subscores: Array, scores: Array) -> int:
     """Sub-scores (P, 8) and scores (P,) of plans (P, 40 or 8, 3) on a packed scene; what went wrong, or OK."""
     values, starts = unpacked(data, ORDERS)
+    if not _is_whole(values, starts):
+        return DAMAGED
+    floats, n_objects = values.view(np.float64), starts[STOPPED + 1] - starts[STOPPED]
+    boxes = np.empty((N_TIMES, n_objects, BOX))
+    for item in range(n_objects):
+        for c in range(BOX):
+            for t in range(N_TIMES):
+                boxes[t, item, c] = floats[starts[BOXES] + (item * BOX + c) * N_TIMES + t]
+    obstacles = obstacles_of(
+        boxes, values[starts[STOPPED] : starts[COLLISION]] != 0, floats[starts[COLLISION] : starts[RED_TIMES]].copy()
+    )
+    if len(poses) >= INDEX_FROM_ROWS:
+        obstacles = with_index(obstacles)
+
+    plans = interpolated(poses) if poses.shape[1] == COARSE_STEPS else poses
+    states = np.empty((len(plans), N_TIMES, EGO_STATE_SIZE))
+    ego = floats[starts[EGO] : starts[HISTORY]].copy()
+    if not (follow(ego, np.empty((0, 3)), plans, True, _WHEEL_BASE, states) and _are_near(states)):
+        return NO_DRIVE
+    context = _context_around(values, starts, states)
+    table = np.empty((N_ROWS, len(states)))
+    areas, comfort = np.empty((len(states), N_TIMES, 3), np.bool_), np.empty((len(states), N_FLAGS), np.bool_)
+    beside = NO_REFERENCE if in_batch else floats[starts[PLACE] + 3]
+    if not score_all(context, obstacles, states, False, beside, table, areas, comfort):
+        return NO_DRIVE
+    _show(table, subscores, scores)
+    return OK
+
+
+@kernel
+def _score_answered(
+    data: Bytes, states: Array, ego_boxes: Array, ego_velocities: Array, in_batch: bool,
+    log: AgentStates, now: AgentStates, roles: Roles, paths: Paths, driver: IdmDriver, yielding: Yielding | None,
+    collision_score: Array, subscores: Array, scores: Array,
+) -> int:  # fmt: skip
+    """The same of drives (1 + P, 41, 11), the first PDM-Closed's, each among the traffic that answers to it.
+
+    ego_boxes (P, 41, 5) and ego_velocities (P, 41, 2) of the plans' drives; collision_score (N + 1,): the last the
+    ego's, who is left out of the obstacles since it touches itself.
+    """
+    values, starts = unpacked(data, ORDERS)
+    if not _is_whole(values, starts):
+        return DAMAGED
+    if not _are_near(states):
+        return NO_DRIVE
+    context, table = _context_around(values, starts, states), np.empty((N_ROWS, len(scores)))
+    pair, of_pair = states[:2].copy(), np.empty((N_ROWS, 2))
+    areas, comfort = np.empty((2, N_TIMES, 3), np.bool_), np.empty((2, N_FLAGS), np.bool_)
+    for k in range(len(scores)):
+        rows = drive(NOW, log, now, roles, paths, driver, ego_boxes[k], ego_velocities[k], yielding)[0]
+        obstacles = obstacles_of_tracks(rows.boxes, rows.velocities, rows.valid, collision_score, ego_boxes[k, 0])
+        pair[1] = states[1 + k]
+        if not score_all(context, obstacles, pair, True, NO_REFERENCE, of_pair, areas, comfort):
+            return NO_DRIVE
+        table[:, k] = of_pair[:, 1]
+    if in_batch:
+        add_up(table, False, NO_REFERENCE)
+    _show(table, subscores, scores)
+    return OK
+
+
+@kernel
+def _is_whole(values: Ints, starts: Ints) -> bool:
+    """Whether an unpacked scene holds what it is read as: nothing beyond it is."""
     n = starts[1:] - starts[:-1]
     if len(values) == 0 or n[PLACE] != N_PLACE or n[SIZES] != N_SIZES or n[EGO] != EGO_STATE_SIZE:
-        return DAMAGED
+        return False
     floats = values.view(np.float64)
     at, size = starts[PLACE], starts[SIZES]
-    low_x, low_y, cell_m, reference_m = floats[at], floats[at + 1], floats[at + 2], floats[at + 3]
+    low_x, low_y, cell_m = floats[at], floats[at + 1], floats[at + 2]
     n_rows, n_columns, n_lane_words, n_words = values[size], values[size + 1], values[size + 2], values[size + 3]
     n_objects, n_lanes, n_edges = n[STOPPED], n[RED_FIRST] - 1, n[EDGE_KIND]
     if (
@@ -125,82 +195,83 @@ def _score_packed(data: Bytes, poses: Array, in_batch: bool, subscores: Array, s
         or (n[PLAYING] != N_LAYERS * n_words or n[BOXES] != n_objects * N_TIMES * BOX or n[COLLISION] != n_objects)
         or (n_lanes < 0 or n[RED_BOUNDS] != 4 * n_lanes or n[RED_TIMES] != (N_TIMES * n_lanes if n_lanes else 0))
     ):
-        return DAMAGED
+        return False
     high_x, high_y = low_x + n_columns * cell_m, low_y + n_rows * cell_m
     for p in range(n[POINT_X]):
         x, y = floats[starts[POINT_X] + p], floats[starts[POINT_Y] + p]
         if not (low_x <= x <= high_x and low_y <= y <= high_y and abs(x) <= LARGEST and abs(y) <= LARGEST):
-            return DAMAGED
-    edges, bounded = np.empty((n_edges, 4)), np.empty((n_edges, n_words), np.uint64)
+            return False
     for e in range(n_edges):
         start, stop = values[starts[EDGE_FROM] + e], values[starts[EDGE_TO] + e]
         kind = values[starts[EDGE_KIND] + e]
         if not (0 <= start < n[POINT_X] and 0 <= stop < n[POINT_X] and 0 <= kind < n[BOUNDED] // n_words):
-            return DAMAGED
+            return False
+    for lane in range(n_lanes):
+        first, end = values[starts[RED_FIRST] + lane], values[starts[RED_FIRST] + lane + 1]
+        if not 0 <= first <= end <= n[RED_EDGES] // 4:
+            return False
+    return True
+
+
+@kernel
+def _are_near(states: Array) -> bool:
+    """Whether all places of drives (K, 41, 11) are some."""
+    for k in range(len(states)):
+        for t in range(N_TIMES):
+            if not (abs(states[k, t, X]) <= LARGEST and abs(states[k, t, Y]) <= LARGEST):
+                return False
+    return True
+
+
+@kernel
+def _context_around(values: Ints, starts: Ints, states: Array) -> RuleContext:
+    """What drives (K, 41, 11) are judged against, the map as far as they reach."""
+    n, floats, at, size = starts[1:] - starts[:-1], values.view(np.float64), starts[PLACE], starts[SIZES]
+    n_lane_words, n_words = values[size + 2], values[size + 3]
+    n_edges, n_lanes, n_red_edges = n[EDGE_KIND], n[RED_FIRST] - 1, n[RED_EDGES] // 4
+    edges, bounded = np.empty((n_edges, 4)), np.empty((n_edges, n_words), np.uint64)
+    for e in range(n_edges):
+        start, stop = values[starts[EDGE_FROM] + e], values[starts[EDGE_TO] + e]
+        kind = values[starts[EDGE_KIND] + e]
         edges[e, 0], edges[e, 1] = floats[starts[POINT_X] + start], floats[starts[POINT_Y] + start]
         edges[e, 2], edges[e, 3] = floats[starts[POINT_X] + stop], floats[starts[POINT_Y] + stop]
         for w in range(n_words):
             bounded[e, w] = np.uint64(values[starts[BOUNDED] + kind * n_words + w])
-    boxes = np.empty((N_TIMES, n_objects, BOX))
-    for item in range(n_objects):
-        for c in range(BOX):
-            for t in range(N_TIMES):
-                boxes[t, item, c] = floats[starts[BOXES] + (item * BOX + c) * N_TIMES + t]
-    first = values[starts[RED_FIRST] : starts[RED_EDGES]]
-    n_red_edges = n[RED_EDGES] // 4
-    for lane in range(n_lanes):
-        if not 0 <= first[lane] <= first[lane + 1] <= n_red_edges:
-            return DAMAGED
-    red = RedLanes(
-        (values[starts[RED_TIMES] : starts[RED_BOUNDS]] != 0).reshape(N_TIMES if n_lanes else 0, n_lanes),
-        floats[starts[RED_BOUNDS] : starts[RED_FIRST]].copy().reshape(n_lanes, 4),
-        first.copy(),
-        floats[starts[RED_EDGES] : starts[RED_EDGES + 1]].copy().reshape(4, n_red_edges),
-    )
-    obstacles = obstacles_of(
-        boxes, values[starts[STOPPED] : starts[COLLISION]] != 0, floats[starts[COLLISION] : starts[RED_TIMES]].copy()
-    )
-    if len(poses) >= INDEX_FROM_ROWS:
-        obstacles = with_index(obstacles)
-
-    plans = interpolated(poses) if poses.shape[1] == COARSE_STEPS else poses
-    states = np.empty((len(plans), N_TIMES, EGO_STATE_SIZE))
-    ego = floats[starts[EGO] : starts[HISTORY]].copy()
-    if not follow(ego, np.empty((0, 3)), plans, True, _WHEEL_BASE, states):
-        return NO_DRIVE
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for k in range(len(states)):
         for t in range(N_TIMES):
             x, y = states[k, t, X], states[k, t, Y]
-            if not (abs(x) <= LARGEST and abs(y) <= LARGEST):
-                return NO_DRIVE
             low[0], low[1], high[0], high[1] = min(low[0], x), min(low[1], y), max(high[0], x), max(high[1], y)
     low -= BEYOND_M
     high += BEYOND_M
-    whole = Grid(low_x, low_y, cell_m, 0, 0, n_rows, n_columns)
+    whole = Grid(floats[at], floats[at + 1], floats[at + 2], 0, 0, values[size], values[size + 1])
     grid = window_around(whole, low[0], low[1], high[0], high[1])
     playing = values[starts[PLAYING] : starts[BOXES]].copy().view(np.uint64).reshape(N_LAYERS, n_words)
     index = assembled(grid, touched_cells(edges, grid)[0], edges, bounded, playing, n_lane_words)
-
+    red = RedLanes(
+        (values[starts[RED_TIMES] : starts[RED_BOUNDS]] != 0).reshape(N_TIMES if n_lanes else 0, n_lanes),
+        floats[starts[RED_BOUNDS] : starts[RED_FIRST]].copy().reshape(n_lanes, 4),
+        values[starts[RED_FIRST] : starts[RED_EDGES]].copy(),
+        floats[starts[RED_EDGES] : starts[RED_EDGES + 1]].copy().reshape(4, n_red_edges),
+    )
     history = floats[starts[HISTORY] : starts[LINE_X]].copy().reshape(n[HISTORY] // EGO_STATE_SIZE, EGO_STATE_SIZE)
     line = line_through(floats[starts[LINE_X] : starts[LINE_Y]].copy(), floats[starts[LINE_Y] : starts[POINT_X]].copy())
-    context = RuleContext(line, index, red, history)
-    table = np.empty((N_ROWS, len(states)))
-    areas, comfort = np.empty((len(states), N_TIMES, 3), np.bool_), np.empty((len(states), N_FLAGS), np.bool_)
-    beside = NO_REFERENCE if in_batch else reference_m
-    if not score_all(context, obstacles, states, False, beside, table, areas, comfort):
-        return NO_DRIVE
-    for k in range(len(states)):
+    return RuleContext(line, index, red, history)
+
+
+@kernel
+def _show(table: Array, subscores: Array, scores: Array) -> None:
+    for k in range(len(scores)):
         scores[k] = table[PDM_SCORE, k]
         for i in range(len(_SHOWN)):
             subscores[k, i] = table[_SHOWN[i], k]
-    return OK
 
 
-# A folder of them: shards of some thousand scenes, each a file of bytes and a head that says where its scenes are.
+# A folder of them: shards of some thousand scenes, each files of bytes and a head that says where its scenes are.
 
 Reference = Literal["pdm_closed", "batch"]
-HEAD, BODY = "scenes-*.json", ".bank"
+Traffic = Literal["replay", "idm"]
+HEAD, BODY, ANSWERING = "scenes-*.json", ".bank", ".traffic"
 
 
 @dataclass(frozen=True)
@@ -222,25 +293,31 @@ class SceneBank:
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         self._bodies: list[Bytes] = []
-        self._place: dict[str, tuple[int, int, int, int]] = {}  # shard, first byte, past the last, CRC-32
+        self._place: dict[tuple[str, str], tuple[int, int, int, int]] = {}  # file, first byte, past the last, CRC-32
+        self._drivers: set[IdmDriver] = set()  # of the answering traffic
         self.left_out: dict[str, str] = {}  # clip id -> why it has no scene
         self.tokens: dict[str, str] = {}  # of the log's frames at T -> clip id
         heads = sorted(self.folder.glob(HEAD))
         if not heads:
             raise FileNotFoundError(f"{folder}: no {HEAD} in it: write it by factory.readers.bank.write_bank")
-        for shard, path in enumerate(heads):
+        for path in heads:
             head = read_head(path)
-            body = path.with_suffix(BODY)
-            ends = head["ends"]
-            if not body.is_file() or body.stat().st_size != ends[-1]:
-                raise Damaged(f"{body}: not {ends[-1]:,} bytes: remove {path.name} and write the bank again")
-            self._bodies.append(np.memmap(body, np.uint8, "r") if ends[-1] else np.empty(0, np.uint8))
-            places = zip([shard] * len(ends), ends, ends[1:], head["crc32"])
-            self._place.update(zip(head["clip_ids"], places, strict=False))
+            self._open(path, BODY, head["clip_ids"], head)
+            if answering := head.get("traffic"):
+                self._open(path, ANSWERING, head["clip_ids"], answering)
+                self._drivers.add(idm_driver(TrafficSettings(**answering["settings"])))
             self.left_out.update(head["left_out"])
             self.tokens.update(head["tokens"])
-        self.clip_ids = tuple(self._place)
-        self._whole: set[str] = set()  # whose bytes were held against their checksum
+        self.clip_ids = tuple(clip_id for clip_id, suffix in self._place if suffix == BODY)
+        self._whole: set[tuple[str, str]] = set()  # whose bytes were held against their checksum
+
+    def _open(self, head: Path, suffix: str, clip_ids: list[str], where: dict[str, Any]) -> None:
+        body, ends = head.with_suffix(suffix), where["ends"]
+        if not body.is_file() or body.stat().st_size != ends[-1]:
+            raise Damaged(f"{body}: not {ends[-1]:,} bytes: remove {head.name} and write the bank again")
+        places = zip([len(self._bodies)] * len(ends), ends, ends[1:], where["crc32"])
+        self._place.update(zip(((clip_id, suffix) for clip_id in clip_ids), places, strict=False))
+        self._bodies.append(np.memmap(body, np.uint8, "r") if ends[-1] else np.empty(0, np.uint8))
 
     def __reduce__(self) -> tuple[type["SceneBank"], tuple[Path]]:
         return type(self), (self.folder,)
@@ -248,9 +325,9 @@ class SceneBank:
     def __len__(self) -> int:
         return len(self.clip_ids)
 
-    def n_bytes(self, clip_id: str) -> int:
-        """Of a scene, in the files."""
-        return len(self._bytes_of(clip_id))
+    def n_bytes(self, clip_id: str, suffix: str = BODY) -> int:
+        """Of a scene, or with ANSWERING of its traffic, in the files."""
+        return len(self._bytes_of(clip_id, suffix))
 
     def score(
         self,
@@ -258,15 +335,17 @@ class SceneBank:
         poses: Array,
         *,
         reference: Reference = "pdm_closed",
+        traffic: Traffic = "replay",
         threads: int | None = None,
     ) -> BankScores:
-        """Scores of P plans made at T on each of B scenes, driven by the tracker among the logged traffic.
+        """Scores of P plans made at T on each of B scenes, driven by the tracker.
 
         Equal to those of `tasks.trajectories.score_trajectories` to the last bit, on any number of threads (None: as
-        many as this process may use). poses: (B, P, 40, 3) at 10 Hz or (B, P, 8, 3) at 2 Hz: x, y [m], heading [rad]
-        in the ego frame at T; a CPU tensor's memory is read as it is. reference: as there.
-        Raises KeyError for an unknown scene, ValueError for other shapes, poses that are no drive or another word, and
-        Damaged where a scene's bytes are not as they were written.
+        many as this process may use); with traffic="idm", which answers to each plan, to those that
+        `tasks.attempt.drive_and_judge` gives it. poses: (B, P, 40, 3) at 10 Hz or (B, P, 8, 3) at 2 Hz: x, y [m],
+        heading [rad] in the ego frame at T; a CPU tensor's memory is read as it is. reference: as there.
+        Raises KeyError for an unknown scene, ValueError for other shapes, poses that are no drive, another word or a
+        bank without answering traffic, and Damaged where a scene's bytes are not as they were written.
         """
         plans = np.require(poses, np.float64, ["C", "W"])
         if plans.ndim != 4 or len(plans) != len(clip_ids):
@@ -275,13 +354,20 @@ class SceneBank:
             )
         if reference not in get_args(Reference):
             raise ValueError(f"reference must be one of {get_args(Reference)}, got {reference!r}")
+        if traffic not in get_args(Traffic):
+            raise ValueError(f"traffic must be one of {get_args(Traffic)}, got {traffic!r}")
         n_scenes, n_plans = plans.shape[:2]
         at_ten_hz(plans.reshape(-1, *plans.shape[2:])[:0])  # its shape
         scores, subscores = np.empty((n_scenes, n_plans)), np.empty((n_scenes, n_plans, len(OF_ONE_PLAN)))
         scenes = [self._bytes_of(clip_id) for clip_id in clip_ids]
+        answering = [self._bytes_of(clip_id, ANSWERING) for clip_id in clip_ids] if traffic == "idm" else []
 
         def work(b: int, _: int) -> None:
-            went = _score_packed(scenes[b], plans[b], reference == "batch", subscores[b], scores[b])
+            given = scenes[b], plans[b], reference == "batch", subscores[b], scores[b]
+            try:
+                went = self._among_answering(answering[b], *given) if answering else _score_packed(*given)
+            except (Damaged, ZeroDivisionError):  # the rollout's, among numbers that no scene has
+                went = DAMAGED
             if went == DAMAGED:
                 raise Damaged(
                     f"{self.folder}: scene {clip_ids[b]}: not as this version writes it: write the bank again"
@@ -293,21 +379,41 @@ class SceneBank:
             run_in_chunks(work, n_scenes, 1, threads or len(os.sched_getaffinity(0)))
         return BankScores(subscores, scores)
 
-    def _bytes_of(self, clip_id: str) -> Bytes:
+    def _among_answering(
+        self, answering: Bytes, data: Bytes, poses: Array, in_batch: bool, subscores: Array, scores: Array
+    ) -> int:
+        banked, (driver,) = unpack_traffic(answering), self._drivers
+        states = np.empty((1 + len(poses), N_TIMES, EGO_STATE_SIZE))
+        states[0] = banked.reference
+        ego, plans = read_only(banked.reference[0]), read_only(at_ten_hz(poses))
+        if not follow(ego, read_only(np.empty((0, 3))), plans, True, _WHEEL_BASE, states[1:]):
+            return NO_DRIVE
+        return _score_answered(
+            data, states, *boxes_and_velocities(states[1:]), in_batch, banked.log, banked.now, banked.roles,
+            banked.paths, driver, banked.yielding, np.append(banked.collision_score, 0.0), subscores, scores,
+        )  # fmt: skip
+
+    def _bytes_of(self, clip_id: str, suffix: str = BODY) -> Bytes:
         clip_id = self.tokens.get(clip_id, clip_id)
-        if clip_id not in self._place:
+        if (clip_id, BODY) not in self._place:
             raise KeyError(f"{self.folder}: no scene {clip_id!r} among its {len(self):,}")
-        shard, first, last, crc = self._place[clip_id]
-        data = self._bodies[shard][first:last]
-        if clip_id not in self._whole:
+        if (clip_id, suffix) not in self._place:
+            raise ValueError(
+                f"{self.folder}: no traffic that answers: write it by write_bank(traffic=TrafficSettings())"
+            )
+        file, first, last, crc = self._place[clip_id, suffix]
+        data = self._bodies[file][first:last]
+        if (clip_id, suffix) not in self._whole:
             if zlib.crc32(data.tobytes()) != crc:
                 raise Damaged(f"{self.folder}: scene {clip_id}: its checksum is another: write the bank again")
-            self._whole.add(clip_id)
+            self._whole.add((clip_id, suffix))
         return np.asarray(data)
 
 
 def read_head(path: Path) -> dict[str, Any]:
-    """A shard's head: format, clip_ids, ends (first 0), crc32, left_out, tokens. Raises Damaged naming the file."""
+    """A shard's head: format, clip_ids, ends (first 0), crc32, left_out, tokens, and of traffic that answers, where
+    there is some, settings, ends, crc32. Raises Damaged naming the file.
+    """
     try:
         head = parse_json_with_checksum(path.read_bytes())
     except Damaged as error:

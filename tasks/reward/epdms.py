@@ -451,12 +451,12 @@ def score_all(
     for first in range(0, len(states), n):  # the last block is a whole one too, some of it judged again
         if not judge_block(context, obstacles, states, min(first, len(states) - n), n, scratch, out):
             return False
-    _add_up(table, in_pairs, reference_m)
+    add_up(table, in_pairs, reference_m)
     return True
 
 
 @kernel
-def _add_up(table: Array, in_pairs: bool, reference_m: float) -> None:
+def add_up(table: Array, in_pairs: bool, reference_m: float) -> None:
     """EP, multiplier and PDM score of a table (N_ROWS, K) from its other rows."""
     for k in range(table.shape[1]):
         multiplier = 1.0

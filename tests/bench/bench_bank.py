@@ -4,7 +4,8 @@ The public metric's recorded scenes where they are at hand, else one of the synt
 each of 64 scenes, which are those again and again, on one thread. `today` is a training loop without a bank: the scene
 made ready from its arrays, then tracked and scored. `recorded` says whether all sub-scores and scores of 256 proposals
 are the public ones. The training step is of a head as large as DrivoR's (arXiv 2601.05083, its drivoR.yaml: 64
-proposals of 8 poses, two decoders of 4 layers, 256 wide, on 64 tokens), without pictures; it needs PyTorch.
+proposals of 8 poses, two decoders of 4 layers, 256 wide, on 64 tokens), without pictures; it needs PyTorch. Traffic
+that answers is that of clips: the recorded logs', or the town's.
 
 PEER=<python of an environment with the packages navsim and nuplan-devkit> also runs the public metric, in turns.
 """
@@ -13,17 +14,23 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.readers.bank import write_scenes
-from tasks.bank import BODY, FORMAT, HEAD, SceneBank, pack_prepared
+from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.town.reader import SyntheticReader
+from factory.readers.bank import write_bank, write_scenes
+from factory.readers.base import ClipReader
+from tasks.bank import ANSWERING, BODY, FORMAT, HEAD, SceneBank, Traffic, pack_prepared
 from tasks.caches import json_with_checksum
 from tasks.reward.epdms import score
 from tasks.rollout.lqr import track
+from tasks.settings import TrafficSettings
 from tasks.subscores import RECORDS
 from tasks.world.frames import to_world
 from tasks.world.vocabulary import kinematic_trajectories
@@ -62,6 +69,8 @@ def main(root: Path, sizes: Sequence[int] = SIZES, many: int = MANY, steps: int 
                 )
         print_memory_and_threads(bank, proposals)
         print_training(bank, proposals, steps)
+    with tempfile.TemporaryDirectory() as folder:
+        print_answering(AV2Reader(root / "data/av2/sensor/val") if has_recorded else SyntheticReader(n_clips=1), folder)
     with tempfile.TemporaryDirectory() as folder:
         print_opening(Path(folder), many)
 
@@ -127,6 +136,28 @@ def print_memory_and_threads(bank: SceneBank, proposals: dict[str, Plans]) -> No
             times.append(time.perf_counter() - begun)
         each_s = float(np.median(times)) / (B * 64)
         print(f"{threads} thread(s): {1e3 * np.median(times):.1f} ms, {1.0 / each_s:,.0f} plans/s")
+
+
+def print_answering(reader: ClipReader, folder: str) -> None:
+    """Plans among traffic that answers to each, beside the same among the log's, over a reader's clips."""
+    write_bank(folder, reader, reader.index().refs[::3], traffic=TrafficSettings())
+    bank = SceneBank(folder)
+    of_scene, of_traffic = (
+        [bank.n_bytes(clip_id, suffix) / 1e3 for clip_id in bank.clip_ids] for suffix in (BODY, ANSWERING)
+    )
+    print(f"{len(bank)} clips: {min(of_scene):.0f} to {max(of_scene):.0f} kB a scene, ", end="")
+    print(f"{min(of_traffic):.0f} to {max(of_traffic):.0f} kB more of traffic that answers")
+    for p in (8, TOGETHER):
+        plans = kinematic_trajectories(p, 0)[None]
+        each = {
+            traffic: [
+                least_and_median_cpu_ms(partial(bank.score, [clip_id], plans, traffic=traffic, threads=1), 5)[1]
+                for clip_id in bank.clip_ids
+            ]
+            for traffic in get_args(Traffic)
+        }
+        told = ", ".join(f"{name} {1e3 * min(ms) / p:.0f} to {1e3 * max(ms) / p:.0f}" for name, ms in each.items())
+        print(f"{p} plans a scene, CPU us each: {told}")
 
 
 def print_opening(folder: Path, many: int) -> None:

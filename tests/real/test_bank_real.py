@@ -1,0 +1,30 @@
+"""Plans among the answering traffic of a bank of recorded logs get the factory's own scores, on every clip here."""
+
+from pathlib import Path
+
+import pytest
+
+from factory.datasets.av2.reader import AV2Reader
+from factory.datasets.scenarionet.reader import ScenarioNetReader
+from factory.readers.bank import write_bank
+from factory.readers.base import ClipReader
+from tasks.bank import SceneBank
+from tests.tasks.test_bank import plans
+from tests.tasks.test_bank_traffic import IDM, expect_the_factory_s
+
+
+@pytest.fixture(params=["av2", "nuscenes"])
+def reader(request: pytest.FixtureRequest, shared_root: Path) -> ClipReader:
+    data = shared_root / "data"
+    if request.param == "av2":
+        return AV2Reader(data / "av2" / "sensor" / "val")
+    return ScenarioNetReader(data / "scenarionet" / "nuscenes")
+
+
+def test_plans_among_recorded_cars_get_the_factory_s_scores(reader: ClipReader, tmp_path: Path) -> None:
+    assert write_bank(tmp_path, reader, traffic=IDM) == {}
+    bank, poses = SceneBank(tmp_path), plans(3, 5)
+    for ref in reader.index().refs:
+        expect_the_factory_s(bank, [reader.read(ref)], poses)
+    ids, many = bank.clip_ids, poses[None].repeat(len(bank), 0)
+    assert (bank.score(ids, many).score != bank.score(ids, many, traffic="idm").score).any()
