@@ -66,15 +66,20 @@ def pack_scene(clip: Clip) -> bytes:
     """
     scene = scene_of_clip(clip)
     prepared = prepare_scene(scene, clip.agents.window(NOW, NOW + N_TIMES))
-    reference = score(prepared, plan_for(scene).driven[None])
-    return pack_prepared(prepared, scene.ego_state, float(reference.ep_raw_m[0] * reference.multiplier[0]))
+    return pack_prepared(prepared, scene.ego_state, compliant_progress_m(prepared, plan_for(scene).driven))
+
+
+def compliant_progress_m(prepared: PreparedScene, driven: Array) -> float:
+    """What progress is relative to beside a reference's drive (41, 11): its progress [m] times its multiplier."""
+    reference = score(prepared, driven[None])
+    return float(reference.ep_raw_m[0] * reference.multiplier[0])
 
 
 def pack_prepared(prepared: PreparedScene, ego_state: Array, reference_m: float = NO_REFERENCE) -> bytes:
     """All that `SceneBank.score` asks of a scene, to the last bit.
 
-    ego_state: (11,) where plans begin; reference_m: the reference's progress times its multiplier [m], NO_REFERENCE
-    where the plans of a call are always a batch.
+    ego_state: (11,) where plans begin; reference_m: of `compliant_progress_m`, NO_REFERENCE where the plans of a call
+    are always a batch.
     """
     index, red, boxes = prepared.map_index, prepared.red_lanes, prepared.obstacles.boxes
     ends = index.edges.reshape(-1, 2).view(np.int64)  # -0.0 is not 0.0
@@ -285,7 +290,7 @@ class BankScores:
 
 class SceneBank:
     """Scenes by clip id, or by NAVSIM's token of the frame at T, to score plans on; what
-    `factory.readers.bank.write_bank` wrote. Pickles, and may be forked.
+    `factory.setup.bank.write_bank` wrote. Pickles, and may be forked.
 
     Raises FileNotFoundError where there are none, Damaged for a head or a body that is not as it was written.
     """
@@ -299,7 +304,7 @@ class SceneBank:
         self.tokens: dict[str, str] = {}  # of the log's frames at T -> clip id
         heads = sorted(self.folder.glob(HEAD))
         if not heads:
-            raise FileNotFoundError(f"{folder}: no {HEAD} in it: write it by factory.readers.bank.write_bank")
+            raise FileNotFoundError(f"{folder}: no {HEAD} in it: write it by factory.setup.bank.write_bank")
         for path in heads:
             head = read_head(path)
             self._open(path, BODY, head["clip_ids"], head)

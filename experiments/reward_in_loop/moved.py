@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from experiments.reward_in_loop.vocabulary import Vocabulary, VocabularySettings
-from factory.readers.bank import write_clips
+from factory.setup.bank import write_clips
 from factory.store.location import Location
 from factory.store.samples import Store
 from factory.views.scene_files import prepared_clip

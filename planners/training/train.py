@@ -97,7 +97,7 @@ class TrainConfig:
     precision: Literal["auto", "fp32", "bf16", "fp16"] = "auto"  # auto: bf16 on a GPU, fp32 elsewhere
     accumulate: int = 1  # parts that a batch is computed in
     recompute: bool = False  # backbones over pictures keep no activations: less memory, a forward pass more
-    workers: int = 2  # threads that decode
+    workers: int = 2  # threads that decode; processes that write a bank first
     log_every: int = 20  # steps
     checkpoint_every: Every = 1000  # steps, or epochs as 2ep or 0.5ep
     validate_every: Every = 0  # the same; 0: after the last step

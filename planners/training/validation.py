@@ -5,14 +5,18 @@ among the logged traffic, and progress is relative to PDM-Closed (docs/bank.md).
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from factory.exits import Stopped
 from factory.files import DamagedFile
-from factory.readers.bank import write_clips
+from factory.graph.parallel import WorkerDied
+from factory.graph.steps import TaskStopped
+from factory.setup.bank import write_clips
 from factory.store.location import Location, SceneFiles
 from factory.store.samples import Store
 from factory.store.schema import UNLISTED
@@ -26,7 +30,7 @@ from tasks.subscores import OF_ONE_PLAN
 from tasks.world.clip import Clip
 
 LARGEST_BATCH = 32
-HOW = "a folder that factory.readers.bank.write_bank wrote of its logs, docs/bank.md"
+HOW = "a folder that factory.setup.bank.write_bank wrote of its logs, docs/bank.md"
 Validation = Callable[[Planner], dict[str, float]]
 
 
@@ -43,7 +47,7 @@ def make_validation(
     dataset = open_data(DataSettings(real=data.tables("val"), **where))
     size = max(n for n in range(1, LARGEST_BATCH + 1) if len(dataset) % n == 0)  # no sample is left out
     loader = Loader(dataset, planner.needs_to_plan, MixSettings(), size, workers=workers)
-    scenes = None if bank is None else open_bank(bank, dataset)
+    scenes = None if bank is None else open_bank(bank, dataset, workers)
     scored = set() if scenes is None else {*scenes.clip_ids}
     clips = dict(zip(dataset.rows.attempt_id.tolist(), dataset.rows.clip_id.tolist()))
 
@@ -69,19 +73,36 @@ def make_validation(
     return measure
 
 
-def open_bank(folder: Path, dataset: Dataset) -> SceneBank:
+@dataclass(frozen=True)
+class _KeptClip:
+    """Where a run kept a clip."""
+
+    table: str
+    clip_id: str
+    settings_hash: str
+
+
+def open_bank(folder: Path, dataset: Dataset, workers: int = 1) -> SceneBank:
     """The bank in a folder; where it lacks clips of the samples it is written first, of what the runs of their tables
-    kept. An interrupted one goes on.
+    kept, by so many processes. An interrupted one goes on.
 
     Raises FileNotFoundError where a run kept no scene of a sample, DamagedFile where a damaged one, Damaged for a bank
-    of other clips, ValueError where none of the samples can be scored.
+    of other clips, ValueError where none of the samples can be scored, Stopped where it is interrupted.
     """
-    places = {clip_id: place for place, clip_id in enumerate(dataset.rows.clip_id.tolist())}
+    rows = dataset.rows
+    hashes = (str(revision).partition(" ")[0] for revision in rows.revision)
+    columns = zip(rows.file.tolist(), rows.clip_id.tolist(), hashes, strict=True)
+    places = {clip_id: _KeptClip(dataset.files[file].table, clip_id, made_by) for file, clip_id, made_by in columns}
     found = SceneBank(folder) if any(folder.glob(HEAD)) else None
     if found is None or places.keys() - {*found.clip_ids, *found.left_out}:
         tables = {file.table for file in dataset.files}
         stores = {table: Store(Location.parse(table, dataset.settings.storage_options)) for table in tables}
-        write_clips(folder, partial(_kept_clip, dataset, stores), places)
+        try:
+            write_clips(folder, partial(_read_kept, stores), places, workers=workers)
+        except TaskStopped as error:
+            raise Stopped("interrupted; what is written of the bank is kept, and the same command goes on") from error
+        except WorkerDied as error:
+            raise Stopped(str(error)) from error
         found = SceneBank(folder)
     if without := sorted(places.keys() - {*found.clip_ids}):
         said = f"{len(without)} of {len(places)} samples of data.val have no score, such as {without[0]}"
@@ -92,20 +113,18 @@ def open_bank(folder: Path, dataset: Dataset) -> SceneBank:
     return found
 
 
-def _kept_clip(dataset: Dataset, stores: Mapping[str, Store], sample: int) -> Clip:
+def _read_kept(stores: Mapping[str, Store], kept: _KeptClip) -> Clip:
     """A sample's clip as its run kept it: among a benchmark's scenes, else prepared for attempts."""
-    rows = dataset.rows
-    table, clip_id = dataset.files[rows.file[sample]].table, str(rows.clip_id[sample])
-    store, settings_hash = stores[table], str(rows.revision[sample]).partition(" ")[0]
+    store, clip_id = stores[kept.table], kept.clip_id
     made = {run["settings_hash"]: run["prepare_digest"] for run in store.runs()}
     try:
         if clip_id in SceneFiles(store.location.child("scenes")).clip_ids():
             return SceneFiles(store.location.child("scenes")).load(clip_id).clip
-        for digest in dict.fromkeys((made.get(settings_hash, UNLISTED), UNLISTED)):
+        for digest in dict.fromkeys((made.get(kept.settings_hash, UNLISTED), UNLISTED)):
             if (clip := prepared_clip(store, clip_id, digest)) is not None:
                 return clip
     except ValueError as error:  # a damaged one; to the bank a ValueError is of a clip that cannot be scored
         raise DamagedFile(f"{error}; or remove it and give bank=<{HOW}>") from error
     raise FileNotFoundError(
-        f"{table}: its run keeps no scene of clip {clip_id}, and data.val is to be scored: give bank=<{HOW}>"
+        f"{kept.table}: its run keeps no scene of clip {clip_id}, and data.val is to be scored: give bank=<{HOW}>"
     )

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.town.reader import SyntheticReader
-from factory.readers.bank import write_bank, write_scenes
 from factory.readers.base import ClipReader
+from factory.setup.bank import PackedScene, write_bank, write_scenes
 from tasks.bank import ANSWERING, BODY, FORMAT, HEAD, SceneBank, Traffic, pack_prepared
 from tasks.caches import json_with_checksum
 from tasks.reward.epdms import score
@@ -77,7 +77,9 @@ def main(root: Path, sizes: Sequence[int] = SIZES, many: int = MANY, steps: int 
 
 def bank_of(scenes: dict[str, BenchScene], folder: Path) -> SceneBank:
     """The scenes without a reference of their own: proposals are a batch."""
-    packed = {name: pack_prepared(prepared_scene(scene), scene.ego_state0) for name, scene in scenes.items()}
+    packed = {
+        name: PackedScene(pack_prepared(prepared_scene(scene), scene.ego_state0)) for name, scene in scenes.items()
+    }
     write_scenes(folder / HEAD.replace("*", "00000"), packed, {})
     return SceneBank(folder)
 

@@ -6,7 +6,7 @@ import pytest
 
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
-from factory.readers.bank import write_bank
+from factory.setup.bank import write_bank
 from factory.readers.base import ClipReader
 from tasks.bank import SceneBank
 from tests.tasks.test_bank import plans

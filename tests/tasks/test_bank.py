@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from examples.csv_logs import CsvReader, write_log
-from factory.readers.bank import write_bank, write_scenes
+from factory.setup.bank import PackedScene, write_bank, write_scenes
 from tasks.bank import SceneBank, _score_packed, pack_prepared
 from tasks.caches import Damaged
 from tasks.reward.epdms import PreparedScene, Scores, prepare, score
@@ -41,7 +41,7 @@ def worlds() -> dict[str, tuple[PreparedScene, np.ndarray]]:
 @pytest.fixture(scope="module")
 def bank(worlds: dict[str, tuple[PreparedScene, np.ndarray]], tmp_path_factory: pytest.TempPathFactory) -> SceneBank:
     folder = tmp_path_factory.mktemp("bank")
-    scenes = [(name, pack_prepared(*world, reference_m=7.0)) for name, world in worlds.items()]
+    scenes = [(name, PackedScene(pack_prepared(*world, reference_m=7.0))) for name, world in worlds.items()]
     write_scenes(folder / "scenes-00000.json", dict(scenes[:10]), {})
     write_scenes(folder / "scenes-00001.json", dict(scenes[10:]), {})
     return SceneBank(folder)
@@ -92,19 +92,19 @@ def test_a_reader_s_clips_get_the_scores_of_trajectories(tmp_path: Path) -> None
 def test_processes_write_the_shards_of_one_and_go_on_after_an_interruption(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("factory.readers.bank.SHARD", 1)
+    monkeypatch.setattr("factory.setup.bank.SHARD", 1)
     for log in ("one", "two", "three"):
         write_log(tmp_path / "logs" / log)
     reader = CsvReader(tmp_path / "logs")
     refs = reader.index().refs
     alone, together = tmp_path / "alone", tmp_path / "together"
-    assert write_bank(alone, reader, refs) == write_bank(together, reader, refs, processes=2) == {}
+    assert write_bank(alone, reader, refs) == write_bank(together, reader, refs, workers=2) == {}
     whole = {path.name: path.read_bytes() for path in alone.iterdir()}
     assert whole == {path.name: path.read_bytes() for path in together.iterdir()} and len(whole) == 2 * len(refs)
     kept = (together / "scenes-00000.json").stat().st_mtime_ns
     (together / "scenes-00001.json").unlink()  # killed before the head, which is written last
     (together / "scenes-00001.bank").write_bytes(b"half")
-    write_bank(together, reader, refs, processes=2)
+    write_bank(together, reader, refs, workers=2)
     assert whole == {path.name: path.read_bytes() for path in together.iterdir()}
     assert kept == (together / "scenes-00000.json").stat().st_mtime_ns, "what was whole is not written again"
 
@@ -129,7 +129,7 @@ def test_damage_is_found_before_it_is_used(worlds: dict[str, tuple[PreparedScene
     head, body = tmp_path / "scenes-00000.json", tmp_path / "scenes-00000.bank"
     with pytest.raises(FileNotFoundError, match="write_bank"):
         SceneBank(tmp_path)
-    write_scenes(head, {"a": pack_prepared(*worlds["0"])}, {})
+    write_scenes(head, {"a": PackedScene(pack_prepared(*worlds["0"]))}, {})
     whole = body.read_bytes()
     body.write_bytes(whole[:99] + bytes([whole[99] ^ 1]) + whole[100:])
     with pytest.raises(Damaged, match="scene a: its checksum is another"):

@@ -11,7 +11,7 @@ import pytest
 
 from factory.datasets.town.reader import SyntheticReader
 from factory.datasets.town.settings import TownSettings
-from factory.readers.bank import write_bank, write_clips
+from factory.setup.bank import write_bank, write_clips
 from tasks.attempt import judge
 from tasks.bank import SceneBank
 from tasks.bank_traffic import pack_traffic, unpack_traffic

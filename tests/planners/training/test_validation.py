@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from factory.files import DamagedFile
-from factory.readers import bank
 from factory.run import main as run_factory
+from factory.setup import bank
 from factory.store.samples import Store
 from factory.views.scene_files import prepared_clip
 from planners.data.batch import Batch
@@ -72,8 +72,8 @@ def own(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "run"))
 
 
-def validated(planner: Toy, table: Path, folder: Path) -> dict[str, float]:
-    return make_validation(DataSettings(val=str(table)), planner, CPU, 1, folder)(planner)
+def validated(planner: Toy, table: Path, folder: Path, workers: int = 1) -> dict[str, float]:
+    return make_validation(DataSettings(val=str(table)), planner, CPU, workers, folder)(planner)
 
 
 @pytest.mark.parametrize("kind", [Steered, Fine])
@@ -123,6 +123,9 @@ def test_a_bank_is_written_once_goes_on_after_a_kill_and_stands_for_what_a_run_h
         heads[1].unlink()  # as a kill leaves it, but for the order
         written = {path: path.stat().st_mtime_ns for path in folder.iterdir() if path.stem != heads[1].stem}
         assert validated(planner, own, folder) == found
+        assert validated(planner, own, tmp_path / "together", workers=2) == found
+        for path in folder.iterdir():
+            assert path.read_bytes() == (tmp_path / "together" / path.name).read_bytes()
         assert written == {path: path.stat().st_mtime_ns for path in written}
     shutil.rmtree(own / "cache")
     assert validated(planner, own, folder) == found

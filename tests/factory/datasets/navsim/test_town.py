@@ -14,7 +14,7 @@ from factory.datasets.navsim.log import read_frames
 from factory.datasets.navsim.reader import LICENCE, NavsimReader
 from factory.datasets.town.settings import TownSettings
 from factory.datasets.town.town import write_logs
-from factory.readers.bank import write_bank
+from factory.setup.bank import write_bank
 from tasks.bank import SceneBank
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW, Clip
