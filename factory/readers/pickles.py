@@ -257,7 +257,7 @@ def _size(value: object, refuse: Callable[[str], BadClip]) -> int:
 
 BUDGET_PER_BYTE = 8
 BUDGET_BASE_BYTES = 1 << 24
-RECORD_BYTES = 512  # what a record is paid for with
+RECORD_BYTES = 256  # what a record is paid for with
 
 _ALL_PLAIN = """
     PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE
@@ -284,20 +284,22 @@ def load_plain(data: bytes, file: str) -> Any:
     `file` names the source in errors. Raises BadClip for a truncated stream, a global that is not one of the plain
     containers or numpy's own array constructors (named), an array of objects, or a stream that outgrows its budget.
     """
-    return _load(data, file, PLAIN_OPCODES, frozenset())
+    return _load(data, file, PLAIN_OPCODES)
 
 
-def load_records(data: bytes, file: str, classes: Collection[str]) -> Any:
+def load_records(data: bytes, file: str, classes: Collection[str], *, drop_object_arrays: bool = False) -> Any:
     """As `load_plain`, where objects of these `classes` ("module name" each) are records of what the pickle says.
 
-    Nothing of them is imported, called or looked up. Raises BadClip as `load_plain` does.
+    Nothing of them is imported, called or looked up. drop_object_arrays: an array of objects comes back empty, for
+    files whose objects stand elsewhere too. Raises BadClip as `load_plain` does.
     """
-    return _load(data, file, PLAIN_OPCODES | {"NEWOBJ"}, frozenset(classes))
+    return _load(data, file, PLAIN_OPCODES | {"NEWOBJ"}, frozenset(classes), drop_object_arrays)
 
 
 class Record:
     """An object that a pickle describes: its class, what it was made with, and its state. Inert."""
 
+    __slots__ = ("arguments", "state")  # files hold ten thousands of them
     module: ClassVar[str]
     name: ClassVar[str]
     arguments: tuple[Any, ...]
@@ -318,12 +320,18 @@ class Record:
         self.state = {name: value for part in parts for name, value in (part or {}).items()}
 
 
-def _load(data: bytes, file: str, opcodes: frozenset[str], classes: frozenset[str]) -> Any:
+def _load(
+    data: bytes,
+    file: str,
+    opcodes: frozenset[str],
+    classes: frozenset[str] = frozenset(),
+    drop_object_arrays: bool = False,
+) -> Any:
     if len(data) > MAX_FILE_BYTES:
         raise BadClip(file, "pickle", f"{len(data)} bytes; more than {MAX_FILE_BYTES} are refused")
     check_opcodes(data, file, opcodes)
     try:
-        value = _Unpickler(data, file, classes).load()
+        value = _Unpickler(data, file, classes, drop_object_arrays).load()
     except _LOAD_ERRORS as error:
         raise BadClip(file, "pickle", f"not a readable pickle ({type(error).__name__}: {error})") from error
     check_values(value, len(data), file, "pickle")
@@ -333,10 +341,11 @@ def _load(data: bytes, file: str, opcodes: frozenset[str], classes: frozenset[st
 class _Unpickler(pickle.Unpickler):
     """Answers globals with stand-ins bound to this load's file name and memory budget."""
 
-    def __init__(self, data: bytes, file: str, classes: frozenset[str]) -> None:
+    def __init__(self, data: bytes, file: str, classes: frozenset[str], drop_object_arrays: bool) -> None:
         super().__init__(io.BytesIO(data))
         self._file = file
-        self._stand_ins = _stand_ins(file, BUDGET_BASE_BYTES + BUDGET_PER_BYTE * len(data), classes)
+        budget = BUDGET_BASE_BYTES + BUDGET_PER_BYTE * len(data)
+        self._stand_ins = _stand_ins(file, budget, classes, drop_object_arrays)
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in self._stand_ins:
@@ -348,8 +357,8 @@ class _Unpickler(pickle.Unpickler):
 class _Dtype:
     """What a pickled numpy dtype says; becomes a real one only after it was checked."""
 
-    def __init__(self, spec: object, file: str) -> None:
-        if not isinstance(spec, str) or not _DTYPE.fullmatch(spec):
+    def __init__(self, spec: object, file: str, may_be_object: bool) -> None:
+        if not isinstance(spec, str) or not (_DTYPE.fullmatch(spec) or (may_be_object and spec == "O8")):
             raise BadClip(file, "pickle", f"refused array type {shown(spec)}; only numbers, flags and text load")
         self.dtype = np.dtype(spec)
 
@@ -365,6 +374,8 @@ class _Array(np.ndarray):
 
     def __setstate__(self, state: Any) -> None:
         version, shape, dtype, is_fortran, raw = state
+        if isinstance(dtype, _Dtype) and dtype.dtype.hasobject:
+            return  # as it is: empty
         if not isinstance(dtype, _Dtype) or not isinstance(raw, bytes):
             raise ValueError("array state without a checked dtype and bytes")
         self.spend(len(raw))
@@ -383,7 +394,9 @@ def _left_after_hashing(value: object, left: int) -> int:
     return left
 
 
-def _stand_ins(file: str, budget: int, classes: frozenset[str]) -> dict[tuple[str, str], Callable[..., Any]]:
+def _stand_ins(
+    file: str, budget: int, classes: frozenset[str], drop_object_arrays: bool
+) -> dict[tuple[str, str], Callable[..., Any]]:
     """(module, name) -> what a global stands for. Functions are made anew per load: no stream can alter another's.
 
     budget: bytes that arrays and copies may take.
@@ -443,7 +456,7 @@ def _stand_ins(file: str, budget: int, classes: frozenset[str]) -> dict[tuple[st
         ("collections", "defaultdict"): plain_dict,
         ("collections", "OrderedDict"): plain_dict,
         ("numpy", "ndarray"): array_class,
-        ("numpy", "dtype"): lambda spec, align=False, copy=False: _Dtype(spec, file),
+        ("numpy", "dtype"): lambda spec, align=False, copy=False: _Dtype(spec, file, drop_object_arrays),
         ("_codecs", "encode"): encode,
     }
     for package in ("numpy.core", "numpy._core"):  # numpy 1 and 2
@@ -456,7 +469,7 @@ def _stand_ins(file: str, budget: int, classes: frozenset[str]) -> dict[tuple[st
         for name in ("dict", "int", "float", "bool", "str"):  # only ever factories of a defaultdict
             table[builtins, name] = plain_dict
     for module, name in (words.split(" ") for words in classes):
-        inert = {"module": module, "name": name, "spend": staticmethod(spend)}
+        inert = {"module": module, "name": name, "spend": staticmethod(spend), "__slots__": ()}
         table[module, name] = type("Record", (Record,), inert)
     return table
 

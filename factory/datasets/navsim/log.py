@@ -497,7 +497,7 @@ def read_scene_pickle(path: Path, *, as_shown: bool = False) -> SyntheticScene:
         raise BadClip(file, "scene", f"holds a {type(value).__name__}, expected a dict")
     values = CheckedValues(value, file)
     about = values.inner("scene_metadata")
-    items = _list(values, "frames")
+    items = list_of(values, "frames")
     if len(items) != about.integer("num_history_frames") + about.integer("num_future_frames"):
         raise values.bad("frames", f"{len(items)}, the scene's metadata say otherwise")
     if about.integer("num_history_frames") != HISTORY_FRAMES:
@@ -552,7 +552,7 @@ def _frame(values: CheckedValues, about: CheckedValues, *, as_shown: bool) -> Fr
 
 def _later(values: CheckedValues, now: Frame) -> list[Frame]:
     """The frames after the last, 0.5 s apart. Raises BadClip."""
-    tracks, lights = _list(values, "extended_detections_tracks"), _list(values, "extended_traffic_light_data")
+    tracks, lights = list_of(values, "extended_detections_tracks"), list_of(values, "extended_traffic_light_data")
     if len(tracks) < FUTURE_FRAMES or len(lights) < FUTURE_FRAMES:
         found = f"{len(tracks)} and {len(lights)} of extended_traffic_light_data"
         raise values.bad("extended_detections_tracks", f"{found}, expected {FUTURE_FRAMES}: 4 s are driven")
@@ -570,69 +570,100 @@ def _later(values: CheckedValues, now: Frame) -> list[Frame]:
 
 
 def _lights(values: CheckedValues, statuses: Any, place: str) -> tuple[tuple[str, bool], ...]:
-    found = _list(_fields(values, statuses, "TrafficLightStatuses", place), "traffic_lights")
+    found = list_of(record_fields(values, statuses, ("TrafficLightStatuses",), place), "traffic_lights")
     out = []
     for k, light in enumerate(found):
-        fields = _fields(values, light, "TrafficLightStatusData", f"{place}.traffic_lights[{k}]")
-        out.append((str(fields.integer("lane_connector_id")), _enum(fields, "status", "TrafficLightStatusType") == RED))
+        fields = record_fields(values, light, ("TrafficLightStatusData",), f"{place}.traffic_lights[{k}]")
+        number = enum_number(fields, fields.get("status"), "TrafficLightStatusType", "status")
+        out.append((str(fields.integer("lane_connector_id")), number == RED))
     return tuple(out)
 
 
 def _boxes(values: CheckedValues, tracks: Any, place: str, now: Frame) -> FrameBoxes:
     """The objects of one instant, in the frame of the ego at now."""
-    holder = _fields(values, tracks, "DetectionsTracks", place)
-    inner = f"{place}.tracked_objects"
-    found = _list(_fields(values, holder.get("tracked_objects"), "TrackedObjects", inner), "tracked_objects")
-    poses, sizes, velocities = np.zeros((len(found), 3)), np.zeros((len(found), 3)), np.zeros((len(found), 3))
+    found = tracked_objects(values, tracks, place)
+    local = to_local(now.pose, found.poses)
+    c, s = np.cos(now.pose[2]), np.sin(now.pose[2])
+    velocities = np.column_stack([found.velocities @ np.array([[c, -s], [s, c]]), np.zeros(len(local))])
+    heights = np.full(len(local), np.nan)
+    boxes = np.column_stack([local[:, :2], heights, found.sizes, wrap_angle(local[:, 2])])
+    return FrameBoxes(boxes, found.kinds, velocities, found.track_tokens)
+
+
+@dataclass(frozen=True)
+class TrackedObjects:
+    """N objects of nuPlan's classes at one instant, world frame."""
+
+    poses: Array  # (N, 3) centre x, y [m], heading [rad]
+    sizes: Array  # (N, 3) length, width, height [m]
+    velocities: Array  # (N, 2) [m/s]; of things that stand 0
+    kinds: tuple[AgentKind, ...]  # (N,)
+    track_tokens: tuple[str, ...]  # (N,) unique
+
+
+def tracked_objects(values: CheckedValues, tracks: Any, place: str) -> TrackedObjects:
+    """What a record of nuPlan's `DetectionsTracks` holds; place: where it stands in the file. Raises BadClip."""
+    holder = record_fields(values, tracks, ("DetectionsTracks",), place)
+    found = list_of(inner_record(holder, "tracked_objects", "TrackedObjects"), "tracked_objects")
+    poses, sizes, velocities = np.zeros((len(found), 3)), np.zeros((len(found), 3)), np.zeros((len(found), 2))
     kinds, names = [], []
     for k, item in enumerate(found):
-        thing = _fields(values, item, None, f"{inner}[{k}]")
-        number = _enum(thing, "_tracked_object_type", "TrackedObjectType")
-        if number >= len(KINDS):
-            raise thing.bad("_tracked_object_type", f"is {number}, expected 0 .. {len(KINDS) - 1}")
+        thing = record_fields(values, item, ("Agent", "StaticObject"), f"{place}.tracked_objects[{k}]")
+        kind = "_tracked_object_type"
+        number = enum_number(thing, thing.get(kind), "TrackedObjectType", kind)
+        if not 0 <= number < len(KINDS):
+            raise thing.bad(kind, f"is {number}, expected 0 .. {len(KINDS) - 1}")
         kinds.append(KINDS[number])
-        about = _fields(values, thing.get("_metadata"), "SceneObjectMetadata", f"{thing.place}_metadata")
-        names.append(about.text("track_token"))
-        box = _fields(values, thing.get("_box"), "OrientedBox", f"{thing.place}_box")
-        center = _fields(values, box.get("_center"), "StateSE2", f"{box.place}_center")
-        poses[k] = [_number(center, key) for key in ("x", "y", "heading")]
-        sizes[k] = [_number(box, key) for key in ("_length", "_width", "_height")]
+        names.append(inner_record(thing, "_metadata", "SceneObjectMetadata").text("track_token"))
+        box = inner_record(thing, "_box", "OrientedBox")
+        poses[k] = se2(inner_record(box, "_center", "StateSE2"))
+        sizes[k] = [number_of(box, key) for key in ("_length", "_width", "_height")]
         if "_velocity" in thing.items:  # nuPlan's static objects have none
-            moves = _fields(values, thing.get("_velocity"), "StateVector2D", f"{thing.place}_velocity")
-            velocities[k, :2] = _number(moves, "_x"), _number(moves, "_y")
+            velocities[k] = vector(inner_record(thing, "_velocity", "StateVector2D"))
     if len(set(names)) < len(names):
         raise values.bad(place, "a track stands twice")
     if (sizes <= 0.0).any():
         raise values.bad(place, "a box has a size that is not positive")
-    local = to_local(now.pose, poses)
-    c, s = np.cos(now.pose[2]), np.sin(now.pose[2])
-    velocities[:, :2] = velocities[:, :2] @ np.array([[c, -s], [s, c]])
-    boxes = np.column_stack([local[:, :2], np.full(len(found), np.nan), sizes, wrap_angle(local[:, 2])])
-    return FrameBoxes(boxes, tuple(kinds), velocities, tuple(names))
+    return TrackedObjects(poses, sizes, velocities, tuple(kinds), tuple(names))
 
 
-def _fields(values: CheckedValues, record: Any, name: str | None, place: str) -> CheckedValues:
-    """The fields of an object of the class `name`, of Agent or StaticObject where it is None. Raises BadClip."""
-    wanted = ("Agent", "StaticObject") if name is None else (name,)
-    if not isinstance(record, Record) or record.name not in wanted:
+def record_fields(values: CheckedValues, record: Any, names: Sequence[str], place: str) -> CheckedValues:
+    """The fields of an object of a class that is one of `names`. Raises BadClip."""
+    if not isinstance(record, Record) or record.name not in names:
         got = record.name if isinstance(record, Record) else type(record).__name__
-        raise values.bad(place, f"is a {got}, expected {' or '.join(wanted)}")
-    return CheckedValues(record.state, values.file, f"{place}.")
+        raise values.bad(place, f"is a {got}, expected {' or '.join(names)}")
+    return CheckedValues(record.state, values.file, f"{values.place}{place}.")
 
 
-def _enum(values: CheckedValues, key: str, name: str) -> int:
-    """The number of an enumeration's member. Raises BadClip."""
-    record = values.get(key)
-    if not isinstance(record, Record) or record.name != name or len(record.arguments) != 1:
-        raise values.bad(key, f"is no {name}")
-    return CheckedValues({key: record.arguments[0]}, values.file, values.place).integer(key)
+def inner_record(values: CheckedValues, key: str, name: str) -> CheckedValues:
+    """The fields of the object under `key`, of the class `name`. Raises BadClip."""
+    return record_fields(values, values.get(key), (name,), key)
 
 
-def _number(values: CheckedValues, key: str) -> float:
+def se2(values: CheckedValues) -> tuple[float, float, float]:
+    """x, y [m], heading [rad] of a `StateSE2`. Raises BadClip."""
+    return number_of(values, "x"), number_of(values, "y"), number_of(values, "heading")
+
+
+def vector(values: CheckedValues) -> tuple[float, float]:
+    """x, y of a `StateVector2D`. Raises BadClip."""
+    return number_of(values, "_x"), number_of(values, "_y")
+
+
+def enum_number(values: CheckedValues, member: Any, name: str, place: str) -> int:
+    """The number of a member of the enumeration `name`. Raises BadClip."""
+    if not isinstance(member, Record) or member.name != name or len(member.arguments) != 1:
+        raise values.bad(place, f"is no {name}")
+    return CheckedValues({place: member.arguments[0]}, values.file, values.place).integer(place)
+
+
+def number_of(values: CheckedValues, key: str) -> float:
+    """A finite number. Raises BadClip."""
     return float(values.numbers(key, ()))
 
 
-def _list(values: CheckedValues, key: str) -> list[Any]:
+def list_of(values: CheckedValues, key: str) -> list[Any]:
+    """Raises BadClip where it is none."""
     found = values.get(key)
     if not isinstance(found, list):
         raise values.bad(key, f"is a {type(found).__name__}, expected a list")

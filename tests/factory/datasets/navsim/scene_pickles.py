@@ -6,7 +6,7 @@ StaticObject has no velocity.
 
 import enum
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -21,7 +21,9 @@ STATE = "nuplan.common.actor_state.state_representation"
 CAMERAS = ("cam_f0", "cam_l0", "cam_l1", "cam_l2", "cam_r0", "cam_r1", "cam_r2", "cam_b0")
 
 
-class _Thing:
+class Thing:
+    """Whatever fields it is given."""
+
     def __init__(self, **fields: Any) -> None:
         self.__dict__.update(fields)
 
@@ -66,7 +68,7 @@ def _slotted(name: str, *slots: str) -> Any:
 TimePoint = _slotted("TimePoint", "time_us")
 SLOTTED = (_slotted("StateSE2", "x", "y", "heading"), _slotted("StateVector2D", "_x", "_y", "_array"), TimePoint)
 TYPES: dict[str, Any] = {
-    f"{module} {name}": type(name, (_Thing,), {})
+    f"{module} {name}": type(name, (Thing,), {})
     for module, names in {
         "nuplan.common.maps.maps_datatypes": ("TrafficLightStatuses", "TrafficLightStatusData"),
         "nuplan.planning.simulation.observation.observation_type": ("DetectionsTracks",),
@@ -84,10 +86,10 @@ TYPES |= {f"{STATE} {kind.__name__}": kind for kind in SLOTTED}
 
 
 @contextmanager
-def importable() -> Iterator[None]:
+def importable(types: Mapping[str, Any] = TYPES) -> Iterator[None]:
     """The classes under nuPlan's names, for as long as something is pickled by reference to them."""
     modules: dict[str, ModuleType] = {}
-    for words, kind in TYPES.items():
+    for words, kind in types.items():
         module, name = words.split(" ")
         for i in range(1, module.count(".") + 2):
             part = ".".join(module.split(".")[:i])
@@ -102,37 +104,37 @@ def importable() -> Iterator[None]:
             del sys.modules[name]
 
 
-def _new(name: str, **fields: Any) -> Any:
+def new(name: str, **fields: Any) -> Any:
+    """An object of nuPlan's class of that name."""
     return next(kind for words, kind in TYPES.items() if words.endswith(f" {name}"))(**fields)
 
 
 def _statuses(lights: list[tuple[int, TrafficLightStatusType]], stamp_us: int) -> Any:
     stamp = TimePoint(stamp_us)
-    return _new(
+    return new(
         "TrafficLightStatuses",
         traffic_lights=[
-            _new("TrafficLightStatusData", status=s, lane_connector_id=lane_id, timestamp=stamp)
-            for lane_id, s in lights
+            new("TrafficLightStatusData", status=s, lane_connector_id=lane_id, timestamp=stamp) for lane_id, s in lights
         ],
     )
 
 
-def _detections(things: list[tuple[int, str, np.ndarray, Any, Any]], token: str) -> Any:
+def detections(things: list[tuple[int, str, np.ndarray, Any, Any]], token: str) -> Any:
     """Of kind, track token, x y heading, length width height, velocity each."""
     found = []
     for number, track, pose, sizes, velocity in things:
         x, y, heading = map(np.float64, pose)
         names = {"token": token, "track_id": None, "track_token": track, "category_name": None}
-        center = _new("StateSE2", x=x, y=y, heading=heading)
+        center = new("StateSE2", x=x, y=y, heading=heading)
         fields = {
-            "_metadata": _new("SceneObjectMetadata", timestamp_us=0, **names),
+            "_metadata": new("SceneObjectMetadata", timestamp_us=0, **names),
             "instance_token": None,
             "_tracked_object_type": _kind(number),
-            "_box": _new("OrientedBox", _center=center, **dict(zip(("_length", "_width", "_height"), sizes))),
+            "_box": new("OrientedBox", _center=center, **dict(zip(("_length", "_width", "_height"), sizes))),
         }
-        moving = {"_velocity": _new("StateVector2D", _x=velocity[0], _y=velocity[1], _array=np.array(velocity))}
-        found.append(_new("StaticObject", **fields) if number >= 3 else _new("Agent", **fields, **moving))
-    return _new("DetectionsTracks", tracked_objects=_new("TrackedObjects", tracked_objects=found))
+        moving = {"_velocity": new("StateVector2D", _x=velocity[0], _y=velocity[1], _array=np.array(velocity))}
+        found.append(new("StaticObject", **fields) if number >= 3 else new("Agent", **fields, **moving))
+    return new("DetectionsTracks", tracked_objects=new("TrackedObjects", tracked_objects=found))
 
 
 def scene_of_log(frames: list[dict[str, Any]], at: int, token: str, cameras: bool = False) -> dict[str, Any]:
@@ -214,7 +216,7 @@ def _log_tracks(frame: dict[str, Any]) -> Any:
         x, y = np.array([[c, -s], [s, c]]) @ box[:2] + frame["ego2global_translation"][:2]
         vx, vy = np.array([[c, -s], [s, c]]) @ velocity[:2]
         things.append((numbers[str(name)], track, np.array([x, y, box[6] + heading]), box[3:6], (vx, vy)))
-    return _detections(things, frame["token"])
+    return detections(things, frame["token"])
 
 
 def write_scene(folder: Path, value: dict[str, Any]) -> Path:
