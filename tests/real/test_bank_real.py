@@ -6,8 +6,8 @@ import pytest
 
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
-from factory.setup.bank import write_bank
 from factory.readers.base import ClipReader
+from factory.setup.bank import write_bank
 from tasks.bank import SceneBank
 from tests.tasks.test_bank import plans
 from tests.tasks.test_bank_traffic import IDM, expect_the_factory_s
