@@ -14,19 +14,28 @@ import cv2
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from tasks.render.scene.asset import OwnBody, RenderAsset, camera_psnr_db, compose_gaussians, mean_psnr_db
-from tasks.render.scene.engine import render
+from tasks.render.scene.asset import (
+    Instant,
+    OwnBody,
+    RenderAsset,
+    camera_psnr_db,
+    compose_gaussians,
+    mean_psnr_db,
+    near_part,
+)
+from tasks.render.scene.engine import render, render_instants
 from tasks.render.scene.movers import BEYOND_M, PlacedAgents, agents_at_time, behind_boxes, boxes_at, world_from_boxes
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky import pixel_directions
 from tasks.render.scene.stereo import FAR_M
-from tasks.render.seen import PhotoSights, guessed_pixels
+from tasks.render.seen import PhotoSights, guessed_pixels, street_views
 from tasks.render.settings import Backend, GateSettings, RenderSettings
 from tasks.render.splatting.gaussians import Gaussians, rotations_of
 from tasks.render.splatting.raster import View
+from tasks.render.views import instants_of_views
 from tasks.stages import Rejected
 from tasks.world.arrays import F32, Array, Bools, Bytes, Ints
-from tasks.world.clip import STEP_S, AgentKind, AgentTracks, Camera, Pinhole, SensorFile, front_camera
+from tasks.world.clip import AgentKind, AgentTracks, Camera, Pinhole, SensorFile, front_camera
 
 # How like its photos a vehicle near the camera looks, judged by the photo that was taken from nearest to here.
 #
@@ -329,6 +338,7 @@ def _best_shifted_likeness(rgb: F32, photo: Bytes, columns: F32, rows: F32, clea
 GREY = np.array([0.299, 0.587, 0.114], np.float32)  # luma of ITU-R BT.601
 SOLID = 0.5  # alpha from which a pixel counts as covered
 INSIDE_SIGMAS = 2.0  # a lens this close to a Gaussian's mean, in its standard deviations, is inside of it
+ROUNDING_M = 0.01  # more than distances in float32 are off by
 MAGNIFIED = 30.0  # takes what is 1 cm from the lens out to the rasteriser's near plane at 0.3 m
 NO_CONTRAST = 1.0e-6
 # These limits and `contrast_min` lie between what was measured on the synthetic town (2 blocks, 3 cameras): 135
@@ -378,22 +388,20 @@ def check_drive_pictures(
     """
     width, height = gate_picture_size(size, settings)
     rig = [camera.resized(width, height) for camera in cameras]
-    for pose, step in zip(world_from_ego, steps, strict=True):
-        there = agents_at_time(agents, step * STEP_S, pose[:2, 3], settings.reach_m)
-        eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, c.width, c.height) for c in rig]
-        scene = compose_near(asset, there, pose[:3, 3], settings.reach_m)
-        affines = [asset.affine_of(camera.name, step * STEP_S) for camera in cameras]
-        views = render(scene, eyes, backend=backend, affines=affines)
-        own = [asset.own_body(camera.name) for camera in cameras]
-        looked_at = measure_rendered_views(scene, eyes, views, pose, backend, own)
-        for camera, eye, view, found, body in zip(rig, eyes, views, looked_at, own, strict=True):
+    asked, own = instants_of_views(asset, cameras, world_from_ego, agents, steps, width, height, settings.reach_m)
+    seen = render_instants(asset, asked, backend)
+    shots = [(camera, pose) for pose, step in zip(world_from_ego, steps) if step in stored for camera in rig]
+    streets = street_views(asset, shots if sights is not None else (), backend)
+    for instant, views, pose, step in zip(asked, seen, world_from_ego, steps, strict=True):
+        there, looked_at = instant.vehicles, measure_rendered_views(asset, instant, views, pose, backend, own)
+        for camera, eye, view, found, body in zip(rig, instant.cameras, views, looked_at, own, strict=True):
             away = eye.world_from_camera[:3, 3] - there.boxes[:, :3]
             local = np.einsum("nij,ni->nj", world_from_boxes(there.boxes)[:, :3, :3], away)
             within = (np.abs(local) < there.boxes[:, 4:7] / 2.0).all(axis=1)
             inside = [there.track_ids[j] for j in np.flatnonzero(within)]
             fault = ("lens_covered", f"inside track {inside[0]}") if inside else picture_fault(found, settings)
             if fault is None and sights is not None and step in stored:
-                fault = guess_fault(asset, sights, there, camera, pose, body, settings, backend)
+                fault = guess_fault(sights, *next(streets), there, body, settings)
             if fault is None and album is not None and step in stored:
                 fault = vehicle_fault(album, there, eye, view, settings)
             if fault is not None:
@@ -428,17 +436,10 @@ def vehicle_fault(
 
 
 def guess_fault(
-    asset: RenderAsset,
-    sights: PhotoSights,
-    there: PlacedAgents,
-    camera: Camera,
-    world_from_ego: Array,
-    body: OwnBody | None,
-    settings: GateSettings,
-    backend: Backend = Backend.CPU,
+    sights: PhotoSights, eye: Pinhole, view: View, there: PlacedAgents, body: OwnBody | None, settings: GateSettings
 ) -> tuple[str, str] | None:
-    """(reason, detail) of a picture that in its worst quarter is a guess, however far away."""
-    guessed = guessed_pixels(asset, sights, camera, world_from_ego, there.boxes, backend)
+    """(reason, detail) of a picture whose street view in its worst quarter is a guess, however far away."""
+    guessed = guessed_pixels(sights, eye, view, there.boxes)
     if body is not None:
         guessed &= ~body.in_front(*guessed.shape[::-1])
     share = worst_quarter(guessed)
@@ -485,33 +486,25 @@ def picture_fault(found: PictureMeasures, settings: GateSettings) -> tuple[str, 
     return None
 
 
-def compose_near(asset: RenderAsset, there: PlacedAgents, place: Array, reach_m: float) -> RenderAsset:
-    """The scene with who is there as its background, without what is farther than reach_m from a place (3,) in the
-    world, seen from above."""
-    east, north = (asset.background.means[:, k] - np.float32(place[k] - asset.origin[k]) for k in (0, 1))
-    rows = np.flatnonzero(east * east + north * north < reach_m * reach_m)
-    near = replace(asset, background=asset.background.take(rows))
-    scene = compose_gaussians(near, there.track_ids, there.kinds, there.boxes)
-    return replace(asset, background=scene, nodes={})
-
-
 def measure_rendered_views(
-    scene: RenderAsset,
-    eyes: Sequence[Pinhole],
+    asset: RenderAsset,
+    instant: Instant,
     views: Sequence[View],
     world_from_ego: Array,
     backend: Backend = Backend.CPU,
     own: Sequence[OwnBody | None] | None = None,
 ) -> list[PictureMeasures]:
-    """Of the view that each camera has of a composed scene; nothing is missed where its `own` body is in front."""
-    out = []
-    for eye, seen, body in zip(eyes, views, own or [None] * len(eyes), strict=True):
+    """Of the view that each camera has at an instant; nothing is missed where its `own` body is in front."""
+    if not views:
+        return []
+    out, around = [], _around_lenses(asset, instant)
+    for eye, seen, body in zip(instant.cameras, views, own or [None] * len(views), strict=True):
         rays = pixel_directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height)
         road = meets_road(rays, eye.world_from_camera[:3, 3], world_from_ego)
         if body is not None:
             road &= ~body.in_front(eye.width, eye.height)
-        close = _on_the_lens(scene.background, eye.world_from_camera[:3, 3] - scene.origin)
-        lens = render(replace(scene, background=close), [eye], backend=backend)[0].alpha if len(close) else None
+        close = _on_the_lens(around, eye.world_from_camera[:3, 3] - asset.origin)
+        lens = render(replace(asset, background=close), [eye], backend=backend)[0].alpha if len(close) else None
         out.append(measure_rendered_view(seen, road, lens))
     return out
 
@@ -541,19 +534,38 @@ def meets_road(rays: Array, eye: Array, world_from_ego: Array) -> Bools:
     return np.asarray((rise < 0.0) & (height * length < -rise * ROAD_M))
 
 
+def _around_lenses(asset: RenderAsset, instant: Instant) -> Gaussians:
+    """What may be on one of an instant's lenses, and few more, of the scene as it is drawn."""
+    eyes = np.stack([eye.world_from_camera[:3, 3] for eye in instant.cameras]) - asset.origin
+    middle, there = eyes.mean(axis=0), instant.vehicles
+    apart_m = float(np.linalg.norm(eyes - middle, axis=1).max())
+    reach = instant.reach and replace(instant.reach, place=instant.reach.place - asset.origin)
+
+    def about(part: Gaussians) -> Gaussians:
+        return part.take(_nearer(part, middle, LENS_M + apart_m + ROUNDING_M))
+
+    near = replace(asset, background=near_part(about(asset.background), reach))
+    return about(compose_gaussians(near, there.track_ids, there.kinds, there.boxes))
+
+
+def _nearer(scene: Gaussians, place: Array, metres: float) -> Ints:
+    """Rows of what comes nearer to a place (3,) than so many metres, INSIDE_SIGMAS of it counted in."""
+    x, y, z = (scene.means[:, k] - np.float32(place[k]) for k in range(3))
+    widest = np.exp(np.maximum(np.maximum(*scene.log_scales.T[:2]), scene.log_scales[:, 2]))
+    return np.flatnonzero(np.sqrt(x * x + y * y + z * z) < metres + INSIDE_SIGMAS * widest)
+
+
 def _on_the_lens(scene: Gaussians, eye: Array) -> Gaussians:
     """What is nearer to `eye` than LENS_M or has it inside, magnified around it.
 
     That gives the same picture but moves nothing in front of the near plane: a wall nearer than that is not drawn, and
     the picture would show what is behind it.
     """
-    x, y, z = (scene.means[:, k] - np.float32(eye[k]) for k in range(3))
-    widest = np.exp(np.maximum(np.maximum(*scene.log_scales.T[:2]), scene.log_scales[:, 2]))
-    distance = np.sqrt(x * x + y * y + z * z)
-    chosen = np.flatnonzero(distance < LENS_M + INSIDE_SIGMAS * widest)
-    near = scene.take(chosen)
+    near = scene.take(_nearer(scene, eye, LENS_M))
+    x, y, z = (near.means[:, k] - np.float32(eye[k]) for k in range(3))
     along = np.einsum("nij,ni->nj", rotations_of(near.quats), near.means - eye) / np.exp(near.log_scales)
-    close = near.take((distance[chosen] < LENS_M) | ((along * along).sum(axis=1) < INSIDE_SIGMAS**2))
+    touched = np.sqrt(x * x + y * y + z * z) < LENS_M
+    close = near.take(touched | ((along * along).sum(axis=1) < INSIDE_SIGMAS**2))
     means = (eye + MAGNIFIED * (close.means - eye)).astype(np.float32)
     return replace(close, means=means, log_scales=close.log_scales + np.float32(math.log(MAGNIFIED)))
 

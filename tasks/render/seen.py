@@ -12,7 +12,7 @@ or scraps before a facade, looks right from the photo's own place alone. Photos 
 their places, which the fit has made near enough.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,11 +20,12 @@ import cv2
 import numpy as np
 
 from tasks.kernels.compiled import kernel
-from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import render
-from tasks.render.scene.movers import behind_boxes
+from tasks.render.scene.asset import Instant, RenderAsset
+from tasks.render.scene.engine import SCENE_S_OWN, render_instants
+from tasks.render.scene.movers import NOBODY, behind_boxes
 from tasks.render.scene.sky import pixel_directions
 from tasks.render.settings import Backend
+from tasks.render.splatting.raster import View
 from tasks.world.arrays import F32, Array, Bools
 from tasks.world.clip import Camera, Pinhole, SensorFile
 
@@ -58,29 +59,29 @@ def photo_sights(
     asset: RenderAsset, files: Sequence[SensorFile], cameras: Sequence[Camera], backend: Backend = Backend.CPU
 ) -> PhotoSights:
     """Of photos at the poses that the scene was made with; its vehicles are left out."""
-    rig = {camera.name: _small(camera) for camera in cameras}
-    eyes = [_eye(rig[file.sensor], file.world_from_ego) for file in files if file.sensor in rig]
+    rig = {camera.name: camera for camera in cameras}
+    shots = [(rig[file.sensor], file.world_from_ego) for file in files if file.sensor in rig]
+    eyes, views = zip(*street_views(asset, shots, backend)) if shots else ((), ())
     poses = np.array([eye.world_from_camera for eye in eyes]).reshape(-1, 4, 4)
     lenses = np.array([eye.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] for eye in eyes]).reshape(-1, 4)
-    views = [render(asset, [eye], backend=backend)[0] for eye in eyes]
     depths, pictures = tuple(view.depth for view in views), tuple(np.ascontiguousarray(view.rgb) for view in views)
     return PhotoSights(poses[:, :3, 3].copy(), np.linalg.inv(poses), lenses, depths, pictures)
 
 
-def guessed_pixels(
-    asset: RenderAsset,
-    sights: PhotoSights,
-    camera: Camera,
-    world_from_ego: Array,
-    boxes: Array,
-    backend: Backend = Backend.CPU,
-) -> Bools:
-    """(H, WIDTH) which pixels of the street are a guess, as a camera of the ego at a pose (4, 4) sees the scene.
+def street_views(
+    asset: RenderAsset, shots: Sequence[tuple[Camera, Array]], backend: Backend = Backend.CPU
+) -> Iterator[tuple[Pinhole, View]]:
+    """What cameras of the ego at poses (4, 4) see of the scene with nobody in it, WIDTH wide, one after the other."""
+    eyes = [_eye(camera, pose) for camera, pose in shots]
+    seen = render_instants(asset, [Instant([eye], NOBODY, [SCENE_S_OWN]) for eye in eyes], backend)
+    return ((eye, view) for eye, (view,) in zip(eyes, seen, strict=True))
+
+
+def guessed_pixels(sights: PhotoSights, eye: Pinhole, view: View, boxes: Array) -> Bools:
+    """(H, WIDTH) which pixels of a street view are a guess.
 
     Sky is none, nor what vehicles in boxes (N, 7), world, hide: they are known by other photos.
     """
-    eye = _eye(_small(camera), world_from_ego)
-    view = render(asset, [eye], backend=backend)[0]
     rays = pixel_directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height)
     here, ahead = (np.ascontiguousarray(eye.world_from_camera[:3, k]) for k in (3, 2))
     places = here + (view.depth / (rays @ ahead))[..., None] * rays
@@ -106,12 +107,9 @@ def best_sights(sights: PhotoSights, places: Array, here: Array, ahead: Array, r
     return best, shown
 
 
-def _small(camera: Camera) -> Camera:
-    return camera.resized(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
-
-
 def _eye(camera: Camera, world_from_ego: Array) -> Pinhole:
-    return Pinhole(camera.intrinsics, world_from_ego @ camera.ego_from_camera, camera.width, camera.height)
+    small = camera.resized(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
+    return Pinhole(small.intrinsics, world_from_ego @ small.ego_from_camera, small.width, small.height)
 
 
 def _likeness(rgb: F32, other: F32) -> Array:

@@ -7,7 +7,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from tasks.render.scene.asset import Instant, OwnBody, RenderAsset
+from tasks.render.scene.asset import Instant, OwnBody, Reach, RenderAsset
 from tasks.render.scene.engine import render_pictures
 from tasks.render.scene.movers import agents_at_time
 from tasks.render.settings import Backend
@@ -49,14 +49,18 @@ def instants_of_views(
     steps: Sequence[float],
     width: int,
     height: int,
+    reach_m: float | None = None,
 ) -> tuple[list[Instant], list[OwnBody | None]]:
-    """What `render_views` draws: one instant a pose, and what each camera sees of its own car."""
+    """What `render_views` draws: one instant a pose, and what each camera sees of its own car.
+
+    reach_m: of the background and of agents what is nearer to the ego; None: all, and agents as far as VISIBLE_M.
+    """
     rig, instants = [camera.resized(width, height) for camera in cameras], []
     for pose, step in zip(world_from_ego, steps, strict=True):
         affines = [asset.affine_of(camera.name, step * STEP_S) for camera in cameras]
-        there = agents_at_time(agents, step * STEP_S, pose[:2, 3], VISIBLE_M)
+        there = agents_at_time(agents, step * STEP_S, pose[:2, 3], VISIBLE_M if reach_m is None else reach_m)
         eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, width, height) for c in rig]
-        instants.append(Instant(eyes, there, affines))
+        instants.append(Instant(eyes, there, affines, None if reach_m is None else Reach(pose[:3, 3], reach_m)))
     return instants, [asset.own_body(camera.name) for camera in cameras]
 
 

@@ -24,7 +24,7 @@ from factory.stages.scene_file import read_scene
 from factory.stages.sensors import block_of, choose_cameras
 from tasks.render.gate import worst_quarter
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.seen import PhotoSights, guessed_pixels, photo_sights
+from tasks.render.seen import PhotoSights, guessed_pixels, photo_sights, street_views
 from tasks.render.settings import GateSettings
 from tasks.world.arrays import Array
 from tasks.world.clip import Camera, SensorFile
@@ -72,7 +72,8 @@ def measured(block: Block, row: dict[str, str]) -> float:
     pose: Array = np.eye(4)
     pose[:3, 3] = [float(row[name]) for name in ("x_m", "y_m", "z_m")]
     pose[:3, :3] = Rotation.from_rotvec([float(row[name]) for name in ("rx_rad", "ry_rad", "rz_rad")]).as_matrix()
-    return worst_quarter(guessed_pixels(asset, sights, cameras[row["camera"]], pose, np.zeros((0, 7))))
+    eye, view = next(street_views(asset, [(cameras[row["camera"]], pose)]))
+    return worst_quarter(guessed_pixels(sights, eye, view, np.zeros((0, 7))))
 
 
 def main() -> None:

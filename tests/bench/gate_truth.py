@@ -21,7 +21,6 @@ from tasks.render.gate import (
     GateSettings,
     VehiclePhotos,
     box_mask,
-    compose_near,
     expected_likeness,
     large_vehicles,
     likeness_to_nearest_photo,
@@ -31,8 +30,8 @@ from tasks.render.gate import (
     ssim_map,
     to_box_frame,
 )
-from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import render
+from tasks.render.scene.asset import Instant, Reach, RenderAsset
+from tasks.render.scene.engine import render, render_instants
 from tasks.render.scene.movers import PlacedAgents, agents_at_time
 from tasks.render.views import VISIBLE_M
 from tasks.world.arrays import F32, Array
@@ -132,9 +131,10 @@ def verdicts(
     large vehicle that is to be least like its photos; and that of the one that beside a photo is least like it."""
     pose = shown.world_from_ego
     there = agents_at_time(drive.agents, shown.step * STEP_S, pose[:2, 3], settings.reach_m)
-    scene = compose_near(asset, there, pose[:3, 3], settings.reach_m)
-    views = render(scene, [shown.eye], affines=[asset.affine_of(shown.camera, shown.step * STEP_S)])
-    fault = picture_fault(measure_rendered_views(scene, [shown.eye], views, pose)[0], settings)
+    affine = asset.affine_of(shown.camera, shown.step * STEP_S)
+    instant = Instant([shown.eye], there, [affine], Reach(pose[:3, 3], settings.reach_m))
+    (views,) = render_instants(asset, [instant])
+    fault = picture_fault(measure_rendered_views(asset, instant, views, pose)[0], settings)
     least, beside = NOTHING_LARGE, NOTHING_LARGE
     for j, _ in large_vehicles(there, shown.eye, views[0], settings.vehicle_share):
         track_id, box = there.track_ids[j], there.boxes[j]

@@ -36,7 +36,7 @@ from tasks.render.fit.state import BACKGROUND, AdamArray, FitState, logits_of
 from tasks.render.scene.asset import Instant, OwnBody, RenderAsset, psnr
 from tasks.render.scene.engine import SCENE_S_OWN, encode_jpeg, render, render_pictures
 from tasks.render.scene.movers import NOBODY, SHIFT_SIZE, PlacedAgents
-from tasks.render.scene.on_device import BATCH_PIXELS, Device, jpegs, nvjpeg, pictures
+from tasks.render.scene.on_device import Device, batches, jpegs, nvjpeg, pictures
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.render.scene.sky import COLUMNS, ROWS, plain_sky
 from tasks.render.settings import FitSettings
@@ -301,7 +301,7 @@ def samples(place: Place, n: int, sizes: Sequence[tuple[int, int]]) -> bool:
         nothing: list[OwnBody | None] = [None] * RIG
         together = partial(_sample, device, asset, [sample], nothing)
         apart = partial(_sample, device, asset, [[instant] for instant in sample], nothing)
-        calls = -(-INSTANTS // max(1, BATCH_PIXELS // (RIG * width * height)))
+        calls = len([*batches(asset, sample)])
         off = int(np.abs(together().astype(int) - apart()).max())
         shown = [*together().reshape(-1, height, width, 3)]
         host = [encode_jpeg(picture, QUALITY) for picture in shown]

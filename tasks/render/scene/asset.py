@@ -83,12 +83,21 @@ class OwnBody:
 
 
 @dataclass(frozen=True)
+class Reach:
+    """What is nearer than so many metres to a place, seen from above."""
+
+    place: Array  # (3,) [m]; in the world, as the cameras of an Instant are
+    metres: float
+
+
+@dataclass(frozen=True)
 class Instant:
     """What is to be drawn of a scene at one time."""
 
     cameras: Sequence[Pinhole]
     vehicles: PlacedAgents
     affines: Sequence[F32]  # (3, 4) a camera: what it makes of the scene's light
+    reach: Reach | None = None  # of the background that is drawn; None: all of it
 
 
 @dataclass(frozen=True)
@@ -171,6 +180,14 @@ class RenderAsset:
         return np.asarray(first.affine + share * (last.affine - first.affine), np.float32)
 
 
+def near_part(background: Gaussians, reach: Reach | None) -> Gaussians:
+    """What of it is in reach of a place in its own frame."""
+    if reach is None:
+        return background
+    east, north = (background.means[:, k] - np.float32(reach.place[k]) for k in (0, 1))
+    return background.take(np.flatnonzero(east * east + north * north < reach.metres * reach.metres))
+
+
 def photo_rises(taken: Sequence[PhotoPose]) -> tuple[Array, Array]:
     """Times (T,) of photos, ascending, and how much higher (T,) [m] they were taken than the log has it."""
     rows = np.array(sorted((photo.time_s, photo.rise_m) for photo in taken)).reshape(-1, 2)
@@ -212,6 +229,8 @@ def compose_gaussians(
     """
     local = boxes - np.concatenate([asset.origin, np.zeros(4)])
     poses = world_from_boxes(local)
+    if not len(track_ids):
+        return asset.background
     parts = [asset.background]
     for j, track_id in enumerate(track_ids):
         node = asset.nodes.get(track_id)

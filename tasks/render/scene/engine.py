@@ -1,9 +1,9 @@
-"""The functions that draw a scene: `render` gives views of one instant, `render_pictures` 8-bit pictures of several.
+"""The functions that draw a scene: `render` and `render_instants` give views, `render_pictures` 8-bit pictures.
 
 Backends with one face. `cpu` is the compiled tile rasteriser of this package: the same input gives the same bytes.
-`gsplat` draws the same Gaussians with CUDA, equal up to the last bits of 8-bit colours, all cameras of a size in one
-call (`gsplat_dense` without packing what they see). All draw ideal pinholes: a camera's distortion is taken out of its
-photos before they enter a scene (`views.undistorted`), so that images at new poses need none.
+`gsplat` draws the same Gaussians with CUDA, equal up to the last bits of 8-bit colours, all cameras of several instants
+in one call (`gsplat_dense` without packing what they see). All draw ideal pinholes: a camera's distortion is taken out
+of its photos before they enter a scene (`views.undistorted`), so that images at new poses need none.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from tasks.render.scene.asset import Instant, OwnBody, RenderAsset, compose_gaussians
+from tasks.render.scene.asset import Instant, OwnBody, RenderAsset, compose_gaussians, near_part
 from tasks.render.scene.movers import NOBODY, PlacedAgents
 from tasks.render.scene.sensed import shift_pose
 from tasks.render.settings import Backend
@@ -47,11 +47,21 @@ def render(
     cannot work on this machine.
     """
     instant = Instant(cameras, vehicles, [SCENE_S_OWN] * len(cameras) if affines is None else affines)
+    return next(render_instants(asset, [instant], backend, threads))
+
+
+def render_instants(
+    asset: RenderAsset, instants: Sequence[Instant], backend: Backend = Backend.CPU, threads: int = 1
+) -> Iterator[list[View]]:
+    """What `render` gives, of one instant after the other: drawn by the CPU when it is asked for, by a GPU with others.
+
+    Raises BackendMissing where the backend cannot work on this machine.
+    """
     if not backend.on_gpu:
-        return _render_on_cpu(asset, instant, threads)
+        return (_render_on_cpu(asset, instant, threads) for instant in instants)
     from tasks.render.scene import on_device  # torch is loaded only where it is asked for
 
-    return on_device.views(gpu(backend), asset, _in_scene(asset, instant))
+    return on_device.views(gpu(backend), asset, [_in_scene(asset, instant) for instant in instants])
 
 
 def render_pictures(
@@ -119,9 +129,10 @@ def _pictures_on_cpu(asset: RenderAsset, instant: Instant, bodies: Sequence[OwnB
 
 
 def _render_on_cpu(asset: RenderAsset, instant: Instant, threads: int, with_depth: bool = True) -> list[View]:
-    agents, seen = instant.vehicles, []
-    scene = compose_gaussians(asset, agents.track_ids, agents.kinds, agents.boxes)
-    for eye, affine in zip(_in_scene(asset, instant).cameras, instant.affines, strict=True):
+    agents, local, seen = instant.vehicles, _in_scene(asset, instant), []
+    near = replace(asset, background=near_part(asset.background, local.reach))
+    scene = compose_gaussians(near, agents.track_ids, agents.kinds, agents.boxes)
+    for eye, affine in zip(local.cameras, instant.affines, strict=True):
         k, pose = eye.intrinsics, eye.world_from_camera
         view = forward(scene, k, pose, eye.width, eye.height, BLACK, threads, asset.screen, with_depth).view
         asset.sky.finish(view.rgb, view.alpha, affine, k, pose, threads)
@@ -130,9 +141,10 @@ def _render_on_cpu(asset: RenderAsset, instant: Instant, threads: int, with_dept
 
 
 def _in_scene(asset: RenderAsset, instant: Instant) -> Instant:
-    """The instant with its cameras in the scene's own frame."""
+    """The instant with its cameras and its reach in the scene's own frame."""
     local = [replace(c, world_from_camera=shift_pose(c.world_from_camera, -asset.origin)) for c in instant.cameras]
-    return replace(instant, cameras=local)
+    reach = instant.reach and replace(instant.reach, place=instant.reach.place - asset.origin)
+    return replace(instant, cameras=local, reach=reach)
 
 
 def gpu(backend: Backend) -> "Device":

@@ -14,7 +14,8 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
-from math import pi
+from itertools import groupby, islice, product
+from math import inf, pi
 from typing import Any
 
 import cv2
@@ -23,8 +24,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tasks.render.scene.asset import Instant, OwnBody, RenderAsset
-from tasks.render.scene.movers import PlacedAgents, world_from_boxes
+from tasks.render.scene.asset import Instant, OwnBody, Reach, RenderAsset
+from tasks.render.scene.movers import world_from_boxes
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.scene.surfels import box_gaussians
 from tasks.render.splatting import sh
@@ -79,22 +80,47 @@ def nvjpeg() -> Callable[[list[Tensor], int], list[bytes]] | None:
     return encode
 
 
-@torch.inference_mode()
-def views(device: Device, asset: RenderAsset, instant: Instant) -> list[View]:
-    """One finished view a camera, of one instant."""
-    by_size: dict[tuple[int, int], list[int]] = defaultdict(list)
-    for i, camera in enumerate(instant.cameras):
-        by_size[camera.width, camera.height].append(i)
-    found: dict[int, View] = {}
-    scene = _composed(device, asset, [instant.vehicles])
-    for rows in by_size.values():
-        mine = replace(instant, cameras=[instant.cameras[i] for i in rows], affines=[instant.affines[i] for i in rows])
-        for i, *view in zip(rows, *map(device.fetch, _lit(device, asset, scene, [mine])), strict=True):
-            found[i] = View(*view)
-    return [found[i] for i in range(len(instant.cameras))]
-
-
 BATCH_PIXELS = 2**23  # drawn in one call, of all cameras of the instants that it takes: 1 GB on the device
+BATCH_GAUSSIANS = 2**22  # of all instants in it, which have a scene each where something moves: some 2 GB, of degree 3
+BATCH_PAIRS = 2**25  # of a Gaussian and a camera in it: some 2 GB
+
+
+def batches(asset: RenderAsset, instants: Sequence[Instant]) -> Iterator[Sequence[Instant]]:
+    """As many instants at once as the bounds let, one at least, whose cameras are of the same sizes."""
+    for sizes, group in groupby(instants, lambda one: [(camera.width, camera.height) for camera in one.cameras]):
+        alike, pixels = [*group], sum(width * height for width, height in sizes)
+        crowd = max(sum(len(asset.nodes.get(name, ())) for name in one.vehicles.track_ids) for one in alike)
+        each = max(1, len(asset.background) + crowd)
+        most = min(BATCH_PIXELS // max(1, pixels), BATCH_PAIRS // (each * max(1, len(sizes))))
+        most = max(1, most if _is_still(alike) else min(most, BATCH_GAUSSIANS // each))
+        yield from (alike[i : i + most] for i in range(0, len(alike), most))
+
+
+def _is_still(instants: Sequence[Instant]) -> bool:
+    """All show the same: the background."""
+    return all(not instant.vehicles.track_ids and instant.reach is None for instant in instants)
+
+
+@torch.inference_mode()
+def views(device: Device, asset: RenderAsset, instants: Sequence[Instant]) -> Iterator[list[View]]:
+    """One finished view a camera, of one instant after the other; a batch is drawn when its first is asked for."""
+    for batch in batches(asset, instants):
+        yield from _views(device, asset, batch)
+
+
+def _views(device: Device, asset: RenderAsset, instants: Sequence[Instant]) -> list[list[View]]:
+    by_size: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for i, camera in enumerate(instants[0].cameras):
+        by_size[camera.width, camera.height].append(i)
+    found: dict[tuple[int, int], View] = {}
+    scene = _composed(device, asset, instants)
+    for rows in by_size.values():
+        mine = [
+            replace(n, cameras=[n.cameras[i] for i in rows], affines=[n.affines[i] for i in rows]) for n in instants
+        ]
+        seen = zip(*map(device.fetch, _lit(device, asset, scene, mine)), strict=True)
+        found |= {place: View(*view) for place, view in zip(product(range(len(mine)), rows), seen, strict=True)}
+    return [[found[f, i] for i in range(len(instant.cameras))] for f, instant in enumerate(instants)]
 
 
 @torch.inference_mode()
@@ -120,25 +146,25 @@ def jpegs(
 ) -> list[list[bytes]]:
     """The same as JPEGs, one a camera, of each instant: nothing else comes back."""
     assert device.encode is not None
-    drawn = (of_instant for batch in _drawn(device, asset, instants, bodies) for of_instant in batch)
-    return [device.encode([picture.permute(2, 0, 1).contiguous() for picture in each], quality) for each in drawn]
+    made: list[list[bytes]] = []
+    for drawn in _drawn(device, asset, instants, bodies):
+        jpegs = iter(device.encode([*drawn.flatten(0, 1).permute(0, 3, 1, 2).contiguous()], quality))
+        made += [[*islice(jpegs, drawn.shape[1])] for _ in drawn]
+    return made
 
 
 def _drawn(
     device: Device, asset: RenderAsset, instants: Sequence[Instant], bodies: Sequence[OwnBody | None]
 ) -> Iterator[Tensor]:
-    """Batches (F, C, H, W, 3) uint8 of as many instants as BATCH_PIXELS lets."""
-    rig = instants[0].cameras if instants else ()
-    at_once = max(1, BATCH_PIXELS // max(1, sum(camera.width * camera.height for camera in rig)))
-    for i in range(0, len(instants), at_once):
-        yield _rounded(device, asset, instants[i : i + at_once], bodies)
+    """Batches (F, C, H, W, 3) uint8."""
+    return (_rounded(device, asset, batch, bodies) for batch in batches(asset, instants))
 
 
 def _rounded(
     device: Device, asset: RenderAsset, instants: Sequence[Instant], bodies: Sequence[OwnBody | None]
 ) -> Tensor:
     """(F, C, H, W, 3) uint8."""
-    scene = _composed(device, asset, [instant.vehicles for instant in instants])
+    scene = _composed(device, asset, instants)
     lit, _, _ = _lit(device, asset, scene, instants)
     rounded = (lit * 255.0).round_().unflatten(0, (len(instants), -1))
     for c, body in enumerate(bodies):
@@ -216,10 +242,18 @@ UNLIT = Gaussians(
 )
 
 
-def _composed(device: Device, asset: RenderAsset, crowds: Sequence[PlacedAgents]) -> GaussianTensors:
-    """As `tasks.render.scene.asset.compose_gaussians` has it, of several instants (F, N, ...): where fewer vehicles are
-    there than at others, Gaussians without light stand for the rest."""
-    background = repeated(gaussians_on(device, asset.background), len(crowds))
+def _composed(device: Device, asset: RenderAsset, instants: Sequence[Instant]) -> GaussianTensors:
+    """As `tasks.render.scene.asset.compose_gaussians` has it, of several instants (F, N, ...), or (1, N, ...) where all
+    are still. Without light is what is out of reach, and what stands for vehicles where there are fewer than at others.
+    """
+    background = gaussians_on(device, asset.background)
+    if _is_still(instants):
+        return repeated(background, 1)
+    crowds, reaches = zip(*((instant.vehicles, instant.reach) for instant in instants))
+    background = repeated(background, len(instants))
+    if any(reaches):
+        within = _within(device, background.means, reaches)
+        background = replace(background, opacities=torch.where(within, background.opacities, 0.0))
     nodes = [
         asset.nodes.get(track_id) or box_gaussians(crowd.boxes[j, 4:7], crowd.kinds[j])
         for crowd in crowds
@@ -236,6 +270,14 @@ def _composed(device: Device, asset: RenderAsset, crowds: Sequence[PlacedAgents]
     rows = torch.as_tensor(np.where(rows < starts[1:, None], rows, starts[-1]), device=device.name)
     taken = GaussianTensors(*(getattr(vehicles, each.name)[rows] for each in fields(GaussianTensors)))
     return _joined([background, taken], dim=1)
+
+
+def _within(device: Device, means: Tensor, reaches: Sequence[Reach | None]) -> Tensor:
+    """(F, N) which of the means (F, N, 3) are in reach at each instant: `tasks.render.scene.asset.near_part`."""
+    known = [(0.0, 0.0, inf) if reach is None else (*reach.place[:2], reach.metres) for reach in reaches]
+    east, north, metres = device.sent(known)[..., None].unbind(1)
+    east, north = means[..., 0] - east, means[..., 1] - north
+    return east * east + north * north < metres * metres
 
 
 def repeated(part: GaussianTensors, times: int) -> GaussianTensors:
@@ -283,8 +325,9 @@ def rasterized(
     device: Device, scene: GaussianTensors, rigs: Sequence[Sequence[Pinhole]], screen: ScreenFilter
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Colours (F x C, H, W, 3) before black, which may leave [0, 1], depth (F x C, H, W) [m], 0 where nothing is, and
-    alpha, of a `scene` (F, N, ...) and C cameras for each of F instants."""
+    alpha, of a `scene` (F, N, ...), or one (1, N, ...) for all, and C cameras for each of F instants."""
     first = rigs[0][0]
+    rigs = rigs if len(scene.means) > 1 else [[camera for rig in rigs for camera in rig]]
     if not scene.means.shape[1]:
         nothing = torch.zeros(len(rigs) * len(rigs[0]), first.height, first.width, 3, device=device.name)
         return nothing, nothing[..., 0], nothing[..., 0]

@@ -22,9 +22,10 @@ from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.experts.protocol import Human, Plan
 from tasks.experts.recovery import RecoveryExpert, RecoveryTable
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
-from tasks.render.gate import compose_near, likeness_to_photo, measure_rendered_views
+from tasks.render.gate import likeness_to_photo, measure_rendered_views
+from tasks.render.scene.asset import Instant, Reach
 from tasks.render.scene.build import AssetSettings, build_asset
-from tasks.render.scene.engine import render
+from tasks.render.scene.engine import SCENE_S_OWN, render_instants
 from tasks.render.scene.movers import NOBODY
 from tasks.render.views import draw_map_views, pinhole, render_views
 from tasks.reward.epdms import Scores, prepare_scene, score
@@ -180,8 +181,8 @@ def pictures() -> dict[str, object]:
     pose[:, 2, 3] = 0.0
     drawn = draw_map_views(clip.road_map, [pinhole("front", 0.0, 70.0)], pose, clip.agents, [NOW], 128, 72)
     eye = Pinhole(front.intrinsics, aside[0] @ front.ego_from_camera, street.WIDTH, street.HEIGHT)
-    near = compose_near(asset, NOBODY, aside[0, :3, 3], 30.0)
-    (found,) = measure_rendered_views(near, [eye], render(near, [eye]), aside[0])
+    near = Instant([eye], NOBODY, [SCENE_S_OWN], Reach(aside[0, :3, 3], 30.0))
+    (found,) = measure_rendered_views(asset, near, next(render_instants(asset, [near])), aside[0])
     alike = likeness_to_photo(asset, photos[2], street.tracks(), ["car"])
     return {"rendered": blocks(seen), "drawn": blocks(drawn), "gate": astuple(found), "likeness": [alike["car"]]}
 

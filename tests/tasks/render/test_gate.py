@@ -12,14 +12,13 @@ from tasks.render.gate import (
     GateSettings,
     PictureMeasures,
     check_drive_pictures,
-    compose_near,
     measure_rendered_view,
     measure_rendered_views,
     meets_road,
     picture_fault,
 )
-from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.engine import render
+from tasks.render.scene.asset import Instant, Reach, RenderAsset
+from tasks.render.scene.engine import SCENE_S_OWN, render_instants
 from tasks.render.scene.movers import NOBODY
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import EMPTY, Gaussians, concatenate
@@ -47,8 +46,8 @@ def turned(x: float, y: float, degrees: float) -> np.ndarray:
 
 def measured_at(asset: RenderAsset, pose: np.ndarray) -> PictureMeasures:
     eye = Pinhole(FRONT.intrinsics, pose @ FRONT.ego_from_camera, *SIZE)
-    scene = compose_near(asset, NOBODY, pose[:3, 3], SETTINGS.reach_m)
-    return measure_rendered_views(scene, [eye], render(scene, [eye]), pose)[0]
+    instant = Instant([eye], NOBODY, [SCENE_S_OWN], Reach(pose[:3, 3], SETTINGS.reach_m))
+    return measure_rendered_views(asset, instant, next(render_instants(asset, [instant])), pose)[0]
 
 
 def blob(x: float, y: float, z: float, sigma_m: float) -> Gaussians:
@@ -132,6 +131,11 @@ def test_a_scene_of_large_gaussians_is_blurred(street_asset: RenderAsset) -> Non
 def test_only_rays_that_come_down_on_the_road_in_reach_are_asked_for() -> None:
     rays = np.array([[[10.0, 0.0, -1.5], [30.0, 0.0, -1.5], [10.0, 0.0, 0.5]]])
     assert meets_road(rays, np.array([0.0, 0.0, 1.5]), np.eye(4)).tolist() == [[True, False, False]]
+
+
+def test_without_cameras_there_is_nothing_to_refuse(street_asset: RenderAsset) -> None:
+    poses = np.stack([street.ego_pose(1.0)])
+    assert check_drive_pictures(street_asset, [], poses, street.tracks(), [8], SIZE, SETTINGS) is None
 
 
 def test_the_first_fault_in_time_is_told(street_asset: RenderAsset) -> None:

@@ -13,7 +13,7 @@ import street
 from tasks.render.gate import GateSettings, check_drive_pictures, worst_quarter
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.sky import plain_sky
-from tasks.render.seen import ANGLE_RAD, WIDTH, PhotoSights, best_sights, guessed_pixels, photo_sights
+from tasks.render.seen import ANGLE_RAD, WIDTH, PhotoSights, best_sights, guessed_pixels, photo_sights, street_views
 from tasks.render.splatting.gaussians import EMPTY, Gaussians, concatenate
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import Camera, SensorFile
@@ -85,7 +85,7 @@ def test_what_stood_before_a_place_in_a_photo_hides_it() -> None:
 
 
 def guessed(asset: RenderAsset, here: Array, *photos: Array, boxes: Array = NOBODY) -> Bools:
-    return guessed_pixels(asset, sights_of(asset, *photos), LENS, here, boxes)
+    return guessed_pixels(sights_of(asset, *photos), *next(street_views(asset, [(LENS, here)])), boxes)
 
 
 def test_a_guess_is_what_photos_do_not_show_and_what_does_not_look_like_there() -> None:
@@ -99,7 +99,7 @@ def test_a_guess_is_what_photos_do_not_show_and_what_does_not_look_like_there() 
     assert 0.02 < seen.mean() < 0.3
     shown = sights_of(plain, pose(0.0))
     other = replace(shown, pictures=(np.ascontiguousarray(shown.pictures[0][:, ::-1]),))
-    assert guessed_pixels(plain, other, LENS, pose(0.0), NOBODY).mean() > 0.5
+    assert guessed_pixels(other, *next(street_views(plain, [(LENS, pose(0.0))])), NOBODY).mean() > 0.5
 
 
 def test_the_sky_and_what_vehicles_hide_is_no_guess() -> None:

@@ -11,7 +11,7 @@ import torch
 
 from tasks.render.scene import on_device
 from tasks.render.scene.asset import Exposure, OwnBody, RenderAsset
-from tasks.render.scene.engine import encode_jpeg, render, render_jpegs, render_pictures
+from tasks.render.scene.engine import encode_jpeg, render, render_instants, render_jpegs, render_pictures
 from tasks.render.scene.movers import PlacedAgents, agents_at_time
 from tasks.render.scene.on_device import Device, finished
 from tasks.render.scene.sky import SkyMap
@@ -91,6 +91,47 @@ def test_samples_pictures_are_the_kernels_to_a_step_of_8_bits(rich: RenderAsset)
     assert (np.abs(drawn[0][:, 1].astype(int) - drawn[0][:, 0]) > 30).mean() > 0.2, "both look at something else"
 
 
+def test_views_of_instants_drawn_together_are_those_of_each_alone(
+    rich: RenderAsset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the bit, and to less than a step the kernels': cameras of two sizes, of the background what is near alone, at
+    instants with two, one and no vehicles; in as many calls as memory asks for."""
+    calls: list[tuple[int, ...]] = []
+
+    def counted(**given: Any) -> Any:
+        calls.append(tuple(given["Ks"].shape[:2]))
+        return rasterization(**given)
+
+    monkeypatch.setattr(on_device, "cuda", lambda packed: Device("cpu", counted, packed))
+    rig = [Camera(n, 96, 54, street.INTRINSICS, np.zeros(5), turned(k)) for n, k in (("a", 0.0), ("b", 170.0))]
+    poses = np.stack([street.ego_pose(x, 0.6) for x in (1.5, 2.5, 3.0)])
+    asked, _ = instants_of_views(rich, rig, poses, two_that_come_and_go(), [9.5, 4, 14], 96, 54, reach_m=16.0)
+    assert [len(one.vehicles.track_ids) for one in asked] == [2, 1, 0]
+    half = [[e if i else replace(e, width=48) for i, e in enumerate(one.cameras)] for one in asked]
+    asked = [replace(one, cameras=eyes) for one, eyes in zip(asked, half)]
+    together = [*render_instants(rich, asked, Backend.GSPLAT)]
+    assert calls == [(3, 1)] * 2, "one call a size"
+    for one, views in zip(asked, together, strict=True):
+        (alone,), (slow,) = (render_instants(rich, [one], by) for by in (Backend.GSPLAT, Backend.CPU))
+        for mine, own, kernels in zip(views, alone, slow, strict=True):
+            for name in ("rgb", "depth", "alpha"):
+                np.testing.assert_array_equal(getattr(mine, name), getattr(own, name))
+            assert mine.rgb.shape == kernels.rgb.shape and np.abs(mine.rgb - kernels.rgb).max() < STEP
+            np.testing.assert_allclose(mine.alpha, kernels.alpha, atol=1e-3)
+    whole = len(rich.background) + len(rich.nodes["car"])
+    for bound, value, expected in (
+        ("BATCH_GAUSSIANS", 2 * whole, [2, 2, 1, 1]),
+        ("BATCH_PAIRS", 2 * whole, [1] * 6),
+        ("BATCH_PIXELS", 2 * (96 + 48) * 54, [2, 2, 1, 1]),
+    ):
+        calls.clear()
+        with monkeypatch.context() as less:
+            less.setattr(on_device, bound, value)
+            again = [*render_instants(rich, asked, Backend.GSPLAT)]
+        assert [instants for instants, _ in calls] == expected, bound
+        np.testing.assert_array_equal(again[2][1].rgb, together[2][1].rgb)
+
+
 def test_all_instants_are_asked_for_before_the_first_comes_back_alone(
     rich: RenderAsset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,9 +159,11 @@ def test_all_instants_are_asked_for_before_the_first_comes_back_alone(
 def test_jpegs_are_those_of_the_pictures_in_their_order(
     rich: RenderAsset, monkeypatch: pytest.MonkeyPatch, by: str
 ) -> None:
-    """A device that makes them has no picture come back."""
+    """A device that makes them has no picture come back, and makes those of one call at once."""
+    encoded: list[int] = []
 
     def encode(pictures: list[torch.Tensor], quality: int) -> list[bytes]:
+        encoded.append(len(pictures))
         assert all(picture.is_contiguous() and picture.dtype == torch.uint8 for picture in pictures)
         return [encode_jpeg(picture.permute(1, 2, 0).numpy(), quality) for picture in pictures]
 
@@ -136,7 +179,9 @@ def test_jpegs_are_those_of_the_pictures_in_their_order(
     pictures = [*render_pictures(rich, *asked, Backend.GSPLAT)]
     if by == "the device":
         monkeypatch.setattr(on_device, "cuda", lambda packed: Device("cpu", rasterization, packed, fetch, encode))
+    monkeypatch.setattr(on_device, "BATCH_PIXELS", 2 * 2 * 96 * 54)
     jpegs = render_jpegs(rich, *asked, 90, Backend.GSPLAT)
+    assert encoded == ([4, 2] if by == "the device" else [])
     assert jpegs == [[encode_jpeg(picture, 90) for picture in of_instant] for of_instant in pictures]
 
 

@@ -34,6 +34,6 @@ def test_gsplat_is_given_float32_for_its_kernels_take_no_less(halved: RenderAsse
         asked.append(given)
         return rasterization(**given)
 
-    views(Device("cpu", listened), halved, Instant([FRONT], there, [np.eye(3, 4, dtype=np.float32)]))
+    next(views(Device("cpu", listened), halved, [Instant([FRONT], there, [np.eye(3, 4, dtype=np.float32)])]))
     arrays = [value for value in asked[0].values() if isinstance(value, torch.Tensor)]
     assert len(arrays) == 7 and all(array.dtype == torch.float32 for array in arrays)

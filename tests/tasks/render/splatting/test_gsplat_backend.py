@@ -14,11 +14,12 @@ from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import render, require_backend
 from tasks.render.scene.movers import agents_at_time
 from tasks.render.scene.on_device import Device
+from tasks.render.seen import photo_sights
 from tasks.render.settings import Backend, GateSettings
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gsplat_backend import BackendMissing, require
 from tasks.render.views import render_views
-from tasks.world.clip import Camera, Pinhole
+from tasks.world.clip import Camera, Pinhole, SensorFile
 from tests.bench.by_kernels import rasterization
 
 POSE = street.ego_pose(3.0, 0.4) @ street.EGO_FROM_CAMERA
@@ -41,7 +42,7 @@ def cloud(n: int, count: int) -> Gaussians:
 def test_the_rig_s_views_of_a_sample_s_instants_are_asked_for_at_once(
     monkeypatch: pytest.MonkeyPatch, street_asset: RenderAsset
 ) -> None:
-    """By the gate those of one instant; with gsplat_dense each is told not to pack."""
+    """By the gate, too, whose street views share one scene; with gsplat_dense each call is told not to pack."""
     asked: list[tuple[int, int, bool]] = []
 
     def counted(**given: Any) -> Any:
@@ -51,6 +52,7 @@ def test_the_rig_s_views_of_a_sample_s_instants_are_asked_for_at_once(
     monkeypatch.setattr(on_device, "cuda", lambda packed: Device("cpu", counted, packed))
     rig = [Camera(n, street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), street.EGO_FROM_CAMERA) for n in "ab"]
     poses, size = np.stack([street.ego_pose(1.5, 0.6), street.ego_pose(2.5, 0.6)]), (64, 36)
+    photos = [SensorFile("a", "", 0.1 * i, pose) for i, pose in enumerate((*poses, street.ego_pose(2.0)))]
     for backend, packed in ((Backend.GSPLAT, True), (Backend.GSPLAT_DENSE, False)):
         asked.clear()
         pictures = np.stack([*render_views(street_asset, rig, poses, street.tracks(), [4, 9], *size, backend)])
@@ -58,8 +60,12 @@ def test_the_rig_s_views_of_a_sample_s_instants_are_asked_for_at_once(
         on_cpu = np.stack([*render_views(street_asset, rig, poses, street.tracks(), [4, 9], *size)])
         np.testing.assert_allclose(pictures.astype(int), on_cpu, atol=1)
         asked.clear()
-        check_drive_pictures(street_asset, rig, poses[:1], street.tracks(), [4], size, GateSettings(), backend)
-        assert asked[0] == (1, 2, packed)
+        sights = photo_sights(street_asset, photos, rig, backend)
+        assert asked == [(1, 3, packed)]
+        asked.clear()
+        how, shown = GateSettings(guessed_max=1.0), {"stored": [4, 9], "sights": sights}
+        found = check_drive_pictures(street_asset, rig, poses, street.tracks(), [4, 9], size, how, backend, **shown)
+        assert found is None and asked == [(2, 2, packed), (1, 4, packed)]
 
 
 @pytest.mark.parametrize("name", ["torch", "gsplat"])
