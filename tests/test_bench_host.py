@@ -16,11 +16,18 @@ def test_it_asks_a_device_for_all_instants_of_a_sample(
         asked.append((tuple(given["means"].shape), tuple(given["Ks"].shape)))  # type: ignore[attr-defined]
         return drawn(**given)
 
-    monkeypatch.setattr(on_device, "cuda", on_device.cuda)  # which the bench replaces
+    for name in ("cuda", "BATCH_PIXELS"):  # which the bench replaces
+        monkeypatch.setattr(on_device, name, getattr(on_device, name))
     monkeypatch.setattr(bench_host, "nothing_is_drawn", counted)
     monkeypatch.setattr(bench_host, "SIZES", ((64, 36),))
     monkeypatch.setattr(bench_host, "NODE", 50)
+    monkeypatch.setattr(bench_host, "LOOKS", 3)
     bench_host.main({"gaussians": "400", "vehicles": "3", "instants": "2", "repeats": "1"})
-    (row,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| 64x36 |")]
-    assert all(float(cell) >= 0.0 for cell in row.split("|")[2:-1])
-    assert asked == [((2, 400 + 3 * 50, 3), (2, 8, 3, 3))] * 2, "one sample that warms up, one that is timed"
+    rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if "64x36" in line]
+    assert all(float(cell) >= 0.0 for row in rows for cell in row[1:])
+    assert [(name.strip(), float(calls), float(fetched)) for name, calls, fetched, _ in rows[1:]] == [
+        ("the gate, 64x36", 1, 3),
+        ("the gate, 64x36", 3, 9),
+    ]
+    assert asked[:2] == [((2, 400 + 3 * 50, 3), (2, 8, 3, 3))] * 2, "one sample that warms up, one that is timed"
+    assert asked[2][1][:2] == (3, 8) and asked[-1][1][:2] == (1, 8), "the gate's instants together, then one by one"

@@ -4,10 +4,12 @@
 
 It draws as the render stage does with render.backend=gsplat, on a device of torch's that costs nothing ("meta": every
 call is made, nothing is computed); what comes back is copied from pictures that the kernels drew before. The CPU path
-stands beside it. CPU time, from a few samples of several instants after one that sends the scene.
+stands beside it. CPU time, from a few samples of several instants after one that sends the scene. Then the gate on a
+drive's pictures, in as few calls as memory lets and instant by instant.
 """
 
 import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -15,14 +17,15 @@ from typing import Any
 import numpy as np
 import torch
 
+from tasks.render.gate import check_drive_pictures
 from tasks.render.scene import on_device
 from tasks.render.scene.asset import Exposure, OwnBody, RenderAsset
 from tasks.render.scene.engine import encode_jpeg
 from tasks.render.scene.on_device import Device
 from tasks.render.scene.sky import plain_sky
-from tasks.render.settings import Backend, RenderSettings
+from tasks.render.settings import Backend, GateSettings, RenderSettings
 from tasks.render.views import render_views
-from tasks.world.arrays import Array, Bytes
+from tasks.world.arrays import F32, Array, Bytes
 from tasks.world.clip import AgentKind, AgentTracks, Camera
 from tests.bench.bench_render import cloud
 from tests.bench.timing import cpu_milliseconds
@@ -31,6 +34,7 @@ SIZES = ((480, 270), (1920, 1080))
 RIG = 8
 FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # ego from camera
 NODE = 2000  # Gaussians of a vehicle
+LOOKS = 18  # of the gate at a drive: 2 Hz from T to T+2H
 
 
 def ring(width: int, height: int) -> list[Camera]:
@@ -96,6 +100,31 @@ def row(width: int, height: int, gaussians: int, vehicles: int, instants: int, r
     print(f"| {width}x{height} | {by_kernels:.0f} | {left:.1f} | {copied:.1f} | {jpeg:.1f} | {total:.3f} |", flush=True)
 
 
+def gate_row(width: int, height: int, gaussians: int, vehicles: int, pixels: int, repeats: int) -> None:
+    """The gate on a drive whose every picture passes, with so many `pixels` in a call at most."""
+    rig, counts, rng = ring(width, height), Counter[str](), np.random.default_rng(0)
+    asset, agents = street(gaussians, vehicles, rig)
+
+    def called(**given: Any) -> Any:
+        counts["calls"] += 1
+        return nothing_is_drawn(**given)
+
+    def noise(tensor: torch.Tensor) -> F32:
+        """Neither blank nor with holes."""
+        counts["fetched"] += 1
+        return rng.uniform(0.6, 1.0, tuple(tensor.shape)).astype(np.float32)
+
+    on_device.cuda = lambda packed: Device("meta", called, packed, noise)  # type: ignore[assignment]
+    on_device.BATCH_PIXELS = pixels
+    steps, poses = [5 * i for i in range(LOOKS)], np.tile(np.eye(4), (LOOKS, 1, 1))
+    asked = (asset, rig, poses, agents, steps, (width, height), GateSettings(), Backend.GSPLAT)
+    if (fault := check_drive_pictures(*asked)) is not None:
+        raise RuntimeError(f"the gate ended early: {fault}")
+    each = dict(counts)
+    ms = cpu_milliseconds(lambda: check_drive_pictures(*asked), repeats)
+    print(f"| the gate, {width}x{height} | {each['calls']} | {each['fetched']} | {ms:.0f} |", flush=True)
+
+
 def main(options: dict[str, str]) -> None:
     """Prints the table."""
     n, vehicles = int(options.get("gaussians", "250000")), int(options.get("vehicles", "20"))
@@ -106,6 +135,10 @@ def main(options: dict[str, str]) -> None:
     print("|---|---|---|---|---|---|")
     for width, height in SIZES:
         row(width, height, n, vehicles, instants, repeats)
+    print(f"\nA drive's {LOOKS} instants by the gate, together and one by one:\n")
+    print("| | calls | arrays fetched | left to the host [CPU ms] |\n|---|---|---|---|")
+    for pixels in (on_device.BATCH_PIXELS, 1):
+        gate_row(*SIZES[0], n, vehicles, pixels, repeats)
 
 
 if __name__ == "__main__":
