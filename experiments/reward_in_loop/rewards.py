@@ -1,4 +1,4 @@
-"""What the planners of this folder have in common: the trunk's settings, and the bank by the ids of a batch."""
+"""What the planners of this folder have in common: the raster's settings, and the bank by the ids of a batch."""
 
 from dataclasses import dataclass, field
 from functools import cache
@@ -17,8 +17,16 @@ from tasks.subscores import OF_ONE_PLAN
 
 
 @dataclass(frozen=True)
-class TrunkSettings(EgoMlpBevSettings):
-    """Those of conf/planner/ego_mlp_bev_small.yaml, and where the reward is."""
+class RewardSettings:
+    """Where the reward is."""
+
+    table: str = ""  # whose real samples are trained on; several, with commas
+    bank: str = ""  # folder of their scenes, written where it is not there
+
+
+@dataclass(frozen=True)
+class TrunkSettings(RewardSettings, EgoMlpBevSettings):
+    """Those of conf/planner/ego_mlp_bev_small.yaml."""
 
     hidden: tuple[int, ...] = (128, 128)
     features: int = 128
@@ -27,18 +35,16 @@ class TrunkSettings(EgoMlpBevSettings):
     bev: BevLayout = field(
         default_factory=lambda: BevLayout(ahead_m=40.0, behind_m=8.0, side_m=24.0, cell_m=1.0, times_s=(-1.0, 0.0))
     )
-    table: str = ""  # whose real samples are trained on
-    bank: str = ""  # folder of their scenes, written where it is not there
 
 
 @cache
 def _opened(table: str, bank: str) -> tuple[SceneBank, dict[str, str]]:
-    dataset = open_data(DataSettings(real=(table,)))
+    dataset = open_data(DataSettings(real=tuple(table.split(","))))
     rows = dataset.rows
     return open_bank(Path(bank), dataset), dict(zip(rows.attempt_id.tolist(), rows.clip_id.tolist()))
 
 
-def scored(settings: TrunkSettings, batch: Batch, plans: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def scored(settings: RewardSettings, batch: Batch, plans: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Of plans (B, P, 8, 3): scores (B, P), sub-scores (B, P, 8), and (B,) whether the sample's scene can be scored.
 
     Zeros where it cannot; a moved sample (jitter) would be scored from the wrong place, so there are none here.

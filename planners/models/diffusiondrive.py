@@ -358,14 +358,18 @@ class DiffusionDrive(Planner):
 
         Raises ValueError where the batch lacks its picture, view from above or agents.
         """
-        s, scene = self.settings, self.scene(batch)
+        return self.losses_seeing(self.scene(batch), batch)
+
+    def losses_seeing(self, scene: EncodedScene, batch: Batch) -> dict[str, Tensor]:
+        """The same of `scene(batch)`."""
+        s = self.settings
         anchors = self.get_buffer("anchors")
         step = torch.randint(0, TRUNCATED, (len(batch),), device=anchors.device)
         noise = torch.randn((len(batch), *anchors.shape), device=anchors.device)
         at = add_noise(normalise_points(anchors), noise, self.get_buffer("alphas_cumprod")[step].view(-1, 1, 1, 1))
         decoded = self._decoded(at, step, scene)
         label = torch.where(batch.imitate[:, None, None], batch.plan_2hz, 0.0)
-        nearest = (label[:, None, :, :2] - anchors).norm(dim=-1).mean(dim=-1).argmin(dim=1)
+        nearest = self.nearest_anchor(label)
         surest = F.one_hot(nearest, len(anchors)).float()
         counted = batch.imitate / len(batch)  # (B,): a mean over the batch to which the others add nothing
         rows = torch.arange(len(batch), device=anchors.device)
@@ -376,6 +380,10 @@ class DiffusionDrive(Planner):
             "regression": s.trajectory_weight * s.regression_weight * torch.as_tensor(apart),
             **auxiliary_losses(s, batch, self.bev_head(scene.bev), *self.agent_head(scene.agents)),
         }
+
+    def nearest_anchor(self, label: Tensor) -> Tensor:
+        """(B,) of plans (B, 8, 3)."""
+        return (label[:, None, :, :2] - self.get_buffer("anchors")).norm(dim=-1).mean(dim=-1).argmin(dim=1)
 
     def plan(self, batch: Batch) -> Tensor:
         with evaluating(self):
@@ -390,19 +398,30 @@ class DiffusionDrive(Planner):
     def _decoded(self, at: Tensor, step: Tensor, scene: EncodedScene) -> list[tuple[Tensor, Tensor]]:
         """Plans and logits of every refinement from positions (B, A, 8, 2) in -1 .. 1 at noise step (B,)."""
         points = denormalise_points(at.clamp(-1.0, 1.0))
-        base = points if self.settings.offsets_from == "noisy" else self.get_buffer("anchors").expand_as(points)
+        base = points if self.settings.offsets_from == "noisy" else self._anchors_like(points)
         return self.decoder(points, base, step, scene.above, scene.agents, scene.ego)
+
+    def _anchors_like(self, points: Tensor) -> Tensor:
+        """(C * A, 8, 2) of points (B, C * A, 8, 2)."""
+        anchors = self.get_buffer("anchors")
+        return anchors.repeat(points.shape[1] // len(anchors), 1, 1)
 
     def denoised(self, scene: EncodedScene) -> Tensor:
         """Plans (B, 8, 3) from the noise that stays the same, or of a public planner is drawn here."""
-        n, levels, anchors = len(scene.ego), self.get_buffer("alphas_cumprod"), self.get_buffer("anchors")
+        n, anchors = len(scene.ego), self.get_buffer("anchors")
         noise = self.get_buffer("first_noise").expand(n, -1, -1, -1)
         if self.settings.is_public:
             noise = torch.randn((n, *anchors.shape), device=anchors.device)
-        at = add_noise(normalise_points(anchors), noise, levels[NOISED_TO])
+        plans, logits = self.denoised_from(noise, scene)
+        return plans[torch.arange(n, device=plans.device), logits.argmax(dim=1)]
+
+    def denoised_from(self, noise: Tensor, scene: EncodedScene) -> tuple[Tensor, Tensor]:
+        """Plans (B, C * A, 8, 3) and logits (B, C * A) from noise (B, C * A, 8, 2): C draws, each of all anchors."""
+        levels = self.get_buffer("alphas_cumprod")
+        at = add_noise(normalise_points(self._anchors_like(noise)), noise, levels[NOISED_TO])
         for step in DENOISED_AT:
-            steps = torch.full((n,), step, device=at.device)
+            steps = torch.full((len(noise),), step, device=at.device)
             plans, logits = self._decoded(at, steps, scene)[-1]
             before = levels[step - 1] if step else torch.ones_like(levels[0])
             at = ddim_step(at, normalise_points(plans[..., :2]), levels[step], before)
-        return plans[torch.arange(n, device=at.device), logits.argmax(dim=1)]
+        return plans, logits

@@ -51,8 +51,8 @@ class Ltf(Planner):
     def needs_to_plan(self) -> Needs:
         return Needs(image=self.settings.picture, command=self.settings.command)
 
-    def decoded(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
-        """Plans (B, 8, 3), queries of agents (B, N, width), features from above (B, C, rows, columns)."""
+    def seen(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Queries (B, 1 + N, width) of plan and agents, features from above (B, C, rows, columns)."""
         assert batch.image is not None
         fused = self.fusion(batch.image)
         cells = self.reduce(fused.latent).flatten(2).transpose(1, 2)
@@ -60,10 +60,14 @@ class Ltf(Planner):
             torch.cat([cells, self.status(visible_status(self.settings.status, batch.status))[:, None]], 1)
             + self.key_position
         )
-        queries = self.decoder(self.queries.expand(len(batch), -1, -1), keys)
+        return self.decoder(self.queries.expand(len(batch), -1, -1), keys), fused.bev
+
+    def decoded(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+        """Plans (B, 8, 3), queries of agents (B, N, width), features from above (B, C, rows, columns)."""
+        queries, above = self.seen(batch)
         raw = self.plan_head(queries[:, 0]).float().view(-1, 8, 3)
         plan = torch.cat([raw[..., :2], raw[..., 2:].tanh() * math.pi], -1)  # the heading as the public code bounds it
-        return add_base_plan(self.settings.plan_from, plan, batch), queries[:, 1:], fused.bev
+        return add_base_plan(self.settings.plan_from, plan, batch), queries[:, 1:], above
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         s = self.settings
