@@ -54,9 +54,9 @@ from tasks.world.frames import EGO_STATE_SIZE, LARGEST, PACIFICA, REAR_AXLE_TO_C
 N_PARTS = 20
 PLACE, SIZES, EGO, HISTORY, LINE_X, LINE_Y, POINT_X, POINT_Y, EDGE_FROM, EDGE_TO = range(10)
 EDGE_KIND, BOUNDED, PLAYING, BOXES, STOPPED, COLLISION, RED_TIMES, RED_BOUNDS, RED_FIRST, RED_EDGES = range(10, N_PARTS)
-ORDERS = (0, 0, 0, 0, 2, 2, 2, 2, 1, 1, 1, 0, 0, 2, 1, 1, 1, 0, 0, 1)  # of packing
+ORDERS = (0, 0, 0, 0, 2, 2, 2, 2, 2, 2, 1, 0, 0, 2, 1, 1, 1, 0, 0, 1)  # of packing
 N_PLACE, N_SIZES, N_LAYERS, BOX = 4, 4, 4, 5  # columns of PLACE and SIZES; parts that a region plays; numbers of a box
-FORMAT = 2
+FORMAT = 3
 
 
 def pack_scene(clip: Clip) -> bytes:
@@ -283,7 +283,7 @@ HEAD, BODY, ANSWERING = "scenes-*.json", ".bank", ".traffic"
 class BankScores:
     """Scores of P plans on each of B scenes."""
 
-    subscores: Array  # (B, P, 8) in the order of `names`, 0 .. 1
+    subscores: Array  # (B, P, 8) in the order of `names`, 0 .. 1, float64 unless the caller's own are other
     score: Array  # (B, P) EPDMS of one frame, without extended comfort
     names: tuple[str, ...] = OF_ONE_PLAN
 
@@ -342,17 +342,20 @@ class SceneBank:
         reference: Reference = "pdm_closed",
         traffic: Traffic = "replay",
         threads: int | None = None,
+        out: BankScores | None = None,
     ) -> BankScores:
         """Scores of P plans made at T on each of B scenes, driven by the tracker.
 
         Equal to those of `tasks.trajectories.score_trajectories` to the last bit, on any number of threads (None: as
         many as this process may use); with traffic="idm", which answers to each plan, to those that
         `tasks.attempt.drive_and_judge` gives it. poses: (B, P, 40, 3) at 10 Hz or (B, P, 8, 3) at 2 Hz: x, y [m],
-        heading [rad] in the ego frame at T; a CPU tensor's memory is read as it is. reference: as there.
+        heading [rad] in the ego frame at T; reference: as there. out: arrays of float32 or float64 that get the scores;
+        None makes new ones of float64. Poses are never copied as a whole: what is not float64 in a row is made so a
+        scene at a time.
         Raises KeyError for an unknown scene, ValueError for other shapes, poses that are no drive, another word or a
         bank without answering traffic, and Damaged where a scene's bytes are not as they were written.
         """
-        plans = np.require(poses, np.float64, ["C", "W"])
+        plans = np.asarray(poses)
         if plans.ndim != 4 or len(plans) != len(clip_ids):
             raise ValueError(
                 f"poses must be ({len(clip_ids)}, P, {HORIZON_STEPS} or {COARSE_STEPS}, 3), got {plans.shape}"
@@ -362,13 +365,17 @@ class SceneBank:
         if traffic not in get_args(Traffic):
             raise ValueError(f"traffic must be one of {get_args(Traffic)}, got {traffic!r}")
         n_scenes, n_plans = plans.shape[:2]
-        at_ten_hz(plans.reshape(-1, *plans.shape[2:])[:0])  # its shape
-        scores, subscores = np.empty((n_scenes, n_plans)), np.empty((n_scenes, n_plans, len(OF_ONE_PLAN)))
+        at_ten_hz(plans[:0].reshape(-1, *plans.shape[2:]))  # its shape
+        found = out or BankScores(np.empty((n_scenes, n_plans, len(OF_ONE_PLAN))), np.empty((n_scenes, n_plans)))
+        if found.subscores.shape != (n_scenes, n_plans, len(OF_ONE_PLAN)) or found.score.shape != (n_scenes, n_plans):
+            raise ValueError(f"out must be ({n_scenes}, {n_plans}, {len(OF_ONE_PLAN)}) and ({n_scenes}, {n_plans})")
         scenes = [self._bytes_of(clip_id) for clip_id in clip_ids]
         answering = [self._bytes_of(clip_id, ANSWERING) for clip_id in clip_ids] if traffic == "idm" else []
 
         def work(b: int, _: int) -> None:
-            given = scenes[b], plans[b], reference == "batch", subscores[b], scores[b]
+            subscores, scores = np.empty((n_plans, len(OF_ONE_PLAN))), np.empty(n_plans)
+            of_scene = np.require(plans[b], np.float64, ["C", "W"])
+            given = scenes[b], of_scene, reference == "batch", subscores, scores
             try:
                 went = self._among_answering(answering[b], *given) if answering else _score_packed(*given)
             except (Damaged, ZeroDivisionError):  # the rollout's, among numbers that no scene has
@@ -379,10 +386,11 @@ class SceneBank:
                 )
             if went == NO_DRIVE:
                 raise ValueError(f"poses[{b}] ({clip_ids[b]}): a plan or its drive is not finite or above {LARGEST:g}")
+            found.subscores[b], found.score[b] = subscores, scores
 
         if n_plans:
             run_in_chunks(work, n_scenes, 1, threads or len(os.sched_getaffinity(0)))
-        return BankScores(subscores, scores)
+        return found
 
     def _among_answering(
         self, answering: Bytes, data: Bytes, poses: Array, in_batch: bool, subscores: Array, scores: Array

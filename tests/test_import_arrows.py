@@ -23,7 +23,7 @@ FORBIDDEN = {
 ROOMS = {
     "tasks": (
         *("caches", "subscores", "stages", "settings", "kernels", "world", "rollout", "reward"),
-        *("experts", "perturb", "attempt", "hard_scenes", "trajectories", "bank_traffic", "bank"),
+        *("experts", "perturb", "attempt", "hard_scenes", "trajectories", "bank_traffic", "bank", "bank_tensors"),
         *("render.settings", "render.splatting", "render.scene", "render.rig", "render.fit", "render"),
     ),
     "factory": (

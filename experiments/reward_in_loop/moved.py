@@ -22,6 +22,7 @@ from planners.data.batch import Batch, BevLayout
 from planners.data.index import DataSettings, open_data
 from planners.data.jitter import JitterSettings, Offset, draw_offset
 from tasks.bank import SceneBank
+from tasks.bank_tensors import score_tensors
 from tasks.subscores import OF_ONE_PLAN
 from tasks.world.arrays import Bytes
 from tasks.world.clip import NOW, Clip
@@ -111,10 +112,9 @@ class MovedVocabulary(Vocabulary):
         known = set(bank.clip_ids)
         new = [i for i, name in enumerate(batch.attempt_ids) if name in known and name not in self._rewards]
         if new:
-            found = bank.score([batch.attempt_ids[i] for i in new], plans[new].double().numpy(), threads=1)
-            for i, score, subscores in zip(new, found.score, found.subscores):
-                values = torch.from_numpy(score).float(), torch.from_numpy(subscores).float()
-                self._rewards[batch.attempt_ids[i]] = (*values, torch.tensor(True))
+            found = score_tensors(bank, [batch.attempt_ids[i] for i in new], plans[new], threads=1)
+            for i, subscores, score in zip(new, *found):
+                self._rewards[batch.attempt_ids[i]] = (score, subscores, torch.tensor(True))
         nothing = (
             plans.new_zeros(plans.shape[1]),
             plans.new_zeros(plans.shape[1], len(OF_ONE_PLAN)),

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,6 +12,7 @@ from planners.data.index import DataSettings, open_data
 from planners.models.settings import EgoMlpBevSettings
 from planners.training.validation import open_bank
 from tasks.bank import SceneBank
+from tasks.bank_tensors import score_tensors
 from tasks.subscores import OF_ONE_PLAN
 
 
@@ -51,11 +51,7 @@ def scored(settings: RewardSettings, batch: Batch, plans: Tensor) -> tuple[Tenso
     """
     bank, clips = _opened(settings.table, settings.bank)
     there = torch.tensor([clips[name] in bank.clip_ids for name in batch.attempt_ids])
-    found = bank.score(
-        [clips[name] for name, known in zip(batch.attempt_ids, there) if known],
-        np.asarray(plans.detach()[there], np.float64),
-        threads=1,
-    )
+    known = [clips[name] for name, known in zip(batch.attempt_ids, there) if known]
     scores, subscores = plans.new_zeros(plans.shape[:2]), plans.new_zeros((*plans.shape[:2], len(OF_ONE_PLAN)))
-    scores[there], subscores[there] = torch.from_numpy(found.score).float(), torch.from_numpy(found.subscores).float()
+    subscores[there], scores[there] = score_tensors(bank, known, plans[there], threads=1)
     return scores, subscores, there

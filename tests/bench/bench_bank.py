@@ -24,9 +24,11 @@ from numpy.typing import NDArray
 
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.town.reader import SyntheticReader
+from factory.datasets.town.settings import TownSettings
 from factory.readers.base import ClipReader
 from factory.setup.bank import PackedScene, write_bank, write_scenes
 from tasks.bank import ANSWERING, BODY, FORMAT, HEAD, SceneBank, Traffic, pack_prepared
+from tasks.bank_tensors import score_tensors
 from tasks.caches import json_with_checksum
 from tasks.reward.epdms import score
 from tasks.rollout.lqr import track
@@ -40,6 +42,7 @@ from tests.bench.timing import least_and_median_cpu_ms, memory_mb
 from tests.real.reference_scenes import SCENES, loader
 
 B, SIZES, MANY, IN_SHARD, STEPS = 64, (16, 64, 256), 100_000, 1024, 12
+UNSEEN = TownSettings(cameras=(), lidar_beams=0)
 TOGETHER = 64  # plans of a scene in memory, threads and training
 Plans = NDArray[np.float64]
 
@@ -70,7 +73,10 @@ def main(root: Path, sizes: Sequence[int] = SIZES, many: int = MANY, steps: int 
         print_memory_and_threads(bank, proposals)
         print_training(bank, proposals, steps)
     with tempfile.TemporaryDirectory() as folder:
-        print_answering(AV2Reader(root / "data/av2/sensor/val") if has_recorded else SyntheticReader(n_clips=1), folder)
+        print_answering(
+            AV2Reader(root / "data/av2/sensor/val") if has_recorded else SyntheticReader(n_clips=1, settings=UNSEEN),
+            folder,
+        )
     with tempfile.TemporaryDirectory() as folder:
         print_opening(Path(folder), many)
 
@@ -213,7 +219,7 @@ def print_training(bank: SceneBank, proposals: dict[str, Plans], steps: int) -> 
         found, logits = planner(tokens, anchors)
         wanted, asked = torch.ones_like(logits), time.perf_counter()
         if with_reward:
-            wanted = torch.from_numpy(bank.score(ids, found.detach().numpy()).subscores).float()
+            wanted = score_tensors(bank, ids, found).subscores
         took = time.perf_counter() - asked
         loss = torch.nn.functional.binary_cross_entropy_with_logits(logits, wanted)
         loss = loss + torch.nn.functional.l1_loss(found, anchors)

@@ -1,6 +1,7 @@
 """A bank's scores are those of the scenes that were put into it, to the last bit."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import pytest
 
 from examples.csv_logs import CsvReader, write_log
 from factory.setup.bank import PackedScene, write_bank, write_scenes
-from tasks.bank import SceneBank, _score_packed, pack_prepared
+from tasks.bank import BankScores, SceneBank, _score_packed, pack_prepared
 from tasks.caches import Damaged
 from tasks.reward.epdms import PreparedScene, Scores, prepare, score
 from tasks.reward.packing import packed, unpacked
@@ -167,14 +168,60 @@ def test_numbers_come_back_to_the_last_bit() -> None:
         np.array([2**63 - 1, -(2**63), 0]),
         np.empty(0),
         np.linspace(4e6, 4e6 + 9, 41),
+        (rng.random(5000) < 0.02).cumsum(),  # runs of all lengths
+        np.zeros(777),
     ]
-    for orders in ((0, 1, 2, 0, 1), (2, 2, 1, 0, 2)):
+    for orders in ((0, 1, 2, 0, 1, 1, 0), (2, 2, 1, 0, 2, 2, 1)):
         data = packed(parts, orders)
         values, starts = unpacked(np.frombuffer(data, np.uint8), orders)
         for part, first, last in zip(parts, starts, starts[1:]):
             assert values[first:last].tobytes() == part.tobytes()
         assert not len(unpacked(np.frombuffer(data[:-1], np.uint8), orders)[0])
-    assert len(packed([np.linspace(0.0, 1.0, 1000) * 0.0 + 3.0], (1,))) < 600
+    assert len(packed([np.full(1000, 3.0)], (1,))) < 40
+
+
+def test_bytes_that_unpack_to_far_more_than_they_are_are_refused() -> None:
+    for length, n_codes in ((2**24 + 1, 2**17), (2**62, 2**62), (1000, 3), (1000, -4)):
+        data = np.array([length, n_codes], np.int64).tobytes() + b"\xff" * 2**17 + bytes(8)
+        assert not len(unpacked(np.frombuffer(data, np.uint8), (1,))[0])
+
+
+@pytest.mark.parametrize(
+    ("dtype", "through"), [("float32", "float32"), ("float64", "float64"), ("bfloat16", "float32")]
+)
+def test_tensors_get_the_scores_of_the_arrays_that_they_are(bank: SceneBank, dtype: str, through: str) -> None:
+    import torch
+
+    from tasks.bank_tensors import score_tensors
+
+    names = ["1", "2", "5"]
+    made = torch.from_numpy(np.stack([plans(int(name), 40, 8) for name in names])).to(getattr(torch, dtype))
+    wide = torch.nn.functional.pad(made, (0, 2)).requires_grad_()
+    for asked in (made, made.clone().requires_grad_(), wide[..., :3]):  # the last one lies with gaps
+        got = score_tensors(bank, names, asked, reference="batch")
+        want = bank.score(names, made.to(getattr(torch, through)).numpy(), reference="batch")
+        assert got.score.dtype == asked.dtype and not got.score.requires_grad
+        for tensor, array in ((got.score, want.score), (got.subscores, want.subscores)):
+            assert torch.equal(tensor, torch.from_numpy(array).to(getattr(torch, through)).to(asked.dtype))
+    with pytest.raises(ValueError, match=r"out must be \(3, 40, 8\) and \(3, 40\)"):
+        bank.score(names, made.double().numpy(), out=replace(want, score=want.score[:2]))
+
+
+def test_a_tensor_s_memory_is_read_where_it_lies(bank: SceneBank, monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    from tasks import bank_tensors
+
+    given: list[tuple[int, ...]] = []
+
+    def score(clip_ids: list[str], poses: np.ndarray, *, out: BankScores, **asked: Any) -> None:
+        given.append((poses.ctypes.data, out.subscores.ctypes.data, out.score.ctypes.data))
+
+    monkeypatch.setattr(bank, "score", score)
+    for dtype in (torch.float32, torch.float64):
+        made = torch.zeros(2, 3, 8, 3, dtype=dtype).requires_grad_()
+        found = bank_tensors.score_tensors(bank, ["1", "2"], made)
+        assert given.pop() == (made.data_ptr(), found.subscores.data_ptr(), found.score.data_ptr())
 
 
 def test_the_page_s_step_teaches_a_planner_to_foresee_its_scores(
