@@ -3,7 +3,7 @@
 The stages behind the machine: what `factory.graph.steps.Work` asks for, with real clips and the science of tasks/.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -278,21 +278,36 @@ class FactoryWork:
 
     # What the reward accepts is drawn.
 
-    def draw(self, driven: AcceptedDrive) -> SampleColumns | RejectedAttempt:
-        """The pictures; RejectedAttempt where they are no sample's. Raises BadClip."""
-        watch, drive, before = Stopwatch(), drive_of(driven), scene_cache_counts()
-        if drive.pictures is not None:
-            return SampleColumns(drive.pictures)
+    def draw(self, driven: Sequence[AcceptedDrive]) -> list[SampleColumns | RejectedAttempt]:
+        """Of each of a clip's drives the pictures; RejectedAttempt where they are no sample's. Raises BadClip."""
+        drives, watch, before = [drive_of(one) for one in driven], Stopwatch(), scene_cache_counts()
+        wanted = [drive for drive in drives if drive.pictures is None]
         with watch.timing("render"):
-            sensed = drive.sampled.scene.clip
-            if self.render.mode is RenderMode.AUTO:
-                now = read_clip(self.reader, drive.ref)
-                sensed = replace(sensed, images=now.images, sweeps=now.sweeps, block=now.block)
-            unfit = self.unfit(sensed, drive)
-            pictures = {} if unfit is not None else self.imaging.pictures(sensed, drive.candidate, drive.sampled)
-        if unfit is not None:
-            return RejectedAttempt(unfit, _subscores(drive), watch.seconds, _all_in_memory(before))
-        return SampleColumns(pictures, watch.seconds, _all_in_memory(before))
+            made = iter(self._pictures(wanted) if wanted else ())
+        seconds = {stage: spent / len(wanted) for stage, spent in watch.seconds.items() if wanted}
+        at_hand, found = _all_in_memory(before), list[SampleColumns | RejectedAttempt]()
+        for drive in drives:
+            pictures = next(made) if drive.pictures is None else drive.pictures
+            if isinstance(pictures, Rejected):
+                found.append(RejectedAttempt(pictures, _subscores(drive), seconds, at_hand))
+            elif drive.pictures is None:
+                found.append(SampleColumns(pictures, seconds, at_hand))
+            else:
+                found.append(SampleColumns(pictures))
+        return found
+
+    def _pictures(self, drives: Sequence[Drive]) -> list[Mapping[str, object] | Rejected]:
+        """Of each of a clip's drives: those that are fit are drawn together."""
+        clips = [drive.sampled.scene.clip for drive in drives]
+        if self.render.mode is RenderMode.AUTO:
+            now = read_clip(self.reader, drives[0].ref)
+            clips = [replace(clip, images=now.images, sweeps=now.sweeps, block=now.block) for clip in clips]
+        found: list[Mapping[str, object] | Rejected | None] = [self.unfit(*of) for of in zip(clips, drives)]
+        fit = [i for i, why in enumerate(found) if why is None]
+        asked = [(clips[i], drives[i].candidate, drives[i].sampled) for i in fit]
+        for i, pictures in zip(fit, self.imaging.pictures(asked), strict=True):
+            found[i] = pictures
+        return [one for one in found if one is not None]
 
     def unfit(self, clip: Clip, drive: Drive) -> Rejected | None:
         """Why the pictures of an accepted drive are no sample's; `clip` with its sensor files. Raises BadClip.

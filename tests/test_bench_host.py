@@ -30,4 +30,5 @@ def test_it_asks_a_device_for_all_instants_of_a_sample(
         ("the gate, 64x36", 3, 9),
     ]
     assert asked[:2] == [((2, 400 + 3 * 50, 3), (2, 8, 3, 3))] * 2, "one sample that warms up, one that is timed"
-    assert asked[2][1][:2] == (3, 8) and asked[-1][1][:2] == (1, 8), "the gate's instants together, then one by one"
+    assert [cameras[:2] for _, cameras in asked[2:4]] == [(1, 8)] * 2, "the same of an instant alone"
+    assert asked[4][1][:2] == (3, 8) and asked[-1][1][:2] == (1, 8), "the gate's instants together, then one by one"

@@ -71,6 +71,9 @@ class Spent:
     def __sub__(self, before: "Spent") -> "Spent":
         return Spent(self.wall_s - before.wall_s, self.cpu_s - before.cpu_s)
 
+    def __truediv__(self, n: int) -> "Spent":
+        return Spent(self.wall_s / n, self.cpu_s / n)
+
 
 @dataclass(frozen=True)
 class PreparedClip:
@@ -173,8 +176,10 @@ class Work(Protocol):
         """Rollout, expert, rollout and reward of one candidate."""
         ...
 
-    def draw(self, driven: AcceptedDrive) -> SampleColumns | RejectedAttempt:
-        """The columns of its pictures and the `tags` they add; RejectedAttempt where the pictures are no sample's."""
+    def draw(self, driven: Sequence[AcceptedDrive]) -> list[SampleColumns | RejectedAttempt]:
+        """Of each of a clip's drives the columns of its pictures and the `tags` they add; RejectedAttempt where the
+        pictures are no sample's.
+        """
         ...
 
     def label(self, driven: AcceptedDrive) -> SampleColumns:
@@ -204,15 +209,19 @@ def run_stage(
     assert isinstance(so_far, PartialAttempt)
     driven, drawn = so_far.driven, so_far.drawn
     if stage == "render":
-        found = work.draw(driven)
-        if isinstance(found, RejectedAttempt):
-            return replace(found, seconds={**driven.seconds, **found.seconds})
-        return PartialAttempt(driven, found)
+        (found,) = work.draw([driven])
+        return _drawn(driven, found)
     assert stage == "label" and drawn is not None
     labelled = work.label(driven)
     tags = [*labelled.row["tags"], *drawn.row.get("tags", ())]  # type: ignore[misc]
     seconds = {**driven.seconds, **drawn.seconds, **labelled.seconds}
     return SampleColumns({**labelled.row, **drawn.row, "tags": tags}, seconds, drawn.scene_at_hand)
+
+
+def _drawn(driven: AcceptedDrive, found: SampleColumns | RejectedAttempt) -> PartialAttempt | RejectedAttempt:
+    if isinstance(found, RejectedAttempt):
+        return replace(found, seconds={**driven.seconds, **found.seconds})
+    return PartialAttempt(driven, found)
 
 
 def run_attempt(work: Work, prepared: PreparedClip, candidate: int, expert: str) -> SampleColumns | RejectedAttempt:
@@ -261,6 +270,8 @@ class BlockUnfinished:
 class AttemptUnfinished:
     """Report on an attempt whose further stages are another task; the result is what that starts from."""
 
+    seconds: tuple[float, ...] = ()  # of a batch, that each took
+
 
 @dataclass(frozen=True)
 class AttemptReport:
@@ -281,6 +292,14 @@ class BatchReport:
 
     reports: tuple[AttemptReport | Failure, ...]
     seconds: tuple[float, ...]  # that each took
+
+
+@dataclass(frozen=True)
+class PartialBatch:
+    """A batch of a walk that some stages are done of: its attempts from the first on, as far as they have come."""
+
+    clip_id: str
+    attempts: tuple[PartialAttempt | AttemptReport | Failure, ...]  # the last one perhaps a failure
 
 
 MakeEpisode = Callable[[Mapping[str, Any], PreparedClip], bytes]  # a sample's row and its prepared clip -> a file
@@ -409,8 +428,7 @@ def attempt(
             return AttemptUnfinished(), result
         seconds = result.seconds or {"attempt": Spent.now() - began}
         if isinstance(result, RejectedAttempt):
-            subscores, at_hand = dict(result.subscores), result.scene_at_hand
-            return AttemptReport(result.rejected, subscores=subscores, seconds=seconds, scene_at_hand=at_hand), None
+            return _rejection(result, seconds), None
         row = sample_rows_to_table([{**result.row, **vars(stamp)}])
         (psnr_db,) = row["psnr"].to_pylist()
         report = AttemptReport(
@@ -426,6 +444,23 @@ def attempt(
         raise
     except BaseException as error:  # the same boundary
         return replace(failure_from_error(error), task=stage), None
+
+
+def _rejection(result: RejectedAttempt, seconds: Mapping[str, Spent]) -> AttemptReport:
+    subscores, at_hand = dict(result.subscores), result.scene_at_hand
+    return AttemptReport(result.rejected, subscores=subscores, seconds=seconds, scene_at_hand=at_hand)
+
+
+@reporting_failures
+def draw_together(
+    work: Work, parts: Sequence[PartialAttempt]
+) -> tuple[Failure | None, list[tuple[AttemptReport | AttemptUnfinished, PartialAttempt | None]] | None]:
+    """The stage `render` of several attempts on a clip at once: of each what `attempt` says of one."""
+    found = [_drawn(part.driven, one) for part, one in zip(parts, work.draw([p.driven for p in parts]), strict=True)]
+    return None, [
+        (AttemptUnfinished(), one) if isinstance(one, PartialAttempt) else (_rejection(one, one.seconds), None)
+        for one in found
+    ]
 
 
 def write(out: Location, *rows: pa.Table) -> tuple[Shard | Failure, None]:

@@ -5,9 +5,10 @@ A human sample of a clip with photos keeps them, whatever its block. Every other
 Photos without lidar give coarse pictures, tagged `photos_only`.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -99,36 +100,48 @@ class Imaging:
         rig = choose_cameras(clip.cameras, self.settings.cameras)
         return judge_block(_scene_of_block(clip, self.settings, self.cache_dir), rig, self.settings)
 
-    def pictures(self, clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[str, object]:
-        """The image columns of a sample, the `tags` they add to its own, and heights as its pictures show them.
+    def pictures(self, samples: Sequence[tuple[Clip, Candidate | None, Judged]]) -> list[dict[str, object]]:
+        """Of each of a clip's samples: the image columns, the `tags` they add to its own, and heights as its pictures
+        show them.
 
-        A human sample of a clip with photos keeps the photos, cut and described by the rig as the scene has it;
-        everything else is drawn at the simulated poses. Raises BadClip for a broken sensor file, and for a human sample
-        that lacks some of its photos.
+        A human sample of a clip with photos keeps the photos, cut and described by the rig as the scene has it; all
+        others are drawn at the simulated poses, those that a block's scene shows together. Raises BadClip for a broken
+        sensor file, and for a human sample that lacks some of its photos.
         """
-        if self.settings.mode is RenderMode.MAP:
-            rig = clip.cameras or MAP_RIG
-            return self._drawn(clip, judged, None, choose_cameras(rig, self.settings.cameras))
-        if self.settings.mode is RenderMode.PAINTER:
-            return self._painted(clip, judged)
-        if self.settings.mode is RenderMode.NONE:
-            return NO_IMAGES
+        found = [self._not_of_scene(*sample) for sample in samples]
+        of_scene = [(clip, judged) for (clip, _, judged), known in zip(samples, found) if known is None]
+        shown = iter(self._of_scene(of_scene) if of_scene else ())
+        return [next(shown) if known is None else known for known in found]
+
+    def _not_of_scene(self, clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[str, object] | None:
+        """A sample's columns where its pictures are not drawn from its block's scene."""
+        match self.settings.mode:
+            case RenderMode.MAP:
+                return self._mapped(clip, judged)
+            case RenderMode.PAINTER:
+                return self._painted(clip, judged)
+            case RenderMode.NONE:
+                return NO_IMAGES
         cameras = choose_cameras(clip.cameras, self.settings.cameras)
         if candidate is None and files_of_cameras(cameras, (*clip.images, *block_of(clip).images)):
             return self._photos(clip, judged, cameras)
-        made_of = block_sensing(clip, self.settings)
-        if made_of is Sensing.NOTHING:
-            return NO_IMAGES
+        return NO_IMAGES if block_sensing(clip, self.settings) is Sensing.NOTHING else None
+
+    def _of_scene(self, samples: Sequence[tuple[Clip, Judged]]) -> list[dict[str, object]]:
+        clip, _ = samples[0]
         asset = scene_in_clip_time(clip, _scene_of_block(clip, self.settings, self.cache_dir))
-        tags, said = [PHOTOS_ONLY] if made_of is Sensing.PHOTOS_ONLY else [], judge_block(asset, cameras, self.settings)
+        cameras = choose_cameras(clip.cameras, self.settings.cameras)
+        said, tags = judge_block(asset, cameras, self.settings), list[str]()
+        if block_sensing(clip, self.settings) is Sensing.PHOTOS_ONLY:
+            tags.append(PHOTOS_ONLY)
         if self.settings.psnr_gate is PsnrGate.MARK:
             if said.fault is not None or said.left_out:
                 tags.append(LOW_PSNR)
             said = BlockVerdict({}, asset.psnr_db, None)
-        drawn = self._drawn(clip, judged, asset, asset.as_corrected(cameras), tuple(said.left_out))
         psnr = said.psnr_db if np.isfinite(said.psnr_db) else None
         left_out = [{"camera": name, "why": why} for name, why in said.left_out.items()]
-        return drawn | {"tags": tags, "psnr": psnr, "cameras_left_out": left_out}
+        block = {"tags": tags, "psnr": psnr, "cameras_left_out": left_out, "asset_digest": asset.digest}
+        return [columns | block for columns in self._drawn(samples, asset, asset.as_corrected(cameras), said.left_out)]
 
     def unfit(self, clip: Clip, candidate: Candidate, judged: Judged, shared: Sequence[int] = ()) -> Rejected | None:
         """Why a simulated drive cannot be shown: what `tasks.render.gate` finds on its pictures from T to T+2H.
@@ -175,39 +188,56 @@ class Imaging:
 
     def _drawn(
         self,
-        clip: Clip,
-        judged: Judged,
-        asset: RenderAsset | None,
+        samples: Sequence[tuple[Clip, Judged]],
+        asset: RenderAsset,
         rig: Sequence[Camera],
-        left_out: Collection[str] = (),
-    ) -> dict[str, object]:
+        left_out: Collection[str],
+    ) -> Iterator[dict[str, object]]:
+        """All samples' pictures are asked of the scene at once."""
         cameras = [camera for camera in rig if camera.name not in left_out]
-        scene, rollout = judged.scene, judged.rollout
-        offsets = STEPS_OF[self.settings.frames]
+        moments = [self._moments(clip, judged, asset) for clip, judged in samples]
+        size = self.settings.width, self.settings.height
+        asked = [instants_of_views(asset, cameras, *moment, *size) for moment in moments]
+        instants, bodies = [instant for of_sample, _ in asked for instant in of_sample], asked[0][1]
+        images = iter(render_jpegs(asset, instants, bodies, self.settings.jpeg_quality, self.settings.backend))
+        for (clip, judged), (poses, lifted, steps) in zip(samples, moments):
+            columns = self._columns(rig, cameras, poses, [*islice(images, len(steps))], ImageSource.RENDER)
+            if asset.taken:
+                on_road = asset.on_road(asset.on_road(clip.world_from_ego))
+                columns |= height_columns(judged.scene, on_road, lifted)
+            yield columns
+
+    def _mapped(self, clip: Clip, judged: Judged) -> dict[str, object]:
+        rig = choose_cameras(clip.cameras or MAP_RIG, self.settings.cameras)
+        poses, agents, steps = self._moments(clip, judged, None)
+        size = self.settings.width, self.settings.height
+        images = [[*pictures] for pictures in draw_map_views(clip.road_map, rig, poses, agents, steps, *size)]
+        return self._columns(rig, rig, poses, images, ImageSource.MAP)
+
+    def _moments(self, clip: Clip, judged: Judged, asset: RenderAsset | None) -> tuple[Array, AgentTracks, list[int]]:
+        """Poses (F, 4, 4), agents and steps of the instants that are drawn."""
+        scene = judged.scene
+        agents = scene.agents.overwritten(scene.step, judged.rollout.agents)
+        if asset is not None:
+            agents = asset.lifted(agents, clip_offset_s(clip))
         logged = clip.world_from_ego if asset is None else asset.on_road(clip.world_from_ego)
-        poses = pose_on_ground(logged, self._ego_states(judged))
-        agents = scene.agents.overwritten(scene.step, rollout.agents)
-        steps = [scene.step + offset for offset in offsets]
-        seen = (cameras, poses, agents, steps, self.settings.width, self.settings.height)
-        images: Sequence[Sequence[Bytes | bytes]]
-        if asset is None:
-            images = [[*pictures] for pictures in draw_map_views(clip.road_map, *seen)]
-        else:
-            lifted = asset.lifted(agents, clip_offset_s(clip))
-            asked = instants_of_views(asset, cameras, poses, lifted, *seen[3:])
-            images = render_jpegs(asset, *asked, self.settings.jpeg_quality, self.settings.backend)
+        steps = [scene.step + offset for offset in STEPS_OF[self.settings.frames]]
+        return pose_on_ground(logged, self._ego_states(judged)), agents, steps
+
+    def _columns(
+        self,
+        rig: Sequence[Camera],
+        shown: Sequence[Camera],
+        poses: Array,
+        images: Sequence[Sequence[Bytes | bytes]],
+        source: ImageSource,
+    ) -> dict[str, object]:
         found = [
             self.image(camera.name, offset * STEP_S, pose, picture)
-            for offset, pose, pictures in zip(offsets, poses, images, strict=True)
-            for camera, picture in zip(cameras, pictures, strict=True)
+            for offset, pose, pictures in zip(STEPS_OF[self.settings.frames], poses, images, strict=True)
+            for camera, picture in zip(shown, pictures, strict=True)
         ]
-        source = ImageSource.MAP if asset is None else ImageSource.RENDER
-        measured: dict[str, object] = {}
-        if asset is not None:
-            measured = {"asset_digest": asset.digest}
-            if asset.taken:
-                measured |= height_columns(scene, asset.on_road(logged), lifted)
-        return {"cameras": self.rig(rig), "images": found, "image_source": str(source), **measured}
+        return {"cameras": self.rig(rig), "images": found, "image_source": str(source)}
 
     def _painted(self, clip: Clip, judged: Judged) -> dict[str, object]:
         assert self.painter is not None, "render.mode=painter goes with a reader that has one"

@@ -82,7 +82,7 @@ class VirtualGpuWork(ToyWork):
             (name, any_row() | {"clip_id": prepared.clip_id, "content_digest": prepared.content_digest})
         )
 
-    def draw(self, driven: AcceptedDrive) -> SampleColumns:
+    def drawn(self, driven: AcceptedDrive) -> SampleColumns:
         with self._gpu("draw"):
             time.sleep(self.request.draw_s)
         row = driven.payload[1]  # type: ignore[index]

@@ -4,8 +4,8 @@
 
 It draws as the render stage does with render.backend=gsplat, on a device of torch's that costs nothing ("meta": every
 call is made, nothing is computed); what comes back is copied from pictures that the kernels drew before. The CPU path
-stands beside it. CPU time, from a few samples of several instants after one that sends the scene. Then the gate on a
-drive's pictures, in as few calls as memory lets and instant by instant.
+stands beside it. CPU time, from a few samples of an instant alone and of several drawn together, as a walk's are, after
+one that sends the scene. Then the gate on a drive's pictures, in as few calls as memory lets and instant by instant.
 """
 
 import sys
@@ -93,11 +93,14 @@ def row(width: int, height: int, gaussians: int, vehicles: int, instants: int, r
     on_device.cuda = lambda packed: Device("meta", nothing_is_drawn, packed, lambda tensor: seen[0].copy())  # type: ignore[assignment]
     draws: Callable[[], list[Bytes]] = partial(draw, backend=Backend.GSPLAT)
     left = cpu_milliseconds(draws, repeats) * each
+    one = partial(drawn, asset, rig, poses[:1], agents, [0.0], width, height, backend=Backend.GSPLAT)
+    alone = cpu_milliseconds(one, repeats)
     copied = cpu_milliseconds(lambda: [pictures.copy() for pictures in seen], repeats) * each
     quality = RenderSettings().jpeg_quality
     jpeg = cpu_milliseconds(lambda: [encode_jpeg(p, quality) for pictures in seen for p in pictures], repeats) * each
     total = (left + jpeg) / 1e3
-    print(f"| {width}x{height} | {by_kernels:.0f} | {left:.1f} | {copied:.1f} | {jpeg:.1f} | {total:.3f} |", flush=True)
+    asked = f"{by_kernels:.0f} | {alone:.1f} | {left:.1f} | {copied:.1f}"
+    print(f"| {width}x{height} | {asked} | {jpeg:.1f} | {total:.3f} |", flush=True)
 
 
 def gate_row(width: int, height: int, gaussians: int, vehicles: int, pixels: int, repeats: int) -> None:
@@ -131,8 +134,8 @@ def main(options: dict[str, str]) -> None:
     instants, repeats = int(options.get("instants", "3")), int(options.get("repeats", "5"))
     torch.set_num_threads(1)
     print(f"{n:,} Gaussians, {vehicles} vehicles, an instant of {RIG} cameras, CPU ms:\n")
-    print("| size | the kernels | asked of a GPU | of that, pictures copied | JPEGs | left to the host [CPU s] |")
-    print("|---|---|---|---|---|---|")
+    print("| size | the kernels | asked of a GPU alone | together | of that, pictures copied | JPEGs ", end="")
+    print("| left to the host [CPU s] |\n|---|---|---|---|---|---|---|")
     for width, height in SIZES:
         row(width, height, n, vehicles, instants, repeats)
     print(f"\nA drive's {LOOKS} instants by the gate, together and one by one:\n")

@@ -91,8 +91,8 @@ class WaitingWork(ToyWork):
             (name, any_row() | {"clip_id": prepared.clip_id, "content_digest": digest}), {"reward": Spent(0.01)}
         )
 
-    def draw(self, driven: AcceptedDrive) -> SampleColumns:
-        drawn = super().draw(driven)
+    def drawn(self, driven: AcceptedDrive) -> SampleColumns:
+        drawn = super().drawn(driven)
         assert isinstance(drawn, SampleColumns)
         name, _ = driven.payload  # type: ignore[misc]
         image: Any = drawn.row["images"]

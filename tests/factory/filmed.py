@@ -20,7 +20,7 @@ class FilmedWork(ToyWork):
 
     shown: Mapping[str, Any] = field(default_factory=lambda: {**WORLD, **VIEW, **TIMES})
 
-    def draw(self, driven: AcceptedDrive) -> SampleColumns:
-        drawn = super().draw(driven)
+    def drawn(self, driven: AcceptedDrive) -> SampleColumns:
+        drawn = super().drawn(driven)
         assert isinstance(drawn, SampleColumns)
         return SampleColumns({**drawn.row, **self.shown})

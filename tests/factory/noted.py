@@ -2,8 +2,8 @@
 
 import json
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
 from factory.graph.steps import (
@@ -46,8 +46,10 @@ class NotedWork(FactoryWork):
         with self.noted("drive"):
             return super().drive(prepared, candidate, expert)
 
-    def draw(self, driven: AcceptedDrive) -> SampleColumns | RejectedAttempt:
-        with self.noted("render"):
+    def draw(self, driven: Sequence[AcceptedDrive]) -> list[SampleColumns | RejectedAttempt]:
+        with ExitStack() as each:
+            for _ in driven:
+                each.enter_context(self.noted("render"))
             return super().draw(driven)
 
     def label(self, driven: AcceptedDrive) -> SampleColumns:

@@ -180,7 +180,10 @@ class ToyWork:
         row["label_10hz"] = payload["states"][candidate % 6, 1:].astype(np.float32)
         return AcceptedDrive((name, row), {"reward": Spent(0.01)})
 
-    def draw(self, driven: AcceptedDrive) -> SampleColumns | RejectedAttempt:
+    def draw(self, driven: Sequence[AcceptedDrive]) -> list[SampleColumns | RejectedAttempt]:
+        return [self.drawn(one) for one in driven]
+
+    def drawn(self, driven: AcceptedDrive) -> SampleColumns | RejectedAttempt:
         name, row = driven.payload  # type: ignore[misc]
         self._note(f"render {name} on {where()}")
         if self._trouble(f"{name}:render") == "unfit":

@@ -52,7 +52,20 @@ from factory.graph.local import (
 from factory.graph.own_process import AGAIN, check_address_answers, no_cluster_text
 from factory.graph.plan import AttemptBatch
 from factory.graph.progress import METRICS, Metric, Type
-from factory.graph.steps import BatchReport, Failure, NotReady, PreparedClip, Work, attempt, never_stop
+from factory.graph.steps import (
+    AttemptReport,
+    AttemptUnfinished,
+    BatchReport,
+    Failure,
+    NotReady,
+    PartialAttempt,
+    PartialBatch,
+    PreparedClip,
+    Work,
+    attempt,
+    draw_together,
+    never_stop,
+)
 from factory.store.location import BadLocation, Location
 from factory.store.samples import ErrorKind
 from factory.store.schema import Stamp
@@ -338,9 +351,7 @@ class RayGraph(Graph):
         return ticket
 
     def attempts_per_task(self) -> int:
-        """As many as usually end in AHEAD_S, more on more workers; 1 where an attempt is several tasks."""
-        if len(self.attempt_tasks) > 1:
-            return 1
+        """As many as usually end in AHEAD_S, more on more workers; of drives, where drawing is another task."""
         return self._costs.tasks_in("+".join(self.attempt_tasks[0]), seconds_ahead(self.parallelism))
 
     def _claims_gpu(self, ticket: Ticket) -> bool:
@@ -391,7 +402,9 @@ class RayGraph(Graph):
             raise ClusterDied(RAYLET_DIED, self._is_ours) from error
         except RayError as error:
             report, worked_s = Failure(_error_kind(error), f"{type(error).__name__}: {error}"[:2000]), 0.0
-        if isinstance(report, BatchReport):
+        if isinstance(report, AttemptUnfinished) and isinstance(ticket.result, list):
+            ticket.result = ticket.result[0]
+        if isinstance(report, BatchReport | AttemptUnfinished) and report.seconds:
             for seconds in report.seconds:
                 self._costs.add(ticket.step, seconds)
         elif not isinstance(report, Failure):
@@ -452,29 +465,64 @@ def _attempt_batch(
     watch: tuple[Path, dict[str, Any]],
     work: Work,
     stages: Sequence[str],
-    prepared: PreparedClip,
+    so_far: PreparedClip | PartialBatch,
     stamp: Stamp,
     batch: AttemptBatch,
 ) -> list[Any]:
-    """A batch of a walk from `stamp` on, each attempt under watch: report, then a row or None for each sample.
+    """Some stages of a batch of a walk from `stamp` on: a report, then a row or None for each sample, or before the
+    last stages what these start from.
 
-    What it makes does not depend on how long it takes, so that Ray can make lost rows again.
+    Each attempt is under watch. As many drives are made as samples are wanted, and their pictures drawn together: a
+    walk that went one by one would make all of them, too. What it makes does not depend on how long it takes, so that
+    Ray can make lost rows again.
     """
     notes, told = watch
-    first, name = stamp.round, "+".join(stages)
-    reports: list[Any] = []
+    name = "+".join(stages)
+    reached: list[PartialAttempt | AttemptReport | Failure] = []
     seconds: list[float] = []
     rows: list[Any] = []
-    for candidate in range(stamp.candidate_index, stamp.candidate_index + batch.n):
+    parts = so_far.attempts if isinstance(so_far, PartialBatch) else (so_far,) * batch.n
+    began = time.perf_counter()
+    drawn = _drawn_together(watch, work, parts, stamp) if name == "render" else {}
+    each_s = (time.perf_counter() - began) / len(drawn) if drawn else 0.0
+    n_going = 0
+    for i, part in enumerate(parts):
+        if isinstance(part, AttemptReport | Failure):
+            reached.append(part)
+            continue
         began = time.perf_counter()
-        given = stages, prepared, stamp.of_attempt(prepared.clip_id, candidate, first + len(rows))
-        report, row = call_watched(notes, told | task_note("attempt", name, given), attempt, work, *given)
-        reports.append(report)
-        seconds.append(time.perf_counter() - began)
-        rows += [row] if row is not None else []
-        if isinstance(report, Failure) or len(rows) == batch.samples:
+        given = stages, part, stamp.of_attempt(so_far.clip_id, stamp.candidate_index + i, stamp.round + len(rows))
+        if i in drawn:
+            report, result = drawn[i]
+        else:
+            report, result = call_watched(notes, told | task_note("attempt", name, given), attempt, work, *given)
+        seconds.append(each_s if i in drawn else time.perf_counter() - began)
+        reached.append(result if isinstance(report, AttemptUnfinished) else report)
+        rows += [result] if isinstance(report, AttemptReport) and result is not None else []
+        n_going += result is not None
+        if isinstance(report, Failure) or n_going == batch.samples:
             break
-    return [BatchReport(tuple(reports), tuple(seconds)), *rows, *[None] * (batch.samples - len(rows))]
+    nothing = [None] * batch.samples
+    reports = [one for one in reached if not isinstance(one, PartialAttempt)]
+    if len(reports) < len(reached):
+        unfinished = PartialBatch(so_far.clip_id, tuple(reached))
+        return [AttemptUnfinished(tuple(seconds)), unfinished, *nothing[1:]]
+    return [BatchReport(tuple(reports), tuple(seconds)), *rows, *nothing[len(rows) :]]
+
+
+def _drawn_together(
+    watch: tuple[Path, dict[str, Any]], work: Work, parts: Sequence[object], stamp: Stamp
+) -> dict[int, tuple[Any, Any]]:
+    """By place, report and result of the parts that are driven; none where they failed together, so that each is drawn
+    alone and a failure is its own."""
+    driven = {i: part for i, part in enumerate(parts) if isinstance(part, PartialAttempt)}
+    if len(driven) < 2:
+        return {}
+    notes, told = watch
+    limit = {"seconds": told["seconds"] and told["seconds"] * len(driven)}
+    note = told | task_note("attempts", "render", (stamp,)) | limit
+    _, found = call_watched(notes, note, draw_together, work, [*driven.values()])
+    return {} if found is None else dict(zip(driven, found, strict=True))
 
 
 def _cached_work(reference: list[Any]) -> Any:

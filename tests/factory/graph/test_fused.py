@@ -1,23 +1,42 @@
 """However the stages of an attempt are cut into tasks, the rows are the same, to the byte."""
 
 import json
+import pickle
 import re
 import time
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import pyarrow as pa
 import pytest
 
 from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, Execution, execute
 from factory.graph.local import Claims, LocalGraph
-from factory.graph.on_ray.graph import ray  # with the environment that keeps it on loopback
-from factory.graph.steps import AcceptedDrive, PreparedClip, RejectedAttempt
+from factory.graph.on_ray.graph import _attempt_batch, ray  # with the environment that keeps it on loopback
+from factory.graph.plan import AttemptBatch
+from factory.graph.steps import (
+    AcceptedDrive,
+    AttemptReport,
+    BatchReport,
+    Failure,
+    PreparedClip,
+    RejectedAttempt,
+    SampleColumns,
+    attempt,
+)
 from factory.pipeline import FactoryWork
 from factory.store.samples import Store
+from factory.store.schema import Stamp
+from tasks.render.scene import on_device
+from tasks.render.scene.on_device import Device
+from tasks.render.settings import Backend
 from tasks.stages import ATTEMPT, TASKS
+from tests.bench.by_kernels import rasterization
 from tests.factory.noted import NotedWork
-from tests.factory.stages.test_pipeline import work_on
+from tests.factory.stages.test_pipeline import prepared_by, work_on
 from tests.factory.tables import assert_same_tables, tables_of
 from tests.factory.toy import ToyWork, executed, ran, refs
 
@@ -54,6 +73,89 @@ def test_stages_as_tasks_of_their_own_make_the_same_rows_in_this_process(
     rejected = [row for row in tables_of(tmp_path / "apart")[1] if row["stage"] == "render"]  # type: ignore[index]
     assert rejected and {row["reason"] for row in rejected} == {"blank"}  # type: ignore[index]
     assert ran(journal, "label") == apart.counts["accepted"] == ran(journal, "render") - len(rejected)
+
+
+WATCH = {"seconds": None, "gb": None, "run": "a run"}
+STAMP = Stamp("", "recovery", "recovery-1", 1, 0, "vocabulary-1", "settings", "{}")
+
+
+def by_tasks(work: ToyWork, prepared: PreparedClip, batch: AttemptBatch, notes: Path) -> tuple[Any, list[Any]]:
+    """A batch's reports and rows, a task for each stage."""
+    so_far: Any = prepared
+    for stage in ATTEMPT:
+        report, *results = _attempt_batch((notes, WATCH), work, (stage,), so_far, STAMP, batch)
+        assert len(results) == batch.samples, "as many as the task has results"
+        if isinstance(report, BatchReport):
+            return report.reports, [row for row in results if row is not None]
+        so_far = results[0]
+    raise AssertionError("the last stage ends it")
+
+
+def said(report: AttemptReport | Failure) -> object:
+    """All but how long it took."""
+    if isinstance(report, Failure):
+        return report.kind, report.error.splitlines()[-1], report.task
+    return replace(report, seconds=dict.fromkeys(report.seconds))  # type: ignore[arg-type]
+
+
+def test_a_batch_cut_into_tasks_and_drawn_together_is_attempts_one_after_the_other(tmp_path: Path) -> None:
+    """Whatever goes wrong, in any stage of any of them; what it does not come to is left to the next batch."""
+    rng, (ref, *_) = np.random.default_rng(0), refs(1)
+    together, kinds, shorter = 0, set(), 0
+    for case in range(80):
+        names = [f"log0:{ref.start_ms}:recovery:{i}" for i in range(12)]
+        trouble = {f"{n}:render": "unfit" for n in names if rng.random() < 0.3}
+        if case % 2:
+            stage = rng.choice(["", ":render", ":label"])
+            trouble[rng.choice(names[:5]) + stage] = "bug"
+        journal = tmp_path / f"journal{case}"
+        work = ToyWork(n_candidates=12, trouble=trouble, journal=str(journal), threshold=0.4)
+        prepared = work.prepare(ref)
+        assert isinstance(prepared, PreparedClip)
+        batch = AttemptBatch(int(rng.integers(2, 12)), int(rng.integers(1, 5)))
+        reports, rows = by_tasks(work, prepared, batch, tmp_path)
+        slow: list[AttemptReport | Failure] = []
+        made: list[pa.Table] = []
+        for i in range(batch.n):
+            report, row = attempt(work, ATTEMPT, prepared, STAMP.of_attempt(ref.clip_id, i, 1 + len(made)))
+            assert isinstance(report, AttemptReport | Failure)
+            slow.append(report)
+            made += [row] if isinstance(row, pa.Table) else []
+            if isinstance(report, Failure) or len(made) == batch.samples:
+                break
+        assert [said(one) for one in reports] == [said(one) for one in slow][: len(reports)]
+        assert len(reports) >= 1 and all(repr(a.to_pylist()) == repr(b.to_pylist()) for a, b in zip(rows, made))
+        assert len(rows) == sum(isinstance(one, AttemptReport) and one.rejected is None for one in reports)
+        kinds |= {one.task for one in reports if isinstance(one, Failure)}
+        shorter += len(reports) < len(slow)
+        together += len(rows) > 1
+    assert kinds == set(ATTEMPT) and shorter and together
+
+
+@pytest.mark.slow
+def test_samples_of_a_walk_are_drawn_in_few_calls_and_as_each_alone(
+    town: FactoryWork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[int] = []
+
+    def counted(**given: Any) -> Any:
+        calls.append(given["viewmats"].shape[0] * given["viewmats"].shape[1])
+        return rasterization(**given)
+
+    monkeypatch.setattr(on_device, "cuda", lambda packed: Device("cpu", counted, packed))
+    gate = replace(town.render.gate, enabled=False)
+    work = replace(town, render=replace(town.render, backend=Backend.GSPLAT, gate=gate))
+    prepared = prepared_by(work)
+    tried = (work.drive(prepared, row.index, "pdm_closed") for row in prepared.candidates)
+    driven = [one for one in tried if isinstance(one, AcceptedDrive)][:4]
+    assert len(driven) == 4
+    together, n_together = work.draw(driven), len(calls)
+    alone = [work.draw([one])[0] for one in driven]
+    assert n_together < len(calls) - n_together and sum(calls[:n_together]) == sum(calls[n_together:])
+    for a, b in zip(together, alone, strict=True):
+        assert isinstance(a, SampleColumns) and isinstance(b, SampleColumns)
+        assert pickle.dumps(a.row) == pickle.dumps(b.row)
+    assert len({pickle.dumps(one.row["images"]) for one in alone if isinstance(one, SampleColumns)}) == 4
 
 
 @pytest.fixture(scope="module")

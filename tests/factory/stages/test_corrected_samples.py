@@ -48,7 +48,7 @@ def judged(clip: Clip) -> Judged:
 def human(clip: Clip, judged: Judged, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """The human sample's columns, and the folder that the corrected rig is kept in."""
     folder = tmp_path_factory.mktemp("imaged")
-    row = Imaging(SETTINGS, str(folder)).pictures(clip, None, judged)
+    row = Imaging(SETTINGS, str(folder)).pictures([(clip, None, judged)])[0]
     assert not list(folder.glob("*.safetensors")), "the rig alone is enough for it"
     return folder, dict(row)
 
@@ -65,7 +65,7 @@ def test_photos_and_pictures_of_a_corrected_block_have_one_calibration_the_one_t
 ) -> None:
     folder, row = human
     candidate = Candidate(0, np.zeros(3), (0, 0), 1.0, 1.0, judged.scores, judged.rollout)
-    simulated = Imaging(SETTINGS, str(folder)).pictures(clip, candidate, judged)
+    simulated = Imaging(SETTINGS, str(folder)).pictures([(clip, candidate, judged)])[0]
     assert (row["image_source"], simulated["image_source"]) == ("photo", "render")
     for camera in clip.cameras:
         for a, b in zip(stored(camera, row), stored(camera, simulated)):
@@ -97,13 +97,13 @@ def test_photos_are_cut_by_the_camera_and_stand_at_the_poses_that_the_rig_s_file
         assert np.abs(decode_stored_image(image).astype(float) - photo.rgb).mean() < 1.0  # JPEG
         off = decode_stored_image(image).astype(float) - photo.rgb
         assert np.abs(off @ [0.299, 0.587, 0.114]).mean() < 1.0  # JPEG, which halves the size of colours
-    again = Imaging(SETTINGS, str(folder)).pictures(clip, None, judged)
+    again = Imaging(SETTINGS, str(folder)).pictures([(clip, None, judged)])[0]
     assert json.dumps(again["cameras"], default=list) == json.dumps(row["cameras"], default=list)
 
 
 def test_with_the_rig_left_alone_photos_have_the_log_s_calibration(clip: Clip, judged: Judged, tmp_path: Path) -> None:
     settings = replace(SETTINGS, rig=RigSettings(adjust=Adjust.OFF))
-    row = Imaging(settings, str(tmp_path)).pictures(clip, None, judged)
+    row = Imaging(settings, str(tmp_path)).pictures([(clip, None, judged)])[0]
     for camera in clip.cameras:
         np.testing.assert_array_equal(stored(camera, row)[1], camera.ego_from_camera)
     poses = {(file.sensor, round(file.time_s, 3)): file.world_from_ego for file in clip.images}

@@ -36,7 +36,7 @@ class PicturedWork(ToyWork):
         self.watching()
         return super().drive(prepared, candidate, expert)
 
-    def draw(self, driven: AcceptedDrive) -> SampleColumns:
+    def drawn(self, driven: AcceptedDrive) -> SampleColumns:
         return SampleColumns(pictures(dict.fromkeys(FRONT_YAWS, VIEW)))
 
 
