@@ -150,7 +150,8 @@ def runs_ahead(settings: AbSettings) -> str:
             said = _call(settings, "factory", "plan", *words.split(), f"out={out / name}").splitlines()
             told += [f"{name}: {line}" for line in said if line.startswith("expected for")]
     n = settings.seeds * len(settings.chosen) * len(settings.planners)
-    each = f", for each of {settings.folds} parts" if settings.folds else ""
+    parts = "log" if settings.folds == "each" else f"of {settings.folds} parts"
+    each = f", for each {parts} that is held out" if settings.folds else ""
     told.append(f"then {n} trainings of {settings.steps} steps{each}: the first says what they cost")
     return "\n".join(["to be made:", *told])
 

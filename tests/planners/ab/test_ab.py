@@ -121,8 +121,10 @@ def test_what_the_runs_will_take_is_said_before_any_is_made(tmp_path: Path) -> N
     (tmp_path / "done" / "report.json").write_text("{}")  # of a run that came to its end
     expected, then = runs_ahead(settings(tmp_path, runs={"t": town, "done": town}, folds=3)).splitlines()[1:]
     assert re.fullmatch(r"t: expected for 9 clips: \d+ attempts, .* core-hours", expected)
-    assert then == "then 6 trainings of 1500 steps, for each of 3 parts: the first says what they cost"
+    assert then == "then 6 trainings of 1500 steps, for each of 3 parts that is held out: the first says what they cost"
     assert not (tmp_path / "t").exists(), "nothing is made"
+    (then,) = runs_ahead(settings(tmp_path, runs={}, folds="each")).splitlines()[1:]
+    assert then == "then 6 trainings of 1500 steps, for each log that is held out: the first says what they cost"
 
 
 def frames_of(bonus: float) -> list[FrameRow]:
