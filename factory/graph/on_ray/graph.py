@@ -80,6 +80,7 @@ VITAL = ("raylet", "gcs_server")
 PROBE_SECONDS = 120.0
 OWN_BYTES = 2**20  # of files of a cluster of our own, before it does anything: less, and another will not begin either
 GPU_WAIT_S = 900.0  # for the first node with one to come
+log = logging.getLogger(__name__)
 RAYLET_DIED = "Ray's raylet on this machine died; run the same command again once Ray is up"
 WORKER_ENV = {
     **dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"),
@@ -521,8 +522,12 @@ def _drawn_together(
     notes, told = watch
     limit = {"seconds": told["seconds"] and told["seconds"] * len(driven)}
     note = told | task_note("attempts", "render", (stamp,)) | limit
-    _, found = call_watched(notes, note, draw_together, work, [*driven.values()])
-    return {} if found is None else dict(zip(driven, found, strict=True))
+    failure, found = call_watched(notes, note, draw_together, work, [*driven.values()])
+    if found is None:
+        why = failure.error.splitlines()[-1]
+        log.warning("%d samples could not be drawn together, each is drawn alone: %s", len(driven), why)
+        return {}
+    return dict(zip(driven, found, strict=True))
 
 
 def _cached_work(reference: list[Any]) -> Any:
