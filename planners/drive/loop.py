@@ -11,7 +11,7 @@ import numpy as np
 
 from planners.drive.cameras import DriveCameras, Images, NoCameras, Observer
 from planners.drive.drivers import Driver
-from planners.drive.mpc import car_at, car_that_moves, follow
+from planners.drive.mpc import ControllerName, car_at, car_that_moves, controller_of, follow
 from planners.drive.starts import LOGGED, DriveStart
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.world.arrays import Array
@@ -19,7 +19,7 @@ from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentTracks, Scene
 from tasks.world.frames import HEADING, to_local, to_world
 from tasks.world.road_map import CenterlineFinder
 
-DRIVE_VERSION = 2  # raised by hand whenever the same start is driven otherwise
+DRIVE_VERSION = 3  # raised by hand whenever the same start is driven otherwise
 PLAN_STEPS = 5  # of 0.1 s between two plans: 2 Hz
 FIRST_QUESTION_S = 0.017  # after the first pose of a recording: a picture's exposure
 
@@ -29,6 +29,7 @@ class LoopSettings:
     """What every drive depends on."""
 
     seconds: float = 5.5  # of the recording; a drive is as long as whole plans fit into it, and into the log
+    controller: ControllerName = "linear"
     traffic: TrafficSettings = field(default_factory=TrafficSettings)
 
     def __post_init__(self) -> None:
@@ -77,7 +78,7 @@ def drive(
     if n_plans < 1:
         raise ValueError(f"the log goes on for {log_steps * STEP_S:.1f} s: 0.5 s of it or more are driven")
     finder = CenterlineFinder(scene.clip.road_map, scene.clip.route)
-    tracker, observer = _MpcTracker(start), Observer(seen)
+    tracker, observer = _MpcTracker(start, settings.controller), Observer(seen)
     states, plans, images = [scene.ego_state], list[Array](), list[Images]()
     for _ in range(n_plans):
         seen_now, sample = observer.observe(scene)
@@ -103,7 +104,8 @@ def drive(
 class _MpcTracker:
     """Follows plans by AlpaSim's MPC, from the log up to the second one by the log."""
 
-    def __init__(self, start: DriveStart) -> None:
+    def __init__(self, start: DriveStart, controller: ControllerName) -> None:
+        self._controller = controller_of(controller)
         self._car = None if start.number == LOGGED else car_at(start.scene.ego_state)
 
     def __call__(self, scene: Scene, plan: Array) -> Array:
@@ -112,12 +114,15 @@ class _MpcTracker:
             log = scene.clip.ego_states[scene.step : scene.step + HORIZON_STEPS + 1]
             poses = log[:, : HEADING + 1]
             self._car, _ = follow(
-                car_that_moves(poses[0], poses[PLAN_STEPS], PLAN_STEPS * STEP_S), poses[1:], PLAN_STEPS
+                car_that_moves(poses[0], poses[PLAN_STEPS], PLAN_STEPS * STEP_S),
+                poses[1:],
+                PLAN_STEPS,
+                self._controller,
             )
             driven = log[1 : PLAN_STEPS + 1]
         else:
             car = np.concatenate([scene.ego_state[: HEADING + 1], self._car[HEADING + 1 :]])
-            self._car, driven = follow(car, plan, PLAN_STEPS)
+            self._car, driven = follow(car, plan, PLAN_STEPS, self._controller)
         held = np.repeat(driven[-1:], HORIZON_STEPS - PLAN_STEPS, axis=0)
         return np.concatenate([scene.ego_state[None], driven, held])
 

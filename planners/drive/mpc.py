@@ -1,21 +1,25 @@
-"""AlpaSim's controller: a linear MPC before a dynamic bicycle, by which a plan is followed there.
+"""AlpaSim's controllers: an MPC before a dynamic bicycle, by which a plan is followed there.
 
-The rule is that of NVlabs/alpasim 9177bd0, src/controller/alpasim_controller (mpc_controller.py, vehicle_model.py,
-mpc_impl/linear_mpc.py, system.py): every 0.1 s the model is linearised at the car, a QP over the next 2 s is solved,
-and its first command drives the car for 0.1 s, ten midpoint steps of 10 ms. Errors cost nothing in the first 0.9 s, so
-of a plan only what lies 1.0 to 2.0 s ahead of each of these instants is looked at.
+The rules are those of NVlabs/alpasim 9177bd0, src/controller/alpasim_controller (mpc_controller.py, vehicle_model.py,
+mpc_impl, system.py): every 0.1 s the best commands of the next 2 s are looked for, and the first of them drives the car
+for 0.1 s, ten midpoint steps of 10 ms. Errors cost nothing in the first 0.9 s, so of a plan only what lies 1.0 to 2.0 s
+ahead of each of these instants is looked at.
 
-Ours: the QP is solved exactly, where theirs stops at a tolerance of 1e-4, and poses stay float64. The board has the
-nonlinear controller, which minimises the errors of the model itself and penalises changes of commands; this one, which
-is AlpaSim's default, penalises commands.
+* Linear, AlpaSim's default: the model is linearised at the car, and commands cost. A QP.
+* Nonlinear, the board's: the errors are those of the model itself, by collocation at Radau's two points of each 0.1 s,
+  and changes of commands cost, from the last one driven on.
+
+Ours: QPs are solved exactly, where theirs stop at a tolerance, the nonlinear problem by QPs one after the other, where
+theirs takes an interior point; poses stay float64.
 """
 
 import math
+from collections.abc import Callable
+from typing import Any, Literal
 
 import numpy as np
-import osqp
-from scipy import sparse
-from scipy.linalg import cho_factor, cho_solve, expm
+from scipy.linalg import cho_solve, cholesky, expm, solve_triangular
+from scipy.optimize import nnls
 
 from tasks.world import frames
 from tasks.world.arrays import Array
@@ -33,15 +37,30 @@ SUBSTEPS = 10  # of a step of 0.1 s
 # Its state: pose of the rear axle, velocity of the centre of gravity in the body frame, yaw rate, the two actuators.
 X, Y, YAW, VX, VY, YAW_RATE, STEERING, ACCEL = range(8)
 N_STATES, N_COMMANDS = 8, 2  # commands: front steering angle [rad], acceleration [m/s2]
+PUSHED = np.zeros((N_STATES, N_COMMANDS))  # what commands change the state by, by the second
+PUSHED[[STEERING, ACCEL], [0, 1]] = 1.0 / ACTUATOR_S
 
 HORIZON, FIRST_COUNTED = 20, 10  # steps of 0.1 s; errors before the tenth cost nothing
-WEIGHTS = np.diag([2.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.1])  # along, across, heading, ..., acceleration
+WEIGHTS = np.array([2.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.1])  # along, across, heading, ..., acceleration
 COMMAND_WEIGHTS = np.array([5.0, 1.0])
 REGULARISATION = 1e-6
-BOUNDED = (YAW, VX, STEERING, ACCEL)
-LOW, HIGH = np.array([-math.pi / 2, 0.0, -math.pi / 4, -8.0]), np.array([math.pi / 2, 35.0, math.pi / 4, 6.0])
+DIFFERENCES = np.eye(HORIZON * N_COMMANDS) - np.eye(HORIZON * N_COMMANDS, k=-N_COMMANDS)  # of a command to the next
 COMMAND_LOW, COMMAND_HIGH = np.array([-2.0, -9.0]), np.array([2.0, 6.0])
 WITHIN = 1e-9  # of a bound that counts as kept
+
+# Of states, (BOUNDED,) each: of the linear problem, and of the nonlinear one.
+BOUNDED = (YAW, VX, STEERING, ACCEL)
+LOW, HIGH = np.array([-math.pi / 2, 0.0, -math.pi / 4, -8.0]), np.array([math.pi / 2, 35.0, math.pi / 4, 6.0])
+BOUNDED_NONLINEAR = (X, Y, YAW, VX, VY, YAW_RATE, STEERING)
+HIGH_NONLINEAR = np.array([500.0, 20.0, 0.78, 35.0, 10.0, 3.0, 0.785])
+LOW_NONLINEAR = np.where(np.array(BOUNDED_NONLINEAR) == VX, 0.0, -HIGH_NONLINEAR)
+
+RADAU = STEP_S * np.array([[5.0, -1.0], [9.0, 3.0]]) / 12.0  # the states at 1/3 and 1 of a step by the slopes there
+SEARCHES = 30  # QPs of a nonlinear problem at most, as iterations there
+FOUND = 1e-7  # no command and no state changes by more in the last of them
+
+ControllerName = Literal["linear", "nonlinear"]
+Controller = Callable[[Array, Array], Array]  # best command (2,) of a car (8,) and where its plan is (20, 3)
 
 
 def car_that_moves(pose: Array, later: Array, after_s: float) -> Array:
@@ -64,15 +83,17 @@ def _car(pose: Array, vx: float, vy: float, rate: float, accel: float) -> Array:
     return np.array([*pose, vx, vy + REAR_TO_CG * rate, rate, steering, accel])
 
 
-def follow(car: Array, plan: Array, steps: int) -> tuple[Array, Array]:
+def follow(car: Array, plan: Array, steps: int, controller: Controller | None = None) -> tuple[Array, Array]:
     """The car `steps` of 0.1 s on (8,), and the ego's states there (steps, 11), columns of tasks.world.frames.
 
-    plan: (P, 3) world poses of the rear axle at 0.1 s, 0.2 s, ...; after its end its last one holds.
+    plan: (P, 3) world poses of the rear axle at 0.1 s, 0.2 s, ...; after its end its last one holds. controller: one
+    for all of a drive, by default the linear one.
     """
+    controller = controller or linear_command
     states = np.empty((steps, EGO_STATE_SIZE))
     for step in range(steps):
         index = np.minimum(step + np.arange(HORIZON), len(plan) - 1)
-        command = best_command(car, to_local(car[: YAW + 1], plan[index]))
+        command = controller(car, to_local(car[: YAW + 1], plan[index]))
         car = advanced(car, command)
         states[step] = ego_state(car, command)
     return car, states
@@ -133,79 +154,179 @@ def _lateral(vx: float) -> Array:
     )
 
 
+def jacobians(cars: Array) -> Array:
+    """(M, 8, 8) by what the derivatives of cars (M, 8) change with their states."""
+    vx, yaw = cars[:, VX], cars[:, YAW]
+    slips = vx >= KINEMATIC_BELOW_MPS
+    side = slips * (cars[:, VY] - cars[:, YAW_RATE] * REAR_TO_CG)
+    ahead, across = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    slope = np.zeros((len(cars), N_STATES, N_STATES))
+    slope[:, : Y + 1, VX], slope[:, : Y + 1, YAW] = ahead.T, (vx * across - side * ahead).T
+    slope[:, : Y + 1, VY], slope[:, : Y + 1, YAW_RATE] = (slips * across).T, (-REAR_TO_CG * slips * across).T
+    slope[:, YAW, YAW_RATE] = slope[:, VX, ACCEL] = 1.0
+    lateral = np.stack([_lateral(speed) for speed in vx])
+    fast = -lateral / np.where(slips, vx, 1.0)[:, None, None]  # what falls with the speed, and below what grows with it
+    fast[:, 0, 1] -= 2.0
+    fast[:, :, 2] = 0.0
+    slow = KINEMATIC_GAIN / WHEELBASE * np.array([[0.0, 0.0, REAR_TO_CG], [0.0, 0.0, 1.0]])
+    by_speed = np.where(slips[:, None, None], fast, slow)
+    slope[:, VY : YAW_RATE + 1, VY : STEERING + 1] = lateral
+    slope[:, VY : YAW_RATE + 1, VX] = np.einsum("mab,mb->ma", by_speed, cars[:, VY : STEERING + 1])
+    slope[:, STEERING, STEERING] = slope[:, ACCEL, ACCEL] = -1.0 / ACTUATOR_S
+    return slope
+
+
 def linearised(car: Array) -> tuple[Array, Array]:
     """(8, 8), (8, 2): the state 0.1 s later from the state now and a command, linear around the car at the origin.
 
     The speed in lateral dynamics is held, as AlpaSim holds it.
     """
     slope = np.zeros((N_STATES + N_COMMANDS,) * 2)
-    vx = car[VX]
-    slope[X, VX] = slope[YAW, YAW_RATE] = slope[VX, ACCEL] = 1.0
-    slope[Y, YAW] = vx
-    if vx >= KINEMATIC_BELOW_MPS:
-        slope[X, YAW] = -(car[VY] - REAR_TO_CG * car[YAW_RATE])
-        slope[Y, VY], slope[Y, YAW_RATE] = 1.0, -REAR_TO_CG
-    slope[np.ix_((VY, YAW_RATE), (VY, YAW_RATE, STEERING))] = _lateral(vx)
-    for command, actuator in enumerate((STEERING, ACCEL)):
-        slope[actuator, actuator], slope[actuator, N_STATES + command] = -1.0 / ACTUATOR_S, 1.0 / ACTUATOR_S
+    slope[:N_STATES, :N_STATES], slope[:N_STATES, N_STATES:] = jacobians(car[None])[0], PUSHED
+    slope[[VY, YAW_RATE], VX] = 0.0
     step = expm(STEP_S * slope)
     return step[:N_STATES, :N_STATES], step[:N_STATES, N_STATES:]
 
 
-def best_command(car: Array, ahead: Array) -> Array:
-    """(2,) the first command of the QP; none at all where it has no solution.
+def linear_command(car: Array, ahead: Array) -> Array:
+    """(2,) the first command of the linear MPC; none at all where nothing keeps its bounds, as there.
 
     ahead: (20, 3) where the plan is 0.1 .. 2.0 s on, in the car's frame.
     """
-    now = car.copy()
-    now[: YAW + 1] = 0.0
+    now = _at_origin(car)
     step, pushed = linearised(now)
-    free, response = np.empty((HORIZON, N_STATES)), np.zeros((HORIZON, N_STATES, HORIZON, N_COMMANDS))
-    state, effect = now, pushed
-    for k in range(HORIZON):
-        state = free[k] = step @ state
-        for j in range(HORIZON - k):
-            response[j + k, :, j] = effect
-        effect = step @ effect
-    counted = slice(FIRST_COUNTED - 1, None)  # row k is k + 1 steps ahead
-    wanted = np.zeros((HORIZON, N_STATES))
-    wanted[:, : YAW + 1] = ahead
-    errors, moved = (free - wanted)[counted], response[counted].reshape(-1, N_STATES, HORIZON * N_COMMANDS)
-    hessian = np.einsum("kaz,ab,kby->zy", moved, WEIGHTS, moved, optimize=True)
+    free, response = _unrolled(now, [step] * HORIZON, [pushed] * HORIZON, [0.0] * HORIZON)
+    hessian, gradient = _errors(free, response, ahead)
     hessian += np.diag(np.tile(COMMAND_WEIGHTS, HORIZON) + REGULARISATION)
-    gradient = np.einsum("kaz,ab,kb->z", moved, WEIGHTS, errors, optimize=True)
     rows = np.concatenate([np.eye(HORIZON * N_COMMANDS), response[:, BOUNDED].reshape(-1, HORIZON * N_COMMANDS)])
     offset = np.concatenate([np.zeros(HORIZON * N_COMMANDS), free[:, BOUNDED].ravel()])
     low = np.concatenate([np.tile(COMMAND_LOW, HORIZON), np.tile(LOW, HORIZON)]) - offset
     high = np.concatenate([np.tile(COMMAND_HIGH, HORIZON), np.tile(HIGH, HORIZON)]) - offset
-    return _minimum(hessian, gradient, rows, low, high)[:N_COMMANDS]
+    best = _minimum(hessian, gradient, rows, low, high)
+    return np.zeros(N_COMMANDS) if best is None else best[:N_COMMANDS]
 
 
-def _minimum(hessian: Array, gradient: Array, rows: Array, low: Array, high: Array) -> Array:
-    """argmin 1/2 u' H u + g' u, low <= rows u <= high; zeros, as AlpaSim takes them, where nothing keeps the bounds.
+class NonlinearController:
+    """The nonlinear MPC of one drive: it begins to search at the commands that it found 0.1 s before."""
 
-    Where the bounds bind, the solver adapts by iterations, never by the clock: the same question, the same bits.
+    def __init__(self) -> None:
+        self._commands = np.zeros((HORIZON, N_COMMANDS))
+        self._driven = np.zeros(N_COMMANDS)  # the last one, from which a change costs
+
+    def __call__(self, car: Array, ahead: Array) -> Array:
+        """(2,) as `linear_command`'s; of the last QP where they do not settle, none where one has no solution."""
+        now = _at_origin(car)
+        commands = np.concatenate([self._commands[1:], self._commands[-1:]])
+        states = _guess(now, commands)
+        for _ in range(SEARCHES):
+            change = self._change(now, commands, states, ahead)
+            if change is None:
+                commands = np.zeros_like(commands)
+                break
+            commands, states = commands + change[0], states + change[1]
+            if max(np.abs(change[0]).max(), np.abs(change[1]).max()) < FOUND:
+                break
+        self._commands, self._driven = commands, commands[0]
+        return self._driven
+
+    def _change(self, now: Array, commands: Array, states: Array, ahead: Array) -> tuple[Array, Array] | None:
+        """Of commands (20, 2) and states (20, 2, 8) at Radau's points, to the best of what is linear around them."""
+        free, response = _collocated(now, commands, states)
+        reached = states.reshape(HORIZON, -1) + free
+        hessian, gradient = _errors(reached[:, N_STATES:], response[:, N_STATES:], ahead)
+        weights = np.tile(COMMAND_WEIGHTS, HORIZON)
+        changes = DIFFERENCES @ commands.ravel() - np.concatenate([self._driven, np.zeros(commands.size - N_COMMANDS)])
+        hessian += DIFFERENCES.T @ (weights[:, None] * DIFFERENCES)
+        gradient += DIFFERENCES.T @ (weights * changes)
+        bounded = [N_STATES * point + state for point in range(2) for state in BOUNDED_NONLINEAR]
+        rows = response[:-1, bounded].reshape(-1, commands.size)  # nothing bounds the last 0.1 s, as there
+        offset = np.concatenate([commands.ravel(), reached[:-1, bounded].ravel()])
+        low = np.concatenate([np.tile(COMMAND_LOW, HORIZON), np.tile(LOW_NONLINEAR, 2 * HORIZON - 2)]) - offset
+        high = np.concatenate([np.tile(COMMAND_HIGH, HORIZON), np.tile(HIGH_NONLINEAR, 2 * HORIZON - 2)]) - offset
+        best = _minimum(hessian, gradient, np.concatenate([np.eye(commands.size), rows]), low, high)
+        return None if best is None else (best.reshape(commands.shape), (free + response @ best).reshape(states.shape))
+
+
+def controller_of(name: ControllerName) -> Controller:
+    """A fresh one, for one drive."""
+    return NonlinearController() if name == "nonlinear" else linear_command
+
+
+def _at_origin(car: Array) -> Array:
+    now = car.copy()
+    now[: YAW + 1] = 0.0
+    return now
+
+
+def _guess(now: Array, commands: Array) -> Array:
+    """(20, 2, 8) states at Radau's points of each step by the linear model."""
+    step, pushed = linearised(now)
+    ends, _ = _unrolled(now, [step] * HORIZON, [pushed] * HORIZON, commands @ pushed.T)
+    begins = np.concatenate([now[None], ends[:-1]])
+    return np.stack([begins + (ends - begins) / 3.0, ends], axis=1)
+
+
+def _collocated(now: Array, commands: Array, states: Array) -> tuple[Array, Array]:
+    """How states at both points of each step must change so that the model holds, linear around them: (20, 16), and
+    (20, 16, 40) what they change by with the commands."""
+    slopes = np.array([[derivative(state, command) for state in both] for both, command in zip(states, commands)])
+    bends = jacobians(states.reshape(-1, N_STATES)).reshape(*states.shape, N_STATES)
+    begins = np.concatenate([now[None], states[:-1, 1]])
+    missed = begins[:, None] + np.einsum("pq,kqa->kpa", RADAU, slopes) - states
+    system = np.eye(2 * N_STATES) - np.einsum("pq,kqab->kpaqb", RADAU, bends).reshape(HORIZON, 2 * N_STATES, -1)
+    begun, pushed = np.tile(np.eye(N_STATES), (2, 1)), np.kron(RADAU.sum(axis=1)[:, None], PUSHED)
+    given = np.concatenate([np.broadcast_to(part, (HORIZON, *part.shape)) for part in (begun, pushed)], axis=2)
+    solved = np.linalg.solve(system, np.concatenate([given, missed.reshape(HORIZON, -1, 1)], axis=2))
+    steps, pushes, left = np.split(solved, [N_STATES, N_STATES + N_COMMANDS], axis=2)
+    return _unrolled(np.zeros(N_STATES), steps, pushes, left[:, :, 0])
+
+
+def _unrolled(state: Array, steps: Any, pushes: Any, added: Any) -> tuple[Array, Array]:
+    """What linear steps from a state (8,) lead to: (20, n) without commands, and (20, n, 40) by all commands.
+
+    Of steps, (n, 8) each by the state before, (n, 2) by the command and (n,) in any case, the last 8 are the state
+    after it.
     """
-    best: Array = cho_solve(cho_factor(hessian), -gradient)
-    reached = rows @ best
-    if (reached >= low - WITHIN).all() and (reached <= high + WITHIN).all():
-        return best
-    solver = osqp.OSQP()
-    solver.setup(
-        P=sparse.csc_matrix(np.triu(hessian)),
-        q=gradient,
-        A=sparse.csc_matrix(rows),
-        l=low,
-        u=high,
-        verbose=False,
-        max_iter=4000,
-        eps_abs=1e-8,
-        eps_rel=1e-8,
-        adaptive_rho=1,
-        adaptive_rho_interval=25,
-        check_termination=25,
-        warm_starting=False,
-        polishing=True,
-    )
-    result = solver.solve(raise_error=False)
-    return np.asarray(result.x, np.float64) if result.info.status.startswith("solved") else np.zeros_like(gradient)
+    free, response = [], []
+    effect = np.zeros((N_STATES, HORIZON * N_COMMANDS))
+    for k, (step, push, more) in enumerate(zip(steps, pushes, added)):
+        free.append(step @ state + more)
+        effect = step @ effect
+        effect[:, N_COMMANDS * k : N_COMMANDS * (k + 1)] += push
+        response.append(effect)
+        state, effect = free[-1][-N_STATES:], effect[-N_STATES:]
+    return np.stack(free), np.stack(response)
+
+
+def _errors(states: Array, response: Array, ahead: Array) -> tuple[Array, Array]:
+    """Hessian (40, 40) and gradient (40,), halved, of the errors that count of states (20, 8) and their response."""
+    errors, moved = states[FIRST_COUNTED - 1 :].copy(), response[FIRST_COUNTED - 1 :]  # row k is k + 1 steps ahead
+    errors[:, : YAW + 1] -= ahead[FIRST_COUNTED - 1 :]
+    errors[:, YAW] = (errors[:, YAW] + math.pi) % (2.0 * math.pi) - math.pi
+    hessian = np.einsum("kaz,a,kay->zy", moved, WEIGHTS, moved, optimize=True)
+    return hessian, np.einsum("kaz,a,ka->z", moved, WEIGHTS, errors, optimize=True)
+
+
+def _minimum(hessian: Array, gradient: Array, rows: Array, low: Array, high: Array) -> Array | None:
+    """argmin 1/2 u' H u + g' u, low <= rows u <= high, to rounding; None where nothing keeps the bounds.
+
+    A least distance problem by non-negative least squares (Lawson and Hanson, Solving least squares problems, 23.4), of
+    the bounds that the free minimum breaks, then of those that the answer breaks too.
+    """
+    factor = cholesky(hessian, lower=True)
+    free: Array = cho_solve((factor, True), -gradient)
+    bounds, ends = np.concatenate([rows, -rows]), np.concatenate([low, -high])
+    best, asked = free, np.zeros(len(ends), bool)
+    while (broken := (bounds @ best < ends - WITHIN) & ~asked).any():
+        asked |= broken
+        sides = solve_triangular(factor, bounds[asked].T, lower=True)
+        scale = np.linalg.norm(sides, axis=0)
+        if not scale.all():
+            return None
+        told = np.concatenate([sides, (ends - bounds @ free)[None, asked]]) / scale
+        weights, _ = nnls(told, np.eye(len(told))[-1])
+        left = told @ weights
+        if 1.0 - left[-1] < WITHIN:
+            return None
+        best = free + solve_triangular(factor.T, left[:-1] / (1.0 - left[-1]), lower=False)
+    return best

@@ -9,6 +9,7 @@ from factory.config.datasets import reader_settings
 from factory.config.run import VocabularyChoice, own_settings, refuse_missing_root
 from factory.config.shapes import deep_merge, defaults_of
 from planners.drive.loop import LoopSettings
+from planners.drive.mpc import ControllerName
 from planners.evaluation.planner_names import compose_with_planner
 from tasks.render.settings import RenderSettings
 from tasks.settings import PdmSettings, PerturbSettings, TrafficSettings
@@ -31,6 +32,7 @@ class DriveSettings:
     logged: bool = True  # drive from the log at T
     perturbed: int = 0  # drive from so many candidates of each clip too, at T+H
     seconds: float = 5.5  # of the log, that are driven
+    controller: ControllerName = "linear"  # AlpaSim's, that follows plans; its board has nonlinear
     films: int | Literal["none", "all"] = "none"  # or n for one drive in n: MP4 files under out/films
     out: str = "drives"  # folder or URL; the same command on it drives what is not driven yet
     cache: str | None = None  # folder of scenes, such as a run's out/cache; null: out/cache
@@ -67,7 +69,7 @@ class DriveSettings:
     @property
     def rules(self) -> LoopSettings:
         """What every drive depends on."""
-        return LoopSettings(self.seconds, self.traffic)
+        return LoopSettings(self.seconds, self.controller, self.traffic)
 
     @property
     def one_film_in(self) -> int:

@@ -182,7 +182,7 @@ class DriveWork:
         found: dict[str, Any] = {
             "drive": DRIVE_VERSION,
             "stages": stage_versions(),
-            "loop": {"seconds": s.seconds},
+            "loop": {"seconds": s.seconds, "controller": s.controller},
             "traffic": traffic_record(s.traffic),
         }
         if start != LOGGED:

@@ -3,10 +3,11 @@
     git clone https://github.com/NVlabs/alpasim && cd alpasim && git checkout 9177bd0
     git show 6f1029c:src/eval/src/eval/scorers/ground_truth.py > october_ground_truth.py
     git show 6f1029c:src/eval/src/eval/aggregation/scene_score.py > october_scene_score.py
+    pip install do_mpc==5.1.2 casadi==3.8.2
     python -m tests.planners.drive.alpasim_judge alpasim > tests/planners/drive/alpasim_judged.json
 
-AlpaSim's scorers and
-aggregation run as they are; stand-ins here are its Rust trajectory (float32, as there) and trajdata's map.
+AlpaSim's scorers, aggregation and controllers run as they are; stand-ins here are its Rust trajectory (float32, as
+there) and trajdata's map.
 """
 
 import json
@@ -238,29 +239,52 @@ def judged(alpasim: Path, october: bool) -> list[dict[str, Any]]:
 
 
 def followed() -> list[dict[str, Any]]:
-    """Cars, plans at 0.1 s steps, and where AlpaSim's linear MPC and vehicle model lead in 0.5 s (5, 3)."""
-    from alpasim_controller.mpc_controller import ControllerInput
+    """Cars, plans at 0.1 s steps, and where AlpaSim's linear MPC and vehicle model lead in 0.5 s."""
     from alpasim_controller.mpc_impl.linear_mpc import LinearMPC
-    from alpasim_controller.vehicle_model import VehicleModel
-
-    from tasks.world.frames import to_local, to_world
 
     rng, told, time = np.random.default_rng(2), [], 0.1 * np.arange(26)
     for speed in (0.0, 2.0, 4.5, 5.5, 9.0, 14.0):
         along = max(speed, 1.0) * time * rng.uniform(0.7, 1.2) + rng.normal(0.0, 0.5) * time**2
         bend = rng.normal(0.0, 0.01)
-        plan = np.round(64 * np.stack([along, bend * along**2 / 2.0, bend * along], axis=1)) / 64
-        model = VehicleModel(np.array([speed, 0.0]), 0.02 * speed)
-        controller, pose, poses, car = LinearMPC(), np.zeros(3), [], model.state.tolist()
-        for step in range(5):
-            model.reset_origin()
-            reference = of_poses(100_000 * np.arange(26), to_local(pose, plan))
-            asked = ControllerInput(model.state.copy(), reference, 100_000 * step)
-            moved = model.advance(controller.compute_control(asked).control, 0.1)
-            pose = to_world(pose, np.array([*moved.vec3[:2], moved.yaw()], float))
-            poses.append(np.round(pose, 9).tolist())
-        told.append({"car": car, "plan": plan[1:].tolist(), "poses": poses})
+        told.append(_followed(LinearMPC(), speed, np.stack([along, bend * along**2 / 2.0, bend * along], axis=1), 5))
     return told
+
+
+def followed_by_nonlinear() -> list[dict[str, Any]]:
+    """The same of its nonlinear MPC, for up to 3 s: across 5 m/s, into a stop, and round bends up to its bounds."""
+    from alpasim_controller.mpc_impl.nonlinear_mpc import NonlinearMPC
+
+    told, time = [], 0.1 * np.arange(60)
+    for speed, accel, bend, steps in (
+        *((0.0, 1.5, 1e-9, 20), (2.0, 0.5, 0.02, 5), (4.5, 0.8, -0.01, 10), (5.5, -0.6, 0.03, 10), (9.0, 0.5, 0.01, 5)),
+        *((14.0, -1.0, -0.004, 5), (6.0, -3.0, 1e-9, 30), (1.0, -0.5, 1e-9, 20), (7.0, 0.0, 0.05, 10)),
+        *((4.0, 0.0, 0.125, 15), (3.0, 0.0, -0.2, 15), (11.0, -4.0, 0.002, 10)),
+    ):
+        driven = np.minimum(time, -speed / accel) if accel < 0.0 else time
+        turned = bend * (speed * driven + accel / 2.0 * driven**2)
+        plan = np.stack([np.sin(turned) / bend, (1.0 - np.cos(turned)) / bend, turned], axis=1)
+        told.append(_followed(NonlinearMPC(), speed, plan, steps))
+    return told
+
+
+def _followed(controller: Any, speed: float, plan: Any, steps: int) -> dict[str, Any]:
+    """plan: x, y, heading, the first where the car is."""
+    from alpasim_controller.mpc_controller import ControllerInput
+    from alpasim_controller.vehicle_model import VehicleModel
+
+    from tasks.world.frames import to_local, to_world
+
+    plan, pose, poses = np.round(64 * plan) / 64, np.zeros(3), []
+    model = VehicleModel(np.array([speed, 0.0]), 0.02 * speed)
+    car = model.state.tolist()
+    for step in range(steps):
+        model.reset_origin()
+        reference = of_poses(100_000 * np.arange(len(plan)), to_local(pose, plan))
+        asked = ControllerInput(model.state.copy(), reference, 100_000 * step)
+        moved = model.advance(controller.compute_control(asked).control, 0.1)
+        pose = to_world(pose, np.array([*moved.vec3[:2], moved.yaw()], float))
+        poses.append(np.round(pose, 9).tolist())
+    return {"car": car, "plan": plan[1:].tolist(), "poses": poses}
 
 
 def main() -> None:
@@ -274,7 +298,8 @@ def main() -> None:
         columns = {name: round(new["metrics"][name], 9) for name in COLUMNS}
         columns |= {name: round(old["metrics"][name], 9) for name in JULY}
         told.append(given | {"columns": columns, "score": new["score"], "score_july": old["score"]})
-    print(json.dumps({"scored": told, "followed": followed()}, separators=(",", ":")))
+    by_both = {"followed": followed(), "followed_by_nonlinear": followed_by_nonlinear()}
+    print(json.dumps({"scored": told, **by_both}, separators=(",", ":")))
 
 
 if __name__ == "__main__":

@@ -106,8 +106,9 @@ def test_other_settings_are_other_drives(towns: Path, tmp_path: Path) -> None:
         BAD_CONFIG,
     )
     n_before = len(rows(tmp_path))
-    assert main(words(towns, tmp_path, "limit=1", "seconds=2")) == COMPLETE
-    assert len(rows(tmp_path)) == n_before + 1
+    for other in ("seconds=2", "controller=nonlinear"):
+        assert main(words(towns, tmp_path, "limit=1", other)) == COMPLETE
+    assert len(rows(tmp_path)) == n_before + 2
 
 
 def test_of_some_logs_alone(towns: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -56,6 +56,18 @@ def test_pdm_closed_keeps_clear_of_who_stands_ahead() -> None:
     assert made.ego_states[-1, X] + PACIFICA.front_length < 50.0 - 2.3
 
 
+def test_drives_of_the_nonlinear_controller_are_their_own_and_each_begins_anew() -> None:
+    """A plan at 4 m/s of a car at 8: the linear one brakes otherwise."""
+    nonlinear = replace(LONG, controller="nonlinear")
+    first, again, linear = (
+        drive(start_on(street_with(nobody()), settings), Steady(4.0), settings)
+        for settings in (nonlinear, nonlinear, LONG)
+    )
+    assert first.ego_states.tobytes() == again.ego_states.tobytes()
+    assert 0.01 < np.abs(first.ego_states - linear.ego_states)[:, X].max() < 5.0
+    assert first.ego_states[-1, VX] == pytest.approx(4.0, abs=0.05)
+
+
 def test_from_a_perturbed_start_the_plans_are_followed_at_once() -> None:
     """From the log its first 0.5 s at 8 m/s are driven whatever is planned."""
     start = start_on(street_with(nobody()), LONG)

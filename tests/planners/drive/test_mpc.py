@@ -1,13 +1,26 @@
-"""AlpaSim's MPC against closed forms, a slow twin, and what AlpaSim's own does."""
+"""AlpaSim's two MPCs against closed forms, slow twins, and what AlpaSim's own do."""
 
 import json
 from pathlib import Path
 
 import numpy as np
+import osqp
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.sparse import csc_matrix
 
 from planners.drive import mpc
-from planners.drive.mpc import advanced, best_command, car_that_moves, follow, linearised
+from planners.drive.mpc import (
+    NonlinearController,
+    advanced,
+    car_that_moves,
+    controller_of,
+    derivative,
+    follow,
+    jacobians,
+    linear_command,
+    linearised,
+)
 from tasks.world.frames import VX, YAW_RATE, to_world
 
 JUDGED = json.loads((Path(__file__).parent / "alpasim_judged.json").read_text())
@@ -24,22 +37,25 @@ def straight(speed: float) -> np.ndarray:
     return np.column_stack([speed * TIMES, np.zeros((40, 2))])
 
 
+@pytest.mark.parametrize("controller", ["linear", "nonlinear"])
 @pytest.mark.parametrize("speed", [0.0, 3.0, 8.0, 25.0])
-def test_a_straight_plan_at_the_car_s_own_speed_is_followed_exactly(speed: float) -> None:
-    _, states = follow(moving(speed), straight(speed), 5)
+def test_a_straight_plan_at_the_car_s_own_speed_is_followed_exactly(speed: float, controller: str) -> None:
+    _, states = follow(moving(speed), straight(speed), 5, controller_of(controller))
     np.testing.assert_allclose(
         states[:, :4], np.column_stack([speed * TIMES[:5], *np.zeros((2, 5)), [speed] * 5]), atol=1e-9
     )
 
 
-def test_only_what_lies_a_second_and_more_ahead_is_looked_at() -> None:
+@pytest.mark.parametrize("controller", ["linear", "nonlinear"])
+def test_only_what_lies_a_second_and_more_ahead_is_looked_at(controller: str) -> None:
     """Of the plan's instants 0.1 .. 0.9 s and from 2.5 s on none is, over five steps of 0.1 s."""
     plan = straight(8.0)
-    expected = follow(moving(6.0), plan, 5)[1]
+    expected = follow(moving(6.0), plan, 5, controller_of(controller))[1]
     for instants, same in ((slice(0, 9), True), (slice(24, 40), True), (slice(9, 10), False), (slice(23, 24), False)):
         other = plan.copy()
         other[instants] += 1.0, 2.0, 0.5
-        assert (follow(moving(6.0), other, 5)[1].tobytes() == expected.tobytes()) == same, instants
+        found = follow(moving(6.0), other, 5, controller_of(controller))[1]
+        assert (found.tobytes() == expected.tobytes()) == same, instants
 
 
 @pytest.mark.parametrize("case", JUDGED["followed"], ids=lambda case: f"{case['car'][3]} m/s")
@@ -47,6 +63,13 @@ def test_it_drives_as_alpasim_s_own(case: dict[str, list[float]]) -> None:
     """Its solver stops at 1e-4 and its poses are float32."""
     _, states = follow(np.array(case["car"]), np.array(case["plan"]), 5)
     np.testing.assert_allclose(states[:, :3], case["poses"], atol=2e-4)
+
+
+@pytest.mark.parametrize("case", JUDGED["followed_by_nonlinear"], ids=lambda case: f"{case['car'][3]} m/s")
+def test_the_nonlinear_one_drives_as_alpasim_s_own(case: dict[str, list[float]]) -> None:
+    """Across 5 m/s, where the model changes, into a stop, and where heading and speed reach their bounds."""
+    _, states = follow(np.array(case["car"]), np.array(case["plan"]), len(case["poses"]), NonlinearController())
+    np.testing.assert_allclose(states[:, :3], case["poses"], atol=1e-5)
 
 
 @pytest.mark.parametrize("speed", [2.0, 7.0])
@@ -60,7 +83,7 @@ def test_no_other_commands_cost_less_by_the_model_stepped_one_by_one(
     asked: list[np.ndarray] = []
     solve = mpc._minimum
     monkeypatch.setattr(mpc, "_minimum", lambda *question: asked.append(solve(*question)) or asked[-1])
-    best_command(car, ahead)
+    linear_command(car, ahead)
     step, pushed = linearised(car)
 
     def cost(commands: np.ndarray) -> float:
@@ -76,6 +99,76 @@ def test_no_other_commands_cost_less_by_the_model_stepped_one_by_one(
     best = asked[0].reshape(20, 2)
     for _ in range(50):
         assert cost(best + rng.normal(0.0, 1e-3, best.shape)) > cost(best)
+
+
+@pytest.mark.parametrize("speed", [3.0, 7.0])
+def test_no_other_commands_cost_the_nonlinear_one_less_by_the_model_integrated(speed: float) -> None:
+    """By another integrator, to a tolerance that is far finer than what the commands beside the best ones cost more."""
+    car = moving(speed)
+    car[[mpc.VY, mpc.YAW_RATE, mpc.STEERING, mpc.ACCEL]] = 0.05, 0.04, 0.03, -0.3
+    ahead = np.column_stack([speed * TIMES[:20] + 0.3, 0.05 * TIMES[:20] ** 2, 0.01 * TIMES[:20]])
+    controller, driven = NonlinearController(), np.array([0.1, -0.5])
+    controller._driven = driven
+    controller(car, ahead)
+
+    def cost(commands: np.ndarray) -> float:
+        state, total = car, 0.0
+        for k, command in enumerate(commands):
+            before = commands[k - 1] if k else driven
+            total += 5.0 * (command[0] - before[0]) ** 2 + (command[1] - before[1]) ** 2
+            told = solve_ivp(lambda _, now: derivative(now, command), (0.0, 0.1), state, rtol=1e-9, atol=1e-9)  # noqa: B023
+            state = told.y[:, -1]
+            if k + 1 >= 10:
+                error = state[:3] - ahead[k]
+                total += 2.0 * error[0] ** 2 + error[1] ** 2 + error[2] ** 2 + 0.1 * state[mpc.ACCEL] ** 2
+        return float(total)
+
+    rng, best = np.random.default_rng(0), controller._commands
+    least = cost(best)
+    for _ in range(10):
+        assert cost(best + rng.normal(0.0, 2e-2, best.shape)) > least
+
+
+def test_derivatives_change_with_the_state_as_their_differences_say() -> None:
+    rng = np.random.default_rng(3)
+    cars = rng.normal(0.0, [5.0, 5.0, 1.0, 0.0, 0.5, 0.3, 0.2, 1.0], (40, 8))
+    cars[:, VX] = rng.uniform(0.0, 12.0, 40)
+    cars = cars[np.abs(cars[:, VX] - 5.0) > 1e-3]
+    for car, told in zip(cars, jacobians(cars)):
+        for state, slope in enumerate(told.T):
+            beside = 1e-6 * np.eye(8)[state]
+            found = (derivative(car + beside, np.zeros(2)) - derivative(car - beside, np.zeros(2))) / 2e-6
+            np.testing.assert_allclose(slope, found, atol=1e-6, rtol=1e-6, err_msg=f"{state} of {car}")
+
+
+def test_bounds_are_kept_at_the_least_cost() -> None:
+    """Random problems by another solver; those without an answer have none."""
+    rng, without = np.random.default_rng(4), 0
+    for _ in range(40):
+        half, rows = rng.normal(size=(4, 4)), rng.normal(size=(5, 4))
+        hessian, gradient = half @ half.T + 0.1 * np.eye(4), rng.normal(size=4)
+        low = rng.uniform(-1.0, 0.5, 5)
+        high = low + rng.uniform(0.0, 1.0, 5)
+        found = mpc._minimum(hessian, gradient, rows, low, high)
+        solver = osqp.OSQP()
+        solver.setup(
+            csc_matrix(np.triu(hessian)),
+            gradient,
+            csc_matrix(rows),
+            low,
+            high,
+            verbose=False,
+            eps_abs=1e-9,
+            eps_rel=1e-9,
+        )
+        told = solver.solve(raise_error=False)
+        assert told.info.status == ("primal infeasible" if found is None else "solved")
+        if found is None:
+            without += 1
+            continue
+        assert (rows @ found >= low - 1e-8).all() and (rows @ found <= high + 1e-8).all()
+        np.testing.assert_allclose(found, told.x, atol=1e-5)
+    assert 0 < without < 20
 
 
 @pytest.mark.parametrize("speed", [4.0, 12.0])
