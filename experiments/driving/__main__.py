@@ -3,8 +3,8 @@
     python -m experiments.driving nuscenes_front=<folder> out=runs/driving
 
 Makes samples of 48 towns, trains `ltf_small` on the real ones and on these and simulated ones, fits the scenes that are
-driven in, and drives: all in one process, then renderer, runtime and driver apart, whose rows must be the same to the
-bit. Prints what README.md has. What is done is not done again.
+driven in, and drives: all in one process, by both controllers, then renderer, runtime and driver apart, whose rows must
+be the same to the bit. Prints what README.md has. What is done is not done again.
 """
 
 import os
@@ -21,7 +21,7 @@ from typing import Any
 from deltalake import DeltaTable
 
 ALONE = os.environ | {"OMP_NUM_THREADS": "1"}  # a plan's rounding depends on how many threads make it
-STEPS, SEEDS = 3000, 1
+STEPS, SEEDS = 3000, 2
 PICTURES = "render.frames=now render.width=256 render.height=144 vocabulary.k=16384"
 BLIND = "clips=synthetic_towns clips.settings.cameras=[] clips.settings.lidar_beams=0"
 SAMPLES = (
@@ -142,7 +142,8 @@ def main(argv: Sequence[str]) -> None:
         run("factory.run", *clips.split(), *SCENES.split(), *FITS[where].split(), "executor=local", f"out={scenes}")
         words = (*clips.split(), *PICTURES.split(), "pictures=[renderer]")
         labels = ", ".join(f"{name}: {spec}" for name, spec in (GO_STRAIGHT | trained).items())
-        run("planners drive", *words, f"renderer={scenes}", f"planners={{{labels}}}", f"out={here}")
+        for more in ((f"out={here}",), ("controller=nonlinear", f"out={here}_nonlinear")):
+            run("planners drive", *words, f"renderer={scenes}", f"planners={{{labels}}}", *more)
         for name, folder in trained.items():
             costs = drive_apart(words, scenes, folder, out / f"{where}_wire_{name}")
             same = same_to_the_bit(rows(here, name), rows(out / f"{where}_wire_{name}"))

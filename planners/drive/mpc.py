@@ -308,7 +308,7 @@ def _errors(states: Array, response: Array, ahead: Array) -> tuple[Array, Array]
 
 
 def _minimum(hessian: Array, gradient: Array, rows: Array, low: Array, high: Array) -> Array | None:
-    """argmin 1/2 u' H u + g' u, low <= rows u <= high, to rounding; None where nothing keeps the bounds.
+    """argmin 1/2 u' H u + g' u, low <= rows u <= high, to rounding; None where nothing that is found keeps the bounds.
 
     A least distance problem by non-negative least squares (Lawson and Hanson, Solving least squares problems, 23.4), of
     the bounds that the free minimum breaks, then of those that the answer breaks too.
@@ -324,7 +324,10 @@ def _minimum(hessian: Array, gradient: Array, rows: Array, low: Array, high: Arr
         if not scale.all():
             return None
         told = np.concatenate([sides, (ends - bounds @ free)[None, asked]]) / scale
-        weights, _ = nnls(told, np.eye(len(told))[-1])
+        try:
+            weights, _ = nnls(told, np.eye(len(told))[-1])
+        except RuntimeError:  # it goes round in circles: no command then, as where AlpaSim's solvers fail
+            return None
         left = told @ weights
         if 1.0 - left[-1] < WITHIN:
             return None

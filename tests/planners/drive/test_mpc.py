@@ -171,6 +171,20 @@ def test_bounds_are_kept_at_the_least_cost() -> None:
     assert 0 < without < 20
 
 
+@pytest.mark.parametrize("controller", ["linear", "nonlinear"])
+def test_without_a_solution_there_is_no_command(controller: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether bounds exclude each other or the solver gives up."""
+    car, stand = moving(12.0), np.zeros((20, 3))
+    assert controller_of(controller)(car, stand)[1] < -7.0
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            mpc, "nnls", lambda *_: (_ for _ in ()).throw(RuntimeError("Maximum number of iterations reached."))
+        )
+        assert not controller_of(controller)(car, stand).any()
+    monkeypatch.setattr(mpc, "COMMAND_HIGH", np.array([2.0, -9.5]))
+    assert not controller_of(controller)(car, stand).any()
+
+
 @pytest.mark.parametrize("speed", [4.0, 12.0])
 def test_the_linear_model_is_the_car_s_own_near_straight_on(speed: float) -> None:
     car, command = moving(speed), np.array([1e-4, 1e-3])
