@@ -10,7 +10,7 @@ from planners.ab.report import write_report
 
 ROOT = Path(__file__).parents[3]
 KEPT = ROOT / "experiments" / "ab"
-PARTS = ("towns", "acceleration", "drives", "drives_acceleration", "drives_parts", "looking")
+PARTS = ("towns", "acceleration", "drives", "drives_acceleration", "looking")
 
 
 def differences(part: str, against: str = "real") -> dict[tuple[str, str], dict[str, str]]:
