@@ -24,7 +24,7 @@ from scipy.optimize import nnls
 from tasks.world import frames
 from tasks.world.arrays import Array
 from tasks.world.clip import STEP_S
-from tasks.world.frames import EGO_STATE_SIZE, to_local
+from tasks.world.frames import EGO_STATE_SIZE, to_local, wrap_angle
 
 # The car, a Ford Fusion: masses [kg], lengths [m], stiffnesses [N/rad].
 MASS, INERTIA, WHEELBASE, REAR_TO_CG = 2014.4, 3414.2, 2.85, 1.59
@@ -196,7 +196,7 @@ def linear_command(car: Array, ahead: Array) -> Array:
     now = _at_origin(car)
     step, pushed = linearised(now)
     free, response = _unrolled(now, [step] * HORIZON, [pushed] * HORIZON, [0.0] * HORIZON)
-    hessian, gradient = _errors(free, response, ahead)
+    hessian, gradient = _cost(_errors(free, ahead), response)
     hessian += np.diag(np.tile(COMMAND_WEIGHTS, HORIZON) + REGULARISATION)
     rows = np.concatenate([np.eye(HORIZON * N_COMMANDS), response[:, BOUNDED].reshape(-1, HORIZON * N_COMMANDS)])
     offset = np.concatenate([np.zeros(HORIZON * N_COMMANDS), free[:, BOUNDED].ravel()])
@@ -233,7 +233,9 @@ class NonlinearController:
         """Of commands (20, 2) and states (20, 2, 8) at Radau's points, to the best of what is linear around them."""
         free, response = _collocated(now, commands, states)
         reached = states.reshape(HORIZON, -1) + free
-        hessian, gradient = _errors(reached[:, N_STATES:], response[:, N_STATES:], ahead)
+        errors = _errors(reached[:, N_STATES:], ahead)
+        errors[:, YAW] = wrap_angle(errors[:, YAW])  # which the linear one does not
+        hessian, gradient = _cost(errors, response[:, N_STATES:])
         weights = np.tile(COMMAND_WEIGHTS, HORIZON)
         changes = DIFFERENCES @ commands.ravel() - np.concatenate([self._driven, np.zeros(commands.size - N_COMMANDS)])
         hessian += DIFFERENCES.T @ (weights[:, None] * DIFFERENCES)
@@ -298,11 +300,16 @@ def _unrolled(state: Array, steps: Any, pushes: Any, added: Any) -> tuple[Array,
     return np.stack(free), np.stack(response)
 
 
-def _errors(states: Array, response: Array, ahead: Array) -> tuple[Array, Array]:
-    """Hessian (40, 40) and gradient (40,), halved, of the errors that count of states (20, 8) and their response."""
-    errors, moved = states[FIRST_COUNTED - 1 :].copy(), response[FIRST_COUNTED - 1 :]  # row k is k + 1 steps ahead
-    errors[:, : YAW + 1] -= ahead[FIRST_COUNTED - 1 :]
-    errors[:, YAW] = (errors[:, YAW] + math.pi) % (2.0 * math.pi) - math.pi
+def _errors(states: Array, ahead: Array) -> Array:
+    """(20, 8) of states (20, 8) from where the plan is (20, 3)."""
+    errors = states.copy()
+    errors[:, : YAW + 1] -= ahead
+    return errors
+
+
+def _cost(errors: Array, response: Array) -> tuple[Array, Array]:
+    """Hessian (40, 40) and gradient (40,), halved, of the errors (20, 8) that count, by their response (20, 8, 40)."""
+    errors, moved = errors[FIRST_COUNTED - 1 :], response[FIRST_COUNTED - 1 :]  # row k is k + 1 steps ahead
     hessian = np.einsum("kaz,a,kay->zy", moved, WEIGHTS, moved, optimize=True)
     return hessian, np.einsum("kaz,a,ka->z", moved, WEIGHTS, errors, optimize=True)
 

@@ -171,6 +171,17 @@ def test_bounds_are_kept_at_the_least_cost() -> None:
     assert 0 < without < 20
 
 
+def test_only_the_nonlinear_one_takes_a_heading_for_the_same_a_turn_further() -> None:
+    """AlpaSim's wraps the error of the heading there alone."""
+    ahead = np.column_stack([7.0 * TIMES[:20], 0.1 * TIMES[:20], 0.05 * TIMES[:20]])
+    once, again = (
+        [controller_of(name)(moving(7.0), ahead + turn) for turn in ([0.0, 0.0, 0.0], [0.0, 0.0, 2.0 * np.pi])]
+        for name in ("nonlinear", "linear")
+    )
+    np.testing.assert_allclose(once[0], once[1], atol=1e-9)
+    assert np.abs(again[0] - again[1]).max() > 0.1
+
+
 @pytest.mark.parametrize("controller", ["linear", "nonlinear"])
 def test_without_a_solution_there_is_no_command(controller: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether bounds exclude each other or the solver gives up."""
