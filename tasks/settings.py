@@ -167,8 +167,6 @@ class FeasibleSettings:
     weight_heading: float = 10.0  # w_h
     weight_yaw_accel: float = 0.1  # w_u
     weight_end: float = 10.0  # as many times do the last 0.3 s count
-    max_iterations: int = 4000  # of a QP
-    tolerance: float = 1e-4  # of a QP
 
 
 FEASIBLE_DEFAULTS = FeasibleSettings()

@@ -42,7 +42,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("clip", 5, "clip", ("ego_standing", "broken_tracks", "route_ended", "no_earlier_frame")),
     Stage("perturb", 3, "clip", ("no_gated_candidate", "no_good_candidate")),
     Stage("rollout", 4, "attempt", ("route_ended",)),
-    Stage("expert", 2, "attempt", ("no_plan", "out_of_reach")),
+    Stage("expert", 3, "attempt", ("no_plan", "out_of_reach")),
     Stage("reward", 2, "attempt", (*SUBSCORES, *END_FAULTS, NEAR_LOG, NOT_RECOVERED)),
     Stage("render", 15, "attempt", ("psnr", *PICTURE_FAULTS)),
     Stage("write", 6, "attempt", ()),

@@ -23,7 +23,17 @@ FORBIDDEN = {
 ROOMS = {
     "tasks": (
         *("caches", "subscores", "stages", "settings", "kernels", "world", "rollout", "reward"),
-        *("experts", "perturb", "attempt", "hard_scenes", "trajectories", "bank_traffic", "bank", "bank_tensors"),
+        *(
+            "quadratic",
+            "experts",
+            "perturb",
+            "attempt",
+            "hard_scenes",
+            "trajectories",
+            "bank_traffic",
+            "bank",
+            "bank_tensors",
+        ),
         *("render.settings", "render.splatting", "render.scene", "render.rig", "render.fit", "render"),
     ),
     "factory": (
@@ -164,7 +174,7 @@ def test_a_run_in_this_process_needs_no_ray() -> None:
 
 
 def test_importing_the_science_needs_numpy_only() -> None:
-    heavy = {"numba", "osqp", "cv2", "shapely", "scipy", "torch", "ray", "pyarrow", "hydra"}
+    heavy = {"numba", "daqp", "cv2", "shapely", "scipy", "torch", "ray", "pyarrow", "hydra"}
     assert not loaded_by("import tasks, tasks.world.clip, tasks.stages") & heavy
 
 

@@ -18,9 +18,9 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky, expm, solve_triangular
-from scipy.optimize import nnls
+from scipy.linalg import expm
 
+from tasks.quadratic import minimum
 from tasks.world import frames
 from tasks.world.arrays import Array
 from tasks.world.clip import STEP_S
@@ -46,7 +46,6 @@ COMMAND_WEIGHTS = np.array([5.0, 1.0])
 REGULARISATION = 1e-6
 DIFFERENCES = np.eye(HORIZON * N_COMMANDS) - np.eye(HORIZON * N_COMMANDS, k=-N_COMMANDS)  # of a command to the next
 COMMAND_LOW, COMMAND_HIGH = np.array([-2.0, -9.0]), np.array([2.0, 6.0])
-WITHIN = 1e-9  # of a bound that counts as kept
 
 # Of states, (BOUNDED,) each: of the linear problem, and of the nonlinear one.
 BOUNDED = (YAW, VX, STEERING, ACCEL)
@@ -198,12 +197,12 @@ def linear_command(car: Array, ahead: Array) -> Array:
     free, response = _unrolled(now, [step] * HORIZON, [pushed] * HORIZON, [0.0] * HORIZON)
     hessian, gradient = _cost(_errors(free, ahead), response)
     hessian += np.diag(np.tile(COMMAND_WEIGHTS, HORIZON) + REGULARISATION)
-    rows = np.concatenate([np.eye(HORIZON * N_COMMANDS), response[:, BOUNDED].reshape(-1, HORIZON * N_COMMANDS)])
+    rows = response[:, BOUNDED].reshape(-1, HORIZON * N_COMMANDS)
     offset = np.concatenate([np.zeros(HORIZON * N_COMMANDS), free[:, BOUNDED].ravel()])
     low = np.concatenate([np.tile(COMMAND_LOW, HORIZON), np.tile(LOW, HORIZON)]) - offset
     high = np.concatenate([np.tile(COMMAND_HIGH, HORIZON), np.tile(HIGH, HORIZON)]) - offset
-    best = _minimum(hessian, gradient, rows, low, high)
-    return np.zeros(N_COMMANDS) if best is None else best[:N_COMMANDS]
+    best = minimum(hessian, gradient, rows, low, high)
+    return np.zeros(N_COMMANDS) if isinstance(best, str) else best[:N_COMMANDS]
 
 
 class NonlinearController:
@@ -245,8 +244,12 @@ class NonlinearController:
         offset = np.concatenate([commands.ravel(), reached[:-1, bounded].ravel()])
         low = np.concatenate([np.tile(COMMAND_LOW, HORIZON), np.tile(LOW_NONLINEAR, 2 * HORIZON - 2)]) - offset
         high = np.concatenate([np.tile(COMMAND_HIGH, HORIZON), np.tile(HIGH_NONLINEAR, 2 * HORIZON - 2)]) - offset
-        best = _minimum(hessian, gradient, np.concatenate([np.eye(commands.size), rows]), low, high)
-        return None if best is None else (best.reshape(commands.shape), (free + response @ best).reshape(states.shape))
+        best = minimum(hessian, gradient, rows, low, high)
+        return (
+            None
+            if isinstance(best, str)
+            else (best.reshape(commands.shape), (free + response @ best).reshape(states.shape))
+        )
 
 
 def controller_of(name: ControllerName) -> Controller:
@@ -312,31 +315,3 @@ def _cost(errors: Array, response: Array) -> tuple[Array, Array]:
     errors, moved = errors[FIRST_COUNTED - 1 :], response[FIRST_COUNTED - 1 :]  # row k is k + 1 steps ahead
     hessian = np.einsum("kaz,a,kay->zy", moved, WEIGHTS, moved, optimize=True)
     return hessian, np.einsum("kaz,a,ka->z", moved, WEIGHTS, errors, optimize=True)
-
-
-def _minimum(hessian: Array, gradient: Array, rows: Array, low: Array, high: Array) -> Array | None:
-    """argmin 1/2 u' H u + g' u, low <= rows u <= high, to rounding; None where nothing that is found keeps the bounds.
-
-    A least distance problem by non-negative least squares (Lawson and Hanson, Solving least squares problems, 23.4), of
-    the bounds that the free minimum breaks, then of those that the answer breaks too.
-    """
-    factor = cholesky(hessian, lower=True)
-    free: Array = cho_solve((factor, True), -gradient)
-    bounds, ends = np.concatenate([rows, -rows]), np.concatenate([low, -high])
-    best, asked = free, np.zeros(len(ends), bool)
-    while (broken := (bounds @ best < ends - WITHIN) & ~asked).any():
-        asked |= broken
-        sides = solve_triangular(factor, bounds[asked].T, lower=True)
-        scale = np.linalg.norm(sides, axis=0)
-        if not scale.all():
-            return None
-        told = np.concatenate([sides, (ends - bounds @ free)[None, asked]]) / scale
-        try:
-            weights, _ = nnls(told, np.eye(len(told))[-1])
-        except RuntimeError:  # it goes round in circles: no command then, as where AlpaSim's solvers fail
-            return None
-        left = told @ weights
-        if 1.0 - left[-1] < WITHIN:
-            return None
-        best = free + solve_triangular(factor.T, left[:-1] / (1.0 - left[-1]), lower=False)
-    return best

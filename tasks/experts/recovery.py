@@ -19,10 +19,9 @@ from dataclasses import dataclass, field
 from functools import cache, cached_property
 
 import numpy as np
-import osqp
-from scipy import sparse
 
 from tasks.experts.protocol import Goal, Plan
+from tasks.quadratic import minimum
 from tasks.settings import FEASIBLE_DEFAULTS, FeasibleSettings, RecoverySettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Ints
@@ -58,12 +57,14 @@ N = HORIZON_STEPS
 T_S: Array = STEP_S * np.arange(1, N + 1, dtype=np.float64)
 END_STEPS = 3  # that decide where and how fast a trajectory ends
 SLOW_MPS = 0.5  # limits that divide by the speed stop growing below it
+TO_CURVATURE: Array = STEP_S * np.tril(np.ones((N, N)))  # from its rates to what they add to it after each step
+HALF_SUM: Array = np.eye(N) / 2.0 + np.eye(N, k=-1) / 2.0  # mean of a step's two ends, without the start's part
 
 
 def make_feasible(trajectory: Array, ego_state: Array, settings: FeasibleSettings = FEASIBLE_DEFAULTS) -> Array | str:
     """The nearest drivable trajectory (40, 3) to `trajectory` (40, 3), both in the frame of `ego_state` (11,).
 
-    Returns the reason as text where a QP does not reach the tolerance within its iterations.
+    Returns the reason as text where a QP has no solution.
     """
     reference = np.concatenate([np.zeros((1, 3)), trajectory])
     heading = np.unwrap(reference[:, 2])
@@ -123,49 +124,35 @@ def _along(wanted: Array, speed0: float, accel0: float, settings: FeasibleSettin
     high_accel = np.maximum(settings.accel_max_mps2, released)
     weight = settings.weight_progress * _at_the_end(settings)
     hessian, rows = _along_matrices(settings)
-    jerk = _solve(
-        hessian=hessian,
+    jerk = minimum(
+        hessian,
         gradient=to_distance.T @ (weight[:, 0] * (free_distance - wanted)),
         rows=rows,
-        low=np.concatenate([low_speed - free_speed, low_accel - accel0, np.full(N, -settings.jerk_max_mps3)]),
-        high=np.concatenate([np.full(N, np.inf), high_accel - accel0, np.full(N, settings.jerk_max_mps3)]),
-        settings=settings,
-        what="longitudinal",
+        low=np.concatenate([np.full(N, -settings.jerk_max_mps3), low_speed - free_speed, low_accel - accel0]),
+        high=np.concatenate([np.full(N, settings.jerk_max_mps3), np.full(N, np.inf), high_accel - accel0]),
     )
     if isinstance(jerk, str):
-        return jerk
+        return f"longitudinal QP: {jerk}"
     distance = np.concatenate([[0.0], free_distance + to_distance @ jerk])
     speed = np.concatenate([[speed0], free_speed + to_speed @ jerk])
     return distance, speed
 
 
 @cache
-def _along_matrices(settings: FeasibleSettings) -> tuple[sparse.csc_matrix, sparse.csc_matrix]:
+def _along_matrices(settings: FeasibleSettings) -> tuple[Array, Array]:
     """(hessian, rows) of the problem along the path, wherever it starts."""
     to_accel, to_speed, to_distance = _integrators()
     weight = settings.weight_progress * _at_the_end(settings)
     hessian = to_distance.T @ (weight * to_distance) + settings.weight_jerk * np.eye(N)
-    return _upper(hessian), sparse.csc_matrix(np.concatenate([to_speed, to_accel, np.eye(N)]))
-
-
-@cache
-def _across_rows() -> sparse.csc_matrix:
-    """Of the problem across it."""
-    return sparse.csc_matrix(np.concatenate([STEP_S * np.tril(np.ones((N, N))), np.eye(N)]))
-
-
-def _upper(hessian: Array) -> sparse.csc_matrix:
-    return sparse.csc_matrix(np.triu(hessian))
+    return hessian, np.concatenate([to_speed, to_accel])
 
 
 def _across(wanted: Array, speed: Array, kappa0: float, settings: FeasibleSettings) -> Array | str:
     """Headings (41,) at 0 .. 4.0 s; `wanted` (41,) is the reference heading at the driven distance."""
     mean_speed = (speed[1:] + speed[:-1]) / 2.0
     step = mean_speed * STEP_S
-    to_kappa = STEP_S * np.tril(np.ones((N, N)))
-    half_sum = np.eye(N) / 2.0 + np.eye(N, k=-1) / 2.0  # mean of a step's two ends, without the start's part
-    to_heading = np.cumsum(step[:, None] * (half_sum @ to_kappa), axis=0)
-    to_lateral = np.cumsum(step[:, None] * (half_sum @ to_heading), axis=0)
+    to_heading = np.cumsum(step[:, None] * (HALF_SUM @ TO_CURVATURE), axis=0)
+    to_lateral = np.cumsum(step[:, None] * (HALF_SUM @ to_heading), axis=0)
     free_heading = np.cumsum(step * kappa0)
     wanted_mean = (wanted[1:] + wanted[:-1]) / 2.0
     start_half = np.concatenate([[0.0], free_heading[:-1]])
@@ -177,22 +164,18 @@ def _across(wanted: Array, speed: Array, kappa0: float, settings: FeasibleSettin
     bound = np.minimum(bound, settings.lateral_accel_max_mps2 / fast[1:] ** 2)
     bound = np.maximum(bound, abs(kappa0) - STEP_S * np.cumsum(rate))
     more = _at_the_end(settings)
-    change = _solve(
-        hessian=_upper(
-            to_lateral.T @ (settings.weight_lateral * more * to_lateral)
-            + to_heading.T @ (settings.weight_heading * more * to_heading)
-            + settings.weight_yaw_accel * np.diag(np.maximum(mean_speed, SLOW_MPS) ** 2)
-        ),
+    change = minimum(
+        hessian=to_lateral.T @ (settings.weight_lateral * more * to_lateral)
+        + to_heading.T @ (settings.weight_heading * more * to_heading)
+        + settings.weight_yaw_accel * np.diag(np.maximum(mean_speed, SLOW_MPS) ** 2),
         gradient=to_lateral.T @ (settings.weight_lateral * more[:, 0] * free_lateral)
         + to_heading.T @ (settings.weight_heading * more[:, 0] * (free_heading - wanted[1:])),
-        rows=_across_rows(),
-        low=np.concatenate([-bound - kappa0, -rate]),
-        high=np.concatenate([bound - kappa0, rate]),
-        settings=settings,
-        what="lateral",
+        rows=TO_CURVATURE,
+        low=np.concatenate([-rate, -bound - kappa0]),
+        high=np.concatenate([rate, bound - kappa0]),
     )
     if isinstance(change, str):
-        return change
+        return f"lateral QP: {change}"
     return np.concatenate([[0.0], free_heading + to_heading @ change])
 
 
@@ -201,43 +184,6 @@ def _at_the_end(settings: FeasibleSettings) -> Array:
     share: Array = np.ones((N, 1))
     share[-END_STEPS:] = settings.weight_end
     return share
-
-
-def _solve(
-    hessian: sparse.csc_matrix,
-    gradient: Array,
-    rows: sparse.csc_matrix,
-    low: Array,
-    high: Array,
-    settings: FeasibleSettings,
-    what: str,
-) -> Array | str:
-    """argmin 1/2 x' H x + g' x, low <= rows x <= high, of H the upper triangle; or why there is none.
-
-    The solver is fresh and its step size adapts by iteration count, never by the clock: the result does not depend on
-    what was solved before or on how busy the machine is.
-    """
-    solver = osqp.OSQP(algebra="builtin")  # its default where no other is installed; to look for others takes longer
-    solver.setup(
-        P=hessian,
-        q=gradient,
-        A=rows,
-        l=low,
-        u=high,
-        verbose=False,
-        max_iter=settings.max_iterations,
-        eps_abs=settings.tolerance,
-        eps_rel=settings.tolerance,
-        adaptive_rho=1,
-        adaptive_rho_interval=25,
-        check_termination=25,
-        warm_starting=False,
-        polishing=False,
-    )
-    result = solver.solve(raise_error=False)
-    if result.info.status != "solved":
-        return f"{what} QP: {result.info.status} after {result.info.iter} iterations"
-    return np.asarray(result.x, dtype=np.float64)
 
 
 # The table of human trajectories, and the expert that searches it.
@@ -321,7 +267,7 @@ class RecoveryExpert:
     def plans(self, scene: Scene, rng: np.random.Generator) -> Iterator[Plan | Rejected]:
         """The ways back that end at the log, its own drive from here first; where there is none, why.
 
-        "no_plan": a quadratic program found no solution; "out_of_reach": no way ends at the log. Where its own does not
+        "no_plan": a quadratic program has no solution; "out_of_reach": no way ends at the log. Where its own does not
         the table is not asked. Raises ValueError where the clip ends within 4 s.
         """
         ego, log = scene.ego_state, scene.log_ahead

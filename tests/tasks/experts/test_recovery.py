@@ -220,9 +220,9 @@ def test_the_same_problem_gives_the_same_bits() -> None:
     np.testing.assert_array_equal(make_feasible(wanted[0], start_state(7.0)), first)
 
 
-def test_a_solver_that_does_not_converge_is_a_rejection_and_never_the_raw_trajectory(road: Road) -> None:
-    hurried = RecoverySettings(feasible=FeasibleSettings(max_iterations=1, tolerance=1e-12))
-    result = RecoveryExpert(RecoveryTable(kinematic_trajectories(50, 2)), hurried).plan(road(y=1.0), RNG)
+def test_a_motion_that_no_limits_allow_is_a_rejection_and_never_the_raw_trajectory(road: Road) -> None:
+    impossible = RecoverySettings(feasible=FeasibleSettings(jerk_max_mps3=-1.0))
+    result = RecoveryExpert(RecoveryTable(kinematic_trajectories(50, 2)), impossible).plan(road(y=1.0), RNG)
     assert isinstance(result, Rejected)
     assert (result.stage, result.reason) == ("expert", "no_plan")
     assert "longitudinal QP" in result.detail
