@@ -31,7 +31,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,6 +193,28 @@ class TrafficScene:
     yielding: Yielding | None = None  # None: drivers give way to nobody, or another mode
 
 
+class _ToldByLog(NamedTuple):
+    """What all scenes of a clip share."""
+
+    is_vehicle: Bools  # (N,)
+    moving_kind: Bools  # (N,)
+    stands: Bools  # (N,) vehicles that never leave their place
+    pairs: tuple[tuple[int, int], ...]  # see couplings
+    first_part: Ints  # (N,)
+    states: AgentStates
+
+
+@lru_cache(maxsize=4)
+def _told_by_log(log: AgentTracks) -> _ToldByLog:
+    is_vehicle = np.array([kind == AgentKind.VEHICLE for kind in log.kinds], dtype=bool)
+    moving_kind = np.array([kind in MOVING_KINDS for kind in log.kinds], dtype=bool)
+    pairs = couplings(log)
+    return _ToldByLog(
+        *(is_vehicle, moving_kind, is_vehicle & stands_always(log)),
+        *(pairs, first_parts(len(log), pairs), _agent_states(log)),
+    )
+
+
 def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     """Roles and paths of all agents; once per scene, however many rollouts follow."""
     if settings.mode == "replay":
@@ -202,11 +224,8 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     now, log = scene.agents, scene.clip.agents
     n, start = len(now), scene.step
     moved = np.zeros(n, dtype=bool) if scene.ever_simulated is None else scene.ever_simulated
-    is_vehicle = np.array([kind == AgentKind.VEHICLE for kind in now.kinds], dtype=bool)
-    moving_kind = np.array([kind in MOVING_KINDS for kind in now.kinds], dtype=bool)
-    standing = is_vehicle & stands_always(log) & ~(moved & now.valid[start])
-    pairs = couplings(log)
-    first_part = first_parts(n, pairs)
+    is_vehicle, moving_kind, stands, pairs, first_part, states = _told_by_log(log)
+    standing = stands & ~(moved & now.valid[start])
     is_first = first_part == np.arange(n)
     index = _indexed_lanes(scene.clip.road_map)
     ahead_m = _needed_path_length(scene, settings)
@@ -253,7 +272,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     paths = stack_paths(
         scene, found, logged_ways, settings.target_speed_mps, settings.decel_max, logged_stops=not yields
     )
-    yielding = prepare_yielding(scene, roles, paths, _agent_states(log)) if yields else None
+    yielding = prepare_yielding(scene, roles, paths, states) if yields else None
     return TrafficScene(scene, settings, roles, paths, yielding=yielding)
 
 
@@ -380,13 +399,14 @@ def _kernel_inputs(
 ) -> tuple[int, AgentStates, AgentStates, Roles, Paths, IdmDriver]:
     """All that the kernels need to know but the ego, and who gives way."""
     assert traffic.roles is not None and traffic.paths is not None
-    start, paths = traffic.scene.step, traffic.paths
+    start, paths, log = traffic.scene.step, traffic.paths, traffic.scene.clip.agents
+    longer = _extend_tracks(log, start + window.n_steps)
     if window.n_steps > len(paths.line_state):  # lights and stops stay as the last step knows them
         more = window.n_steps - len(paths.line_state)
         paths = paths._replace(line_state=np.concatenate([paths.line_state, np.repeat(paths.line_state[-1:], more, 0)]))
     return (
         start,
-        _agent_states(_extend_tracks(traffic.scene.clip.agents, start + window.n_steps)),
+        _told_by_log(log).states if longer is log else _agent_states(longer),
         _agent_states(window.window(0, 1)),
         Roles(*_writable(traffic.roles)),
         Paths(*_writable(paths)),

@@ -34,7 +34,7 @@ MOVING_KINDS = frozenset({AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.BIC
 PER_STEP = ("boxes", "velocities", "valid", "center_z")  # fields of AgentTracks
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AgentTracks:
     """N tracks over S steps of 0.1 s, world frame. Absent entries hold NaN and valid = False."""
 
