@@ -448,8 +448,10 @@ def _in_pieces(tracks: ObservedTracks, n: int, pieces: Sequence[Ints]) -> tuple[
             things[-1] = np.concatenate([before, piece])
         else:
             things.append(piece)
-    for later in things[1:]:
-        tracks, renamed = _named_anew(tracks, n, later)
+    if len(things) < 2:
+        return tracks, done
+    tracks, names = _named_anew(tracks, n, things[1:])
+    for later, renamed in zip(things[1:], names):
         span = tracks.times_s[later[[0, -1]]].tolist()
         done.append(Repair("jump", name, span[0], name, renamed, span[1]))
     return tracks, done
@@ -469,24 +471,26 @@ def _goes_on(tracks: ObservedTracks, n: int, before: Ints, after: Ints) -> bool:
     return bool(not ends or np.hypot(*(moved - usual * dt)) <= NOISE_M + LARGEST_ACCEL_MPS2 * dt**2)
 
 
-def _named_anew(tracks: ObservedTracks, n: int, frames: Ints) -> tuple[ObservedTracks, str]:
-    """Those frames of thing n as a thing of their own, behind the others; and its name."""
-    taken, k = set(tracks.track_ids), 2
-    while (name := f"{tracks.track_ids[n]}#{k}") in taken:
-        k += 1
-    rows, column = tracks.rows.copy(), np.full(len(tracks.rows), UNSEEN)
-    column[frames] = rows[frames, n]
-    rows[frames, n] = UNSEEN
-    return (
-        replace(
-            tracks,
-            track_ids=(*tracks.track_ids, name),
-            kinds=(*tracks.kinds, tracks.kinds[n]),
-            boxes=np.concatenate([tracks.boxes, tracks.boxes[:, [n]]], axis=1),
-            rows=np.column_stack([rows, column]),
-        ),
-        name,
+def _named_anew(tracks: ObservedTracks, n: int, pieces: Sequence[Ints]) -> tuple[ObservedTracks, list[str]]:
+    """Pieces (frames each) of thing n as things of their own, behind the others; and their names."""
+    taken, names, k = set(tracks.track_ids), list[str](), 2
+    for _ in pieces:
+        while (name := f"{tracks.track_ids[n]}#{k}") in taken:
+            k += 1
+        names.append(name)
+        taken.add(name)
+    rows, columns = tracks.rows.copy(), np.full((len(tracks.rows), len(pieces)), UNSEEN)
+    for column, frames in zip(columns.T, pieces):
+        column[frames] = rows[frames, n]
+        rows[frames, n] = UNSEEN
+    named = replace(
+        tracks,
+        track_ids=(*tracks.track_ids, *names),
+        kinds=(*tracks.kinds, *[tracks.kinds[n]] * len(pieces)),
+        boxes=np.concatenate([tracks.boxes, tracks.boxes[:, [n] * len(pieces)]], axis=1),
+        rows=np.column_stack([rows, columns]),
     )
+    return named, names
 
 
 def _too_fast(tracks: ObservedTracks, n: int) -> Ints:
