@@ -23,8 +23,8 @@ from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
 
 pytestmark = pytest.mark.slow
 
-# Three clips of the town with photos and lidar, so that there are photos, renderings and pictures that are refused.
-WORDS = ["clips=synthetic", "clips.n_clips=3", "clips.settings.width=160", "clips.settings.height=90", "rounds=2"]
+# Two clips of the town with photos and lidar, so that there are photos, renderings and pictures that are refused.
+WORDS = ["clips=synthetic", "clips.n_clips=2", "clips.settings.width=160", "clips.settings.height=90", "rounds=2"]
 WORDS += ["render.scene=discs", "render.psnr_min=10", "render.camera_psnr_min=0", "render.width=96", "render.height=54"]
 WORDS += ["render.frames=now", "vocabulary.k=512", "executor=local"]
 CHANGED = {
@@ -161,7 +161,7 @@ def test_killed_at_any_moment_the_same_command_makes_the_same_rows(
         (["label", "seed=3"], "seed: 0 -> 3: the drives depend on it, so this is a new run"),
         (["gate", "reward.after=false", "rounds=1"], "rounds=2 of expert pdm_closed, this asks for 1"),
         (["gate", "reward.after=false", "experts=[human]"], "this asks for 0"),
-        (["gate", "reward.after=false", "limit=2"], "1 of its clips"),
+        (["gate", "reward.after=false", "limit=1"], "1 of its clips"),
         (["pictures", "render.width=64"], "the stages are render, label, gate"),
     ],
 )
