@@ -1,5 +1,6 @@
 """Benches at their smallest: they run, and print the rows that README and docs quote."""
 
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -12,14 +13,19 @@ from factory.datasets.town.town import write_logs
 from tests.bench import (
     bench_bank,
     bench_decoding,
+    bench_label_ends,
+    bench_labels,
     bench_planner_steps,
     bench_render,
     bench_reward,
     bench_rollout,
     bench_run,
     bench_scale,
+    bench_sizes,
     bench_store,
     bench_traffic,
+    bench_traversals,
+    bench_validation,
 )
 from tests.tasks.rollout.test_navsim_traffic import recorded
 
@@ -60,18 +66,22 @@ def test_a_run_s_parts_come_to_its_whole(tmp_path: Path, capsys: pytest.CaptureF
     assert cost[bench_run.SAMPLES] == pytest.approx(3600.0 / cost["whole"], rel=0.01)  # of the clip's one sample
 
 
+ONE_TOWN = ("clips=synthetic", "clips.n_clips=1", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0")
 STEPS_OF = partial(bench_planner_steps.main, ["gtrs_dense_public"], torch.device("cpu"), 1, 1, 8, 0.3, True)
 
 
 @pytest.mark.parametrize(
     ("bench", "rows", "says"),
     [
-        pytest.param(lambda at: bench_bank.main(at, (4,), 2000, 1), 1, "2,000 scenes opened", id="bank"),
+        pytest.param(lambda at: bank_of_few(at), 1, "2,000 scenes opened", id="bank"),
         pytest.param(lambda at: bench_decoding.main(2, 1, 3, 128, 32), 5, "a kept picture: 0.01 MB", id="decoding"),
         pytest.param(lambda at: STEPS_OF(), 3, "`gtrs_dense_public` | H100 SXM", id="planner_steps"),
+        pytest.param(lambda at: bench_label_ends.main([*ONE_TOWN, "experts=[human]"]), 1, "| human |", id="label_ends"),
         pytest.param(lambda at: bench_render.main(None, 1, 500, 1), 2, "| seeded | 500 |", id="render"),
         pytest.param(lambda at: bench_reward.main(at, (2,)), 1, "| synthetic town | 2 |", id="reward"),
         pytest.param(lambda at: rollout_of_a_town(at), 4, "| idm |", id="rollout"),
+        pytest.param(lambda at: traversals_of_a_town(at), 6, "| a drive that was not seen |", id="traversals"),
+        pytest.param(lambda at: bench_validation.main(["ego_mlp"], 1, 1), 1, "| `ego_mlp` |", id="validation"),
     ],
 )
 def test_a_bench_prints_its_rows(
@@ -84,9 +94,39 @@ def test_a_bench_prints_its_rows(
     assert len(lines) - heads >= rows and says in printed, printed
 
 
+def bank_of_few(folder: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("B", "TOGETHER"):
+            patch.setattr(bench_bank, name, 4)
+        bench_bank.main(folder, (4,), 2000, 1)
+
+
+def traversals_of_a_town(folder: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        small = ("width=64", "height=36", "iterations=2", "hz=1", "start_gaussians=2000")
+        patch.setattr(sys, "argv", ["bench_traversals", f"out={folder}", *small])
+        bench_traversals.main()
+
+
 def rollout_of_a_town(folder: Path) -> None:
     write_logs(folder, range(1), 0, TownSettings(cameras=(), lidar_beams=0))
     bench_rollout.main(folder)
+
+
+def test_labels_of_a_real_log_are_made_and_read(shared_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bench_labels.main(shared_root, n_random=2, k=32, clips=1)
+    said = capsys.readouterr().out
+    assert "2 samples, K = 32" in said and said.count("\n| ") == 6, said
+
+
+def test_a_block_of_eight_cameras_is_measured_by_size(
+    shared_root: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    small = ("sizes=48x27", "iterations=1", "start_gaussians=500", "stereo_photos=0")
+    monkeypatch.setattr(sys, "argv", ["bench_sizes", str(shared_root / "data/openscene_0101"), *small])
+    bench_sizes.main()
+    (row,) = (line.split(" | ") for line in capfd.readouterr().out.splitlines() if line.startswith("| 48x27"))
+    assert int(row[1]) > 100 and len(row) == 8
 
 
 def test_the_bench_of_traffic_finds_no_difference_from_a_recorded_answer() -> None:

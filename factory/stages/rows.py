@@ -1,9 +1,13 @@
 """A judged drive as a sample row (columns of factory.store.schema): the world in the frame of the ego at now."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from factory.store.schema import AGENT_STEPS, MAP_RADIUS_M, NOW_INDEX
 from tasks.attempt import Judged, off_log
@@ -11,11 +15,11 @@ from tasks.perturb import Candidate, end_speed_mps
 from tasks.reward.epdms import Scores
 from tasks.reward.label_bytes import VocabularyLabels, encode
 from tasks.subscores import OF_ONE_PLAN, SUBSCORES
-from tasks.world.arrays import Array
+from tasks.world.arrays import Array, Bools
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Clip, Scene
 from tasks.world.frames import AX, AY, HEADING, VX, VY, points_to_local, pose_on_ground, to_local
 from tasks.world.repair.records import repair_counts
-from tasks.world.road_map import driving_command
+from tasks.world.road_map import Lane, RoadMap, driving_command
 
 NEAR_M = 30.0  # for the tags
 
@@ -123,21 +127,42 @@ def agent_columns(tracks: AgentTracks, now: int, pose: Array) -> Mapping[str, ob
     }
 
 
+class _Shapes(NamedTuple):
+    """Of a map, as shapely has them."""
+
+    lanes: list[Lane]  # that cars drive on
+    centerlines: NDArray[np.object_]
+    crossings: NDArray[np.object_]
+    rings: NDArray[np.object_]  # of the drivable areas
+    areas: NDArray[np.object_]
+
+
+@lru_cache(maxsize=4)  # clips of one log share the map
+def _shapes(road_map: RoadMap) -> _Shapes:
+    def lines(of: Iterable[Array]) -> NDArray[np.object_]:
+        return np.array([shapely.linestrings(line[:, :2]) for line in of], object)
+
+    lanes = [lane for lane in road_map.lanes.values() if lane.drives_cars]
+    centerlines, crossings = lines(lane.centerline for lane in lanes), lines(road_map.crossings)
+    areas = np.array([shapely.polygons(ring[:, :2]) for ring in road_map.road_rings], object)
+    return _Shapes(lanes, centerlines, crossings, lines(road_map.road_rings), areas)
+
+
 def map_columns(scene: Scene, pose: Array) -> Mapping[str, object]:
     """What of the map is near, the lights of its lanes and the route, in the frame of `pose`."""
     road_map, clip = scene.clip.road_map, scene.clip
+    shapes, x, y = _shapes(road_map), *pose[:2]
 
-    here = shapely.Point(pose[:2])
+    def near(lines: NDArray[np.object_]) -> Bools:
+        return np.asarray(shapely.dwithin(lines, shapely.Point(x, y), MAP_RADIUS_M), bool)
 
-    def near(line: Array) -> bool:
-        return bool(shapely.dwithin(shapely.linestrings(line[:, :2]), here, MAP_RADIUS_M))
+    lanes = list(compress(shapes.lanes, near(shapes.centerlines)))
+    # A large drivable area may have no edge near the ego and hold it all the same.
+    areas = compress(road_map.road_rings, near(shapes.rings) | shapely.contains_xy(shapes.areas, x, y))
 
     def local_ring(ring: Array) -> Array:
         return points_to_local(pose, ring[:, :2])
 
-    lanes = [lane for lane in road_map.lanes.values() if lane.drives_cars and near(lane.centerline)]
-    # A large drivable area may have no edge near the ego and hold it all the same.
-    areas = [r for r in road_map.road_rings if near(r) or shapely.contains_xy(shapely.polygons(r[:, :2]), *pose[:2])]
     shown = {lane.lane_id for lane in lanes}
     lights = [i for i, lane_id in enumerate(clip.lights.lane_ids) if lane_id in shown]
     steps = slice(scene.step - NOW_INDEX, scene.step - NOW_INDEX + AGENT_STEPS)
@@ -147,7 +172,7 @@ def map_columns(scene: Scene, pose: Array) -> Mapping[str, object]:
         "lane_centerlines": [to_local(pose, lane.centerline) for lane in lanes],
         "lane_is_intersection": [lane.is_intersection for lane in lanes],
         "drivable_rings": [local_ring(ring) for ring in areas],
-        "crossing_rings": [local_ring(ring) for ring in road_map.crossings if near(ring)],
+        "crossing_rings": [local_ring(ring) for ring in compress(road_map.crossings, near(shapes.crossings))],
         "light_lane_ids": [clip.lights.lane_ids[i] for i in lights],
         "light_states": clip.lights.states[steps, lights].T if lights else np.zeros((0, AGENT_STEPS), np.int8),
         "map_location": road_map.location,

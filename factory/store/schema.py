@@ -71,14 +71,14 @@ class Column:
     nan: bool = False  # NaN marks absent entries; elsewhere it is refused
     members: tuple["Column", ...] = ()  # of a struct
 
-    @property
+    @cached_property
     def arrow_type(self) -> pa.DataType:
         inner = _ARROW[self.dtype] if self.dtype != "struct" else pa.struct([m.arrow_field for m in self.members])
         for size in reversed(self.shape):
             inner = pa.list_(inner, size) if isinstance(size, int) else pa.list_(inner)
         return inner
 
-    @property
+    @cached_property
     def arrow_field(self) -> pa.Field:
         notes = {"unit": self.unit, "frame": self.frame, "shape": str(list(self.shape)), "about": self.about}
         return pa.field(self.name, self.arrow_type, metadata={k: v for k, v in notes.items() if v and v != "[]"})

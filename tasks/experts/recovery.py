@@ -116,7 +116,7 @@ def _along(wanted: Array, speed0: float, accel0: float, settings: FeasibleSettin
     release, released = np.empty(N), np.empty(N)
     accel = accel0
     for k in range(N):
-        release[k] = np.clip(-accel / STEP_S, -settings.jerk_max_mps3, settings.jerk_max_mps3)
+        release[k] = min(max(-accel / STEP_S, -settings.jerk_max_mps3), settings.jerk_max_mps3)
         accel = accel + STEP_S * release[k]
         released[k] = accel
     low_speed = np.minimum(0.0, free_speed + to_speed @ release)

@@ -34,6 +34,7 @@ ANGLE_RAD = np.deg2rad(15.0)
 BEHIND, BEHIND_M = 1.15, 0.5  # a place this much farther than what a photo shows there, and this many metres, is hidden
 NEAREST_M = 0.1
 SOLID = 0.5  # alpha from which a pixel is a place and not sky
+SURELY = 1.0 - 1.0e-9  # whatever is rounded
 LOOKS_ELSEWHERE = -0.5  # cosine between two optical axes below which one photo says nothing of what the other shows
 # Chosen on pictures labelled by eye (docs/reconstruction.md).
 SIGHT_MIN = 0.3  # of the best photo of a pixel
@@ -147,8 +148,10 @@ def _look(
             mine = np.sqrt((x - here[0]) ** 2 + (y - here[1]) ** 2 + (z - here[2]) ** 2)
             its = np.sqrt((x - eye[0]) ** 2 + (y - eye[1]) ** 2 + (z - eye[2]) ** 2)
             dot = (x - here[0]) * (x - eye[0]) + (y - here[1]) * (y - eye[1]) + (z - here[2]) * (z - eye[2])
-            angle = np.arccos(min(1.0, max(-1.0, dot / max(mine * its, 1.0e-9))))
-            score = np.exp(-((angle / ANGLE_RAD) ** 2)) * min(1.0, mine / max(its, 1.0e-9))
+            cosine, near = min(1.0, max(-1.0, dot / max(mine * its, 1.0e-9))), min(1.0, mine / max(its, 1.0e-9))
+            if near < best[row, column] * (1.0 + 2.0 * (1.0 - cosine) / ANGLE_RAD**2) * SURELY:
+                continue  # below the best: e^-x < 1 / (1 + x), and the angle's square is at least 2 (1 - cosine)
+            score = np.exp(-((np.arccos(cosine) / ANGLE_RAD) ** 2)) * near
             if score > best[row, column]:
                 best[row, column] = score
                 # between the middles of the four pixels around it

@@ -19,11 +19,11 @@ from tests.real.reference_scenes import loader
 K = 16384
 
 
-def main(shared: Path, n_random: int = 20) -> None:
+def main(shared: Path, n_random: int = 20, k: int = K, clips: int | None = None) -> None:
     """Makes two samples a clip (simulated and human), stores them, prints one table."""
     with tempfile.TemporaryDirectory() as folder:
         vocabulary, out = Path(folder) / "proposals.npy", Path(folder) / "out"
-        np.save(vocabulary, loader(shared).proposals("7fab2350_20", K))
+        np.save(vocabulary, loader(shared).proposals("7fab2350_20", k))
         overrides = (
             "clips=av2",
             f"clips.root={shared / 'data/av2/sensor/val'}",
@@ -38,7 +38,7 @@ def main(shared: Path, n_random: int = 20) -> None:
         store = Store(out)
         summary = execute(
             run.work,
-            run.index.refs,
+            run.index.refs[:clips],
             run.config.experts,
             1,
             store,
@@ -58,7 +58,7 @@ def main(shared: Path, n_random: int = 20) -> None:
             for place in places:
                 labels_of(table.sample(place, LABEL_COLUMNS))
 
-        print(f"{len(table)} samples, K = {K:,}\n\n| labels of one sample | |\n|---|---|")
+        print(f"{len(table)} samples, K = {k:,}\n\n| labels of one sample | |\n|---|---|")
         print(f"| stored, mean | {compressed_bytes(store) / len(table) / 1e3:.1f} kB |")
         print(f"| driven and scored | {spent.cpu_s / n:.3f} CPU s |")
         print(f"| read and decoded in a pass over all | {milliseconds(one_pass, 5) / len(table):.2f} ms |")

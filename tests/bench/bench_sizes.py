@@ -2,7 +2,7 @@
 
 Each size is fitted for a few iterations in a process of its own: CPU seconds to prepare, an iteration and a picture,
 and memory at most. Calibration is as given: how well it comes out is `bench_scenes`' question. `iterations=` are timed
-after as many that are not; `threads=` share them; other names are those of `FitSettings`.
+after as many that are not; `threads=` share them, `sizes=` names others; other names are those of `FitSettings`.
 """
 
 import resource
@@ -24,9 +24,10 @@ from tasks.render.settings import FitSettings
 from tasks.world.clip import Pinhole
 from tests.bench.sidecars import read_openscene
 
-SIZES = ((480, 270), (960, 540), (1920, 1080))
+SIZES = "480x270,960x540,1920x1080"
 SETTINGS = replace(FitSettings(), start_gaussians=300_000, most_gaussians=350_000)
 HELD_OUT_S = (2.0, 5.5)
+MODULE = "tests.bench.bench_sizes"
 JPEG_QUALITY = 90  # the default of runs
 MB = 2**10  # of ru_maxrss, which is in KB
 
@@ -35,8 +36,11 @@ def main() -> None:
     """Prints one row a size."""
     told = "size | photos | MB of photos | CPU s to prepare | an iteration | a picture | peak memory [MB] | a JPEG [kB]"
     print(f"| {told} |\n|---|---|---|---|---|---|---|---|", flush=True)
-    for width, height in SIZES:
-        subprocess.run([sys.executable, "-m", __spec__.name, "--one", f"{width}x{height}", *sys.argv[1:]], check=True)
+    root, *options = sys.argv[1:]
+    sizes = next((option for option in options if option.startswith("sizes=")), f"sizes={SIZES}")
+    rest = [root, *(option for option in options if option != sizes)]
+    for size in sizes.removeprefix("sizes=").split(","):
+        subprocess.run([sys.executable, "-m", MODULE, "--one", size, *rest], check=True)
 
 
 def one(size: str, root: Path, options: dict[str, str]) -> None:

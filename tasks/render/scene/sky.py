@@ -87,6 +87,15 @@ STRAIGHT = 3.0  # columns of the sky that a square spans at most: below some 57 
 LEAST_LIGHT = 1.0 / 1024.0  # that passes, for the sky to be looked up: what less adds is a quarter of a step of 8 bits
 
 
+@inlined
+def _shows_sky(alpha: Any, top: int, bottom: int, start: int, end: int) -> bool:
+    for row in range(top, bottom):
+        for column in range(start, end):
+            if np.float32(1.0) - alpha[row, column] > LEAST_LIGHT:
+                return True
+    return False
+
+
 @kernel
 def _finish(cells: Any, k: Any, turn: Any, step: int, affine: Any, alpha: Any, rgb: Any, first: int, last: int) -> None:
     """Rows of a picture (H, W, 3): the sky put behind them, in the camera's colours, from 0 to 1. The sky's places are
@@ -94,12 +103,22 @@ def _finish(cells: Any, k: Any, turn: Any, step: int, affine: Any, alpha: Any, r
     width, zero, one = rgb.shape[1], np.float32(0.0), np.float32(1.0)
     for top in range(first, last, step):
         bottom = min(top + step, last)
-        v_right, u_right = _place(k, turn, 0, top)
-        v_under, u_under = _place(k, turn, 0, bottom)
+        known, v_right, u_right, v_under, u_under = False, 0.0, 0.0, 0.0, 0.0
         for start in range(0, width, step):
-            v_here, u_here, v_below, u_below = v_right, u_right, v_under, u_under
-            v_right, u_right = _place(k, turn, start + step, top)
-            v_under, u_under = _place(k, turn, start + step, bottom)
+            if not _shows_sky(alpha, top, bottom, start, min(start + step, width)):
+                known = False
+                continue
+            if known:  # the last square's right corners are this one's left ones
+                v_here, u_here, v_below, u_below = v_right, u_right, v_under, u_under
+            else:
+                v_here, u_here = _place(k, turn, start, top)
+                v_below, u_below = (v_here, u_here) if step == 1 else _place(k, turn, start, bottom)
+            if step == 1:  # its first corner is the only pixel
+                v_right, u_right, v_under, u_under = v_here, u_here, v_here, u_here
+            else:
+                v_right, u_right = _place(k, turn, start + step, top)
+                v_under, u_under = _place(k, turn, start + step, bottom)
+            known = step > 1
             most, least = max(u_here, u_right, u_below, u_under), min(u_here, u_right, u_below, u_under)
             for row in range(top, bottom):
                 share = (row - top) / (bottom - top)
