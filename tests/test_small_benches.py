@@ -103,7 +103,7 @@ def bank_of_few(folder: Path) -> None:
 
 def traversals_of_a_town(folder: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        small = ("width=64", "height=36", "iterations=2", "hz=1", "start_gaussians=2000")
+        small = ("width=64", "height=36", "iterations=2", "hz=2", "start_gaussians=2000")
         patch.setattr(sys, "argv", ["bench_traversals", f"out={folder}", *small])
         bench_traversals.main()
 
@@ -114,9 +114,9 @@ def rollout_of_a_town(folder: Path) -> None:
 
 
 def test_labels_of_a_real_log_are_made_and_read(shared_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bench_labels.main(shared_root, n_random=2, k=32, clips=1)
+    bench_labels.main(shared_root, n_random=2, k=256, clips=1)
     said = capsys.readouterr().out
-    assert "2 samples, K = 32" in said and said.count("\n| ") == 6, said
+    assert "2 samples, K = 256" in said and said.count("\n| ") == 6, said
 
 
 def test_a_block_of_eight_cameras_is_measured_by_size(

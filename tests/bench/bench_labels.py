@@ -1,4 +1,4 @@
-"""Bytes and reading time of vocabulary labels: K = 16,384 reference proposals from samples of two real logs."""
+"""Bytes and reading time of vocabulary labels: K human trajectories from samples of two real logs."""
 
 import sys
 import tempfile
@@ -14,22 +14,25 @@ from factory.store.reader import SampleTable, labels_of
 from factory.store.samples import Store
 from factory.store.schema import LABEL_COLUMNS
 from tests.bench.timing import milliseconds
-from tests.real.reference_scenes import loader
 
-K = 16384
+K = 8192
 
 
 def main(shared: Path, n_random: int = 20, k: int = K, clips: int | None = None) -> None:
     """Makes two samples a clip (simulated and human), stores them, prints one table."""
     with tempfile.TemporaryDirectory() as folder:
-        vocabulary, out = Path(folder) / "proposals.npy", Path(folder) / "out"
-        np.save(vocabulary, loader(shared).proposals("7fab2350_20", k))
+        human, labelled, out = (
+            shared / "data/vocabulary/human_8192x40x3.npy",
+            Path(folder) / "few.npy",
+            Path(folder) / "out",
+        )
+        np.save(labelled, np.load(human)[:k])
         overrides = (
             "clips=av2",
             f"clips.root={shared / 'data/av2/sensor/val'}",
-            f"vocabulary.file={shared / 'data/vocabulary/human_8192x40x3.npy'}",
+            f"vocabulary.file={human}",
             "vocabulary.k=1000",
-            f"reward.label_vocabulary={vocabulary}",
+            f"reward.label_vocabulary={labelled}",
             "experts=[pdm_closed,human]",
             "render=none",
             f"out={out}",
