@@ -260,6 +260,7 @@ def _projected(boxes: Array, points: Array, intrinsics: Array, world_from_camera
 # bonnet does, is off by 0.01 rad after a step of 1 m at 10 m: a pixel of a picture of 160. Nothing of the scene's own
 # shape goes in: by its own depths a torn vehicle would look like every photo that it was fitted to.
 
+REACH_PX = 2 * (math.ceil(4.0 * SIGMA_PX) + 2)  # of the similarity's window, at half size
 SHIFTS_PX = (-2, -1, 0, 1, 2)  # by which the photo is moved either way to fit: a box is no car, nor where it is exactly
 
 
@@ -324,6 +325,8 @@ def intersect_box(box: Array, eye: Array, rays: Array) -> tuple[Array, Ints, Arr
 
 def _best_shifted_likeness(rgb: F32, photo: Bytes, columns: F32, rows: F32, clear: Bools) -> float:
     """Likeness of the `clear` pixels to the photo's at columns and rows (H, W) under the best of the shifts."""
+    around = _window_around(clear)
+    rgb, columns, rows, clear = rgb[around], columns[around], rows[around], clear[around]
     theirs = photo.astype(np.float32) / np.float32(255.0)
     best = 0.0
     for down in SHIFTS_PX:
@@ -333,6 +336,20 @@ def _best_shifted_likeness(rgb: F32, photo: Bytes, columns: F32, rows: F32, clea
             mixed = np.where(clear[..., None], moved, rgb).astype(np.float32)
             best = max(best, masked_mean(ssim_map(rgb, mixed), clear))
     return best
+
+
+def _window_around(clear: Bools) -> tuple[slice, slice]:
+    """The rows and columns of a picture that the similarity of its `clear` pixels (H, W) comes from.
+
+    All, where half the picture's size is none of whole pixels.
+    """
+    spans = []
+    for axis, size in enumerate(clear.shape):
+        there: list[int] = np.flatnonzero(clear.any(axis=1 - axis)).tolist()
+        first, last = max(0, there[0] - REACH_PX) // 2 * 2, min(size, (there[-1] + 1 + REACH_PX) // 2 * 2)
+        spans.append(slice(first, last) if size % 2 == 0 else slice(0, size))
+    rows, columns = spans
+    return rows, columns
 
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)  # luma of ITU-R BT.601
