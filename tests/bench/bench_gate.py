@@ -5,7 +5,8 @@ any gate. Each picture is labelled by what the painter of the town shows from th
 likeness (SSIM at half of 160 pixels' width, tasks/render/gate.py) inside the outline of each vehicle that covers
 `share` of the picture or more (0.02, the gate's own); the worst counts. Limits were chosen on the first seeds and are
 reported on the others. Options: chosen=0,1 held=2 clips=9 share=0.02 out=out/bench_gate, drives=4 of each clip and
-expert, every=2 of the gate's instants. A later call with the same `out` reads <out>/labels-<seed>.csv and only prints.
+expert, every=2 of the gate's instants, iterations= fewer for a quick look. A later call with the same `out` reads
+<out>/labels-<seed>.csv and only prints.
 """
 
 import csv
@@ -52,9 +53,11 @@ class Labelled:
     beside: float  # the likeness to that photo itself, seen from here; 1 where none is near enough
 
 
-def labelled(seed: int, clips: int, most: int, every: int, share_min: float, out: Path) -> list[Labelled]:
-    """Runs the seed's towns."""
-    overrides = [f"clips.seed={seed}", f"clips.n_clips={clips}", f"out={out}/town{seed}", "render.psnr_gate=mark"]
+def labelled(
+    seed: int, clips: int, most: int, every: int, share_min: float, out: Path, fit: Sequence[str]
+) -> list[Labelled]:
+    """Runs the seed's towns; fit: settings of their scenes."""
+    overrides = [*fit, f"clips.seed={seed}", f"clips.n_clips={clips}", f"out={out}/town{seed}", "render.psnr_gate=mark"]
     config = load_config(["preset=demo", *overrides])
     gate = replace(config.render.gate, vehicle_share=share_min)
     work = assemble(replace(config, render=replace(config.render, gate=gate))).work
@@ -85,8 +88,9 @@ def labelled(seed: int, clips: int, most: int, every: int, share_min: float, out
             f"{ref.log_id} at {ref.start_ms} ms: {len(rows)} pictures, {time.perf_counter() - began:.0f} s", flush=True
         )
     whole = np.array([pair for pair in costs if np.isfinite(pair).all()])
-    without, held = whole.mean(axis=0)
-    print(f"gate of {len(whole)} drives that pass: {without:.0f} CPU ms a drive without photos, {held:.0f} with")
+    if len(whole):
+        without, held = whole.mean(axis=0)
+        print(f"gate of {len(whole)} drives that pass: {without:.0f} CPU ms a drive without photos, {held:.0f} with")
     return rows
 
 
@@ -164,6 +168,7 @@ def main() -> None:
         name: [int(s) for s in options.pop(name, given).split(",")]
         for name, given in (("chosen", "0,1"), ("held", "2"))
     }
+    fit = [f"render.fit.iterations={options.pop('iterations')}"] if "iterations" in options else []
     if options:
         raise SystemExit(f"no such option: {', '.join(options)}")
     out.mkdir(parents=True, exist_ok=True)
@@ -172,7 +177,7 @@ def main() -> None:
         for seed in seeds:
             path = out / f"labels-{seed}.csv"
             if not path.exists():
-                kept(path, labelled(seed, clips, most, every, share_min, out))
+                kept(path, labelled(seed, clips, most, every, share_min, out, fit))
             rows += read(path)
         what = "limits were chosen on" if name == "chosen" else "held out"
         print(f"\nseeds {', '.join(map(str, seeds))} ({what}): {table(rows)}")

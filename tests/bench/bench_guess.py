@@ -5,7 +5,8 @@ rated by eye before the gate had a say: good, usable, or bad (torn, smeared, rub
 are `chosen`, the others were kept aside: of nuScenes' front camera pictures of the same street, of the town all. Forty
 more are `accepted`: drawn with numpy's seed 0 from the pictures of the run of docs/photos.md, gate and all. Scenes are
 built as runs build them, into `out`; rig=<scene file> is openscene_0101's, as `factory scene build` writes it. Options:
-out=out/bench_guess, town=0 leaves the town out. Vehicles of simulated drives are not in the pictures.
+out=out/bench_guess, town=0 leaves the town out, iterations= fewer, of one log of it, for a quick look. Vehicles of
+simulated drives are not in the pictures.
 """
 
 import csv
@@ -81,12 +82,13 @@ def main() -> None:
     options = dict(option.split("=", 1) for option in sys.argv[1:])
     out = Path(options.get("out", "out/bench_guess"))
     blocks: dict[str, Block] = {}
+    fewer = [f"render.fit.iterations={options['iterations']}"] if "iterations" in options else []
     if options.get("town", "1") != "0":
-        blocks |= blocks_of_run(TOWN, out / "town")
+        blocks |= blocks_of_run([*TOWN, *fewer, *(["clips.n_clips=1"] if fewer else [])], out / "town")
     if "front" in options:
         root = options["front"]
         sidecar = [f"clips.root={next(Path(root).glob('*.pkl'))}", f"clips.cameras={root}"]
-        blocks |= blocks_of_run([*FRONT, *sidecar], out / "front")
+        blocks |= blocks_of_run([*FRONT, *sidecar, *fewer], out / "front")
     if "rig" in options:
         blocks["openscene_0101"] = block_of_file(Path(options["rig"]))
     found: dict[tuple[str, str, str], list[float]] = {}

@@ -2,8 +2,8 @@
 
 The painter of the town knows what is to be seen from everywhere: from held-out photos' poses, from 1 and 2 m to either
 side, turned by 20 degrees (road, vehicles and the rest apart), and with every vehicle put 3 m ahead and 0.8 m to the
-left. Only photos, lidar, poses and boxes go into the scene. Options: log=0 width=320 height=180 out=out/bench_town
-threads=2 and the settings of `FitSettings`.
+left. Only photos, lidar, poses and boxes go into the scene. Options: log=0 width=320 height=180 steps=1 (of 0.1 s
+between photos) out=out/bench_town threads=2 and the settings of `FitSettings`.
 A camera that would be within 0.6 m of somebody's box is left out. With moved vehicles all pixels count whose sight line
 meets the box of one of them within 40 m, whatever else is in front.
 """
@@ -101,17 +101,16 @@ def main() -> None:
     options = dict(option.split("=", 1) for option in sys.argv[1:])
     log, threads = int(options.pop("log", "0")), int(options.pop("threads", "2"))
     width, height = int(options.pop("width", "320")), int(options.pop("height", "180"))
-    out = Path(options.pop("out", "out/bench_town"))
+    steps, out = int(options.pop("steps", "1")), Path(options.pop("out", "out/bench_town"))
     kinds = {field.name: type(getattr(SETTINGS, field.name)) for field in fields(FitSettings)}
     settings = replace(SETTINGS, **{k: kinds[k](float(v)) for k, v in options.items()})
 
     town, drive = plan_log(0, log)
-    root = out / f"log{log}-{width}x{height}"
+    root = out / f"log{log}-{width}x{height}-{steps}"
     if not root.exists():
         began = time.perf_counter()
-        write_log(
-            root / log_name(0, log), town, drive, TownSettings(width=width, height=height, steps_per_photo=1), log
-        )
+        sensors = TownSettings(width=width, height=height, steps_per_photo=steps)
+        write_log(root / log_name(0, log), town, drive, sensors, log)
         print(f"writing the log {time.perf_counter() - began:.0f} s", flush=True)
     reader = AV2Reader(root, name="synthetic")
     clip = reader.read(reader.index().refs[0])

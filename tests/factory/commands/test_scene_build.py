@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from tasks.render.scene.asset import psnr
 from tasks.render.settings import FitSettings, RenderSettings
 from tasks.render.views import render_views
 from tasks.world.clip import STEP_S, AgentKind, Block, Clip
+from tests.bench import bench_alpasim
 
 main = COMMANDS["scene"].load()
 FIT = {"iterations": 150, "start_gaussians": 6000, "most_gaussians": 8000, "start_every": 2, "stereo_photos": 2}
@@ -80,7 +82,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
 
 @pytest.mark.slow
 def test_a_sidecar_alone_gives_the_scene_that_a_run_makes_and_a_film_of_it(
-    drive: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    drive: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same Gaussians, vehicles in nodes of their own, and photos held out that it shows."""
     to, root = tmp_path / "town.scene", f"root={drive.photos}"
@@ -126,6 +128,11 @@ def test_a_sidecar_alone_gives_the_scene_that_a_run_makes_and_a_film_of_it(
     other.write_text(drive.sidecar.read_text())
     assert main(["film", str(to), str(other), root, f"to={tmp_path / 'x.mp4'}"]) == 2
     assert "is no scene that was built of" in capsys.readouterr().err
+
+    monkeypatch.setattr(sys, "argv", ["bench_alpasim", str(to), str(drive.sidecar), root, "width=32", "instants=1"])
+    bench_alpasim.main()
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    assert len(rows) == 11 and "1 views of 32x18, lenses" in rows[3], rows
 
 
 def without(key: str) -> Callable[[Sidecar], object]:
