@@ -7,6 +7,7 @@ import pytest
 import street
 from numpy.typing import NDArray
 
+from tasks.render import gate
 from tasks.render.gate import (
     BEHIND_BOX_M,
     BESIDE_GAP,
@@ -122,6 +123,25 @@ def test_a_pixel_or_two_off_is_forgiven() -> None:
     here, taken = eye_at(0.0), vehicle_photo(eye_at(0.0))
     moved = np.roll(painted(here, BOX[None]), (1, 2), axis=(0, 1))
     assert likeness_beside_photo(moved, here, BOX, NOBODY, taken)[0] > 0.97
+
+
+@pytest.mark.parametrize("size", [(160, 90), (107, 60), (160, 91)])
+def test_only_the_part_around_a_vehicle_is_compared_and_nothing_else_would_tell(
+    size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same likeness as of the whole picture, at its edges too."""
+    rng, (width, height) = np.random.default_rng(8), size
+    rgb = rng.uniform(size=(height, width, 3)).astype(np.float32)
+    photo = np.rint(255.0 * rng.uniform(size=(height, width, 3))).astype(np.uint8)
+    columns, rows = (grid.astype(np.float32) for grid in np.meshgrid(np.arange(width), np.arange(height)))
+    for left, top, wide, high in ((0, 0, 12, 9), (60, 30, 33, 21), (90, 50, 30, 60), (width - 8, 3, 8, 70)):
+        clear = np.zeros((height, width), bool)
+        clear[top : top + high, left : left + wide] = True
+        of_part = gate._best_shifted_likeness(rgb, photo, columns, rows, clear)
+        with monkeypatch.context() as patch:
+            patch.setattr(gate, "_window_around", lambda _: (slice(None), slice(None)))
+            assert of_part == pytest.approx(gate._best_shifted_likeness(rgb, photo, columns, rows, clear), abs=1e-6)
+        assert of_part > 0.0
 
 
 def test_faces_that_the_photo_does_not_show_say_nothing() -> None:

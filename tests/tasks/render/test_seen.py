@@ -12,10 +12,10 @@ import street
 
 from tasks.render.gate import GateSettings, check_drive_pictures, worst_quarter
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.sky import plain_sky
+from tasks.render.scene.sky import pixel_directions, plain_sky
 from tasks.render.seen import ANGLE_RAD, WIDTH, PhotoSights, best_sights, guessed_pixels, photo_sights, street_views
 from tasks.render.splatting.gaussians import EMPTY, Gaussians, concatenate
-from tasks.world.arrays import Array, Bools
+from tasks.world.arrays import F32, Array, Bools
 from tasks.world.clip import Camera, SensorFile
 
 MOUNT = street.EGO_FROM_CAMERA.copy()
@@ -76,6 +76,27 @@ def sight_of_middle(asset: RenderAsset, here: Array, *photos: Array) -> float:
 )
 def test_a_place_counts_as_much_as_the_best_photo_shows_it(here: Array, photos: list[Array], expected: float) -> None:
     assert sight_of_middle(scene(wall(WALL_M, -30.0, 30.0)), here, *photos) == pytest.approx(expected, abs=1e-5)
+
+
+def test_of_many_photos_each_pixel_has_the_best_of_all_alone() -> None:
+    rng, asset = np.random.default_rng(6), scene(wall(WALL_M, -30.0, 30.0, seed=1), wall(14.0, -4.0, -2.0, seed=2))
+    photos = [pose(rng.uniform(-10.0, 9.0), rng.uniform(-6.0, 6.0), rng.uniform(-25.0, 25.0)) for _ in range(24)]
+    sights = sights_of(asset, *photos)
+    eye, view = next(street_views(asset, [(LENS, pose(4.0, 1.0, 5.0))]))
+    here, ahead = (np.ascontiguousarray(eye.world_from_camera[:3, k]) for k in (3, 2))
+    rays = pixel_directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height)
+    places = here + (view.depth / (rays @ ahead))[..., None] * rays
+
+    def of(rows: slice) -> tuple[F32, F32]:
+        parts = {name: getattr(sights, name)[rows] for name in vars(sights)}
+        return best_sights(PhotoSights(**parts), places, here, ahead, view.rgb)
+
+    best, shown = of(slice(None))
+    scores, pictures = map(np.stack, zip(*[of(slice(i, i + 1)) for i in range(len(photos))]))
+    np.testing.assert_array_equal(best, scores.max(axis=0))
+    of_best = np.take_along_axis(pictures, scores.argmax(axis=0)[None, ..., None], axis=0)[0]
+    np.testing.assert_array_equal(shown, np.where(best[..., None] > 0.0, of_best, view.rgb))
+    assert (best > 0.5).mean() > 0.5
 
 
 def test_what_stood_before_a_place_in_a_photo_hides_it() -> None:

@@ -75,3 +75,20 @@ def test_a_sky_that_nobody_may_write_to_is_seen_all_the_same() -> None:
 def test_a_map_of_another_size_is_refused() -> None:
     with pytest.raises(ValueError, match=rf"sky: \(8, 16, 3\), expected \({ROWS}, {COLUMNS}, 3\)"):
         finished(SkyMap(np.zeros((8, 16, 3), np.float32)), np.eye(4))
+
+
+@pytest.mark.parametrize("focal", [80.0, 250.0, 1300.0])  # squares of 1, 2 and 13 pixels
+def test_what_hides_some_of_the_sky_changes_none_of_it_beside(focal: float) -> None:
+    rng, size = np.random.default_rng(7), (211, 120)
+    sky, k = SkyMap(rng.random((ROWS, COLUMNS, 3)).astype(np.float32)), np.diag([focal, focal, 1.0])
+    k[:2, 2] = 100.0, 50.0
+    ahead = np.eye(4)  # far from the poles, where every pixel has an angle of its own
+    ahead[:3, :3] = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
+    hidden = np.zeros(size[::-1], bool)
+    for row, column, high, wide in rng.integers(0, 100, (8, 4)):
+        hidden[row : row + high // 2, column : column + wide // 2] = True
+    rgb = np.zeros((*hidden.shape, 3), np.float32)
+    sky.finish(rgb, hidden.astype(np.float32), np.eye(3, 4), k, ahead)
+    all_of_it = finished(sky, ahead, k=k, size=size)
+    np.testing.assert_array_equal(rgb, np.where(hidden[..., None], np.float32(0.0), all_of_it))
+    assert 0.1 < hidden.mean() < 0.9
