@@ -245,11 +245,9 @@ class NonlinearController:
         low = np.concatenate([np.tile(COMMAND_LOW, HORIZON), np.tile(LOW_NONLINEAR, 2 * HORIZON - 2)]) - offset
         high = np.concatenate([np.tile(COMMAND_HIGH, HORIZON), np.tile(HIGH_NONLINEAR, 2 * HORIZON - 2)]) - offset
         best = minimum(hessian, gradient, rows, low, high)
-        return (
-            None
-            if isinstance(best, str)
-            else (best.reshape(commands.shape), (free + response @ best).reshape(states.shape))
-        )
+        if isinstance(best, str):
+            return None
+        return best.reshape(commands.shape), (free + response @ best).reshape(states.shape)
 
 
 def controller_of(name: ControllerName) -> Controller:

@@ -193,8 +193,8 @@ class TrafficScene:
     yielding: Yielding | None = None  # None: drivers give way to nobody, or another mode
 
 
-class _ToldByLog(NamedTuple):
-    """What all scenes of a clip share."""
+class _LogFacts(NamedTuple):
+    """Of a clip's log alone, whichever of its scenes is simulated."""
 
     is_vehicle: Bools  # (N,)
     moving_kind: Bools  # (N,)
@@ -205,13 +205,17 @@ class _ToldByLog(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def _told_by_log(log: AgentTracks) -> _ToldByLog:
+def _log_facts(log: AgentTracks) -> _LogFacts:
     is_vehicle = np.array([kind == AgentKind.VEHICLE for kind in log.kinds], dtype=bool)
     moving_kind = np.array([kind in MOVING_KINDS for kind in log.kinds], dtype=bool)
     pairs = couplings(log)
-    return _ToldByLog(
-        *(is_vehicle, moving_kind, is_vehicle & stands_always(log)),
-        *(pairs, first_parts(len(log), pairs), _agent_states(log)),
+    return _LogFacts(
+        is_vehicle=is_vehicle,
+        moving_kind=moving_kind,
+        stands=is_vehicle & stands_always(log),
+        pairs=pairs,
+        first_part=first_parts(len(log), pairs),
+        states=_agent_states(log),
     )
 
 
@@ -224,7 +228,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     now, log = scene.agents, scene.clip.agents
     n, start = len(now), scene.step
     moved = np.zeros(n, dtype=bool) if scene.ever_simulated is None else scene.ever_simulated
-    is_vehicle, moving_kind, stands, pairs, first_part, states = _told_by_log(log)
+    is_vehicle, moving_kind, stands, pairs, first_part, states = _log_facts(log)
     standing = stands & ~(moved & now.valid[start])
     is_first = first_part == np.arange(n)
     index = _indexed_lanes(scene.clip.road_map)
@@ -406,7 +410,7 @@ def _kernel_inputs(
         paths = paths._replace(line_state=np.concatenate([paths.line_state, np.repeat(paths.line_state[-1:], more, 0)]))
     return (
         start,
-        _told_by_log(log).states if longer is log else _agent_states(longer),
+        _log_facts(log).states if longer is log else _agent_states(longer),
         _agent_states(window.window(0, 1)),
         Roles(*_writable(traffic.roles)),
         Paths(*_writable(paths)),
