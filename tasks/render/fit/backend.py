@@ -18,14 +18,14 @@ from tasks.render.fit.start import FitProblem
 from tasks.render.fit.state import FitState
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.movers import SHIFT_SIZE, interpolate_knots, shift_boxes, world_from_boxes
-from tasks.render.scene.sensed import Photo
-from tasks.render.scene.sky import COLUMNS, ROWS, SkyCells, look_up_sky, sky_cells
+from tasks.render.scene.sensed import Photo, boxes_in_view
+from tasks.render.scene.sky import COLUMNS, ROWS, SkyCells, put_sky_behind, sky_cells
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.render.splatting.gradient import Gradients, backward, untransformed_gradients
 from tasks.render.splatting.project import DEPTH
 from tasks.render.splatting.raster import ForwardPass, forward
-from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
+from tasks.world.arrays import F32, Array, Ints, ShortInts
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,6 @@ class FitBackend(Protocol):
 
 
 # Which Gaussians a photo of the fit may show, and where their owners were at its time.
-
-VIEW_MARGIN_M = 0.5  # how far Gaussians of a track may reach beyond its box
 
 
 @dataclass(frozen=True)
@@ -103,20 +101,6 @@ def box_gradient(part: OwnedGaussians, means: Any, quats: Any, d_means: Any, d_q
     w, i, j, k = (quats[:, n] for n in range(4))  # turned by a little: half of (0, 0, 0, 1) times it more
     turn = turn + 0.5 * (d_quats[:, 3] * w + d_quats[:, 2] * i - d_quats[:, 1] * j - d_quats[:, 0] * k).sum()
     return d_means.sum(0), turn
-
-
-def boxes_in_view(boxes: Array, photo: Photo) -> Bools:
-    """Whether a ball around each box (N, 7) reaches into the photo's pyramid: (N,)."""
-    radius = 0.5 * np.linalg.norm(boxes[:, 4:], axis=1) + VIEW_MARGIN_M
-    height, width = photo.rgb.shape[:2]
-    camera_from_scene = np.linalg.inv(photo.world_from_camera)
-    at = boxes[:, :3] @ camera_from_scene[:3, :3].T + camera_from_scene[:3, 3]
-    seen = at[:, 2] > -radius
-    for axis, size in enumerate((width, height)):
-        focal, middle = photo.intrinsics[axis, axis], photo.intrinsics[axis, 2]
-        slope = max(middle, size - middle) / focal
-        seen &= np.abs(at[:, axis]) < slope * at[:, 2] + radius * np.hypot(1.0, slope)
-    return np.asarray(seen)
 
 
 # The backward pass of looking up the sky, which is learned.
@@ -193,7 +177,8 @@ class CpuBackend:
         back = backward(seen, scene, d_rgb, d_alpha=d_alpha, threads=self.threads)
         cells, d_cells = backdrop_gradient(d_rgb, seen.view.alpha, sky)
         rows, mine = _gradients_in_owner_frames(back, parts)
-        tracks, boxes = _box_gradients(state, parts, rows, mine)
+        moving = parts if held.iteration >= settings.pose_from else []  # before it no box is asked
+        tracks, boxes = _box_gradients(state, moving, rows, mine)
         score = psnr(np.clip(picture, 0.0, 1.0), compared.target.rgb)
         depths = seen.splats.projected[:, DEPTH]
         return Derivatives(loss, score, d_colours, back.camera, cells, d_cells, rows, mine, depths, tracks, boxes)
@@ -220,9 +205,11 @@ def draw_with_sky(
 ) -> tuple[ForwardPass, SkyCells]:
     """The photo's picture from `camera` (4, 4), and where its sky comes from."""
     height, width = photo.rgb.shape[:2]
-    sky = sky_cells(photo.intrinsics, camera, width, height, threads)
-    behind = look_up_sky(state.learned["sky"].values, sky, threads)
-    return forward(scene, photo.intrinsics, camera, width, height, behind, threads), sky
+    black = np.zeros(3, np.float32)
+    seen = forward(scene, photo.intrinsics, camera, width, height, black, threads, with_depth=False)
+    sky = sky_cells(photo.intrinsics, camera, width, height, threads, seen.view.alpha)
+    put_sky_behind(seen.view.rgb, seen.view.alpha, state.learned["sky"].values, sky, threads)
+    return seen, sky
 
 
 def _gradients_in_owner_frames(back: Gradients, parts: Sequence[OwnedGaussians]) -> tuple[Ints, Gradients]:

@@ -21,15 +21,16 @@ class Target:
     rgb: F32  # (H, W, 3) in [0, 1]
     mean: F32  # (H, W, 3) under the window
     variance: F32  # (H, W, 3) under the window
-    weight: F32  # (H, W) 0: the pixel says nothing
+    share: F32  # (H, W, 3) of a mean over all that says something; 0: the pixel says nothing
 
 
 def photo_target(rgb: Bytes, ignored: Bools | None = None) -> Target:
     """`rgb` (H, W, 3), `ignored` (H, W) pixels to leave out."""
     image = rgb.astype(np.float32) / np.float32(255.0)
     mean = _blur(image)
-    weight = np.ones(rgb.shape[:2], np.float32) if ignored is None else (~ignored).astype(np.float32)
-    return Target(image, mean, _blur(image * image) - mean * mean, weight)
+    counted = np.ones(image.shape, bool) if ignored is None else np.repeat(~ignored, 3).reshape(image.shape)
+    share = counted.astype(np.float32) / np.float32(max(counted.sum(), 1))
+    return Target(image, mean, _blur(image * image) - mean * mean, share)
 
 
 def _blur(image: F32) -> F32:
@@ -39,30 +40,24 @@ def _blur(image: F32) -> F32:
 
 def ssim(rgb: F32, target: Target) -> tuple[float, F32]:
     """Mean structural similarity over weighted pixels and channels, and its gradient (H, W, 3)."""
-    share = _share(target)
-    square, cross = _blur(rgb * rgb), _blur(rgb * target.rgb)
-    mean = _blur(rgb)
-    similar = _similarity(mean, square, cross, target.mean, target.variance, share)
-    by_mean, by_square, by_cross = _blur(mean), _blur(square), _blur(cross)
-    return float((share * similar).sum()), by_mean + np.float32(2.0) * rgb * by_square + target.rgb * by_cross
+    windowed = _blur(rgb), _blur(rgb * rgb), _blur(rgb * target.rgb)
+    mean, _ = _similarity(*windowed, target.mean, target.variance, target.share)
+    by_rgb, by_square, by_cross = (_blur(by) for by in windowed)
+    _pull_back(rgb, target.rgb, by_rgb, by_square, by_cross)
+    return mean, by_rgb
 
 
 def similarity(rgb: F32, target: Target) -> F32:
     """Structural similarity of each pixel and channel (H, W, 3)."""
     windowed = _blur(rgb), _blur(rgb * rgb), _blur(rgb * target.rgb)
-    return np.asarray(_similarity(*windowed, target.mean, target.variance, np.zeros_like(rgb)), np.float32)
-
-
-def _share(target: Target) -> F32:
-    """Of each pixel and channel (H, W, 3) in a mean over those that are weighted."""
-    share = target.weight / np.float32(3.0 * max(float(target.weight.sum()), 1.0))
-    return np.repeat(share, 3).reshape(target.rgb.shape)
+    return np.asarray(_similarity(*windowed, target.mean, target.variance, target.share)[1], np.float32)
 
 
 @numpy_division_kernel
 def _similarity(mean: Any, square: Any, cross: Any, target_mean: Any, target_variance: Any, share: Any) -> Any:
-    """Similarity of windowed x, x^2 and xy, which become the derivatives by them of the sum of share times it."""
-    out = np.empty_like(mean)
+    """The mean of all shares of the similarity, and this (H, W, 3), of windowed x, x^2 and xy, which become the
+    derivatives by them of that mean."""
+    out, total = np.empty_like(mean), 0.0
     x, xx, xy, to = mean.ravel(), square.ravel(), cross.ravel(), out.ravel()
     y, yy, s = target_mean.ravel(), target_variance.ravel(), share.ravel()
     for i in range(x.size):
@@ -73,18 +68,37 @@ def _similarity(mean: Any, square: Any, cross: Any, target_mean: Any, target_var
         by_square = -s[i] * value * by_2
         by_mean = 2.0 * s[i] * (y[i] * (a2 - a1) * by_1 * by_2 - x[i] * value * by_1) - 2.0 * x[i] * by_square
         x[i], xx[i], xy[i], to[i] = by_mean, by_square, 2.0 * s[i] * a1 * by_1 * by_2, value
-    return out
+    for row in range(out.shape[0]):
+        total += (share[row] * out[row]).sum()
+    return total, out
+
+
+@numpy_division_kernel
+def _pull_back(rgb: Any, photo: Any, by_mean: Any, by_square: Any, by_cross: Any) -> None:
+    """From derivatives by windowed x, x^2 and xy, themselves windowed, to those by x, in place of the first."""
+    x, y, by, square, cross = rgb.ravel(), photo.ravel(), by_mean.ravel(), by_square.ravel(), by_cross.ravel()
+    for i in range(x.size):
+        by[i] += np.float32(2.0) * x[i] * square[i] + y[i] * cross[i]
+
+
+@numpy_division_kernel
+def _add_difference(rgb: Any, photo: Any, share: Any, similar: Any, gradient: Any) -> Any:
+    """The mean difference; `gradient` (H, W, 3) becomes that of (1 - `similar`) times it less `similar` times what it
+    was."""
+    x, y, s, by, total = rgb.ravel(), photo.ravel(), share.ravel(), gradient.ravel(), 0.0
+    for i in range(x.size):
+        off = x[i] - y[i]
+        total += s[i] * abs(off)
+        by[i] = (np.float32(1.0) - similar) * s[i] * np.sign(off) - similar * by[i]
+    return total
 
 
 def photo_loss(rgb: F32, target: Target, ssim_weight: float) -> tuple[float, F32]:
     """(1 - w) L1 + w (1 - SSIM) of a picture (H, W, 3), and its gradient (H, W, 3)."""
-    share, off = np.float32(1.0 - ssim_weight) * _share(target), rgb - target.rgb
-    loss, gradient = float((share * np.abs(off)).sum()), share * np.sign(off)
-    if ssim_weight > 0.0:
-        alike, by_rgb = ssim(rgb, target)
-        loss += ssim_weight * (1.0 - alike)
-        gradient -= np.float32(ssim_weight) * by_rgb
-    return loss, gradient
+    alike, gradient = ssim(rgb, target) if ssim_weight > 0.0 else (0.0, np.zeros_like(rgb))
+    similar = np.float32(ssim_weight)
+    apart = float(_add_difference(rgb, target.rgb, target.share, similar, gradient))
+    return (1.0 - ssim_weight) * apart + ssim_weight * (1.0 - alike), gradient
 
 
 def opaque_loss(alpha: F32, ground: Bools, weight: float) -> tuple[float, F32]:

@@ -41,7 +41,7 @@ from tasks.render.fit.state import (
 from tasks.render.scene.body import BEFORE_M, NEAREST_M, BodyView
 from tasks.render.scene.movers import SHIFT_SIZE
 from tasks.render.scene.on_device import sky_places
-from tasks.render.scene.sky import COLUMNS
+from tasks.render.scene.sky import COLUMNS, LEAST_LIGHT
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gradient import Gradients
 from tasks.render.splatting.tensors import Draw, Eye, SceneTensors, hamilton, moved
@@ -139,7 +139,7 @@ def composite_sky(
 ) -> tuple[Tensor, Tensor]:
     """A picture (H, W, 3) with the sky behind it, and which of the `cells` (ROWS * COLUMNS, 3) that it asks for.
 
-    As `sky.look_up_sky` has it, and `backend.backdrop_gradient`: what hides more than HIDDEN asks nothing.
+    As `sky.put_sky_behind` has it, and `backend.backdrop_gradient`: what hides more than HIDDEN asks nothing.
     """
     lens, turn = (torch.as_tensor(of[None, :3, :3], device=alpha.device) for of in (intrinsics, scene_from_camera))
     (tops, lefts), rights, belows = sky_places(lens, turn, *alpha.shape)
@@ -158,7 +158,8 @@ def composite_sky(
         looked_up = cells[cell]
         behind = behind + share * torch.where(open_to_it[..., None], looked_up, looked_up.detach())
         asked[cell[open_to_it]] = True
-    return rgb + (1.0 - alpha)[..., None] * behind, asked.nonzero()[:, 0]
+    light = 1.0 - alpha
+    return rgb + torch.where(light > LEAST_LIGHT, light, 0.0)[..., None] * behind, asked.nonzero()[:, 0]
 
 
 def lay_flat(means: Tensor, quats: Tensor, log_scales: Tensor, rows: Tensor, surface: Tensor, corner: Array) -> None:
@@ -182,7 +183,7 @@ def lay_flat(means: Tensor, quats: Tensor, log_scales: Tensor, rows: Tensor, sur
 
 
 def limit_stretch(log_scales: Tensor, most: float) -> Tensor:
-    """`state.limit_stretch`."""
+    """What `state.FitState.keep_round` does to logarithms (M, 3) of sizes, all of one kind."""
     return torch.maximum(log_scales, log_scales.amax(dim=1, keepdim=True) - math.log(most))
 
 
@@ -385,7 +386,8 @@ class TorchBackend:
         d_shapes, sky, d_exposure, d_camera, screen = torch.autograd.grad(loss, asked, materialize_grads=True)
         spans = [torch.arange(span.start, span.stop, device=self.device) for span in map(_row_slice, parts)]
         rows = torch.cat(spans)[seen.index]
-        tracks, boxes = _box_gradients(parts, shapes.detach(), d_shapes)
+        moving = parts if held.iteration >= settings.pose_from else []  # before it no box is asked
+        tracks, boxes = _box_gradients(moving, shapes.detach(), d_shapes)
         back: dict[str, Any] = dict(zip(SHAPES, d_shapes[rows].split(WIDTHS, dim=1)))
         back |= {"logits": back["logits"][:, 0], "index": rows, "screen": screen}
         back["camera"] = d_camera.double().cpu().numpy()
@@ -399,7 +401,8 @@ class TorchBackend:
         if id(shot) in self._photos:
             return self._photos[id(shot)][1]
         compared = shot.compared
-        sent = self._sent(shot.photo.rgb), self._sent(compared.target.weight), self._sent(compared.ground)
+        weight = (compared.target.share[..., 0] > 0.0).astype(np.float32)
+        sent = self._sent(shot.photo.rgb), self._sent(weight), self._sent(compared.ground)
         if sum(tensor.nbytes for _, kept in self._photos.values() for tensor in kept) < KEPT_BYTES:
             self._photos[id(shot)] = shot, sent
         return sent

@@ -3,10 +3,11 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
-from tasks.render.fit.backend import CpuBackend, Derivatives, FitBackend, boxes_in_view
+from tasks.render.fit.backend import CpuBackend, Derivatives, FitBackend
 from tasks.render.fit.corrections import (
     apply_exposure,
     chain_exposures,
@@ -24,7 +25,7 @@ from tasks.render.fit.state import (
     LearnedState,
     Road,
     add_to_average,
-    height_above_road,
+    rays_meet_road,
     relocate_and_grow,
 )
 from tasks.render.scene.asset import ClassQuality, Exposure, RenderAsset, ViewQuality, mean_psnr_db, psnr
@@ -40,7 +41,7 @@ from tasks.render.scene.movers import (
     shift_boxes,
     world_from_boxes,
 )
-from tasks.render.scene.sensed import Photo, shift_pose
+from tasks.render.scene.sensed import Photo, boxes_in_view, shift_pose
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap, pixel_directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import Backend, FitSettings
@@ -55,7 +56,6 @@ from tasks.world.clip import AgentKind, Pinhole
 # are what looks at a vehicle's box, road what meets the road's surface within ROAD_M, rest is all else.
 
 ROAD_M = 30.0  # from the camera; farther a pixel is too long a piece of road
-RAY_FROM_M, STEPS = 0.5, 60  # where a ray is followed from, and in how many steps
 LEAST_PIXELS = 40  # of a class in a photo, that it is measured
 SAME_WAY = 0.87  # cosine: photos that look within 30 degrees of each other
 
@@ -73,7 +73,7 @@ def measure_photo(
     boxes, valid = boxes_at_photo(asset, problem, photo)
     vehicles = boxes[[j for j in np.flatnonzero(valid) if problem.tracks.kinds[j] == AgentKind.VEHICLE]]
     classes = pixel_classes(photo, vehicles, problem.road)
-    alike, counted = similarity(picture, target), target.weight > 0.0
+    alike, counted = similarity(picture, target), target.share[..., 0] > 0.0
     found = [_class_quality(name, picture, target, alike, inside & counted) for name, inside in classes.items()]
     return ViewQuality(
         photo.camera,
@@ -116,22 +116,9 @@ def pixel_classes(photo: Photo, vehicles: Array, road: Road | None) -> dict[str,
     rays = pixel_directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3)
     eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
     on_vehicle = np.asarray(behind_boxes(eye + FAR_M * rays, eye, np.ascontiguousarray(vehicles)), bool)
-    on_road = np.zeros(len(rays), bool) if road is None else rays_meet_road(road, eye, rays) & ~on_vehicle
+    on_road = np.zeros(len(rays), bool) if road is None else rays_meet_road(road, eye, rays, ROAD_M) & ~on_vehicle
     classes = {"road": on_road, "vehicles": on_vehicle, "rest": ~(on_road | on_vehicle)}
     return {name: inside.reshape(height, width) for name, inside in classes.items()}
-
-
-def rays_meet_road(road: Road, eye: Array, rays: Array) -> Bools:
-    """Which rays (M, 3) from `eye` (3,) go below the known road within ROAD_M, not where it is unknown."""
-    unit, lengths = rays / np.linalg.norm(rays, axis=1, keepdims=True), np.geomspace(RAY_FROM_M, ROAD_M, STEPS)
-    over, found = np.zeros(len(rays), bool), np.zeros(len(rays), bool)
-    down = np.flatnonzero(unit[:, 2] * ROAD_M < np.nanmax(road.heights) - eye[2])  # others stay above all of it
-    for length in lengths:
-        height = height_above_road((eye + length * unit[down]).astype(np.float32), road)
-        found[down] = over[down] & (height <= 0.0)
-        over[down] = height > 0.0
-        down = down[~found[down]]
-    return found
 
 
 def distance_to_nearest_m(photo: Photo, others: Sequence[Photo]) -> float:
@@ -291,8 +278,12 @@ def decay(end: float, progress: float) -> float:
 
 def photo_of_iteration(iteration: int, n: int, seed: int) -> int:
     """Which of n photos an iteration looks at: each once per round, shuffled by seed and round alone."""
-    order = np.random.Generator(np.random.Philox(key=[seed, iteration // n])).permutation(n)
-    return int(order[iteration % n])
+    return int(_round_order(iteration // n, n, seed)[iteration % n])
+
+
+@lru_cache(maxsize=4)
+def _round_order(turn: int, n: int, seed: int) -> Ints:
+    return np.random.Generator(np.random.Philox(key=[seed, turn])).permutation(n)
 
 
 def _iterate(

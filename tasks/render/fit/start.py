@@ -30,7 +30,7 @@ from tasks.render.scene.build import build_sky, build_surfaces, held_out_rows
 from tasks.render.scene.depth import PhotoDepth, estimate_photo_depth, label_confirmed
 from tasks.render.scene.features import NOTHING_KNOWN, KnownPoints, SurfacePoints, points_without_lidar
 from tasks.render.scene.movers import SHIFT_SIZE, behind_boxes
-from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse_sweeps, resize_photo, shift_pose
+from tasks.render.scene.sensed import Photo, Sweep, Tracks, boxes_in_view, fuse_sweeps, resize_photo, shift_pose
 from tasks.render.scene.sky import pixel_directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import FitSettings
@@ -40,14 +40,14 @@ from tasks.world.clip import AgentKind, AgentTracks
 
 ROAD_TOP_M = 0.08  # a Gaussian that starts no further from the road's surface belongs to it
 START_WIDTH = 640  # pixels of a photo across, more of which say no better where surfaces are
-COMPARED_BYTES, KEPT_BYTES = 41, 10**9  # of a pixel in `PhotoTarget`, and of all that are kept
+COMPARED_BYTES, KEPT_BYTES = 49, 10**9  # of a pixel in `PhotoTarget`, and of all that are kept
 LOOKS_DOWN = 0.05  # sine of the angle below the horizon from which on a ray meets the ground
 UPRIGHT = 0.5  # unless it stands: the least vertical part of its normal
 
 
 @dataclass(frozen=True)
 class PhotoTarget:
-    """What a picture is compared with: ten times its own bytes."""
+    """What a picture is compared with: sixteen times its own bytes."""
 
     target: Target
     ground: Bools  # (H, W) looks down, so that no sky can be behind
@@ -173,20 +173,24 @@ def _unseen_bodies(
 def _hidden_pixels(photo: Photo, tracks: Tracks, unknown: Bools) -> Bools | None:
     """Pixels of what moves and has no Gaussians of its own, the own body too: it would be painted on the street."""
     boxes, valid = tracks.at(photo.time_s)
-    if not (valid & unknown).any():
+    unknown = valid & unknown
+    unknown[unknown] = boxes_in_view(boxes[unknown], photo)
+    if not unknown.any():
         return photo.own_body
     height, width = photo.rgb.shape[:2]
     rays = pixel_directions(photo.intrinsics, photo.world_from_camera, width, height)
     eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
     far = rays.reshape(-1, 3) * FAR_M + eye
-    hidden = np.asarray(behind_boxes(far, eye, boxes[valid & unknown]), bool).reshape(height, width)
+    hidden = np.asarray(behind_boxes(far, eye, boxes[unknown]), bool).reshape(height, width)
     return hidden if photo.own_body is None else hidden | photo.own_body
 
 
 def _photo_target(photo: Photo, hidden: Bools | None) -> PhotoTarget:
     height, width = photo.rgb.shape[:2]
-    rays = pixel_directions(photo.intrinsics, photo.world_from_camera, width, height)
-    ground = rays[..., 2] < -LOOKS_DOWN * np.linalg.norm(rays, axis=-1)
+    k, up = photo.intrinsics, photo.world_from_camera[2, :3]
+    x = (np.arange(width) + 0.5 - k[0, 2]) / k[0, 0]
+    y = ((np.arange(height) + 0.5 - k[1, 2]) / k[1, 1])[:, None]
+    ground = up[0] * x + (up[1] * y + up[2]) < -LOOKS_DOWN * np.sqrt(x * x + (y * y + 1.0))
     return PhotoTarget(photo_target(photo.rgb, hidden), ground)
 
 

@@ -42,7 +42,7 @@ class AdamArray:
     def step(self, rows: Ints, gradient: F32, rate: float, scale: F32 | None = None) -> None:
         """Moves `rows` (M,), none twice, against `gradient` (M, C) by `rate`, times `scale` (M,) where given."""
         sizes = np.ones(len(rows), np.float32) if scale is None else scale
-        unbiased = _unbiased(int(self.steps.max(initial=0) + 1).bit_length())
+        unbiased = _unbiased(int(self.steps[rows].max(initial=0) + 1).bit_length())
         adam_step(self.values, self.first, self.second, self.steps, rows, gradient, np.float32(rate), sizes, unbiased)
 
     def take(self, rows: Ints) -> "AdamArray":
@@ -116,19 +116,18 @@ def fit_road(points: Array, eyes: Array) -> Road | None:
     Around each few metres of the way a plane is fitted to what lies below the cameras, and fitted again to what is
     near it; points near any plane make the height field.
     """
-    on_road, order = np.zeros(len(points), bool), np.argsort(points[:, 0])
+    points = points[np.argsort(points[:, 0], kind="stable")]
+    on_road = np.zeros(len(points), bool)
     for eye in _spaced(eyes):
         reach = eye[0] + np.array([-1.0, 1.0]) * max(PLANE_REACH_M, BESIDE_M)
-        rows = np.sort(order[slice(*np.searchsorted(points[:, 0], reach, sorter=order))])  # of most streets a few
-        around = points[rows]
-        away = np.linalg.norm(around[:, :2] - eye[:2], axis=1)
-        below = eye[2] - around[:, 2]
-        plane = _plane(around[(away < PLANE_REACH_M) & (below > BELOW_M[0]) & (below < BELOW_M[1])], eye)
-        if plane is None:
-            continue
-        near = np.flatnonzero(away < BESIDE_M)
-        off = around[near, 2] - np.column_stack([around[near, :2] - eye[:2], np.ones(len(near))]) @ plane
-        on_road[rows[near[np.abs(off) < NEAR_PLANE_M]]] = True
+        first, last = np.searchsorted(points[:, 0], reach)  # of most streets a few
+        east, north, height = (points[first:last, axis] - (eye[0], eye[1], 0.0)[axis] for axis in range(3))
+        away, below = east * east + north * north, eye[2] - height
+        looked_at = (away < PLANE_REACH_M**2) & (below > BELOW_M[0]) & (below < BELOW_M[1])
+        plane = _plane(east[looked_at], north[looked_at], height[looked_at])
+        if plane is not None:
+            off = height - (plane[0] * east + plane[1] * north + plane[2])
+            on_road[first:last] |= (away < BESIDE_M**2) & (np.abs(off) < NEAR_PLANE_M)
     if on_road.sum() < LEAST_POINTS:
         return None
     return _height_field(points[on_road])
@@ -142,17 +141,18 @@ def _spaced(eyes: Array) -> Sequence[Array]:
     return kept
 
 
-def _plane(points: Array, eye: Array) -> Array | None:
-    """z = a (x - eye x) + b (y - eye y) + c, (3,), by trimmed least squares from the median height on."""
-    if len(points) < LEAST_POINTS:
+def _plane(east: Array, north: Array, height: Array) -> Array | None:
+    """height = a east + b north + c, (3,), of points (M,) each, by trimmed least squares from the median on."""
+    if len(height) < LEAST_POINTS:
         return None
-    design = np.column_stack([points[:, :2] - eye[:2], np.ones(len(points))])
-    plane = np.array([0.0, 0.0, float(np.median(points[:, 2]))])
+    design = np.stack([east, north, np.ones(len(height))])
+    plane = np.array([0.0, 0.0, float(np.median(height))])
     for limit in (0.6, 0.4, 0.25, 0.15, NEAR_PLANE_M):
-        near = np.abs(points[:, 2] - design @ plane) < limit
+        near = np.abs(height - plane @ design) < limit
         if near.sum() < LEAST_POINTS:
             return None
-        plane = np.linalg.lstsq(design[near], points[near, 2], rcond=None)[0]
+        kept = design[:, near]
+        plane = np.linalg.lstsq(kept @ kept.T, kept @ height[near], rcond=None)[0]
     return np.asarray(plane)
 
 
@@ -202,6 +202,34 @@ def _above(means: Any, heights: Any, slopes: Any, corner: Any) -> Any:
 def height_above_road(means: FloatArray, road: Road) -> Array:
     """How far points (N, 3) lie above the road [m]; NaN beyond it."""
     return np.asarray(_above(means, road.heights, road.slopes, road.corner))
+
+
+@kernel
+def _first_below(eye: Any, rays: Any, lengths: Any, heights: Any, slopes: Any, corner: Any) -> Any:
+    """Whether each of unit `rays` (M, 3) from `eye` is above the known road at one of `lengths` and not at the next."""
+    found = np.zeros(rays.shape[0], np.bool_)
+    for i in range(rays.shape[0]):
+        over = False
+        for length in lengths:
+            x, y = eye[0] + length * rays[i, 0], eye[1] + length * rays[i, 1]
+            off = eye[2] + length * rays[i, 2] - _interpolate_height(heights, slopes, corner, x, y)[0]
+            if over and off <= 0.0:
+                found[i] = True
+                break
+            over = off > 0.0
+    return found
+
+
+RAY_FROM_M, STEPS = 0.5, 60  # where a ray is followed from, and in how many steps
+
+
+def rays_meet_road(road: Road, eye: Array, rays: Array, reach_m: float) -> Bools:
+    """Which rays (M, 3) from `eye` (3,) go below the known road within `reach_m`, not where it is unknown."""
+    unit, lengths = rays / np.linalg.norm(rays, axis=1, keepdims=True), np.geomspace(RAY_FROM_M, reach_m, STEPS)
+    found = np.zeros(len(rays), bool)
+    down = np.flatnonzero(unit[:, 2] * reach_m < np.nanmax(road.heights) - eye[2])  # others stay above all of it
+    found[down] = _first_below(np.ascontiguousarray(eye), unit[down], lengths, road.heights, road.slopes, road.corner)
+    return found
 
 
 @kernel
@@ -330,9 +358,7 @@ class FitState:
 
         Returns the nearest depths (M,) so far.
         """
-        self.nearest[rows] = np.minimum(self.nearest[rows], depths)
-        self.wanted[rows] += np.hypot(screen[:, 0], screen[:, 1])
-        return self.nearest[rows]
+        return np.asarray(_record_view(self.nearest, self.wanted, rows, depths, screen))
 
     def step_gaussians(self, rows: Ints, gradients: Gradients, rates: Mapping[str, float], depths: F32) -> None:
         """Moves `rows` (M,) against the gradients by them, by `rates` of SHAPES, means times `depths` (M,)."""
@@ -350,10 +376,8 @@ class FitState:
 
         `background` and `boxes`: that factor of those of either, 0: none.
         """
-        log_scales, owned = self.learned["log_scales"].values, self.owner[rows] != BACKGROUND
-        for most, mine in ((background, rows[~owned & ~self.road[rows]]), (boxes, rows[owned])):
-            if most > 0.0 and len(mine):
-                log_scales[mine] = limit_stretch(log_scales[mine], most)
+        most = (np.float32(np.log(factor) if factor > 0.0 else np.inf) for factor in (background, boxes))
+        _keep_round(self.learned["log_scales"].values, self.owner, self.road, rows, *most)
 
     def to_host(self, array: F32) -> F32:
         """An array of this state's kind, as numpy's: itself."""
@@ -438,9 +462,28 @@ def add_to_average(held: LearnedState) -> None:
         average += (values - average) / float(held.noted)
 
 
-def limit_stretch(log_scales: F32, most: float) -> F32:
-    """Logarithms (M, 3) of sizes, the shorter ones raised to the longest over `most`."""
-    return np.maximum(log_scales, log_scales.max(axis=1, keepdims=True) - np.float32(np.log(most)))
+@kernel
+def _record_view(nearest: Any, wanted: Any, rows: Any, depths: Any, screen: Any) -> Any:
+    out = np.empty(rows.shape[0], np.float32)
+    for k in range(rows.shape[0]):
+        i, u, v = rows[k], screen[k, 0], screen[k, 1]
+        nearest[i] = min(nearest[i], depths[k])
+        wanted[i] += np.sqrt(u * u + v * v)
+        out[k] = nearest[i]
+    return out
+
+
+@kernel
+def _keep_round(log_scales: Any, owner: Any, road: Any, rows: Any, background: Any, boxes: Any) -> None:
+    """Raises the shorter sides of `rows` to the longest less `background` or `boxes`, all of them logarithms."""
+    for k in range(rows.shape[0]):
+        i = rows[k]
+        if owner[i] == BACKGROUND and road[i]:
+            continue
+        least = max(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2])
+        least -= background if owner[i] == BACKGROUND else boxes
+        for axis in range(3):
+            log_scales[i, axis] = max(log_scales[i, axis], least)
 
 
 def opacities_of(logits: F32) -> F32:

@@ -211,7 +211,8 @@ def mean_psnr_db(views: Sequence[ViewQuality]) -> float:
 def psnr(a: NDArray[np.generic], b: NDArray[np.generic]) -> float:
     """Peak signal-to-noise ratio [dB] of two images of the same type: uint8 (peak 255) or float (peak 1)."""
     peak = 255.0 if a.dtype == np.uint8 else 1.0
-    error = float(np.mean((a.astype(np.float64) - b.astype(np.float64)) ** 2))
+    apart = np.subtract(a, b, dtype=np.float64)
+    error = float(np.mean(np.square(apart, out=apart)))
     return float("inf") if error == 0.0 else 10.0 * float(np.log10(peak**2 / error))
 
 

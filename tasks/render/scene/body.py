@@ -148,13 +148,8 @@ def distance_before_bodies(points: Array, view: BodyView) -> tuple[Array, Array]
 
     Negative: behind it; NaN where the photo shows no such body in the point's place.
     """
-    pixel, depth_m = project_points(points, view.camera_from_scene, view.intrinsics, view.height, view.width)
-    eye, rows = view.eye, np.flatnonzero(pixel >= 0)
-    rays = points[rows] - eye
-    along, first = nearest_box_along_rays(rays, eye, view.bodies)
-    on = (first >= 0) & view.drives[first]
-    before_m = np.full(len(points), np.nan)
-    before_m[rows[on]] = (along[on] - 1.0) * np.linalg.norm(rays[on], axis=1)
+    camera = view.camera_from_scene, view.intrinsics, view.height, view.width
+    before_m, depth_m = _distance_before(points, *camera, view.eye, view.bodies, view.drives)
     return before_m, depth_m
 
 
@@ -174,6 +169,25 @@ def project_points(points: Any, camera_from_scene: Any, k: Any, height: int, wid
         if 0.0 <= u < width and 0.0 <= v < height:
             pixel[i] = int(v) * width + int(u)
     return pixel, depth
+
+
+@kernel
+def _distance_before(
+    points: Any, camera_from_scene: Any, k: Any, height: int, width: int, eye: Any, bodies: Any, drives: Any
+) -> Any:
+    pixel, depth_m = project_points(points, camera_from_scene, k, height, width)
+    rows = np.flatnonzero(pixel >= 0)
+    rays = np.empty((len(rows), 3))
+    for n, i in enumerate(rows):
+        for axis in range(3):
+            rays[n, axis] = points[i, axis] - eye[axis]
+    along, first = nearest_box_along_rays(rays, eye, bodies)
+    before_m = np.full(points.shape[0], np.nan)
+    for n, i in enumerate(rows):
+        if first[n] >= 0 and drives[first[n]]:
+            x, y, z = rays[n, 0], rays[n, 1], rays[n, 2]
+            before_m[i] = (along[n] - 1.0) * np.sqrt(x * x + y * y + z * z)
+    return before_m, depth_m
 
 
 def unseen_body_gaussians(seen: Gaussians, size: Array) -> Gaussians:

@@ -103,6 +103,23 @@ class Tracks:
         return boxes, valid & self._movable
 
 
+VIEW_MARGIN_M = 0.5  # how far Gaussians of a track may reach beyond its box
+
+
+def boxes_in_view(boxes: Array, photo: Photo) -> Bools:
+    """Whether a ball around each box (N, 7) reaches into the photo's pyramid: (N,)."""
+    radius = 0.5 * np.linalg.norm(boxes[:, 4:], axis=1) + VIEW_MARGIN_M
+    height, width = photo.rgb.shape[:2]
+    camera_from_scene = np.linalg.inv(photo.world_from_camera)
+    at = boxes[:, :3] @ camera_from_scene[:3, :3].T + camera_from_scene[:3, 3]
+    seen = at[:, 2] > -radius
+    for axis, size in enumerate((width, height)):
+        focal, middle = photo.intrinsics[axis, axis], photo.intrinsics[axis, 2]
+        slope = max(middle, size - middle) / focal
+        seen &= np.abs(at[:, axis]) < slope * at[:, 2] + radius * np.hypot(1.0, slope)
+    return np.asarray(seen)
+
+
 def fuse_sweeps(sweeps: Sequence[Sweep], tracks: Tracks) -> tuple[Array, dict[int, Array]]:
     """Lidar points that stay (M, 3) local, and those of each track in its box's frame; both thinned by voxels."""
     static, moving = [np.zeros((0, 3))], dict[int, list[Array]]()

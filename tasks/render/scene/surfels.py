@@ -1,8 +1,8 @@
 """Photos with depth to flat Gaussians: one disc per pixel, or per block of pixels where the photo is plain."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any
 
 import numpy as np
@@ -99,18 +99,19 @@ def _blocks(rgb: F32, depth: F32, label: ShortInts, free: Bools, size: int) -> t
         return rows, columns
     height, width = depth.shape[0] // size, depth.shape[1] // size
 
-    def tiled(image: NDArray[Any]) -> NDArray[Any]:
-        cut = image[: height * size, : width * size]
-        return cut.reshape(height, size, width, size, *image.shape[2:]).swapaxes(1, 2)
+    def over_blocks(merge: Callable[[Any, Any], Any], image: NDArray[Any]) -> NDArray[Any]:
+        pixels = (image[k // size : height * size : size, k % size : width * size : size] for k in range(size * size))
+        return reduce(merge, pixels)
 
-    colour, z, owner = tiled(rgb), tiled(depth), tiled(label)
-    plain = (colour.max(axis=(2, 3)) - colour.min(axis=(2, 3))).max(axis=-1) < PLAIN
-    inverse = 1.0 / np.maximum(z, 1e-3)
-    bend = inverse[..., 0, 0] + inverse[..., -1, -1] - inverse[..., 0, -1] - inverse[..., -1, 0]
-    mean = inverse.mean(axis=(2, 3))
-    across_edge = z.max(axis=(2, 3)) > STEEP * z.min(axis=(2, 3))
-    same = owner.max(axis=(2, 3)) == owner.min(axis=(2, 3))
-    good = plain & same & ~across_edge & (np.abs(bend) < BEND * mean) & tiled(free).all(axis=(2, 3))
+    inverse = 1.0 / np.maximum(depth, 1e-3)
+    corner = inverse[: height * size, : width * size]
+    bend = corner[::size, ::size] + corner[size - 1 :: size, size - 1 :: size]
+    bend = bend - corner[::size, size - 1 :: size] - corner[size - 1 :: size, ::size]
+    mean = over_blocks(np.add, inverse) / size**2
+    plain = (over_blocks(np.maximum, rgb) - over_blocks(np.minimum, rgb)).max(axis=-1) < PLAIN
+    across_edge = over_blocks(np.maximum, depth) > STEEP * over_blocks(np.minimum, depth)
+    same = over_blocks(np.maximum, label) == over_blocks(np.minimum, label)
+    good = plain & same & ~across_edge & (np.abs(bend) < BEND * mean) & over_blocks(np.logical_and, free)
     rows, columns = np.nonzero(good)
     return rows * size, columns * size
 
@@ -258,14 +259,14 @@ def choose_discs(looks: Sequence[PhotoDiscs]) -> dict[int, Discs]:
             mine = np.where(look.late, len(BANDS_M) + 1, np.searchsorted(BANDS_M, depth)) == band
             if not mine.any():
                 continue
-            covered = np.zeros(look.depth.shape, np.bool_)
+            covered, reach = np.zeros(look.depth.shape, np.bool_), (float(depth[mine].min()), float(depth[mine].max()))
             for owner, parts in kept.items():
                 pose = np.eye(4) if owner == BACKGROUND else look.scene_from_box.get(owner)
                 if pose is None:
                     continue
                 photo = np.ascontiguousarray(np.linalg.inv(look.scene_from_camera) @ pose), look.intrinsics, look.depth
                 for part in parts:
-                    _mark_covered(part.points, part.across, part.down, part.spacing, *photo, covered)
+                    _mark_covered(part.points, part.across, part.down, part.spacing, *photo, *reach, covered)
             rows, columns = look.discs.pixels.T
             new = np.flatnonzero(mine & ~covered[rows, columns])
             for owner in np.unique(look.owner[new]):
@@ -292,9 +293,19 @@ def with_mirror_image(discs: Discs) -> Discs:
 
 @kernel
 def _mark_covered(
-    points: Any, across: Any, down: Any, spacing: Any, camera_from_scene: Any, k: Any, depth: Any, covered: Any
+    points: Any,
+    across: Any,
+    down: Any,
+    spacing: Any,
+    camera_from_scene: Any,
+    k: Any,
+    depth: Any,
+    nearest: float,
+    farthest: float,
+    covered: Any,
 ) -> None:
-    """Marks the pixels (H, W) whose surface a disc shows about as finely as the photo does."""
+    """Marks the pixels (H, W) whose surface a disc shows about as finely as the photo does, all of those from `nearest`
+    to `farthest` [m] and maybe others."""
     height, width = depth.shape
     r = camera_from_scene
     fx, fy = k[0, 0], k[1, 1]
@@ -303,17 +314,21 @@ def _mark_covered(
         z = r[2, 0] * px + r[2, 1] * py + r[2, 2] * pz + r[2, 3]
         if z < 0.5 or spacing[i] > COARSER * z / fx:
             continue
+        ax, ay, az = float(across[i, 0]), float(across[i, 1]), float(across[i, 2])
+        bx, by, bz = float(down[i, 0]), float(down[i, 1]), float(down[i, 2])
+        cz, dz = r[2, 0] * ax + r[2, 1] * ay + r[2, 2] * az, r[2, 0] * bx + r[2, 1] * by + r[2, 2] * bz
+        deep = 0.5 * (abs(cz) + abs(dz))  # the disc reaches no further to either side
+        if (1.0 + SAME_DEPTH) * (z + deep) + SAME_DEPTH_M < nearest:
+            continue
+        if (1.0 - SAME_DEPTH) * (z - deep) - SAME_DEPTH_M > farthest:
+            continue
         x = (r[0, 0] * px + r[0, 1] * py + r[0, 2] * pz + r[0, 3]) / z
         y = (r[1, 0] * px + r[1, 1] * py + r[1, 2] * pz + r[1, 3]) / z
         u, v = fx * x + k[0, 2], fy * y + k[1, 2]
         if u < -8.0 or v < -8.0 or u > width + 8.0 or v > height + 8.0:
             continue
-        ax, ay, az = float(across[i, 0]), float(across[i, 1]), float(across[i, 2])
-        cz = r[2, 0] * ax + r[2, 1] * ay + r[2, 2] * az
         au = fx * (r[0, 0] * ax + r[0, 1] * ay + r[0, 2] * az - x * cz) / z
         av = fy * (r[1, 0] * ax + r[1, 1] * ay + r[1, 2] * az - y * cz) / z
-        bx, by, bz = float(down[i, 0]), float(down[i, 1]), float(down[i, 2])
-        dz = r[2, 0] * bx + r[2, 1] * by + r[2, 2] * bz
         bu = fx * (r[0, 0] * bx + r[0, 1] * by + r[0, 2] * bz - x * dz) / z
         bv = fy * (r[1, 0] * bx + r[1, 1] * by + r[1, 2] * bz - y * dz) / z
         na = min(MOST_PARTS, int(np.sqrt(au * au + av * av) * 1.5) + 1)

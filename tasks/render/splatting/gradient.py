@@ -406,7 +406,7 @@ def backward(
     `gaussians` as traced, of SH degree 0. By the background it is d_rgb * (1 - alpha). Where the cut-off at 1/255, the
     cap on alpha or the order in depth changes the picture jumps, and its jumps have no derivative: alpha beyond the cap
     counts as flat.
-    Raises ValueError where shapes are not the view's.
+    Raises ValueError where shapes are not the view's, or it has no depth and `d_depth` is given.
     """
     splats, n = forward.splats, len(forward.splats.index)
     # Pairs are numbered ellipse by ellipse, the tiles of each row by row.
@@ -441,7 +441,10 @@ def _pairs(
     shapes = (d_rgb.shape, by_depth.shape, by_alpha.shape)
     if shapes != (view.rgb.shape, view.alpha.shape, view.alpha.shape):
         raise ValueError(f"backward: upstream shapes {shapes} do not fit a view of {view.rgb.shape}")
-    upstream, seen = (np.ascontiguousarray(d_rgb, np.float32), by_depth, by_alpha), (view.rgb, view.depth, view.alpha)
+    if d_depth is not None and not view.depth.size:
+        raise ValueError("backward: derivatives by depth of a view that was drawn without")
+    depth = view.depth if view.depth.size else by_depth
+    upstream, seen = (np.ascontiguousarray(d_rgb, np.float32), by_depth, by_alpha), (view.rgb, depth, view.alpha)
     dealt = (splats.projected, splats.tiles, splats.tile_start, splats.tile_splats)
     out = np.empty((len(splats.tile_splats), SUMS_SIZE), np.float32)
     run = partial(blend_gradient, *dealt, forward.tile_end, pair_start, *upstream, *seen, out)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from slow_raster import covariances_of
 
+from tasks.render.scene import surfels
 from tasks.render.scene.depth import dense_depth, sparse_depth
 from tasks.render.scene.sky import look_up_sky, pixel_directions, sky_cells, sky_of_views
 from tasks.render.scene.surfels import BACKGROUND, PhotoDiscs, choose_discs, discs_of_photo, discs_to_gaussians
@@ -83,6 +84,25 @@ def test_the_closest_look_at_a_surface_is_the_one_that_is_kept() -> None:
 def test_a_second_photo_from_the_same_place_adds_nothing() -> None:
     first = look((0.5, 0.5, 0.5), 9.0, 0.0)
     assert len(choose_discs([first, first])[BACKGROUND].points) == len(first.discs.points)
+
+
+def test_discs_too_near_or_too_far_for_a_band_are_passed_over_without_a_difference(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A ramp seen from two places, whose discs cross every band: the same are kept where all are looked at."""
+    depth = (np.linspace(3.0, 90.0, WIDTH) * np.ones((HEIGHT, 1))).astype(np.float32)
+    rgb = np.random.default_rng(3).uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    looks = []
+    for ahead in (0.0, 2.5):
+        pose, zs = np.eye(4), depth - np.float32(ahead)
+        pose[:3, 3] = 0.1, 0.0, ahead
+        discs = discs_of_photo(rgb, zs, np.full(zs.shape, -1, np.int32), INTRINSICS, pose)
+        n = len(discs.points)
+        looks.append(PhotoDiscs(discs, np.full(n, BACKGROUND, np.int32), np.zeros(n, bool), zs, INTRINSICS, pose, {}))
+    kept, mark = choose_discs(looks)[BACKGROUND], surfels._mark_covered
+    monkeypatch.setattr(surfels, "_mark_covered", lambda *a: mark(*a[:-3], 0.0, np.inf, a[-1]))
+    np.testing.assert_array_equal(kept.points, choose_discs(looks)[BACKGROUND].points)
+    assert len(looks[0].discs.points) < len(kept.points) < sum(len(look.discs.points) for look in looks)
 
 
 def test_discs_become_flat_gaussians_that_lie_in_their_surface() -> None:

@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap, look_up_sky, pixel_directions, sky_cells
+from tasks.render.scene.sky import (
+    COLUMNS,
+    LEAST_LIGHT,
+    ROWS,
+    SkyMap,
+    look_up_sky,
+    pixel_directions,
+    put_sky_behind,
+    sky_cells,
+)
 
 RNG = np.random.default_rng(4)
 SIZE = (53, 31)
@@ -63,6 +72,17 @@ def test_a_picture_is_finished_in_its_camera_s_colours() -> None:
     sky.finish(light, alpha, affine, K, np.eye(4))
     np.testing.assert_allclose(light, np.clip(expected, 0.0, 1.0), atol=0.5 / 255.0)
     assert (light == 0.0).any() and (light == 1.0).any()
+
+
+def test_a_picture_of_the_fit_gets_the_sky_that_it_lets_through() -> None:
+    """Where next to nothing passes, no angle is worked out."""
+    sky, alpha = SkyMap(RNG.random((ROWS, COLUMNS, 3)).astype(np.float32)), RNG.random(SIZE[::-1]).astype(np.float32)
+    alpha[::3], light = 1.0 - 0.9 * LEAST_LIGHT, RNG.random((*SIZE[::-1], 3)).astype(np.float32)
+    expected = light + np.where(1.0 - alpha > LEAST_LIGHT, 1.0 - alpha, 0.0)[..., None] * slow_lookup(sky, np.eye(4))
+    where = sky_cells(K, np.eye(4), *SIZE, alpha=alpha)
+    put_sky_behind(light, alpha, sky.cells, where)
+    np.testing.assert_allclose(light, expected, atol=1e-5)
+    assert not where.shares[::3].any() and where.shares[1::3].all()
 
 
 def test_a_sky_that_nobody_may_write_to_is_seen_all_the_same() -> None:

@@ -61,8 +61,8 @@ def upstream(seed: int) -> tuple[NDArray[np.float32], ...]:
     return tuple(rng.normal(size=shape).astype(np.float32) for shape in shapes)
 
 
-def traced(scene: Gaussians, threads: int = 1) -> ForwardPass:
-    return forward(scene, INTRINSICS, CAMERA, WIDTH, HEIGHT, BACKGROUND, threads)
+def traced(scene: Gaussians, threads: int = 1, with_depth: bool = True) -> ForwardPass:
+    return forward(scene, INTRINSICS, CAMERA, WIDTH, HEIGHT, BACKGROUND, threads, with_depth=with_depth)
 
 
 def dense(gradients: Gradients, kind: str, n: int) -> NDArray[np.float32]:
@@ -96,10 +96,12 @@ def same(fast: NDArray[np.floating], slow: NDArray[np.floating]) -> bool:
 @pytest.mark.parametrize("terms", ["rgb", "rgb, depth, alpha"])
 def test_gradients_are_those_of_the_slow_twin(name: str, terms: str) -> None:
     scene, (d_rgb, d_depth, d_alpha) = SCENES[name], upstream(7)
-    record = traced(scene)
+    record = traced(scene, with_depth="depth" in terms)
     d_depth = d_depth * (record.view.alpha > 0.05)  # the mean depth of almost nothing is steep beyond float32
     if terms == "rgb":
         fast = backward(record, scene, d_rgb)
+        with pytest.raises(ValueError, match="drawn without"):
+            backward(record, scene, d_rgb, d_depth)
         d_depth, d_alpha = np.zeros_like(d_depth), np.zeros_like(d_alpha)
     else:
         fast = backward(record, scene, d_rgb, d_depth, d_alpha)
