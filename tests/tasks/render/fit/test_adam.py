@@ -16,9 +16,9 @@ def test_rows_move_as_by_plain_adam_over_the_steps_they_were_in() -> None:
         rate = 0.1 * 0.97**t
         learned.step(rows, gradient, rate, scale.astype(np.float32))
         steps[rows] += 1
-        first[rows] = 0.9 * first[rows] + 0.1 * gradient
+        first[rows] = 0.3 * first[rows] + 0.7 * gradient
         second[rows] = 0.999 * second[rows] + 0.001 * gradient.astype(np.float64) ** 2
-        m, v = first[rows] / (1 - 0.9 ** steps[rows]), second[rows] / (1 - 0.999 ** steps[rows])
+        m, v = first[rows] / (1 - 0.3 ** steps[rows]), second[rows] / (1 - 0.999 ** steps[rows])
         values[rows] -= rate * scale[:, None] * m / (np.sqrt(v) + 1e-15)
     np.testing.assert_allclose(learned.values, values, rtol=1e-4, atol=1e-5)
 
