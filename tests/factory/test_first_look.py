@@ -44,7 +44,7 @@ def test_without_clips_and_preset_a_run_is_the_first_look_and_every_word_of_it_c
         (
             ["rounds=5"],
             r"clips=synthetic: 3 clips of a drawn town, 3 cameras of 256x144, lidar; rounds=5; pictures of 256x144 "
-            r"where there are photos, from scenes fitted in 500 iterations; out=runs/synthetic\n"
+            r"where there are photos, from scenes fitted in 550 iterations; out=runs/synthetic\n"
             rf"no clips= given, so this is a first look \({' '.join(FIRST_LOOK)}\); your logs: clips=av2\|custom.*\n",
         ),
         (
