@@ -13,6 +13,7 @@ from typing import cast
 
 import cv2
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from tasks.render.scene.depth import PhotoDepth
@@ -89,20 +90,21 @@ def relative_brightness(grey: F32, seen: Bools) -> Array:
     `grey` (N, M) in (0, 1] of M points in the photos that have `seen` (N, M) them. Least squares over log grey =
     photo + point with Cauchy's weights; a photo that shares fewer than LEAST points with others gets 0.
     """
-    logs = np.log(np.maximum(grey, 1e-2)).astype(np.float64)
-    shares = (seen & (seen.sum(axis=0) > 1)).astype(np.float64)
-    tied = shares.sum(axis=1) >= LEAST
-    out = np.zeros(len(grey))
+    photo, point = np.nonzero(seen & (seen.sum(axis=0) > 1))  # most photos see few of the points
+    logs = np.log(np.maximum(grey[photo, point], 1e-2)).astype(np.float64)
+    n, points = len(grey), seen.shape[1]
+    tied = np.bincount(photo, minlength=n) >= LEAST
+    weight, of, out = np.ones(len(logs)), np.bincount(point, minlength=points), np.zeros(n)
     for turn in range(BRIGHTNESS_ROUNDS if tied.any() else 0):
-        if turn == 0:
-            weight = shares
-        else:
-            off = logs - out[:, None]
-            means = (weight * off).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
-            weight = shares / (1.0 + ((off - means) / DISAGREES) ** 2)
-        of = np.maximum(weight.sum(axis=0), 1e-12)
-        system = np.diag(weight.sum(axis=1) + 1.0) - (weight / of) @ weight.T  # a point's own colour is eliminated
-        right = (weight * logs).sum(axis=1) - weight @ ((weight * logs).sum(axis=0) / of)
+        if turn > 0:
+            off = logs - out[photo]
+            means = np.bincount(point, weight * off, points) / np.maximum(of, 1e-12)
+            weight = 1.0 / (1.0 + ((off - means[point]) / DISAGREES) ** 2)
+        of = np.bincount(point, weight, points)
+        every = csr_array((weight, (photo, point)), shape=seen.shape)
+        shares = csr_array((weight / of[point], (photo, point)), shape=seen.shape)
+        system = np.diag(every.sum(axis=1) + 1.0) - (shares @ every.T).toarray()  # a point's own colour is eliminated
+        right = np.bincount(photo, weight * logs, n) - shares @ np.bincount(point, weight * logs, points)
         out = np.linalg.solve(system, right)
         out[~tied] = 0.0
         out[tied] -= out[tied].mean()

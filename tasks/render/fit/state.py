@@ -19,9 +19,9 @@ from tasks.world.arrays import F32, Array, Bools, FloatArray, Ints, ShortInts
 
 # Adam (Kingma and Ba 2015) for rows of an array, each with a count of steps of its own.
 #
-# Only rows that a photo shows are stepped: what is out of sight keeps still, and its moments wait for it. The
-# mean of gradients is short, 0.3 where usually 0.9: a row's next photo is another one, from elsewhere. On four data sets
-# that brings 0.06 to 0.5 dB of held-out photos (docs/reconstruction.md).
+# Only rows that a photo shows are stepped: what is out of sight keeps still, and its moments wait for it. The mean of
+# gradients is short, 0.3 where usually 0.9: a row's next photo is another one, from elsewhere. On four data sets that
+# brings 0.06 to 0.5 dB of held-out photos (docs/reconstruction.md).
 
 BETA1, BETA2, EPSILON = 0.3, 0.999, 1e-15
 

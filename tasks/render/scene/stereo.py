@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from tasks.kernels.compiled import kernel
+from tasks.kernels.compiled import kernel, numpy_division_kernel
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky import is_smooth_around, may_be_sky, sky_agrees
 from tasks.world.arrays import F32, Array, Bools
@@ -72,42 +72,49 @@ def matching_cost(
     )
 
 
-@kernel
+@numpy_division_kernel
 def _disagreement(rgb: Any, photos: Any, turned: Any, shifts: Any, k: Any, depth: Any, wanted: Any) -> Any:
     """(H, W) mean absolute colour difference to the better half of the other photos (n, H, W, 3), pixel by pixel.
 
     An occluder rarely hides a point from two photos on opposite sides: the half that agrees is trusted.
     """
     n, height, width = photos.shape[:3]
-    out = np.zeros((height, width), np.float32)
-    costs = np.empty(n)
+    out, one, half = np.zeros((height, width), np.float32), np.float32(1.0), (n + 1) // 2
+    costs, ways = (
+        np.empty(n),
+        np.empty((n, 6)),
+    )  # of each photo: what it sees of a pixel's ray in the row, and its slope
     for row in range(height):
+        b = (row + 0.5 - k[1, 2]) / k[1, 1]
+        for j in range(n):
+            for axis in range(3):
+                ways[j, axis] = turned[j, axis, 1] * b + turned[j, axis, 2]
+                ways[j, 3 + axis] = turned[j, axis, 0]
         for column in range(width):
             if not wanted[row, column]:
                 continue
-            z0 = depth[row, column] if depth[row, column] > 0.0 else 1.0
-            a, b = z0 * (column + 0.5 - k[0, 2]) / k[0, 0], z0 * (row + 0.5 - k[1, 2]) / k[1, 1]
+            z0, a = depth[row, column] if depth[row, column] > 0.0 else 1.0, (column + 0.5 - k[0, 2]) / k[0, 0]
             for j in range(n):
-                m = turned[j]
-                z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * z0 + shifts[j, 2]
+                z = (ways[j, 5] * a + ways[j, 2]) * z0 + shifts[j, 2]
                 cost = UNSEEN_COST
                 if z > 0.1:
-                    x = (m[0, 0] * a + m[0, 1] * b + m[0, 2] * z0 + shifts[j, 0]) / z - 0.5
-                    y = (m[1, 0] * a + m[1, 1] * b + m[1, 2] * z0 + shifts[j, 1]) / z - 0.5
+                    x = ((ways[j, 3] * a + ways[j, 0]) * z0 + shifts[j, 0]) / z - 0.5
+                    y = ((ways[j, 4] * a + ways[j, 1]) * z0 + shifts[j, 1]) / z - 0.5
                     if 0.0 <= x < width - 1 and 0.0 <= y < height - 1:
-                        x0, y0 = int(x), int(y)
-                        fx, fy = x - x0, y - y0
-                        cost = 0.0
+                        x0, y0, photo = np.uint64(x), np.uint64(y), np.uint64(j)  # unsigned: none counts from the end
+                        x1, y1 = x0 + np.uint64(1), y0 + np.uint64(1)
+                        fx, fy = np.float32(x - x0), np.float32(y - y0)
+                        off = np.float32(0.0)
                         for c in range(3):
-                            top = photos[j, y0, x0, c] * (1 - fx) + photos[j, y0, x0 + 1, c] * fx
-                            bottom = photos[j, y0 + 1, x0, c] * (1 - fx) + photos[j, y0 + 1, x0 + 1, c] * fx
-                            cost += abs(top * (1 - fy) + bottom * fy - rgb[row, column, c]) / 3.0
+                            top = photos[photo, y0, x0, c] * (one - fx) + photos[photo, y0, x1, c] * fx
+                            bottom = photos[photo, y1, x0, c] * (one - fx) + photos[photo, y1, x1, c] * fx
+                            off += abs(top * (one - fy) + bottom * fy - rgb[row, column, c])
+                        cost = float(off) / 3.0
                 place = j
                 while place > 0 and costs[place - 1] > cost:
                     costs[place] = costs[place - 1]
                     place -= 1
                 costs[place] = cost
-            half = (n + 1) // 2
             total = 0.0
             for j in range(half):
                 total += costs[j]
