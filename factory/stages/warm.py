@@ -91,7 +91,9 @@ def compile_kernels(parts: Sequence[str], enough: Event | None = None) -> None:
                 missing, enough = [name for name in parts if not _is_compiled(name)], enough or Event()
                 with ThreadPoolExecutor(os.cpu_count()) as pool:
                     try:
-                        list(pool.map(partial(_compile_part, enough=enough), missing))
+                        with terminal_signals_blocked():  # amid it one could leave a lock of the pool's held for ever
+                            begun = pool.map(partial(_compile_part, enough=enough), missing)
+                        list(begun)
                     except KeyboardInterrupt:  # which a part does not hear
                         enough.set()
                         raise
