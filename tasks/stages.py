@@ -44,7 +44,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("rollout", 4, "attempt", ("route_ended",)),
     Stage("expert", 3, "attempt", ("no_plan", "out_of_reach")),
     Stage("reward", 2, "attempt", (*SUBSCORES, *END_FAULTS, NEAR_LOG, NOT_RECOVERED)),
-    Stage("render", 15, "attempt", ("psnr", *PICTURE_FAULTS)),
+    Stage("render", 16, "attempt", ("psnr", *PICTURE_FAULTS)),
     Stage("write", 6, "attempt", ()),
 )
 

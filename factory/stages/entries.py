@@ -1,5 +1,7 @@
 """Calls that enter every kernel once, with the types that runs enter it with: what compiling a part executes."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from factory.graph.steps import NotReady
@@ -9,15 +11,17 @@ from tasks.experts.pdm_closed import forecast, proposals
 from tasks.experts.protocol import Plan
 from tasks.render.fit.reconstruct import finish_scene, run_iterations
 from tasks.render.fit.start import prepare_fit
+from tasks.render.gate import check_drive_pictures
 from tasks.render.rig.adjust import N_CAMERA, AdjustedRig, CornerTracks, bundle_adjust, initial_rig
 from tasks.render.scene.asset import Instant, RenderAsset
 from tasks.render.scene.build import AssetSettings, build_asset
 from tasks.render.scene.depth import confirm_depths
-from tasks.render.scene.movers import NOBODY
+from tasks.render.scene.movers import NOBODY, agents_at_time
 from tasks.render.scene.sensed import Photo, Sweep
 from tasks.render.scene.sky import plain_sky
 from tasks.render.scene.stereo import choose_partners, wide_baseline_depth
-from tasks.render.settings import FitSettings
+from tasks.render.seen import guessed_pixels, photo_sights, street_views
+from tasks.render.settings import FitSettings, GateSettings
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.sh import rotate_coefficients
 from tasks.reward.epdms import INDEX_FROM_ROWS, prepare_scene, score
@@ -100,9 +104,20 @@ POINTS = ((8.0, 1.0, 1.0), (9.0, -1.0, 2.0))  # that the rig is adjusted to
 
 
 def enter_render() -> RenderAsset:
-    """Builds and measures a scene of two 32 x 32 photos, some ground and one box that drives."""
+    """Builds, measures and looks at a scene of two 32 x 32 photos, some ground and one box that drives."""
     rotate_coefficients(np.zeros((1, 3, 3), np.float32), np.diag([1.0, -1.0, 1.0]))
-    return build_asset(*_tiny_recording(), AssetSettings(hold_out_every=3))
+    photos, sweeps, agents = _tiny_recording()
+    asset = build_asset(photos, sweeps, agents, AssetSettings(hold_out_every=3))
+    files, rig = _files_and_rig(photos)
+    check_drive_pictures(asset, rig, files[0].world_from_ego[None], agents, [0], (32, 32), GateSettings())
+    ((eye, view),) = street_views(asset, [(rig[0], files[0].world_from_ego)])
+    guessed_pixels(photo_sights(asset, files, rig), eye, view, agents_at_time(agents, 0.0).boxes)
+    return asset
+
+
+def _files_and_rig(photos: Sequence[Photo]) -> tuple[list[SensorFile], list[Camera]]:
+    files = [SensorFile(p.camera, "", p.time_s, p.world_from_camera @ np.linalg.inv(FRONT)) for p in photos]
+    return files, [Camera(photos[0].camera, 32, 32, photos[0].intrinsics, np.zeros(5), FRONT)]
 
 
 def enter_rig() -> AdjustedRig:
@@ -121,8 +136,8 @@ def enter_rig() -> AdjustedRig:
         rgb, nowhere, nowhere, choose_partners(photo, photos, 2), k, photo.world_from_camera, everywhere
     )
     confirm_depths(photos, [nowhere] * len(photos))
-    files = [SensorFile(p.camera, "", p.time_s, p.world_from_camera @ np.linalg.inv(FRONT)) for p in photos]
-    rig, shots = initial_rig([Camera(photo.camera, 32, 32, k, np.zeros(5), FRONT)], files)
+    files, cameras = _files_and_rig(photos)
+    rig, shots = initial_rig(cameras, files)
     at = [[16.0 - 20.0 * y / (x - k), 16.0 + 20.0 * (1.5 - z) / (x - k)] for x, y, z in POINTS for k in range(3)]
     matched = CornerTracks(np.array([0, 3, 6]), np.tile(np.arange(3), 2), np.array(at), np.ones(6))
     return bundle_adjust(rig, shots, matched, np.ones(6 * len(files) + N_CAMERA))

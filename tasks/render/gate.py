@@ -9,11 +9,13 @@ here as it did from where the photos were taken, and is most of a block's Gaussi
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 from scipy.ndimage import uniform_filter
 
+from tasks.kernels.compiled import kernel
 from tasks.render.scene.asset import (
     Instant,
     OwnBody,
@@ -26,7 +28,7 @@ from tasks.render.scene.asset import (
 from tasks.render.scene.engine import render, render_instants
 from tasks.render.scene.movers import BEYOND_M, PlacedAgents, agents_at_time, behind_boxes, boxes_at, world_from_boxes
 from tasks.render.scene.sensed import Photo
-from tasks.render.scene.sky import pixel_directions
+from tasks.render.scene.sky import pixel_directions, rises
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.seen import PhotoSights, guessed_pixels, street_views
 from tasks.render.settings import Backend, GateSettings, RenderSettings
@@ -516,8 +518,7 @@ def measure_rendered_views(
         return []
     out, around = [], _around_lenses(asset, instant)
     for eye, seen, body in zip(instant.cameras, views, own or [None] * len(views), strict=True):
-        rays = pixel_directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height)
-        road = meets_road(rays, eye.world_from_camera[:3, 3], world_from_ego)
+        road = meets_road(eye, world_from_ego)
         if body is not None:
             road &= ~body.in_front(eye.width, eye.height)
         close = _on_the_lens(around, eye.world_from_camera[:3, 3] - asset.origin)
@@ -539,15 +540,14 @@ def measure_rendered_view(seen: View, road: Bools, lens: F32 | None = None) -> P
     )
 
 
-def meets_road(rays: Array, eye: Array, world_from_ego: Array) -> Bools:
-    """Which rays (H, W, 3) from `eye` (3,) meet the plane of the ego frame's x and y nearer than ROAD_M.
+def meets_road(eye: Pinhole, world_from_ego: Array) -> Bools:
+    """Which pixels (H, W) look at the plane of the ego frame's x and y nearer than ROAD_M.
 
     Where that frame lies at the axle the plane is a wheel's radius above the road: a few rays less are asked for.
     """
-    up = world_from_ego[:3, 2]
-    rise = rays @ up
-    height = float((eye - world_from_ego[:3, 3]) @ up)
-    length = np.sqrt((rays * rays).sum(axis=-1))
+    up, place = world_from_ego[:3, 2], eye.world_from_camera[:3, 3]
+    rise, length = rises(eye.intrinsics, up @ eye.world_from_camera[:3, :3], eye.width, eye.height)
+    height = float((place - world_from_ego[:3, 3]) @ up)
     return np.asarray((rise < 0.0) & (height * length < -rise * ROAD_M))
 
 
@@ -559,17 +559,28 @@ def _around_lenses(asset: RenderAsset, instant: Instant) -> Gaussians:
     reach = instant.reach and replace(instant.reach, place=instant.reach.place - asset.origin)
 
     def about(part: Gaussians) -> Gaussians:
-        return part.take(_nearer(part, middle, LENS_M + apart_m + ROUNDING_M))
+        return part.take(rows_nearer(part, middle, LENS_M + apart_m + ROUNDING_M))
 
     near = replace(asset, background=near_part(about(asset.background), reach))
     return about(compose_gaussians(near, there.track_ids, there.kinds, there.boxes))
 
 
-def _nearer(scene: Gaussians, place: Array, metres: float) -> Ints:
+def rows_nearer(scene: Gaussians, place: Array, metres: float) -> Ints:
     """Rows of what comes nearer to a place (3,) than so many metres, INSIDE_SIGMAS of it counted in."""
-    x, y, z = (scene.means[:, k] - np.float32(place[k]) for k in range(3))
-    widest = np.exp(np.maximum(np.maximum(*scene.log_scales.T[:2]), scene.log_scales[:, 2]))
-    return np.flatnonzero(np.sqrt(x * x + y * y + z * z) < metres + INSIDE_SIGMAS * widest)
+    return np.asarray(_near_rows(scene.means, scene.log_scales, place.astype(np.float32), np.float32(metres)))
+
+
+@kernel
+def _near_rows(means: Any, log_scales: Any, place: Any, metres: Any) -> Any:
+    rows, count, sigmas = np.empty(means.shape[0], np.int64), 0, np.float32(INSIDE_SIGMAS)
+    for i in range(means.shape[0]):
+        x, y, z = means[i, 0] - place[0], means[i, 1] - place[1], means[i, 2] - place[2]
+        beyond = np.sqrt(x * x + y * y + z * z) - metres
+        widest = max(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2])
+        if beyond < 0.0 or ((widest > 0.0 or beyond < sigmas) and beyond < sigmas * np.exp(widest)):
+            rows[count] = i
+            count += 1
+    return rows[:count]
 
 
 def _on_the_lens(scene: Gaussians, eye: Array) -> Gaussians:
@@ -578,7 +589,7 @@ def _on_the_lens(scene: Gaussians, eye: Array) -> Gaussians:
     That gives the same picture but moves nothing in front of the near plane: a wall nearer than that is not drawn, and
     the picture would show what is behind it.
     """
-    near = scene.take(_nearer(scene, eye, LENS_M))
+    near = scene.take(rows_nearer(scene, eye, LENS_M))
     x, y, z = (near.means[:, k] - np.float32(eye[k]) for k in range(3))
     along = np.einsum("nij,ni->nj", rotations_of(near.quats), near.means - eye) / np.exp(near.log_scales)
     touched = np.sqrt(x * x + y * y + z * z) < LENS_M

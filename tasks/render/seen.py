@@ -26,7 +26,7 @@ from tasks.render.scene.movers import NOBODY, behind_boxes
 from tasks.render.scene.sky import pixel_directions
 from tasks.render.settings import Backend
 from tasks.render.splatting.raster import View
-from tasks.world.arrays import F32, Array, Bools
+from tasks.world.arrays import F32, Array, Bools, Ints
 from tasks.world.clip import Camera, Pinhole, SensorFile
 
 WIDTH = 80  # pixels of photos and pictures that are looked at
@@ -49,8 +49,9 @@ class PhotoSights:
     eyes: Array  # (P, 3) [m] in the world
     cameras_from_world: Array  # (P, 4, 4)
     lenses: Array  # (P, 4) focal lengths, principal point [px]
-    depths: tuple[F32, ...]  # (P) of (H, W) [m], 0 where nothing is
-    pictures: tuple[F32, ...]  # (P) of (H, W, 3)
+    heights: Ints  # (P,) rows of each photo's picture, at most H
+    depths: F32  # (P, H, WIDTH) [m], 0 where nothing is
+    pictures: F32  # (P, H, WIDTH, 3)
 
     def __len__(self) -> int:
         return len(self.eyes)
@@ -65,8 +66,12 @@ def photo_sights(
     eyes, views = zip(*street_views(asset, shots, backend)) if shots else ((), ())
     poses = np.array([eye.world_from_camera for eye in eyes]).reshape(-1, 4, 4)
     lenses = np.array([eye.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] for eye in eyes]).reshape(-1, 4)
-    depths, pictures = tuple(view.depth for view in views), tuple(np.ascontiguousarray(view.rgb) for view in views)
-    return PhotoSights(poses[:, :3, 3].copy(), np.linalg.inv(poses), lenses, depths, pictures)
+    heights = np.array([eye.height for eye in eyes], np.int64)
+    depths = np.zeros((len(eyes), heights.max(initial=0), WIDTH), np.float32)
+    pictures = np.zeros((*depths.shape, 3), np.float32)
+    for view, height, depth, picture in zip(views, heights, depths, pictures):
+        depth[:height], picture[:height] = view.depth, view.rgb
+    return PhotoSights(poses[:, :3, 3].copy(), np.linalg.inv(poses), lenses, heights, depths, pictures)
 
 
 def street_views(
@@ -100,11 +105,10 @@ def best_sights(sights: PhotoSights, places: Array, here: Array, ahead: Array, r
     And what that photo shows there (H, W, 3); where none shows it `rgb`, the picture itself.
     """
     best, shown = np.zeros(places.shape[:2], np.float32), rgb.copy()
-    for i, depth in enumerate(sights.depths):
-        photo_from_world = sights.cameras_from_world[i]
-        if photo_from_world[2, :3] @ ahead > LOOKS_ELSEWHERE:
-            photo = sights.eyes[i], photo_from_world, sights.lenses[i], depth, sights.pictures[i]
-            _look(places, here, *photo, best, shown)
+    apart_m = np.linalg.norm(sights.eyes - here, axis=1)  # the nearest first: they leave the others least to better
+    order = np.argsort(apart_m, kind="stable")
+    photos = sights.eyes, sights.cameras_from_world, sights.lenses, sights.heights, sights.depths, sights.pictures
+    _look(places, here, ahead, order, apart_m, *photos, best, shown)
     return best, shown
 
 
@@ -126,39 +130,68 @@ def _likeness(rgb: F32, other: F32) -> Array:
     return (2.0 * mean_a * mean_b + C1) * (2.0 * cross + C2) / ((mean_a**2 + mean_b**2 + C1) * (spread + C2))
 
 
+# A photo at least as far from here as the place is shows it worse than d / (d + |here - photo|): with cosine c of the
+# angle d_photo is c (d + |here - photo|) at least, and the exponential is less than c. So is every farther photo's.
+
+
 @kernel
 def _look(
-    places: Any, here: Any, eye: Any, photo_from_world: Any, lens: Any, depth: Any, picture: Any, best: Any, shown: Any
+    places: Any,
+    here: Any,
+    ahead: Any,
+    order: Any,
+    apart_m: Any,
+    eyes: Any,
+    photos_from_world: Any,
+    lenses: Any,
+    heights: Any,
+    depths: Any,
+    pictures: Any,
+    best: Any,
+    shown: Any,
 ) -> None:
-    m = photo_from_world
-    height, width = depth.shape
-    for row in range(places.shape[0]):
-        for column in range(places.shape[1]):
+    far = np.empty(best.shape)  # [m] each place from here
+    for row in range(best.shape[0]):
+        for column in range(best.shape[1]):
             x, y, z = places[row, column, 0], places[row, column, 1], places[row, column, 2]
-            away = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-            if away < NEAREST_M:
-                continue
-            u = lens[0] * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / away + lens[2]
-            v = lens[1] * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / away + lens[3]
-            if not (0.0 <= u < width and 0.0 <= v < height):
-                continue
-            first = depth[int(v), int(u)]
-            if first > 0.0 and away > BEHIND * first + BEHIND_M:
-                continue
-            mine = np.sqrt((x - here[0]) ** 2 + (y - here[1]) ** 2 + (z - here[2]) ** 2)
-            its = np.sqrt((x - eye[0]) ** 2 + (y - eye[1]) ** 2 + (z - eye[2]) ** 2)
-            dot = (x - here[0]) * (x - eye[0]) + (y - here[1]) * (y - eye[1]) + (z - here[2]) * (z - eye[2])
-            cosine, near = min(1.0, max(-1.0, dot / max(mine * its, 1.0e-9))), min(1.0, mine / max(its, 1.0e-9))
-            if near < best[row, column] * (1.0 + 2.0 * (1.0 - cosine) / ANGLE_RAD**2) * SURELY:
-                continue  # below the best: e^-x < 1 / (1 + x), and the angle's square is at least 2 (1 - cosine)
-            score = np.exp(-((np.arccos(cosine) / ANGLE_RAD) ** 2)) * near
-            if score > best[row, column]:
-                best[row, column] = score
-                # between the middles of the four pixels around it
-                right, down = min(max(u - 0.5, 0.0), width - 1.0), min(max(v - 0.5, 0.0), height - 1.0)
-                i, j = min(int(right), width - 2), min(int(down), height - 2)
-                a, b = right - i, down - j
-                for k in range(3):
-                    upper = (1.0 - a) * picture[j, i, k] + a * picture[j, i + 1, k]
-                    lower = (1.0 - a) * picture[j + 1, i, k] + a * picture[j + 1, i + 1, k]
-                    shown[row, column, k] = (1.0 - b) * upper + b * lower
+            far[row, column] = np.sqrt((x - here[0]) ** 2 + (y - here[1]) ** 2 + (z - here[2]) ** 2)
+    for photo in order:
+        m, lens, height, width = photos_from_world[photo], lenses[photo], heights[photo], depths.shape[2]
+        if m[2, 0] * ahead[0] + m[2, 1] * ahead[1] + m[2, 2] * ahead[2] <= LOOKS_ELSEWHERE:
+            continue
+        eye, depth, picture, may_better = eyes[photo], depths[photo], pictures[photo], False
+        for row in range(best.shape[0]):
+            for column in range(best.shape[1]):
+                mine, least = far[row, column], best[row, column]
+                if apart_m[photo] >= mine and mine < least * (mine + apart_m[photo]) * SURELY:
+                    continue
+                may_better = True
+                x, y, z = places[row, column, 0], places[row, column, 1], places[row, column, 2]
+                its = np.sqrt((x - eye[0]) ** 2 + (y - eye[1]) ** 2 + (z - eye[2]) ** 2)
+                dot = (x - here[0]) * (x - eye[0]) + (y - here[1]) * (y - eye[1]) + (z - here[2]) * (z - eye[2])
+                cosine, near = min(1.0, max(-1.0, dot / max(mine * its, 1.0e-9))), min(1.0, mine / max(its, 1.0e-9))
+                if near < least * (1.0 + 2.0 * (1.0 - cosine) / ANGLE_RAD**2) * SURELY:
+                    continue  # below the best: e^-x < 1 / (1 + x), and the angle's square is at least 2 (1 - cosine)
+                away = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+                if away < NEAREST_M:
+                    continue
+                u = lens[0] * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / away + lens[2]
+                v = lens[1] * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / away + lens[3]
+                if not (0.0 <= u < width and 0.0 <= v < height):
+                    continue
+                first = depth[int(v), int(u)]
+                if first > 0.0 and away > BEHIND * first + BEHIND_M:
+                    continue
+                score = np.exp(-((np.arccos(cosine) / ANGLE_RAD) ** 2)) * near
+                if score > least:
+                    best[row, column] = score
+                    # between the middles of the four pixels around it
+                    right, down = min(max(u - 0.5, 0.0), width - 1.0), min(max(v - 0.5, 0.0), height - 1.0)
+                    i, j = min(int(right), width - 2), min(int(down), height - 2)
+                    a, b = right - i, down - j
+                    for k in range(3):
+                        upper = (1.0 - a) * picture[j, i, k] + a * picture[j, i + 1, k]
+                        lower = (1.0 - a) * picture[j + 1, i, k] + a * picture[j + 1, i + 1, k]
+                        shown[row, column, k] = (1.0 - b) * upper + b * lower
+        if not may_better:
+            break

@@ -31,7 +31,7 @@ from tasks.render.scene.depth import PhotoDepth, estimate_photo_depth, label_con
 from tasks.render.scene.features import NOTHING_KNOWN, KnownPoints, SurfacePoints, points_without_lidar
 from tasks.render.scene.movers import SHIFT_SIZE, behind_boxes
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, boxes_in_view, fuse_sweeps, resize_photo, shift_pose
-from tasks.render.scene.sky import pixel_directions
+from tasks.render.scene.sky import pixel_directions, rises
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians, concatenate, rotations_of
@@ -187,11 +187,8 @@ def _hidden_pixels(photo: Photo, tracks: Tracks, unknown: Bools) -> Bools | None
 
 def _photo_target(photo: Photo, hidden: Bools | None) -> PhotoTarget:
     height, width = photo.rgb.shape[:2]
-    k, up = photo.intrinsics, photo.world_from_camera[2, :3]
-    x = (np.arange(width) + 0.5 - k[0, 2]) / k[0, 0]
-    y = ((np.arange(height) + 0.5 - k[1, 2]) / k[1, 1])[:, None]
-    ground = up[0] * x + (up[1] * y + up[2]) < -LOOKS_DOWN * np.sqrt(x * x + (y * y + 1.0))
-    return PhotoTarget(photo_target(photo.rgb, hidden), ground)
+    rise, length = rises(photo.intrinsics, photo.world_from_camera[2, :3], width, height)
+    return PhotoTarget(photo_target(photo.rgb, hidden), rise < -LOOKS_DOWN * length)
 
 
 def _first_state(

@@ -62,24 +62,38 @@ def _angle(y: Any, x: Any) -> Any:
 
 
 @inlined
-def _place(k: Any, turn: Any, column: Any, row: Any) -> Any:
-    """Row and column of the sky, with fractions, that a pixel looks at."""
-    a, b = (column + 0.5 - k[0, 2]) / k[0, 0], (row + 0.5 - k[1, 2]) / k[1, 1]
-    x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2]
-    y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2]
-    z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2]
-    v = (0.5 - _angle(z, np.sqrt(x * x + y * y)) / np.pi) * ROWS - 0.5
-    u = (_angle(y, x) / (2.0 * np.pi) + 0.5) * COLUMNS - 0.5
-    return v, u
+def _open_columns(alpha: Any, row: int) -> Any:
+    """From which column of a row on, and up to which, light passes: none beside them shows the sky."""
+    start, end = 0, alpha.shape[1]
+    while start < end and np.float32(1.0) - alpha[row, start] <= LEAST_LIGHT:
+        start += 1
+    while start < end and np.float32(1.0) - alpha[row, end - 1] <= LEAST_LIGHT:
+        end -= 1
+    return start, end
+
+
+@inlined
+def _places(k: Any, turn: Any, row: int, start: int, end: int, v: Any, u: Any) -> None:
+    """Rows `v` and columns `u` of the sky, with fractions, that pixels of a row look at; several at a time."""
+    for column in range(start, end):
+        a, b = (column + 0.5 - k[0, 2]) / k[0, 0], (row + 0.5 - k[1, 2]) / k[1, 1]
+        x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2]
+        y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2]
+        z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2]
+        v[column] = (0.5 - _angle(z, np.sqrt(x * x + y * y)) / np.pi) * ROWS - 0.5
+        u[column] = (_angle(y, x) / (2.0 * np.pi) + 0.5) * COLUMNS - 0.5
 
 
 @numpy_division_kernel
 def _find(k: Any, turn: Any, alpha: Any, corners: Any, shares: Any, first: int, last: int) -> None:
+    vs, us = np.empty(alpha.shape[1]), np.empty(alpha.shape[1])
     for row in range(first, last):
-        for column in range(corners.shape[1]):
+        start, end = _open_columns(alpha, row)
+        _places(k, turn, row, start, end, vs, us)
+        for column in range(start, end):
             if np.float32(1.0) - alpha[row, column] <= LEAST_LIGHT:
                 continue
-            v, u = _place(k, turn, column, row)
+            v, u = vs[column], us[column]
             v0, u0 = min(max(int(np.floor(v)), 0), ROWS - 2), int(np.floor(u))
             corners[row, column, 0] = v0
             corners[row, column, 1] = u0 & (COLUMNS - 1)
@@ -115,72 +129,40 @@ def _add_sky(cells: Any, corners: Any, shares: Any, alpha: Any, rgb: Any, first:
                 rgb[row, column, c] += light * (top * (1.0 - fv) + low * fv)
 
 
-# A picture needs no cells and no angles of each pixel: over so small a square they run straight to 0.02 cells, but near
-# the poles and at the seam.
-
-SQUARE_RAD = 0.01
-STRAIGHT = 3.0  # columns of the sky that a square spans at most: below some 57 degrees of elevation
-
-
 @inlined
-def _shows_sky(alpha: Any, top: int, bottom: int, start: int, end: int) -> bool:
-    for row in range(top, bottom):
+def _mix(weights: Any, red: Any, green: Any, blue: Any) -> Any:
+    """A channel as a camera shows it, from 0 to 1."""
+    seen = weights[0] * red + weights[1] * green + weights[2] * blue + weights[3]
+    return min(max(seen, np.float32(0.0)), np.float32(1.0))
+
+
+@numpy_division_kernel
+def _finish(cells: Any, k: Any, turn: Any, affine: Any, alpha: Any, rgb: Any, first: int, last: int) -> None:
+    """Rows of a picture (H, W, 3): the sky put behind them, in the camera's colours, from 0 to 1."""
+    vs, us = np.empty(alpha.shape[1]), np.empty(alpha.shape[1])
+    to_red = affine[0, 0], affine[0, 1], affine[0, 2], affine[0, 3]
+    to_green = affine[1, 0], affine[1, 1], affine[1, 2], affine[1, 3]
+    to_blue = affine[2, 0], affine[2, 1], affine[2, 2], affine[2, 3]
+    for row in range(first, last):
+        start, end = _open_columns(alpha, row)
+        _places(k, turn, row, start, end, vs, us)
         for column in range(start, end):
-            if np.float32(1.0) - alpha[row, column] > LEAST_LIGHT:
-                return True
-    return False
-
-
-@kernel
-def _finish(cells: Any, k: Any, turn: Any, step: int, affine: Any, alpha: Any, rgb: Any, first: int, last: int) -> None:
-    """Rows of a picture (H, W, 3): the sky put behind them, in the camera's colours, from 0 to 1. The sky's places are
-    those of the corners of squares of `step` pixels."""
-    width, zero, one = rgb.shape[1], np.float32(0.0), np.float32(1.0)
-    for top in range(first, last, step):
-        bottom = min(top + step, last)
-        known, v_right, u_right, v_under, u_under = False, 0.0, 0.0, 0.0, 0.0
-        for start in range(0, width, step):
-            if not _shows_sky(alpha, top, bottom, start, min(start + step, width)):
-                known = False
+            light = np.float32(1.0) - alpha[row, column]
+            if light <= LEAST_LIGHT:
                 continue
-            if known:  # the last square's right corners are this one's left ones
-                v_here, u_here, v_below, u_below = v_right, u_right, v_under, u_under
-            else:
-                v_here, u_here = _place(k, turn, start, top)
-                v_below, u_below = (v_here, u_here) if step == 1 else _place(k, turn, start, bottom)
-            if step == 1:  # its first corner is the only pixel
-                v_right, u_right, v_under, u_under = v_here, u_here, v_here, u_here
-            else:
-                v_right, u_right = _place(k, turn, start + step, top)
-                v_under, u_under = _place(k, turn, start + step, bottom)
-            known = step > 1
-            most, least = max(u_here, u_right, u_below, u_under), min(u_here, u_right, u_below, u_under)
-            for row in range(top, bottom):
-                share = (row - top) / (bottom - top)
-                v_first, u_first = v_here + share * (v_below - v_here), u_here + share * (u_below - u_here)
-                dv = (v_right + share * (v_under - v_right) - v_first) / step
-                du = (u_right + share * (u_under - u_right) - u_first) / step
-                for column in range(start, min(start + step, width)):
-                    light = one - alpha[row, column]
-                    if light <= LEAST_LIGHT:
-                        continue
-                    u, v = u_first + (column - start) * du, v_first + (column - start) * dv
-                    if most - least > STRAIGHT:
-                        v, u = _place(k, turn, column, row)
-                    v = min(max(v, 0.0), ROWS - 1.0)
-                    v0, u0 = min(int(v), ROWS - 2), int(u + COLUMNS)  # which rounds down, being positive
-                    fu, fv = np.float32(u + COLUMNS - u0), np.float32(v - v0)
-                    left, right = v0 * COLUMNS + (u0 & (COLUMNS - 1)), v0 * COLUMNS + ((u0 + 1) & (COLUMNS - 1))
-                    for c in range(3):
-                        high = cells[left, c] + (cells[right, c] - cells[left, c]) * fu
-                        low = cells[left + COLUMNS, c] + (cells[right + COLUMNS, c] - cells[left + COLUMNS, c]) * fu
-                        rgb[row, column, c] += light * (high + (low - high) * fv)
-        for row in range(top, bottom):
-            for column in range(width):
-                red, green, blue = rgb[row, column, 0], rgb[row, column, 1], rgb[row, column, 2]
-                for c in range(3):
-                    seen = affine[c, 0] * red + affine[c, 1] * green + affine[c, 2] * blue + affine[c, 3]
-                    rgb[row, column, c] = min(max(seen, zero), one)
+            v, u = min(max(vs[column], 0.0), ROWS - 1.0), us[column] + COLUMNS
+            v0, u0 = min(int(v), ROWS - 2), int(u)  # which rounds down, being positive
+            fu, fv = np.float32(u - u0), np.float32(v - v0)
+            left, right = v0 * COLUMNS + (u0 & (COLUMNS - 1)), v0 * COLUMNS + ((u0 + 1) & (COLUMNS - 1))
+            for c in range(3):
+                high = cells[left, c] + (cells[right, c] - cells[left, c]) * fu
+                low = cells[left + COLUMNS, c] + (cells[right + COLUMNS, c] - cells[left + COLUMNS, c]) * fu
+                rgb[row, column, c] += light * (high + (low - high) * fv)
+        for column in range(rgb.shape[1]):
+            colour = rgb[row, column, 0], rgb[row, column, 1], rgb[row, column, 2]
+            rgb[row, column, 0] = _mix(to_red, *colour)
+            rgb[row, column, 1] = _mix(to_green, *colour)
+            rgb[row, column, 2] = _mix(to_blue, *colour)
 
 
 WINDOWS = 96  # side by side in a picture, in which it is smooth or not
@@ -208,8 +190,8 @@ class SkyMap:
         """Makes a picture (H, W, 3) of a scene's own light, in place: the sky behind it where `alpha` (H, W) lets it
         through, then all in the colours of a camera with `affine` (3, 4), from 0 to 1. Raises ValueError as `cells`."""
         camera = np.array(intrinsics, np.float64), np.array(world_from_camera, np.float64)
-        step, colours = max(1, int(SQUARE_RAD * intrinsics[0, 0])), np.ascontiguousarray(affine, np.float32)
-        run_in_chunks(partial(_finish, self.cells, *camera, step, colours, alpha, rgb), len(rgb), ROWS_CHUNK, threads)
+        colours = np.ascontiguousarray(affine, np.float32)
+        run_in_chunks(partial(_finish, self.cells, *camera, colours, alpha, rgb), len(rgb), ROWS_CHUNK, threads)
 
 
 SKY_RGB, HAZE_RGB = (0.72, 0.78, 0.85), (0.30, 0.30, 0.31)  # above and below the horizon
@@ -254,6 +236,14 @@ def camera_rays(intrinsics: Array, width: int, height: int) -> Array:
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     x, y = (u - intrinsics[0, 2]) / intrinsics[0, 0], (v - intrinsics[1, 2]) / intrinsics[1, 1]
     return np.stack([x, y, np.ones_like(u)], axis=-1)
+
+
+def rises(intrinsics: Array, up: Array, width: int, height: int) -> tuple[Array, Array]:
+    """(H, W) how far viewing directions of depth 1 rise along `up` (3,) in camera coordinates, and how long they are:
+    of `camera_rays`, without working them out."""
+    x = (np.arange(width) + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0]
+    y = ((np.arange(height) + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1])[:, None]
+    return up[0] * x + (up[1] * y + up[2]), np.sqrt(x * x + (y * y + 1.0))
 
 
 def _cells(rays: Array) -> tuple[Array, Array]:

@@ -42,7 +42,10 @@ class Gaussians:
 
     def take(self, rows: Bools | Indices | slice) -> "Gaussians":
         """The Gaussians at `rows` (indices or mask); a slice copies nothing."""
-        return Gaussians(*(getattr(self, each.name)[rows] for each in fields(self)))
+        arrays = [getattr(self, each.name) for each in fields(self)]
+        if isinstance(rows, slice) or rows.dtype == np.bool_:
+            return Gaussians(*(array[rows] for array in arrays))
+        return Gaussians(*(array.take(rows, axis=0) for array in arrays))  # a third of the time
 
 
 EMPTY = Gaussians(*(np.zeros((0, *row), np.float32) for row in ((3,), (4,), (3,), (), (3,))))

@@ -102,7 +102,7 @@ GOLDEN: dict[str, Golden] = {
         },
     ),
     "render": Golden(
-        15,
+        16,
         {
             "rendered": (714.36471, 34.856669),
             "drawn": (1001.11158, 15.1497572),

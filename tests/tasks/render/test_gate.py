@@ -16,11 +16,12 @@ from tasks.render.gate import (
     measure_rendered_views,
     meets_road,
     picture_fault,
+    rows_nearer,
 )
 from tasks.render.scene.asset import Instant, Reach, RenderAsset
 from tasks.render.scene.engine import SCENE_S_OWN, render_instants
 from tasks.render.scene.movers import NOBODY
-from tasks.render.scene.sky import SkyMap
+from tasks.render.scene.sky import SkyMap, pixel_directions
 from tasks.render.splatting.gaussians import EMPTY, Gaussians, concatenate
 from tasks.render.splatting.raster import View
 from tasks.stages import PICTURE_FAULTS, STAGES
@@ -129,8 +130,24 @@ def test_a_scene_of_large_gaussians_is_blurred(street_asset: RenderAsset) -> Non
 
 
 def test_only_rays_that_come_down_on_the_road_in_reach_are_asked_for() -> None:
-    rays = np.array([[[10.0, 0.0, -1.5], [30.0, 0.0, -1.5], [10.0, 0.0, 0.5]]])
-    assert meets_road(rays, np.array([0.0, 0.0, 1.5]), np.eye(4)).tolist() == [[True, False, False]]
+    ego = street.ego_pose(3.0)
+    ego[:3, :3] = [[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]
+    eye = Pinhole(street.INTRINSICS, ego @ street.EGO_FROM_CAMERA, street.WIDTH, street.HEIGHT)
+    rays = pixel_directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height)
+    with np.errstate(divide="ignore"):
+        along = (ego[2, 3] - eye.world_from_camera[2, 3]) / rays[..., 2]  # lengths of a ray to the road's plane
+    away = along * np.linalg.norm(rays, axis=-1)
+    np.testing.assert_array_equal(meets_road(eye, ego), (along > 0.0) & (away < 20.0))
+
+
+def test_what_comes_near_is_told_by_its_middle_and_how_wide_it_is() -> None:
+    rng = np.random.default_rng(8)
+    blobs = concatenate([blob(*rng.uniform(-4.0, 4.0, 3), rng.choice([0.05, 0.5, 1.5])) for _ in range(400)])
+    sides = np.exp(blobs.log_scales + rng.uniform(-2.0, 0.0, (400, 3)).astype(np.float32))
+    blobs, place = replace(blobs, log_scales=np.log(sides)), np.array([0.5, -1.0, 0.25])
+    near = np.linalg.norm(blobs.means - place, axis=1) < 1.2 + 2.0 * sides.max(axis=1)
+    np.testing.assert_array_equal(rows_nearer(blobs, place, 1.2), np.flatnonzero(near))
+    assert 20 < near.sum() < 380
 
 
 def test_without_cameras_there_is_nothing_to_refuse(street_asset: RenderAsset) -> None:

@@ -80,7 +80,7 @@ def test_a_place_counts_as_much_as_the_best_photo_shows_it(here: Array, photos: 
 
 def test_of_many_photos_each_pixel_has_the_best_of_all_alone() -> None:
     rng, asset = np.random.default_rng(6), scene(wall(WALL_M, -30.0, 30.0, seed=1), wall(14.0, -4.0, -2.0, seed=2))
-    photos = [pose(rng.uniform(-10.0, 9.0), rng.uniform(-6.0, 6.0), rng.uniform(-25.0, 25.0)) for _ in range(24)]
+    photos = [pose(rng.uniform(-40.0, 9.0), rng.uniform(-6.0, 6.0), rng.uniform(-25.0, 25.0)) for _ in range(48)]
     sights = sights_of(asset, *photos)
     eye, view = next(street_views(asset, [(LENS, pose(4.0, 1.0, 5.0))]))
     here, ahead = (np.ascontiguousarray(eye.world_from_camera[:3, k]) for k in (3, 2))
@@ -119,7 +119,7 @@ def test_a_guess_is_what_photos_do_not_show_and_what_does_not_look_like_there() 
     seen = guessed(scrap, pose(0.0, 1.5), pose(0.0))
     assert 0.02 < seen.mean() < 0.3
     shown = sights_of(plain, pose(0.0))
-    other = replace(shown, pictures=(np.ascontiguousarray(shown.pictures[0][:, ::-1]),))
+    other = replace(shown, pictures=np.ascontiguousarray(shown.pictures[:, :, ::-1]))
     assert guessed_pixels(other, *next(street_views(plain, [(LENS, pose(0.0))])), NOBODY).mean() > 0.5
 
 

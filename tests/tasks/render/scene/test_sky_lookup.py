@@ -57,9 +57,6 @@ def test_the_sky_is_what_numpy_looks_up(seed: int) -> None:
     for found in (seen, looked_up):
         np.testing.assert_allclose(found, slow_lookup(sky, pose), atol=1e-5)
     np.testing.assert_array_equal(seen, finished(sky, pose, threads=3))
-    fine = np.array([[1300.0, 0.0, 300.0], [0.0, 1300.0, 170.0], [0.0, 0.0, 1.0]])  # angles of squares of 13 pixels
-    wide = pose, 3, fine, (601, 340)
-    np.testing.assert_allclose(finished(sky, *wide), slow_lookup(sky, pose, *wide[2:]), atol=0.02)  # of any two cells
 
 
 def test_a_picture_is_finished_in_its_camera_s_colours() -> None:
@@ -97,18 +94,16 @@ def test_a_map_of_another_size_is_refused() -> None:
         finished(SkyMap(np.zeros((8, 16, 3), np.float32)), np.eye(4))
 
 
-@pytest.mark.parametrize("focal", [80.0, 250.0, 1300.0])  # squares of 1, 2 and 13 pixels
-def test_what_hides_some_of_the_sky_changes_none_of_it_beside(focal: float) -> None:
+def test_what_hides_some_of_the_sky_changes_none_of_it_beside() -> None:
     rng, size = np.random.default_rng(7), (211, 120)
-    sky, k = SkyMap(rng.random((ROWS, COLUMNS, 3)).astype(np.float32)), np.diag([focal, focal, 1.0])
+    sky, k = SkyMap(rng.random((ROWS, COLUMNS, 3)).astype(np.float32)), np.diag([80.0, 80.0, 1.0])
     k[:2, 2] = 100.0, 50.0
-    ahead = np.eye(4)  # far from the poles, where every pixel has an angle of its own
-    ahead[:3, :3] = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
     hidden = np.zeros(size[::-1], bool)
     for row, column, high, wide in rng.integers(0, 100, (8, 4)):
         hidden[row : row + high // 2, column : column + wide // 2] = True
+    hidden[:, 150:] = hidden[60:, :40] = True  # rows end behind something, or begin so
     rgb = np.zeros((*hidden.shape, 3), np.float32)
-    sky.finish(rgb, hidden.astype(np.float32), np.eye(3, 4), k, ahead)
-    all_of_it = finished(sky, ahead, k=k, size=size)
+    sky.finish(rgb, hidden.astype(np.float32), np.eye(3, 4), k, np.eye(4))
+    all_of_it = finished(sky, np.eye(4), k=k, size=size)
     np.testing.assert_array_equal(rgb, np.where(hidden[..., None], np.float32(0.0), all_of_it))
     assert 0.1 < hidden.mean() < 0.9
