@@ -90,7 +90,7 @@ class FitSettings:
     rate_end: float = constant(0.3)  # that share, but for mean_rate
     mean_rate: float = 1.6e-3  # times the nearest viewing depth
     quat_rate: float = 4e-3  # of rotations
-    scale_rate: float = 2e-2  # of sizes
+    scale_rate: float = 2e-2  # of sizes; farther in fits of less than 8,000 iterations, by the root of how many less
     opacity_rate: float = 8e-2  # of opacities
     colour_rate: float = 1.2e-2  # of colours
     sky_rate: float = 4e-3  # of the sky map

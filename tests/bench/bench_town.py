@@ -47,7 +47,6 @@ SETTINGS = FitSettings(
     mean_rate=3.2e-3,
     mean_rate_end=0.15,
     quat_rate=8e-3,
-    scale_rate=4e-2,
     opacity_rate=0.16,
     colour_rate=2.4e-2,
     sky_rate=1e-2,
