@@ -215,6 +215,16 @@ def test_a_camera_keeps_its_pose_until_pose_from_and_then_shifts_and_turns_at_ra
     assert not np.delete(poses, row, axis=0).any()
 
 
+@pytest.mark.parametrize(("iterations", "times"), [(16_000, 1.0), (8_000, 1.0), (2_000, 2.0), (500, 4.0), (24, 4.0)])
+def test_sizes_step_farther_in_short_fits(prepared: tuple[FitProblem, FitState], iterations: int, times: float) -> None:
+    problem, state = prepared[0], fresh(prepared[1])
+    before = {name: state.learned[name].values[state.owner < 0].copy() for name in ("log_scales", "logits")}
+    run_iterations(problem, state, replace(SETTINGS, iterations=iterations), until=1)
+    moved_by = {name: np.abs(state.learned[name].values[state.owner < 0] - before[name]).max() for name in before}
+    assert moved_by["log_scales"] == pytest.approx(times * SETTINGS.scale_rate, rel=1e-3)  # Adam's first step
+    assert moved_by["logits"] == pytest.approx(SETTINGS.opacity_rate, rel=1e-3)
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_camera_that_was_turned_away_turns_back(prepared: tuple[FitProblem, FitState], sign: float) -> None:
     """By 2 degrees to either side, of a scene that is fitted so far."""
