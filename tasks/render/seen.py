@@ -150,7 +150,7 @@ def _look(
     best: Any,
     shown: Any,
 ) -> None:
-    far = np.empty(best.shape)  # [m] each place from here
+    far, in_question = np.empty(best.shape), np.ones(best.shape[0], np.bool_)  # [m] each place from here; by row
     for row in range(best.shape[0]):
         for column in range(best.shape[1]):
             x, y, z = places[row, column, 0], places[row, column, 1], places[row, column, 2]
@@ -159,13 +159,16 @@ def _look(
         m, lens, height, width = photos_from_world[photo], lenses[photo], heights[photo], depths.shape[2]
         if m[2, 0] * ahead[0] + m[2, 1] * ahead[1] + m[2, 2] * ahead[2] <= LOOKS_ELSEWHERE:
             continue
-        eye, depth, picture, may_better = eyes[photo], depths[photo], pictures[photo], False
+        eye, depth, picture = eyes[photo], depths[photo], pictures[photo]
         for row in range(best.shape[0]):
+            if not in_question[row]:
+                continue
+            in_question[row] = False
             for column in range(best.shape[1]):
                 mine, least = far[row, column], best[row, column]
-                if apart_m[photo] >= mine and mine < least * (mine + apart_m[photo]) * SURELY:
+                if mine == 0.0 or (apart_m[photo] >= mine and mine < least * (mine + apart_m[photo]) * SURELY):
                     continue
-                may_better = True
+                in_question[row] = True
                 x, y, z = places[row, column, 0], places[row, column, 1], places[row, column, 2]
                 its = np.sqrt((x - eye[0]) ** 2 + (y - eye[1]) ** 2 + (z - eye[2]) ** 2)
                 dot = (x - here[0]) * (x - eye[0]) + (y - here[1]) * (y - eye[1]) + (z - here[2]) * (z - eye[2])
@@ -193,5 +196,3 @@ def _look(
                         upper = (1.0 - a) * picture[j, i, k] + a * picture[j, i + 1, k]
                         lower = (1.0 - a) * picture[j + 1, i, k] + a * picture[j + 1, i + 1, k]
                         shown[row, column, k] = (1.0 - b) * upper + b * lower
-        if not may_better:
-            break
