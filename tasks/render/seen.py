@@ -130,8 +130,9 @@ def _likeness(rgb: F32, other: F32) -> Array:
     return (2.0 * mean_a * mean_b + C1) * (2.0 * cross + C2) / ((mean_a**2 + mean_b**2 + C1) * (spread + C2))
 
 
-# A photo at least as far from here as the place is shows it worse than d / (d + |here - photo|): with cosine c of the
-# angle d_photo is c (d + |here - photo|) at least, and the exponential is less than c. So is every farther photo's.
+# A photo at least as far from here as the place is shows it no better than d / (d + |here - photo|): with cosine c of
+# the angle, d_photo is c (d + |here - photo|) at least, and the exponential is c at most (from 90 degrees on it is less
+# than 1e-15, which betters nothing). What holds for one photo does for every farther one.
 
 
 @kernel

@@ -331,15 +331,15 @@ def _step_boxes(problem: FitProblem, held: LearnedState, settings: FitSettings, 
             boxes.values[at] = values + np.float32(weight) * rates * (boxes.values[at] - values)
 
 
-FULL, FARTHEST = 8000, 4.0  # iterations from which on sizes step by scale_rate, and how many times as far at most
+FULL_ITERATIONS, MOST_TIMES = 8000, 4.0  # from which on sizes step by scale_rate, and how many times as far at most
 
 
-def _farther(iterations: int) -> float:
-    """How many times as far sizes step in a shorter fit: those of few iterations end with discs too large or small.
+def _size_step_factor(iterations: int) -> float:
+    """How many times as far sizes step in a shorter fit.
 
-    The root is between what was measured best at 550, 1,200, 2,000 and 6,000 iterations (experiments/reconstruction).
+    The root lies among what came out best at 550, 1,200, 2,000 and 6,000 iterations (experiments/reconstruction).
     """
-    return min(max(FULL / iterations, 1.0) ** 0.5, FARTHEST)
+    return min(max(FULL_ITERATIONS / iterations, 1.0) ** 0.5, MOST_TIMES)
 
 
 def _step_gaussians(held: LearnedState, settings: FitSettings, found: Derivatives) -> None:
@@ -349,7 +349,7 @@ def _step_gaussians(held: LearnedState, settings: FitSettings, found: Derivative
     rates = {
         "means": settings.mean_rate * decay(settings.mean_rate_end, held.iteration / settings.iterations),
         "quats": fall * settings.quat_rate,
-        "log_scales": fall * settings.scale_rate * _farther(settings.iterations),
+        "log_scales": fall * settings.scale_rate * _size_step_factor(settings.iterations),
         "logits": fall * settings.opacity_rate,
         "colours": fall * settings.colour_rate,
     }
