@@ -318,11 +318,12 @@ def project_on_path(paths: Paths, m: int, x: float, y: float) -> tuple[float, fl
     rectangles = paths.stretches
     near = np.inf  # the nearest point is no farther than this
     for b in range(rectangles.shape[1]):
-        near = min(near, math.hypot(x - rectangles[m, b, 0], y - rectangles[m, b, 1]) + rectangles[m, b, 6])
+        dx, dy = x - rectangles[m, b, 0], y - rectangles[m, b, 1]
+        near = min(near, math.sqrt(dx * dx + dy * dy) + rectangles[m, b, 6])
     best, best_s, best_offset = np.inf, 0.0, 0.0
     for b in range(rectangles.shape[1]):
-        away = math.hypot(x - rectangles[m, b, 0], y - rectangles[m, b, 1]) - rectangles[m, b, 6]
-        if away > near + SLACK_M:
+        dx, dy, reach = x - rectangles[m, b, 0], y - rectangles[m, b, 1], near + rectangles[m, b, 6] + SLACK_M
+        if dx * dx + dy * dy > reach * reach:
             continue
         for k in range(b * CELLS, min((b + 1) * CELLS, paths.heading.shape[1] - 1)):
             px, py = paths.xy[m, k, 0], paths.xy[m, k, 1]
@@ -404,6 +405,16 @@ def corridor_ahead(paths: Paths, way: Way, blend_length: float, lookahead: float
     return corridor_between(paths.stretches, length, way.path, begin, begin + lookahead, offset, turn, way.half_width)
 
 
+@hidden_kernel
+def free_way(x: float, y: float, cell_radius: float, box: Box, radius: float) -> float:
+    """[m] of a way that are free of a box, `radius` around it, from its point (x, y) on; below 0: perhaps none.
+
+    cell_radius: around a cell of the corridor.
+    """
+    clearance = math.hypot(box[0] - x, box[1] - y) - radius - cell_radius
+    return 0.8 * clearance  # a blended path is a little longer than its own length
+
+
 @inner_kernel
 def corridor_gap(
     paths: Paths, way: Way, box: Box, radius: float, blend_length: float, lookahead: float
@@ -413,14 +424,13 @@ def corridor_gap(
     The corridor is walked in cells of PATH_SPACING_M; where the box is far, by that distance at once. radius: around
     the box.
     """
-    ahead = 0.0
-    cell_radius = math.hypot(way.half_width, PATH_SPACING_M)
+    ahead, cell_radius = 0.0, math.hypot(way.half_width, PATH_SPACING_M)
     while ahead < lookahead:
         s, travelled = way.s + way.front + ahead, way.travelled + way.front + ahead
         x, y, h = pose_on_path(paths, way.path, s, travelled, way.offset, way.turn, blend_length)
-        clearance = math.hypot(box[0] - x, box[1] - y) - radius - cell_radius
-        if clearance > 0.0:
-            ahead += max(0.8 * clearance, PATH_SPACING_M)  # 0.8: a blended path is a little longer than its own length
+        free = free_way(x, y, cell_radius, box, radius)
+        if free > 0.0:
+            ahead += max(free, PATH_SPACING_M)
             continue
         low, high = _range_in_strip(box, x, y, h, way.half_width)
         if low <= PATH_SPACING_M and high >= 0.0:

@@ -24,6 +24,7 @@ from tasks.rollout.corridor import (
     boxes_overlap,
     corridor_ahead,
     corridor_gap,
+    free_way,
     may_meet,
     near_corridor,
     pose_on_path,
@@ -36,6 +37,7 @@ from tasks.world.geometry import wrapped
 
 STOP_LINE_TOLERANCE_M = 1.0  # a car that stopped with its nose this far over the line still waits
 SMALLEST_GAP_M = 0.1  # keeps s* / gap finite
+SURELY_MPS2 = 1e-9  # above what rounding can do to an acceleration
 
 
 class IdmDriver(NamedTuple):
@@ -74,6 +76,17 @@ def needed_deceleration(speed: float, gap: float, lead_speed: float, driver: Idm
     lead_stop = max(lead_speed, 0.0) ** 2 / (2.0 * driver.emergency_decel)
     distance = max(gap - 0.5 * driver.min_gap_m, SMALLEST_GAP_M) + lead_stop
     return speed * speed / (2.0 * distance)
+
+
+@inner_kernel
+def matters_within(free: float, speed: float, accel: float, lead_speed: float, driver: IdmDriver) -> float:
+    """Gap [m] from which on a leader, `lead_speed` fast in any direction, leaves a driver at least `accel` [m/s2]."""
+    spare = free - accel - SURELY_MPS2
+    if spare <= 0.0:
+        return np.inf
+    closing = speed * (speed + lead_speed) / (2.0 * math.sqrt(driver.accel_max * driver.decel_max))
+    desired = driver.min_gap_m + max(0.0, speed * driver.headway_s + closing)
+    return max(desired * math.sqrt(driver.accel_max / spare), SMALLEST_GAP_M)
 
 
 @inner_kernel
@@ -255,15 +268,16 @@ def way_along(rows: RolloutRows, t: int, i: int, m: int, s: float, travelled: fl
 
 @hidden_kernel
 def gap_to(
-    paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int, way: Way, view: CorridorAhead, j: int
-) -> tuple[float, float]:
-    """(gap [m] from the bumper of agent i along its path to j, path heading there); inf: not in the way."""
+    paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int, way: Way, view: CorridorAhead, j: int,
+    within: float,
+) -> tuple[float, float]:  # fmt: skip
+    """(gap [m] from the bumper of agent i along its path to j, path heading there); inf: not in the way `within` m."""
     box, radius = box_of(rows.boxes, t, j), rows.radius[t, j]
     away = math.hypot(box[0] - rows.boxes[t, i, 0], box[1] - rows.boxes[t, i, 1])
     if away <= driver.lookahead_m + rows.boxes[t, i, 3] + radius and may_meet(
         paths.stretches, way.path, view, box, radius
     ):
-        return corridor_gap(paths, way, box, radius, driver.blend_length_m, driver.lookahead_m)
+        return corridor_gap(paths, way, box, radius, driver.blend_length_m, min(driver.lookahead_m, within))
     return np.inf, 0.0
 
 
@@ -286,7 +300,7 @@ def must_brake(roles: Roles, paths: Paths, driver: IdmDriver, rows: RolloutRows,
             or not near_corridor(view, rows.boxes[t, j, 0], rows.boxes[t, j, 1], rows.radius[t, j])
         ):
             continue
-        gap, h = gap_to(paths, driver, rows, t, i, way, view, j)
+        gap, h = gap_to(paths, driver, rows, t, i, way, view, j, driver.lookahead_m)
         if gap < np.inf:
             lead_speed = rows.velocities[t, j, 0] * math.cos(h) + rows.velocities[t, j, 1] * math.sin(h)
             if needed_deceleration(speed, gap, lead_speed, driver) > driver.decel_max:
@@ -308,13 +322,20 @@ def road_acceleration(paths: Paths, driver: IdmDriver, t: int, m: int, s: float,
 @hidden_kernel
 def acceleration_for_others(
     roles: Roles, paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int, way: Way, speed: float,
-    accel: float, yielding: Yielding | None,
+    accel: float, yielding: Yielding | None, near: Ints,
 ) -> float:  # fmt: skip
-    """Acceleration [m/s2] of agent i, driven, for the others but what it tows; `accel` without them.
+    """Acceleration [m/s2] of agent i, driven, for the others but what it tows; `accel` without them. near: scratch.
 
     One that keeps its intent slows down for a leader from what it could do at most, not from what it means to do.
     """
     view = corridor_ahead(paths, way, driver.blend_length_m, driver.lookahead_m)
+    if yielding is None:
+        free = free_acceleration(speed, paths.target_speed[way.path, nearest_point_index(paths, way.s)], driver)
+    else:
+        free = driver.accel_max
+    nose, travelled = way.s + way.front, way.travelled + way.front
+    x, y, _ = pose_on_path(paths, way.path, nose, travelled, way.offset, way.turn, driver.blend_length_m)
+    cell_radius, n, nearest, least = math.hypot(way.half_width, PATH_SPACING_M), 0, 0, np.inf
     for j in range(rows.valid.shape[1]):
         if (
             j == i
@@ -323,13 +344,20 @@ def acceleration_for_others(
             or not near_corridor(view, rows.boxes[t, j, 0], rows.boxes[t, j, 1], rows.radius[t, j])
         ):
             continue
-        gap, h = gap_to(paths, driver, rows, t, i, way, view, j)
+        away = free_way(x, y, cell_radius, box_of(rows.boxes, t, j), rows.radius[t, j])
+        near[n] = j
+        if away < least:
+            nearest, least = n, away
+        n += 1
+    for k in range(n):
+        j = near[nearest if k == 0 else k - (k <= nearest)]  # behind the nearest fewer matter
+        lead_speed = math.hypot(rows.velocities[t, j, 0], rows.velocities[t, j, 1])
+        within = matters_within(free, speed, accel, lead_speed, driver)
+        if free_way(x, y, cell_radius, box_of(rows.boxes, t, j), rows.radius[t, j]) >= within:
+            continue
+        gap, h = gap_to(paths, driver, rows, t, i, way, view, j, within)
         if gap < np.inf:
             lead_speed = rows.velocities[t, j, 0] * math.cos(h) + rows.velocities[t, j, 1] * math.sin(h)
-            if yielding is None:
-                free = free_acceleration(speed, paths.target_speed[way.path, nearest_point_index(paths, way.s)], driver)
-            else:
-                free = driver.accel_max
             behind = following_acceleration(free, speed, gap, lead_speed, driver)
             if behind < accel:
                 accel = behind
@@ -363,15 +391,18 @@ def is_clear(
     if not roles.enters_clear[i]:
         return not (roles.moving_kind[i] and touches_driven(log.boxes, k, i, rows, t, mode))
     x, y, heading, length, width = box_of(log.boxes, k, i)
+    c, s, radius = math.cos(heading), math.sin(heading), 0.5 * (length + width)
+    speed = log.velocities[k, i, 0] * c + log.velocities[k, i, 1] * s
     for j in range(len(mode)):
         if mode[j] == ABSENT or (j < len(roles.first_part) and roles.first_part[j] == roles.first_part[i]):
             continue
         margin = driver.min_gap_m
         if yielding is not None:
-            c, s = math.cos(heading), math.sin(heading)
-            speed = log.velocities[k, i, 0] * c + log.velocities[k, i, 1] * s
             closing = speed - rows.velocities[t, j, 0] * c - rows.velocities[t, j, 1] * s
             margin += driver.headway_s * speed + closing * closing / (2.0 * driver.decel_max)
+        dx, dy, reach = rows.boxes[t, j, 0] - x, rows.boxes[t, j, 1] - y, radius + abs(margin) + rows.radius[t, j]
+        if dx * dx + dy * dy > reach * reach:
+            continue
         if boxes_overlap((x, y, heading, length + 2.0 * margin, width), box_of(rows.boxes, t, j)):
             return False
     return True

@@ -481,10 +481,10 @@ def drive(
     yielding: None where drivers have no intent but their target speed, and give way to nobody.
     """
     rows, motion = initial_rows(now, roles, ego_boxes, ego_velocities)
-    mode, scratch = np.empty(len(roles.path) + 1, np.int64), np.empty(len(roles.path), np.int64)
+    mode, scratch = np.empty(len(roles.path) + 1, np.int64), np.empty(len(roles.path) + 1, np.int64)
     for t in range(ego_boxes.shape[0] - 1):
         _switch_to_idm(roles, paths, driver, t, rows, mode, scratch, motion, yielding)
-        _drive_on(start, roles, paths, driver, t, rows, mode, motion, yielding)
+        _drive_on(start, roles, paths, driver, t, rows, mode, scratch, motion, yielding)
         _tow(roles, driver, t, rows, mode, motion)
         _replay(log, roles, t, rows, mode, motion)
         _admit(start, log, roles, driver, t, rows, mode, scratch, motion, yielding)
@@ -616,9 +616,9 @@ def _switch_to_idm(
 @hidden_kernel
 def _drive_on(
     start: int, roles: Roles, paths: Paths, driver: IdmDriver, t: int,
-    rows: RolloutRows, mode: Ints, motion: Motion, yielding: Yielding | None,
+    rows: RolloutRows, mode: Ints, near: Ints, motion: Motion, yielding: Yielding | None,
 ) -> None:  # fmt: skip
-    """Those who are driven look at row t and move."""
+    """Those who are driven look at row t and move. near: (N + 1,) scratch."""
     for i in range(motion.mode.shape[1]):
         if mode[i] != DRIVEN:
             continue
@@ -632,7 +632,7 @@ def _drive_on(
             nose = s + 0.5 * rows.boxes[t, i, 3]
             accel = intended_acceleration(yielding, paths, driver, m, s, speed, start, t, nose)
         way = way_along(rows, t, i, m, s, travelled, motion.offset[t, i], motion.turn[t, i])
-        accel = acceleration_for_others(roles, paths, driver, rows, t, i, way, speed, accel, yielding)
+        accel = acceleration_for_others(roles, paths, driver, rows, t, i, way, speed, accel, yielding, near)
         if yielding is not None:
             accel = yielding_acceleration(yielding, driver, start, t, i, m, s, speed, rows, mode, motion, accel)
         motion.was_driven[t + 1, i] = True
