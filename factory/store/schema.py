@@ -494,7 +494,7 @@ def sample_rows_to_table(rows: Sequence[Mapping[str, object]]) -> pa.Table:
         if unknown:
             raise BadRow(f"unknown columns {unknown}")
         tables.append(pa.table([field.to_arrow(row.get(field.name)) for field in FIELDS], schema=SCHEMA))
-    return pa.concat_tables([SCHEMA.empty_table(), *tables]).combine_chunks()
+    return tables[0] if len(tables) == 1 else pa.concat_tables([SCHEMA.empty_table(), *tables]).combine_chunks()
 
 
 def table_to_rows(table: pa.Table) -> list[dict[str, object]]:
