@@ -16,6 +16,7 @@ from itertools import islice
 import numpy as np
 
 from tasks.experts.pdm_closed import PdmSettings, plan_for
+from tasks.kernels.simd import LANES
 from tasks.reward.epdms import Scores, prepare_scene, score, with_objects
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
@@ -27,6 +28,7 @@ from tasks.world.frames import HEADING, VX, to_local, to_world
 from tasks.world.vocabulary import FIRST_START, OF_LOG, Vocabulary
 
 NO_STARTS = np.empty((0, HORIZON_STEPS, 3))
+AT_ONCE = LANES - 1  # scored together, beside PDM-Closed: more take longer, fewer hardly less
 START_FATES = ("reached_gate", "score", "reactive")  # what drops starts, counted where a clip has some
 
 
@@ -80,23 +82,31 @@ def grid_cells(end_poses: Array, settings: PerturbSettings) -> Ints:
     return np.floor(end_poses[..., :2] / steps + 0.5).astype(np.int64)
 
 
-def first_good_per_cell(cell_of: Ints, order: Ints, is_good: Callable[[Ints], Bools]) -> Ints:
+def first_good_per_cell(cell_of: Ints, order: Ints, is_good: Callable[[Ints], Bools]) -> tuple[Ints, Ints]:
     """Per cell the first of `order`, (G',) in seeded order, that is good (C,); cells in the order of their first.
 
-    cell_of: (G, 2) cell of each trajectory; is_good: asked for a batch at a time, at most once for each.
+    And all that were needed to know, those up to the first good one of each cell. cell_of: (G, 2) cell of each
+    trajectory; is_good: asked for a batch at a time, at most once for each, also for some beyond those needed.
     """
     queues: dict[tuple[int, int], list[int]] = {}
     for member in order:
         queues.setdefault((int(cell_of[member, 0]), int(cell_of[member, 1])), []).append(int(member))
     chosen: dict[tuple[int, int], int] = {}
+    needed: list[int] = []
     rank = 0
-    while True:
-        asked = [(cell, queue[rank]) for cell, queue in queues.items() if cell not in chosen and rank < len(queue)]
-        if not asked:
-            return np.array([chosen[cell] for cell in queues if cell in chosen], dtype=np.int64)
-        good = is_good(np.array([member for _, member in asked], dtype=np.int64))
-        chosen.update({cell: member for (cell, member), ok in zip(asked, good) if ok})
-        rank += 1
+    while waiting := [cell for cell, queue in queues.items() if cell not in chosen and rank < len(queue)]:
+        ranks = max(1, AT_ONCE // len(waiting))
+        asked = {cell: queues[cell][rank : rank + ranks] for cell in waiting}
+        members = [member for queue in asked.values() for member in queue]
+        good = dict(zip(members, is_good(np.array(members, dtype=np.int64)).tolist()))
+        for cell, queue in asked.items():
+            first = next((k for k, member in enumerate(queue) if good[member]), len(queue))
+            needed += queue[: first + 1]
+            if first < len(queue):
+                chosen[cell] = queue[first]
+        rank += ranks
+    found = [chosen[cell] for cell in queues if cell in chosen]
+    return np.array(found, dtype=np.int64), np.array(needed, dtype=np.int64)
 
 
 def spread_out(points: Array, is_good: Callable[[int], bool], at_most: int) -> list[int]:
@@ -176,8 +186,9 @@ def perturb(
     rank = np.empty(len(walk_order), dtype=np.int64)
     rank[walk_order] = np.arange(len(walk_order))
     usable = np.flatnonzero((reached & black)[:n_gated])
-    kept = first_good_per_cell(cells, usable[np.argsort(rank[gated[usable]])], passes_replay)
-    kept_starts = first_good_per_cell(cells, np.flatnonzero(reached & is_start), passes_replay)
+    kept, needed = first_good_per_cell(cells, usable[np.argsort(rank[gated[usable]])], passes_replay)
+    kept_starts, needed_starts = first_good_per_cell(cells, np.flatnonzero(reached & is_start), passes_replay)
+    scores[np.setdiff1d(np.arange(len(index)), np.concatenate([needed, needed_starts]))] = np.nan
     counts["replay_score"] = int((scores[:n_gated] < settings.epdms_min).sum())
 
     fate = np.where(~reached, "reached_gate", np.where(~black, "white_cell", "not_needed")).astype(object)
