@@ -1,7 +1,7 @@
 """A judged drive as a sample row (columns of factory.store.schema): the world in the frame of the ego at now."""
 
-from collections.abc import Iterable, Mapping
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache, partial
 from itertools import compress
 from typing import NamedTuple
 
@@ -160,19 +160,19 @@ def map_columns(scene: Scene, pose: Array) -> Mapping[str, object]:
     # A large drivable area may have no edge near the ego and hold it all the same.
     areas = compress(road_map.road_rings, near(shapes.rings) | shapely.contains_xy(shapes.areas, x, y))
 
-    def local_ring(ring: Array) -> Array:
-        return points_to_local(pose, ring[:, :2])
+    def local_rings(rings: Iterable[Array]) -> list[Array]:
+        return _moved(partial(points_to_local, pose), [ring[:, :2] for ring in rings])
 
     shown = {lane.lane_id for lane in lanes}
     lights = [i for i, lane_id in enumerate(clip.lights.lane_ids) if lane_id in shown]
     steps = slice(scene.step - NOW_INDEX, scene.step - NOW_INDEX + AGENT_STEPS)
     return {
         "lane_ids": [lane.lane_id for lane in lanes],
-        "lane_polygons": [local_ring(lane.ring) for lane in lanes],
-        "lane_centerlines": [to_local(pose, lane.centerline) for lane in lanes],
+        "lane_polygons": local_rings(lane.ring for lane in lanes),
+        "lane_centerlines": _moved(partial(to_local, pose), [lane.centerline for lane in lanes]),
         "lane_is_intersection": [lane.is_intersection for lane in lanes],
-        "drivable_rings": [local_ring(ring) for ring in areas],
-        "crossing_rings": [local_ring(ring) for ring in compress(road_map.crossings, near(shapes.crossings))],
+        "drivable_rings": local_rings(areas),
+        "crossing_rings": local_rings(compress(road_map.crossings, near(shapes.crossings))),
         "light_lane_ids": [clip.lights.lane_ids[i] for i in lights],
         "light_states": clip.lights.states[steps, lights].T if lights else np.zeros((0, AGENT_STEPS), np.int8),
         "map_location": road_map.location,
@@ -180,6 +180,13 @@ def map_columns(scene: Scene, pose: Array) -> Mapping[str, object]:
         "route_lane_ids": sorted(clip.route.lane_ids),
         "route_centerline": to_local(pose, scene.centerline),
     }
+
+
+def _moved(move: Callable[[Array], Array], lines: Sequence[Array]) -> list[Array]:
+    """Every one of the lines (P, C) moved, all in one call."""
+    if not lines:
+        return []
+    return np.split(move(np.concatenate(lines)), np.cumsum([len(line) for line in lines])[:-1])
 
 
 def scene_tags(scene: Scene, command: str) -> list[str]:

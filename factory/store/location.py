@@ -446,27 +446,32 @@ class _Stored:
 
 
 def _encode(value: Any, arrays: _Arrays) -> Any:
+    kind: Any = type(value)
+    if kind in _PLAIN:
+        return value
+    if kind in (tuple, list):
+        return {kind.__name__: [_encode(v, arrays) for v in value]}
     if isinstance(value, enum.Enum):
-        return {"enum": _name(type(value)), "value": value.value}
+        return {"enum": _name(kind), "value": value.value}
     if isinstance(value, np.ndarray):
         if value.dtype.hasobject:
             raise TypeError("an array of objects cannot be cached")
         return {"array": arrays.place(value)}
     if isinstance(value, np.generic):
         return {"scalar": arrays.place(np.asarray(value))}
-    if isinstance(value, _PLAIN):
-        return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        members = {f.name: _encode(getattr(value, f.name), arrays) for f in dataclasses.fields(value) if f.init}
-        return {"class": _name(type(value)), "members": members}
+        return {"class": _name(kind), "members": {name: _encode(getattr(value, name), arrays) for name in _given(kind)}}
     if isinstance(value, Mapping):
         return {"dict": [[_encode(k, arrays), _encode(v, arrays)] for k, v in value.items()]}
-    for kind in (tuple, list):
-        if type(value) is kind:
-            return {kind.__name__: [_encode(v, arrays) for v in value]}
     if isinstance(value, frozenset):
         return {"frozenset": [_encode(v, arrays) for v in sorted(value)]}
-    raise TypeError(f"{_name(type(value))} cannot be cached; allowed: dataclasses of {PACKAGES}, arrays, containers")
+    raise TypeError(f"{_name(kind)} cannot be cached; allowed: dataclasses of {PACKAGES}, arrays, containers")
+
+
+@cache
+def _given(kind: Any) -> tuple[str, ...]:
+    """The fields that a dataclass is made of."""
+    return tuple(member.name for member in dataclasses.fields(kind) if member.init)
 
 
 def _decode(node: Any, arrays: _Stored) -> Any:
@@ -483,10 +488,7 @@ def _decode(node: Any, arrays: _Stored) -> Any:
         build: Any = kind
         return build(**{name: _decode(child, arrays) for name, child in node["members"].items()})
     if "enum" in node:
-        kind = _class(node["enum"])
-        if not issubclass(kind, enum.Enum):
-            raise BadCacheFile(f"{node['enum']} is no enum")
-        return kind(node["value"])
+        return _member(node["enum"], node["value"])
     if "dict" in node:
         return {_decode(k, arrays): _decode(v, arrays) for k, v in node["dict"]}
     if "tuple" in node:
@@ -496,6 +498,15 @@ def _decode(node: Any, arrays: _Stored) -> Any:
     return [_decode(child, arrays) for child in node["list"]]
 
 
+@cache
+def _member(name: str, value: Any) -> enum.Enum:
+    kind = _class(name)
+    if not issubclass(kind, enum.Enum):
+        raise BadCacheFile(f"{name} is no enum")
+    return kind(value)
+
+
+@cache
 def _name(kind: type) -> str:
     return f"{kind.__module__}:{kind.__qualname__}"
 

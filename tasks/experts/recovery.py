@@ -16,7 +16,7 @@ there, as from 10 m ahead of a log that stops, the state is out of reach.
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 
 import numpy as np
 
@@ -59,6 +59,7 @@ END_STEPS = 3  # that decide where and how fast a trajectory ends
 SLOW_MPS = 0.5  # limits that divide by the speed stop growing below it
 TO_CURVATURE: Array = STEP_S * np.tril(np.ones((N, N)))  # from its rates to what they add to it after each step
 HALF_SUM: Array = np.eye(N) / 2.0 + np.eye(N, k=-1) / 2.0  # mean of a step's two ends, without the start's part
+TO_MEAN_CURVATURE: Array = HALF_SUM @ TO_CURVATURE
 
 
 def make_feasible(trajectory: Array, ego_state: Array, settings: FeasibleSettings = FEASIBLE_DEFAULTS) -> Array | str:
@@ -109,6 +110,22 @@ def _integrators() -> tuple[Array, Array, Array]:
 def _along(wanted: Array, speed0: float, accel0: float, settings: FeasibleSettings) -> tuple[Array, Array] | str:
     """Distance and speed (41,) each at 0 .. 4.0 s."""
     _, to_speed, to_distance = _integrators()
+    free_distance, free_speed, low, high = _along_from(speed0, accel0, settings)
+    weight = settings.weight_progress * _at_the_end(settings)
+    hessian, rows = _along_matrices(settings)
+    gradient = to_distance.T @ (weight[:, 0] * (free_distance - wanted))
+    jerk = minimum(hessian, gradient, rows, low, high)
+    if isinstance(jerk, str):
+        return f"longitudinal QP: {jerk}"
+    distance = np.concatenate([[0.0], free_distance + to_distance @ jerk])
+    speed = np.concatenate([[speed0], free_speed + to_speed @ jerk])
+    return distance, speed
+
+
+@lru_cache(maxsize=4)  # several plans are tried from one start
+def _along_from(speed0: float, accel0: float, settings: FeasibleSettings) -> tuple[Array, Array, Array, Array]:
+    """Distance and speed (40,) each without a jerk, and the bounds (120,) of the problem along the path."""
+    _, to_speed, _ = _integrators()
     free_speed = speed0 + accel0 * T_S
     free_distance = speed0 * T_S + accel0 * T_S**2 / 2.0
 
@@ -122,20 +139,9 @@ def _along(wanted: Array, speed0: float, accel0: float, settings: FeasibleSettin
     low_speed = np.minimum(0.0, free_speed + to_speed @ release)
     low_accel = np.minimum(settings.accel_min_mps2, released)
     high_accel = np.maximum(settings.accel_max_mps2, released)
-    weight = settings.weight_progress * _at_the_end(settings)
-    hessian, rows = _along_matrices(settings)
-    jerk = minimum(
-        hessian,
-        gradient=to_distance.T @ (weight[:, 0] * (free_distance - wanted)),
-        rows=rows,
-        low=np.concatenate([np.full(N, -settings.jerk_max_mps3), low_speed - free_speed, low_accel - accel0]),
-        high=np.concatenate([np.full(N, settings.jerk_max_mps3), np.full(N, np.inf), high_accel - accel0]),
-    )
-    if isinstance(jerk, str):
-        return f"longitudinal QP: {jerk}"
-    distance = np.concatenate([[0.0], free_distance + to_distance @ jerk])
-    speed = np.concatenate([[speed0], free_speed + to_speed @ jerk])
-    return distance, speed
+    low = np.concatenate([np.full(N, -settings.jerk_max_mps3), low_speed - free_speed, low_accel - accel0])
+    high = np.concatenate([np.full(N, settings.jerk_max_mps3), np.full(N, np.inf), high_accel - accel0])
+    return free_distance, free_speed, low, high
 
 
 @cache
@@ -151,7 +157,7 @@ def _across(wanted: Array, speed: Array, kappa0: float, settings: FeasibleSettin
     """Headings (41,) at 0 .. 4.0 s; `wanted` (41,) is the reference heading at the driven distance."""
     mean_speed = (speed[1:] + speed[:-1]) / 2.0
     step = mean_speed * STEP_S
-    to_heading = np.cumsum(step[:, None] * (HALF_SUM @ TO_CURVATURE), axis=0)
+    to_heading = np.cumsum(step[:, None] * TO_MEAN_CURVATURE, axis=0)
     to_lateral = np.cumsum(step[:, None] * (HALF_SUM @ to_heading), axis=0)
     free_heading = np.cumsum(step * kappa0)
     wanted_mean = (wanted[1:] + wanted[:-1]) / 2.0
@@ -179,6 +185,7 @@ def _across(wanted: Array, speed: Array, kappa0: float, settings: FeasibleSettin
     return np.concatenate([[0.0], free_heading + to_heading @ change])
 
 
+@cache
 def _at_the_end(settings: FeasibleSettings) -> Array:
     """(40, 1) by how much each step counts: the last ones are where, and how fast, it has to end."""
     share: Array = np.ones((N, 1))

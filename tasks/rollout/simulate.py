@@ -449,14 +449,19 @@ def _agent_states(agents: AgentTracks) -> AgentStates:
 
 def _writable(arrays: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
     """Arrays as the kernel was compiled for; a shared object store hands out read-only ones."""
-    return (np.require(a, requirements=["C", "W"]) for a in arrays)
+    return (a if a.flags.carray else np.require(a, requirements=["C", "W"]) for a in arrays)
+
+
+@lru_cache(maxsize=4)
+def _highest_limit(road_map: RoadMap) -> float:
+    return max((lane.speed_limit_mps or 0.0 for lane in road_map.lanes.values()), default=0.0)
 
 
 def _needed_path_length(scene: Scene, settings: TrafficSettings) -> float:
     """Metres of path any vehicle can need: what the fastest covers in H, and its view beyond."""
     speeds = np.hypot(*np.moveaxis(scene.agents.velocities, -1, 0))
-    limits = [lane.speed_limit_mps or 0.0 for lane in scene.clip.road_map.lanes.values()]
-    fastest = max(settings.target_speed_mps, float(np.nanmax(speeds, initial=0.0)), max(limits, default=0.0))
+    limit = _highest_limit(scene.clip.road_map)
+    fastest = max(settings.target_speed_mps, float(np.nanmax(speeds, initial=0.0)), limit)
     if not fastest <= MOST:
         raise ValueError(f"agents.velocities or a lane's speed limit reach {fastest:g} m/s, at most {MOST:g} do")
     return fastest * HORIZON_STEPS * STEP_S + settings.lookahead_m + 10.0
