@@ -67,6 +67,7 @@ from tasks.rollout.idm import (
     way_along,
 )
 from tasks.rollout.lane_following import (
+    KNOWN_PATHS,
     NEVER,
     LanePath,
     faster_than_first,
@@ -202,6 +203,9 @@ class _LogFacts(NamedTuple):
     pairs: tuple[tuple[int, int], ...]  # see couplings
     first_part: Ints  # (N,)
     states: AgentStates
+    poses: dict[int, Array]  # (K, 3) every LOG_STRIDE-th, of the vehicles asked for
+    later_steps: dict[tuple[int, int], int]  # `first_later_step_on_lane` of the steps and vehicles asked for
+    ways: dict[tuple[Any, ...], LanePath | None]  # the newest of `_logged_way`
 
 
 @lru_cache(maxsize=4)
@@ -216,7 +220,25 @@ def _log_facts(log: AgentTracks) -> _LogFacts:
         pairs=pairs,
         first_part=first_parts(len(log), pairs),
         states=_agent_states(log),
+        poses={
+            i: log.boxes[np.flatnonzero(log.valid[:, i])[::LOG_STRIDE], i, :3]
+            for i in np.flatnonzero(is_vehicle).tolist()
+        },
+        later_steps={},
+        ways={},
     )
+
+
+def _logged_way(scene: Scene, i: int, clock: int, ahead_m: float) -> LanePath | None:
+    """The path along agent i's own log, as known ones are handed out: most of a clip's attempts ask for the same."""
+    now, start, known = scene.agents, scene.step, _log_facts(scene.clip.agents).ways
+    here = (getattr(now, name)[start, i].tobytes() for name in ("boxes", "velocities", "center_z", "valid"))
+    key = i, clock, ahead_m, *here
+    if key not in known:
+        if len(known) >= KNOWN_PATHS:
+            known.clear()
+        known[key] = logged_path(logged_track(scene, i, clock), ahead_m)
+    return known[key]
 
 
 def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
@@ -228,7 +250,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     now, log = scene.agents, scene.clip.agents
     n, start = len(now), scene.step
     moved = np.zeros(n, dtype=bool) if scene.ever_simulated is None else scene.ever_simulated
-    is_vehicle, moving_kind, stands, pairs, first_part, states = _log_facts(log)
+    is_vehicle, moving_kind, stands, pairs, first_part, states, poses, later_steps, _ = _log_facts(log)
     standing = stands & ~(moved & now.valid[start])
     is_first = first_part == np.arange(n)
     index = _indexed_lanes(scene.clip.road_map)
@@ -243,17 +265,18 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     for i in np.flatnonzero(is_vehicle & ~standing & is_first).tolist():
         driven_before = bool(moved[i] and now.valid[start, i])
         if join[i] == NEVER and not driven_before:
-            join[i] = first_later_step_on_lane(index, scene, i)
+            if (start, i) not in later_steps:
+                later_steps[start, i] = first_later_step_on_lane(index, scene, i)
+            join[i] = later_steps[start, i]
         step = start if driven_before else int(join[i])
         if step != start:
-            logged_ways[i] = logged_path(logged_track(scene, i, int(clock[i])), ahead_m)
+            logged_ways[i] = _logged_way(scene, i, int(clock[i]), ahead_m)
         if step == NEVER:
             continue
         pose = (now.boxes[start, i, :3] if step == start else log.boxes[step, i, :3]).copy()
-        logged = log.boxes[np.flatnonzero(log.valid[:, i])[::LOG_STRIDE], i, :3]
-        found[i] = find_path(index, pose, logged, ahead_m)
+        found[i] = find_path(index, pose, poses[i], ahead_m)
         if found[i] is None:  # a driven car that left the map
-            found[i] = logged_path(logged_track(scene, i, int(clock[i])), ahead_m) or straight_path(pose, ahead_m)
+            found[i] = _logged_way(scene, i, int(clock[i]), ahead_m) or straight_path(pose, ahead_m)
         if driven_before:
             join[i] = 0  # wherever its log is by now
         else:
