@@ -1,6 +1,7 @@
 """Episodes: MCAP files of one sample each, for people to look at in Foxglove, Lichtblick or Rerun.
 
-Chunked, zstd-compressed, with CRCs and an index, as those tools want it; their bytes depend on samples alone.
+Chunked, zstd-compressed, with CRCs and an index, as those tools want it; their bytes depend on samples alone. MCAP and
+Protobuf are loaded where an episode is written or checked: every run names episodes, most write none.
 """
 
 import hashlib
@@ -9,14 +10,10 @@ import zlib
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from google.protobuf.message import Message as Content
-from mcap.records import Footer
-from mcap.stream_reader import MAGIC_SIZE, StreamReader
-from mcap.well_known import MessageEncoding
-from mcap.writer import CompressionType, Writer
-from mcap_protobuf.schema import register_schema
+if TYPE_CHECKING:
+    from google.protobuf.message import Message as Content
 
 EPISODES_FOLDER = "episodes"  # beside the table, of those that a run writes
 LIBRARY = "driving-data-factory"
@@ -31,7 +28,7 @@ class Message:
 
     topic: str
     time_ns: int
-    content: Content
+    content: "Content"
 
 
 def wants_episode(attempt_id: str, every: int) -> bool:
@@ -47,6 +44,10 @@ def episode_name(row: Mapping[str, Any]) -> str:
 
 def episode_bytes(messages: Sequence[Message], metadata: Mapping[str, str]) -> bytes:
     """An MCAP file of messages, in their order; metadata stands under the name `sample`."""
+    from mcap.well_known import MessageEncoding
+    from mcap.writer import CompressionType, Writer
+    from mcap_protobuf.schema import register_schema
+
     stream = io.BytesIO()
     writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(library=LIBRARY)
@@ -67,6 +68,9 @@ def check_episode(data: bytes) -> None:
 
     Raises ValueError, with the reason, where it is not whole.
     """
+    from mcap.records import Footer
+    from mcap.stream_reader import MAGIC_SIZE, StreamReader
+
     try:
         last = deque(StreamReader(io.BytesIO(data), emit_chunks=True).records, maxlen=1)[0]  # none is unpacked
     except Exception as error:  # whatever damaged records, or a broken zstd frame, raise

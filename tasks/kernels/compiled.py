@@ -30,6 +30,7 @@ import numba
 import numpy as np
 from numba.core.compiler import CompileResult
 from numba.core.registry import cpu_target
+from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 from numpy.typing import NDArray
 
@@ -148,7 +149,7 @@ class KernelCache:
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """The form compiled for `signature`; None where there is none."""
-        target.refresh()
+        rtsys.initialize(target)  # all that machine code needs of numba; what compiling needs takes 0.4 s to load
         path = self._path(signature)
         try:
             kept = without_checksum(path.read_bytes(), _cache_key(path))
