@@ -13,6 +13,7 @@ from collections import OrderedDict, defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache
 from itertools import count
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -145,18 +146,28 @@ def read_only(value: T) -> T:
     waiting: list[object] = [value]
     while waiting:
         one = waiting.pop()
-        if isinstance(one, str | bytes | int | float | bool | None) or id(one) in seen:
+        kind: Any = type(one)
+        if kind in _LEAVES or id(one) in seen:
             continue
         seen.add(id(one))
-        if isinstance(one, np.ndarray):
+        if isinstance(one, list | tuple | frozenset):
+            waiting += one
+        elif isinstance(one, np.ndarray):
             one.flags.writeable = False
-        elif is_dataclass(one) and not isinstance(one, type):
-            waiting += [getattr(one, member.name) for member in fields(one)]
+        elif names := _members(kind):
+            waiting += [getattr(one, name) for name in names]
         elif isinstance(one, Mapping):
             waiting += one.values()
-        elif isinstance(one, list | tuple | frozenset):
-            waiting += one
     return value
+
+
+_LEAVES = frozenset({str, bytes, int, float, bool, type(None)})
+
+
+@cache
+def _members(kind: Any) -> tuple[str, ...]:
+    """Of a dataclass; none of another type."""
+    return tuple(member.name for member in fields(kind)) if is_dataclass(kind) else ()
 
 
 MAX_RETRIES = 2  # of a task whose worker died

@@ -8,7 +8,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.world.arrays import Array, Bools
+from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.frames import PACIFICA, to_local, wrap_angle
 
 
@@ -173,6 +173,9 @@ def valid_ring(ring: Array) -> Array:
     return np.asarray(max(parts, key=lambda part: part.area).exterior.coords, dtype=np.float64)[:, :2]
 
 
+SLACK_M = 1e-6  # above what rounding can do to a coordinate of a city
+
+
 class Rings:
     """Point queries against N closed rings at once; a point on an edge may count as inside or outside."""
 
@@ -181,24 +184,44 @@ class Rings:
         self._start = np.concatenate([ring[:-1] for ring in rings])
         self._step = np.concatenate([np.diff(ring, axis=0) for ring in rings])
         self._square = np.maximum((self._step**2).sum(axis=1), 1e-300)  # a repeated point is a segment of length 0
-        self._first = np.cumsum([0] + [len(ring) - 1 for ring in rings[:-1]])
+        self._count = np.array([len(ring) - 1 for ring in rings])
+        self._low = np.array([ring.min(axis=0) for ring in rings])
+        self._high = np.array([ring.max(axis=0) for ring in rings])
 
     def contains(self, point: Array) -> Bools:
         """(N,) whether the point (2,) is inside each ring, by the even-odd rule."""
-        y0 = self._start[:, 1] - point[1]
-        y1 = y0 + self._step[:, 1]
-        crosses = (y0 > 0.0) != (y1 > 0.0)
-        rise = np.where(crosses, self._step[:, 1], 1.0)
-        right_of_point = self._start[:, 0] - point[0] - y0 * self._step[:, 0] / rise > 0.0
-        count = np.add.reduceat((crosses & right_of_point).astype(np.int64), self._first)
-        return count % 2 == 1
+        return _inside(point, self._start, self._step, self._count)
 
-    def distances(self, point: Array) -> Array:
-        """(N,) distance [m] from the point (2,) to each polygon; 0 inside."""
-        offset = point - self._start
-        along = np.clip((offset * self._step).sum(axis=1) / self._square, 0.0, 1.0)
-        to_edge = np.hypot(*(offset - along[:, None] * self._step).T)
-        return np.where(self.contains(point), 0.0, np.minimum.reduceat(to_edge, self._first))
+    def distances(self, point: Array, within_m: float = np.inf) -> Array:
+        """(N,) distance [m] from the point (2,) to each polygon; 0 inside, or inf where it is more than `within_m`."""
+        near = (np.maximum(self._low - point, point - self._high) <= within_m + SLACK_M).all(axis=1)
+        found = np.full(len(near), np.inf)
+        if not near.any():
+            return found
+        on, count = np.repeat(near, self._count), self._count[near]
+        start, step = self._start[on], self._step[on]
+        x, y = (point - start).T
+        along = np.clip((x * step[:, 0] + y * step[:, 1]) / self._square[on], 0.0, 1.0)
+        to_edge = np.hypot(x - along * step[:, 0], y - along * step[:, 1])
+        nearest = np.minimum.reduceat(to_edge, _firsts(count))
+        found[near] = np.where(_inside(point, start, step, count), 0.0, nearest)
+        return np.where(found <= within_m, found, np.inf)
+
+
+def _inside(point: Array, start: Array, step: Array, count: Ints) -> Bools:
+    """(N,) whether the point (2,) is inside each ring; their edges, `count` (N,) each, stand one after another."""
+    y0 = start[:, 1] - point[1]
+    y1 = y0 + step[:, 1]
+    crosses = (y0 > 0.0) != (y1 > 0.0)
+    rise = np.where(crosses, step[:, 1], 1.0)
+    right_of_point = start[:, 0] - point[0] - y0 * step[:, 0] / rise > 0.0
+    crossed = np.add.reduceat((crosses & right_of_point).astype(np.int64), _firsts(count))
+    return crossed % 2 == 1
+
+
+def _firsts(count: Ints) -> Ints:
+    """(N,) where each of the groups begins."""
+    return np.cumsum(count) - count
 
 
 def polygons_near(road_map: RoadMap, center_xy: Array, radius_m: float = MAP_RADIUS_M) -> tuple[MapPolygon, ...]:
@@ -216,7 +239,7 @@ def polygons_near(road_map: RoadMap, center_xy: Array, radius_m: float = MAP_RAD
     around = float(center_xy[0]), float(center_xy[1]), float(radius_m)
     found = known.get(around)
     if found is None:
-        near = rings.distances(np.array(around[:2])) <= radius_m
+        near = rings.distances(np.array(around[:2]), radius_m) <= radius_m
         found = tuple(polygon for polygon, is_near in zip(every, near, strict=True) if is_near)
         if len(known) >= PLACES_KEPT:
             known.clear()
@@ -318,7 +341,7 @@ def driven_lanes(road_map: RoadMap, poses: Array) -> tuple[str, ...]:
     cost: dict[str, float] = {}
     came_from: list[dict[str, str | None]] = []
     for pose in poses:
-        here = _candidate_costs(lanes, rings.distances(pose[:2]), pose)
+        here = _candidate_costs(lanes, rings.distances(pose[:2], MAX_LANE_DISTANCE_M), pose)
         if not here:
             continue
         total: dict[str, float] = {}
@@ -392,7 +415,7 @@ class CenterlineFinder:
         Of a way that is `enough_m` long no more is looked at. Lanes are not changed on it.
         """
         waiting: list[tuple[str, float]] = []  # a lane, and the way up to its end
-        for index in np.flatnonzero(self._rings.distances(pose[:2]) <= within_m).tolist():
+        for index in np.flatnonzero(self._rings.distances(pose[:2], within_m) <= within_m).tolist():
             line = self._lanes[self._ids[index]].centerline
             at = int(np.argmin(np.hypot(*(line[:, :2] - pose[:2]).T)))
             if abs(float(wrap_angle(line[at, 2] - pose[2]))) <= within_rad:

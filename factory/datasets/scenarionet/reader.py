@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter
-from scipy.signal import savgol_filter
 
 from factory.datasets.scenarionet.map import as_floats, road_map, traffic_lights
 from factory.datasets.scenarionet.photos import (
@@ -429,6 +428,8 @@ def smooth_drive(xy: Array, heading: Array, weight: Array, smoothing: float) -> 
     weight: (S,) 1 where a step was observed, 0 where it only lies between two that were, three or more of them 1;
     S >= 7. Steering and rates are 0.
     """
+    from scipy.signal import savgol_filter  # 0.4 s, and most processes of a run smooth no drive
+
     drive = _least_third_difference(np.column_stack([xy, heading]), weight, smoothing)
     velocity = savgol_filter(drive[:, :2], FIT_STEPS, 2, deriv=1, delta=STEP_S, axis=0)
     acceleration = savgol_filter(drive[:, :2], FIT_STEPS, 2, deriv=2, delta=STEP_S, axis=0)

@@ -199,7 +199,11 @@ def test_ring_queries_equal_shapely() -> None:
     for point in rng.uniform(-60, 60, (200, 2)):
         at = shapely.Point(point)
         assert list(rings.contains(point)) == [polygon.contains(at) for polygon in polygons]
-        assert np.abs(rings.distances(point) - [polygon.distance(at) for polygon in polygons]).max() < 1e-9
+        distance = rings.distances(point)
+        assert np.abs(distance - [polygon.distance(at) for polygon in polygons]).max() < 1e-9
+        for within_m in (0.0, 5.0, float(distance[0]), 1e3):
+            within = rings.distances(point, within_m)
+            assert np.array_equal(within, np.where(distance <= within_m, distance, np.inf))
 
 
 def test_a_crossed_ring_is_repaired_to_its_largest_part() -> None:
