@@ -140,6 +140,35 @@ def test_a_copy_of_the_project_elsewhere_compiles_nothing_again(tmp_path: Path, 
     assert hits_and_misses(second, **where) == "0 1"
 
 
+ARRAY_THEN_NUMBER = """
+import sys
+import numpy as np
+from tasks.squares import squared
+assert squared(np.full(3, 3.0)).tolist() == [9.0] * 3  # an array of numba's
+loaded = "numba.np.arraymath" in sys.modules
+assert squared(complex(sys.argv[1])) == complex(sys.argv[1]) ** 2
+print(loaded, sum(squared.stats.cache_misses.values()))
+"""
+
+
+@pytest.mark.slow
+def test_a_kernel_from_the_cache_runs_without_what_compiling_needs(tmp_path: Path) -> None:
+    """Numba's types and rules take every process 0.4 s; one that compiles after all loads them then."""
+    project = copy_with_one_kernel(tmp_path / "project")
+    env = dict(os.environ) | {"PYTHONPATH": str(project), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+
+    def said() -> str:
+        command = [sys.executable, "-c", ARRAY_THEN_NUMBER, "2j"]
+        return subprocess.run(command, env=env, cwd=project, text=True, check=True, capture_output=True).stdout.strip()
+
+    assert said() == "True 2"
+    assert said() == "False 0"
+    for kept in (tmp_path / "cache").rglob("*.kernel"):
+        if b"complex" in kept.read_bytes():
+            kept.unlink()
+    assert said() == "False 1"
+
+
 @pytest.mark.slow
 def test_a_user_s_kernel_whose_file_goes_by_two_names_is_found_under_each(tmp_path: Path) -> None:
     """What is kept names its module, which the next process need not be able to import."""

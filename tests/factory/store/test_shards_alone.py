@@ -51,6 +51,16 @@ def test_a_shard_that_was_sent_alone_tells_expert_and_round(
         }
 
 
+def test_numbers_that_differ_take_no_more_than_their_bytes(out: Path) -> None:
+    """A dictionary of coordinates is larger than they are; one of texts that stand again is not."""
+    for path in Store(out).samples.live_files():
+        group = pq.read_metadata(out / "samples" / path).row_group(0)
+        columns = [group.column(k) for k in range(group.num_columns)]
+        numbers = {c.has_dictionary_page for c in columns if c.physical_type in ("FLOAT", "DOUBLE")}
+        texts = {c.path_in_schema: c.has_dictionary_page for c in columns if c.physical_type == "BYTE_ARRAY"}
+        assert numbers == {False} and texts["clip_id"] and texts["expert"]
+
+
 ENGINES = {
     "delta-rs": lambda uri: DeltaTable(uri).to_pyarrow_table(columns=PLACE).to_pylist(),
     "duckdb on delta-rs": lambda uri: delta_in_duckdb(uri),
