@@ -19,6 +19,7 @@ from tasks.rollout.idm import (
     advance,
     following_acceleration,
     free_acceleration,
+    matters_within,
     needed_deceleration,
     stop_line_gap,
 )
@@ -82,6 +83,19 @@ def test_the_needed_deceleration_stops_half_the_minimum_gap_behind_the_leaders_e
         needed = needed_deceleration(speed, gap, lead, DRIVER)
         left = gap + lead**2 / (2.0 * DRIVER.emergency_decel) - speed**2 / (2.0 * needed)
         assert left == pytest.approx(0.5 * DRIVER.min_gap_m)
+
+
+def test_who_is_farther_than_matters_leaves_the_acceleration_and_who_is_a_little_nearer_does_not() -> None:
+    rng, lowered = np.random.default_rng(5), 0
+    for _ in range(2000):
+        speed, most = rng.uniform(0.0, 20.0), rng.uniform(0.0, 15.0)
+        free = free_acceleration(speed, 15.0, DRIVER)
+        accel = free - rng.choice([1e-6, 0.1, 2.0]) * rng.random()
+        within = matters_within(free, speed, accel, most, DRIVER)
+        for lead_speed in (-most, rng.uniform(-most, most), most):
+            assert following_acceleration(free, speed, within, lead_speed, DRIVER) >= accel
+        lowered += following_acceleration(free, speed, 0.99 * within, -most, DRIVER) < accel
+    assert lowered > 1000  # the others' braking has a floor
 
 
 def test_a_braking_car_stops_where_it_stops_and_never_reverses() -> None:
