@@ -28,7 +28,7 @@ from tasks.world.frames import HEADING, VX, to_local, to_world
 from tasks.world.vocabulary import FIRST_START, OF_LOG, Vocabulary
 
 NO_STARTS = np.empty((0, HORIZON_STEPS, 3))
-AT_ONCE = LANES - 1  # scored together, beside PDM-Closed: more take longer, fewer hardly less
+AT_ONCE = LANES - 1  # scored together: with PDM-Closed one block of the reward
 START_FATES = ("reached_gate", "score", "reactive")  # what drops starts, counted where a clip has some
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from tasks.kernels.compiled import hidden_kernel, inner_kernel, kernel
 from tasks.world.arrays import Array, Bytes, Ints
+from tasks.world.frames import SLACK_M
 from tasks.world.geometry import nearest_on_edge, wrapped
 
 # Polylines in kernels: between their points, past their ends, how they are headed, and what is nearest on them.
@@ -128,7 +129,6 @@ Box = Array | tuple[float, float, float, float, float]  # centre x, y [m], headi
 PATH_SPACING_M = 0.5  # of every path's points
 CELLS = 16  # of a stretch: 8 m
 STRETCH_M = CELLS * PATH_SPACING_M
-SLACK_M = 1e-6  # above what rounding can do to a coordinate of a city
 
 
 class CorridorAhead(NamedTuple):

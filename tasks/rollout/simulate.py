@@ -204,7 +204,6 @@ class _LogFacts(NamedTuple):
     first_part: Ints  # (N,)
     states: AgentStates
     poses: dict[int, Array]  # (K, 3) every LOG_STRIDE-th, of the vehicles asked for
-    later_steps: dict[tuple[int, int], int]  # `first_later_step_on_lane` of the steps and vehicles asked for
     ways: dict[tuple[Any, ...], LanePath | None]  # the newest of `_logged_way`
 
 
@@ -224,9 +223,14 @@ def _log_facts(log: AgentTracks) -> _LogFacts:
             i: log.boxes[np.flatnonzero(log.valid[:, i])[::LOG_STRIDE], i, :3]
             for i in np.flatnonzero(is_vehicle).tolist()
         },
-        later_steps={},
         ways={},
     )
+
+
+@lru_cache(maxsize=4)
+def _later_steps(log: AgentTracks, road_map: RoadMap) -> dict[tuple[int, int], int]:
+    """`first_later_step_on_lane` of the steps and vehicles asked for: of a log on a map."""
+    return {}
 
 
 def _logged_way(scene: Scene, i: int, clock: int, ahead_m: float) -> LanePath | None:
@@ -250,7 +254,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     now, log = scene.agents, scene.clip.agents
     n, start = len(now), scene.step
     moved = np.zeros(n, dtype=bool) if scene.ever_simulated is None else scene.ever_simulated
-    is_vehicle, moving_kind, stands, pairs, first_part, states, poses, later_steps, _ = _log_facts(log)
+    is_vehicle, moving_kind, stands, pairs, first_part, states, poses, _ = _log_facts(log)
     standing = stands & ~(moved & now.valid[start])
     is_first = first_part == np.arange(n)
     index = _indexed_lanes(scene.clip.road_map)
@@ -265,6 +269,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     for i in np.flatnonzero(is_vehicle & ~standing & is_first).tolist():
         driven_before = bool(moved[i] and now.valid[start, i])
         if join[i] == NEVER and not driven_before:
+            later_steps = _later_steps(log, scene.clip.road_map)
             if (start, i) not in later_steps:
                 later_steps[start, i] = first_later_step_on_lane(index, scene, i)
             join[i] = later_steps[start, i]

@@ -151,6 +151,7 @@ def touching(first: Array, second: Array) -> Bools:
 # How large a number of a scene may be: no road has a length [m], heading [rad] or speed [m/s] like it; kernels number
 # cells and turns of a circle, which stops working far above it.
 LARGEST = 1e8
+SLACK_M = 1e-6  # above what rounding can do to a coordinate of a city
 
 
 def all_within(values: Array) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.world.arrays import Array, Bools, Ints
-from tasks.world.frames import PACIFICA, to_local, wrap_angle
+from tasks.world.frames import PACIFICA, SLACK_M, to_local, wrap_angle
 
 
 @dataclass(frozen=True)
@@ -171,9 +171,6 @@ def valid_ring(ring: Array) -> Array:
     if not parts:
         raise ValueError("the ring bounds no area")
     return np.asarray(max(parts, key=lambda part: part.area).exterior.coords, dtype=np.float64)[:, :2]
-
-
-SLACK_M = 1e-6  # above what rounding can do to a coordinate of a city
 
 
 class Rings:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tasks.rollout.idm import AgentStates, IdmDriver
+from tasks.rollout.lane_following import NEVER
 from tasks.rollout.simulate import (
     SHORTEST_HEADWAY_S,
     TrafficScene,
@@ -124,6 +125,20 @@ def test_a_train_in_a_crowd_equals_its_slow_twin(yields: bool, seed: int) -> Non
     for traffic in (first, prepare_traffic(after, of)):
         for ego in egos:
             assert_same(roll_out(traffic, ego), slow_roll_out(traffic, ego))
+
+
+def test_what_a_log_does_on_one_map_is_not_told_of_it_on_another() -> None:
+    """Who comes onto a lane later is kept for the attempts that ask again."""
+    later = 0
+    for seed in range(8):
+        scene = worlds.random_scene(seed)
+        nowhere = replace(scene, clip=replace(scene.clip, road_map=replace(scene.clip.road_map, lanes={})))
+        first, other, again = (prepare_traffic(s, IDM).roles for s in (scene, nowhere, scene))
+        assert first is not None and other is not None and again is not None
+        later += int(((first.join_step > scene.step) & (first.join_step < NEVER)).sum())
+        assert (other.path < 0).all(), "on a map without lanes nobody has a path on one"
+        assert again.join_step.tolist() == first.join_step.tolist()
+    assert later > 0
 
 
 def test_the_random_worlds_reach_every_rule() -> None:
