@@ -24,6 +24,7 @@ from factory.readers.base import BadClip, ClipReader, ClipRef, Unreadable, paint
 from factory.stages.assets import running_fits
 from factory.stages.imaging import Imaging, scene_cache_counts
 from factory.stages.rows import label_columns, sample_row
+from factory.store.location import ClipCache
 from factory.store.remake import EarlierRows
 from factory.store.samples import CAMERA_LEFT_OUT, MOST_RECORDS, CandidateRow
 from factory.store.schema import UNLISTED, RunIdentity, attempt_id
@@ -71,7 +72,17 @@ def logged_clip(prepared: object) -> Clip | None:
 def logged_poses(prepared: object) -> Array | None:
     """(81, 3) the log from T to T+2H, world frame, of a prepared clip; None as `logged_clip` has it."""
     clip = logged_clip(prepared)
-    return None if clip is None else clip.ego_states[NOW:, : HEADING + 1]
+    return None if clip is None else _logged_poses(clip.ego_states)
+
+
+def cached_poses(cache: ClipCache, key: str) -> Array | None:
+    """The same of a prepared clip in the cache, or none. Raises BadCacheFile."""
+    states = cache.load(key, within=("payload", "clip", "ego_states"))
+    return _logged_poses(states) if isinstance(states, np.ndarray) else None
+
+
+def _logged_poses(ego_states: Array) -> Array:
+    return ego_states[NOW:, : HEADING + 1]
 
 
 @dataclass(frozen=True)

@@ -180,7 +180,7 @@ class RunConfig:
 
 def compose_run(words: Sequence[str]) -> dict[str, Any]:
     """The settings of a command line with all defaults, not yet typed. Raises ConfigError, SettingsShown."""
-    return compose("run", [*first_look(words), *words], RunConfig, _with_defaults, settings_classes)
+    return compose("run", [*first_look(words), *words], RunConfig, completed, settings_classes)
 
 
 def first_look(words: Sequence[str]) -> list[str]:
@@ -206,7 +206,7 @@ def announcement(config: RunConfig, words: Sequence[str]) -> str:
     return f"{line}\nno clips= given, so this is a first look ({' '.join(first)}); your logs: clips={others}"
 
 
-def _with_defaults(values: Mapping[str, Any]) -> dict[str, Any]:
+def completed(values: Mapping[str, Any]) -> dict[str, Any]:
     """With every installed expert, and the defaults of the chosen reader and of the experts."""
     values = add_installed_experts(values, conf_dir())
     for key, shape in settings_classes(values).items():

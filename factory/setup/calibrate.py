@@ -7,9 +7,12 @@ import os
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import reduce
 from typing import Any, cast
 
-from factory.config.run import RunConfig, load_config
+from factory.config.compose import conf_dir
+from factory.config.run import RunConfig, completed, typed_run_config
+from factory.config.shapes import deep_merge, defaults_of
 from factory.graph.plan import candidate_order
 from factory.graph.steps import SampleColumns, Spent, run_attempt
 from factory.readers.base import ClipRef
@@ -252,7 +255,7 @@ def differences_from_paper(config: RunConfig, vocabulary: Vocabulary) -> list[st
 
     Nothing is said of pictures where none are rendered, nor of experts that do not drive.
     """
-    paper = load_config(["preset=paper", "vocabulary.file=given"])
+    paper = paper_config()
     given, wanted = _dotted_items(asdict(config)), dict(_dotted_items(asdict(paper)))
     found, size = [], paper.vocabulary.k
     if len(vocabulary) != size or config.vocabulary.file is None:
@@ -266,6 +269,26 @@ def differences_from_paper(config: RunConfig, vocabulary: Vocabulary) -> list[st
         for key, value in given
         if _within(key, WATCHED) and not _within(key, unseen) and value != wanted[key]
     ]
+
+
+def paper_config() -> RunConfig:
+    """What `preset=paper vocabulary.file=given` composes, but for `out`.
+
+    Read here file by file: every run asks, and Hydra takes a quarter of a second for it.
+    """
+    from omegaconf import OmegaConf
+
+    def read(name: str) -> Any:
+        return OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{name}.yaml"))
+
+    values = defaults_of(RunConfig)
+    groups = {group: choice for line in read("run")["defaults"] if line != "_self_" for group, choice in line.items()}
+    for group, choice in {**groups, "preset": "paper"}.items():
+        folder, _, package = group.partition("@")
+        within = [] if folder == "preset" else (package or folder).split(".")
+        found = reduce(lambda inner, key: {key: inner}, reversed(within), read(f"{folder}/{choice}"))
+        values = deep_merge(values, found)
+    return typed_run_config(completed(deep_merge(values, {"vocabulary": {"file": "given"}, "out": "anywhere"})))
 
 
 def _within(key: str, groups: Sequence[str]) -> bool:

@@ -6,12 +6,11 @@ import dataclasses
 import enum
 import hashlib
 import importlib
-import io
 import json
 import math
 import os
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
@@ -298,15 +297,14 @@ def raising_damaged_file(path: str) -> Iterator[None]:
 
 # Prepared clips on disk, so that a later run goes on without a perturb task, and the scenes of a benchmark.
 #
-# A file is a plain zip of arrays (npz, no pickle), all of a type one behind the other: a clip has some 1,200, and a
-# member of a zip costs more than most of them. One more is a JSON tree that says how frozen dataclasses, tuples, dicts
-# and arrays nest. Reading it builds only dataclasses and enums of this distribution, by their fields, and nothing else.
-# The zip as a whole is compressed by zstd, which sees further back than a zip's members (0.5 MB for 1.9, in 5 ms for
-# 70); its size stands before it, a seal (tasks.caches) behind; a damaged or foreign file counts as missing, with the
-# reason.
+# A file is a JSON tree that says how frozen dataclasses, tuples, dicts and arrays nest, and all arrays of a type one
+# behind the other: a clip has some 1,200, and its candidates name the same agents twenty times. Reading it builds only
+# dataclasses and enums of this distribution, by their fields, and nothing else. All of it is compressed by zstd; its
+# size stands before it, a seal (tasks.caches) behind; a damaged or foreign file counts as missing, with the reason.
 
-FORMAT = 3
-MOST_BYTES = 2**30  # of a zip
+FORMAT = 4
+ALIGNED = 16  # where arrays begin [bytes]
+MOST_BYTES = 2**30  # of a file before it is compressed
 CLIP_SUFFIX = ".clip"
 PACKAGES = ("tasks.", "factory.")  # whose dataclasses and enums a file may name
 _AGAIN = "the command that made it writes it again"
@@ -322,27 +320,41 @@ def encode_tree(value: object) -> bytes:
 
     Raises TypeError naming the type of anything else.
     """
-    arrays = _Arrays()
-    tree = json.dumps({"format": FORMAT, "root": _encode(value, arrays)})
-    sink = io.BytesIO()
-    np.savez(sink, allow_pickle=False, tree=np.frombuffer(tree.encode(), np.uint8), **arrays.by_type())
-    plain = sink.getbuffer()
+    parts = _Parts()
+    root = _encode(value, parts)
+    arrays = parts.by_type()
+    sizes = {kind: array.size for kind, array in arrays.items()}
+    tree = json.dumps({"sizes": sizes, "tuples": parts.tuples, "root": root}).encode()
+    plain = bytearray(FORMAT.to_bytes(8, "little") + len(tree).to_bytes(8, "little") + tree)
+    for array in arrays.values():
+        plain += bytes(-len(plain) % ALIGNED)
+        plain += array.view(np.uint8).data
     return len(plain).to_bytes(8, "little") + pa.compress(plain, codec="zstd", asbytes=True)
 
 
-def decode_tree(data: bytes) -> Any:
-    """The opposite. Raises BadCacheFile."""
+def decode_tree(data: bytes, within: Sequence[str] = ()) -> Any:
+    """The opposite; within: fields that lead to the part that is wanted, None where there is none. Raises BadCacheFile.
+
+    Nothing else of the tree is built: one drive of a clip with its candidates takes a third of the time.
+    """
     try:
         size = int.from_bytes(data[:8], "little")
         if size > MOST_BYTES:
             raise BadCacheFile(f"{size:,} bytes in {len(data):,}: no clip is that large")
-        plain = pa.decompress(data[8:], decompressed_size=size, codec="zstd")
-        with np.load(io.BytesIO(plain), allow_pickle=False) as stored:
-            tree = json.loads(stored["tree"].tobytes())
-            if tree["format"] != FORMAT:
-                raise BadCacheFile(f"format {tree['format']}, this version reads {FORMAT}")
-            return _decode(tree["root"], _Stored({name: stored[name] for name in stored.files}))
-    except Exception as error:  # whatever a zip, an array's header or a class makes of bytes that are none of ours
+        plain = bytearray(pa.decompress(data[8:], decompressed_size=size, codec="zstd"))  # arrays in it can be written
+        if (found := int.from_bytes(plain[:8], "little")) != FORMAT:
+            raise BadCacheFile(f"another format ({found}), this version reads {FORMAT}")
+        at = 16 + int.from_bytes(plain[8:16], "little")
+        tree, arrays = json.loads(plain[16:at]), dict[str, NDArray[np.generic]]()
+        for kind, count in tree["sizes"].items():
+            at += -at % ALIGNED
+            arrays[kind] = np.frombuffer(plain, kind, count, at) if count else np.empty(0, kind)
+            at += arrays[kind].nbytes
+        node = tree["root"]
+        for name in within:
+            node = node.get("members", {}).get(name) if isinstance(node, dict) else None
+        return _Stored(arrays, tree["tuples"]).decode(node)
+    except Exception as error:  # whatever a type's name, a size or a class makes of bytes that are none of ours
         raise BadCacheFile(str(error) or type(error).__name__) from error
 
 
@@ -352,10 +364,10 @@ class ClipCache:
     def __init__(self, location: Location) -> None:
         self.location = location
 
-    def load(self, key: str) -> object | None:
-        """The stored value, None where there is none. Raises BadCacheFile."""
+    def load(self, key: str, within: Sequence[str] = ()) -> object | None:
+        """The stored value, or a part of it (see decode_tree); None where there is none. Raises BadCacheFile."""
         data = self.location.read(f"{key}{CLIP_SUFFIX}")
-        return None if data is None else decode_tree(_unsealed(data, key))
+        return None if data is None else decode_tree(_unsealed(data, key), within)
 
     def store(self, key: str, value: object) -> None:
         """Whole or not at all."""
@@ -409,62 +421,66 @@ def _unsealed(data: bytes, key: str = "") -> bytes:
         raise BadCacheFile(str(error)) from error
 
 
-class _Arrays:
-    """Where arrays lie: type, first element, shape. One that stands twice in the tree is stored once."""
+class _Parts:
+    """Arrays and tuples of a tree; one that stands in it twice is stored once."""
 
     def __init__(self) -> None:
-        self._parts: dict[str, list[NDArray[np.generic]]] = {}
+        self.tuples: list[Any] = []
+        self._flat: dict[str, list[NDArray[np.generic]]] = {}
         self._ends: dict[str, int] = {}
-        self._known: dict[int, tuple[NDArray[np.generic], list[object]]] = {}  # by id, which is taken while it is here
+        self._known: dict[int, tuple[Any, Any]] = {}  # by id, which is taken while the value is here
 
-    def place(self, array: NDArray[np.generic]) -> list[object]:
+    def place(self, array: NDArray[np.generic]) -> Any:
+        """Where an array lies: type, first element, shape."""
         if id(array) not in self._known:
-            kind = array.dtype.str[1:]
+            kind = _type_name(array.dtype)
             first = self._ends.get(kind, 0)
-            self._parts.setdefault(kind, []).append(array.astype(array.dtype.newbyteorder("="), copy=False).ravel())
+            own = array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
+            self._flat.setdefault(kind, []).append(own.ravel())
             self._ends[kind] = first + array.size
             self._known[id(array)] = array, [kind, first, list(array.shape)]
         return self._known[id(array)][1]
 
+    def number(self, value: tuple[Any, ...]) -> int:
+        """Which of the tuples it is."""
+        if id(value) not in self._known:
+            members = [_encode(v, self) for v in value]
+            self._known[id(value)] = value, len(self.tuples)
+            self.tuples.append(members)
+        return int(self._known[id(value)][1])
+
     def by_type(self) -> dict[str, NDArray[np.generic]]:
-        return {kind: np.concatenate(parts) for kind, parts in self._parts.items()}
+        """All arrays of a type as one (N,)."""
+        return {kind: np.concatenate(parts) for kind, parts in self._flat.items()}
 
 
-class _Stored:
-    """The arrays of a file by where they lie; one that stands twice in the tree is one array."""
-
-    def __init__(self, by_type: Mapping[str, NDArray[np.generic]]) -> None:
-        self._by_type = by_type
-        self._known: dict[tuple[str, int, tuple[int, ...]], NDArray[np.generic]] = {}
-
-    def at(self, place: Any) -> NDArray[np.generic]:
-        kind, first, shape = place[0], place[1], tuple(place[2])
-        if (kind, first, shape) not in self._known:
-            flat = self._by_type[kind][first : first + math.prod(shape)]
-            self._known[kind, first, shape] = flat.reshape(shape)
-        return self._known[kind, first, shape]
+@cache
+def _type_name(dtype: Any) -> str:
+    return str(dtype.str[1:])
 
 
-def _encode(value: Any, arrays: _Arrays) -> Any:
+def _encode(value: Any, parts: _Parts) -> Any:
     kind: Any = type(value)
     if kind in _PLAIN:
         return value
-    if kind in (tuple, list):
-        return {kind.__name__: [_encode(v, arrays) for v in value]}
+    if kind is tuple:
+        return {"tuple": parts.number(value)}
+    if kind is list:
+        return {"list": [_encode(v, parts) for v in value]}
     if isinstance(value, enum.Enum):
         return {"enum": _name(kind), "value": value.value}
     if isinstance(value, np.ndarray):
         if value.dtype.hasobject:
             raise TypeError("an array of objects cannot be cached")
-        return {"array": arrays.place(value)}
+        return {"array": parts.place(value)}
     if isinstance(value, np.generic):
-        return {"scalar": arrays.place(np.asarray(value))}
+        return {"scalar": parts.place(np.asarray(value))}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {"class": _name(kind), "members": {name: _encode(getattr(value, name), arrays) for name in _given(kind)}}
+        return {"class": _name(kind), "members": {name: _encode(getattr(value, name), parts) for name in _given(kind)}}
     if isinstance(value, Mapping):
-        return {"dict": [[_encode(k, arrays), _encode(v, arrays)] for k, v in value.items()]}
+        return {"dict": [[_encode(k, parts), _encode(v, parts)] for k, v in value.items()]}
     if isinstance(value, frozenset):
-        return {"frozenset": [_encode(v, arrays) for v in sorted(value)]}
+        return {"frozenset": [_encode(v, parts) for v in sorted(value)]}
     raise TypeError(f"{_name(kind)} cannot be cached; allowed: dataclasses of {PACKAGES}, arrays, containers")
 
 
@@ -474,28 +490,49 @@ def _given(kind: Any) -> tuple[str, ...]:
     return tuple(member.name for member in dataclasses.fields(kind) if member.init)
 
 
-def _decode(node: Any, arrays: _Stored) -> Any:
-    if not isinstance(node, dict):
-        return node
-    if "array" in node:
-        return arrays.at(node["array"])
-    if "scalar" in node:
-        return arrays.at(node["scalar"])[()]
-    if "class" in node:
-        kind = _class(node["class"])
-        if not dataclasses.is_dataclass(kind):
-            raise BadCacheFile(f"{node['class']} is no dataclass")
-        build: Any = kind
-        return build(**{name: _decode(child, arrays) for name, child in node["members"].items()})
-    if "enum" in node:
-        return _member(node["enum"], node["value"])
-    if "dict" in node:
-        return {_decode(k, arrays): _decode(v, arrays) for k, v in node["dict"]}
-    if "tuple" in node:
-        return tuple(_decode(child, arrays) for child in node["tuple"])
-    if "frozenset" in node:
-        return frozenset(_decode(child, arrays) for child in node["frozenset"])
-    return [_decode(child, arrays) for child in node["list"]]
+class _Stored:
+    """The arrays and tuples of a file; one that stands twice in the tree is one."""
+
+    def __init__(self, by_type: Mapping[str, NDArray[np.generic]], tuples: Sequence[Any]) -> None:
+        self._by_type, self._tuples = by_type, tuples
+        self._known: dict[Any, Any] = {}
+
+    def decode(self, node: Any) -> Any:
+        """What a node of the tree says."""
+        if not isinstance(node, dict):
+            return node
+        if "array" in node:
+            return self._array(node["array"])
+        if "scalar" in node:
+            return self._array(node["scalar"])[()]
+        if "class" in node:
+            kind = _class(node["class"])
+            if not dataclasses.is_dataclass(kind):
+                raise BadCacheFile(f"{node['class']} is no dataclass")
+            build: Any = kind
+            return build(**{name: self.decode(child) for name, child in node["members"].items()})
+        if "enum" in node:
+            return _member(node["enum"], node["value"])
+        if "dict" in node:
+            return {self.decode(k): self.decode(v) for k, v in node["dict"]}
+        if "tuple" in node:
+            return self._tuple(node["tuple"])
+        if "frozenset" in node:
+            return frozenset(self.decode(child) for child in node["frozenset"])
+        return [self.decode(child) for child in node["list"]]
+
+    def _array(self, place: Any) -> NDArray[np.generic]:
+        kind, first, shape = key = place[0], place[1], tuple(place[2])
+        if key not in self._known:
+            self._known[key] = self._by_type[kind][first : first + math.prod(shape)].reshape(shape)
+        found: NDArray[np.generic] = self._known[key]
+        return found
+
+    def _tuple(self, number: int) -> tuple[Any, ...]:
+        if number not in self._known:
+            self._known[number] = tuple(self.decode(child) for child in self._tuples[number])
+        found: tuple[Any, ...] = self._known[number]
+        return found
 
 
 @cache

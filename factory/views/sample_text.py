@@ -88,14 +88,14 @@ def label_lines(row: dict[str, Any], drawn: bool) -> Iterable[str]:
 def logged_drive(store: "Store", clip_id: str, settings_hash: str) -> "Array | None":
     """(81, 3) the log from T to T+2H, world frame, from the prepared clip; None where the cache has it no more."""
     from factory.graph.steps import cache_key
-    from factory.pipeline import logged_poses
+    from factory.pipeline import cached_poses
     from factory.store.location import BadCacheFile
 
     digests = {run["settings_hash"]: run["prepare_digest"] for run in store.runs()}
     if settings_hash not in digests:
         return None
     try:
-        return logged_poses(store.cache.load(cache_key(clip_id, digests[settings_hash])))
+        return cached_poses(store.cache, cache_key(clip_id, digests[settings_hash]))
     except BadCacheFile:
         return None
 

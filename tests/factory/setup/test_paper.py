@@ -9,6 +9,7 @@ from factory.config.compose import ConfigError
 from factory.config.run import RunConfig, load_config
 from factory.setup.calibrate import (
     differences_from_paper,
+    paper_config,
     paper_deviations_line,
     plan_text,
 )
@@ -31,6 +32,10 @@ def test_the_preset_has_the_paper_s_settings(vocabulary: Vocabulary) -> None:
     assert (config.rounds, config.vocabulary.k, config.render.width, config.render.height) == (5, 16384, 1920, 1080)
     assert (config.render.psnr_min, config.render.camera_psnr_min) == (27.0, 0.0)
     assert (config.perturb.epdms_min, config.reward.progress_above) == (0.8, 0.5)
+
+
+def test_the_preset_is_read_as_hydra_composes_it() -> None:
+    assert paper_config() == load_config(["preset=paper", "vocabulary.file=given", "out=anywhere"])
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Prepared clips on disk: exact, and no way for a file to run code."""
 
-import io
 import json
 import os
 import sys
@@ -18,9 +17,9 @@ from tasks.world.clip import AgentKind, AgentTracks
 
 
 def forged(tree: object) -> bytes:
-    sink = io.BytesIO()
-    np.savez(sink, tree=np.frombuffer(json.dumps(tree).encode(), np.uint8))
-    return len(sink.getvalue()).to_bytes(8, "little") + pa.compress(sink.getvalue(), codec="zstd", asbytes=True)
+    text = json.dumps({"sizes": {}, "tuples": [], "root": tree}).encode()
+    plain = FORMAT.to_bytes(8, "little") + len(text).to_bytes(8, "little") + text
+    return len(plain).to_bytes(8, "little") + pa.compress(plain, codec="zstd", asbytes=True)
 
 
 def tracks() -> AgentTracks:
@@ -46,9 +45,36 @@ def test_a_tree_of_dataclasses_comes_back_exactly() -> None:
         assert getattr(back["tracks"], name).dtype == getattr(tracks(), name).dtype
 
 
-def test_an_array_that_stands_twice_is_stored_once() -> None:
+def test_an_array_or_tuple_that_stands_twice_is_stored_once() -> None:
     big = np.random.default_rng(0).random(10_000)
     assert len(encode_tree((big, big, {"again": big}))) < 1.1 * len(encode_tree((big,)))
+    names = tuple(map(str, big))
+    first, again = decode_tree(encode_tree([names, {"again": names}]))
+    assert first == names and again["again"] is first
+
+
+def test_a_part_of_a_tree_is_read_without_the_rest() -> None:
+    row, strange = CandidateRow(0, 1, 0.5, 0.0, 0.0, 0.0, (0, 1), 1.0, 1.0), {"class": "this:Poem", "members": {}}
+    members = {"file": {"class": "tests:none", "members": {"end_x": 0.5}}, "problem": strange}
+    assert decode_tree(encode_tree(row), ["end_x"]) == 0.5 and decode_tree(encode_tree(row), ["cell"]) == (0, 1)
+    assert decode_tree(forged({"class": "this:Poem", "members": members}), ["file", "end_x"]) == 0.5
+    for none in (["nothing"], ["end_x", "more"], ["cell", "0"]):
+        assert decode_tree(encode_tree(row), none) is None
+
+
+def test_a_file_of_another_version_is_refused_by_its_number() -> None:
+    size, packed = encode_tree(1)[:8], encode_tree(1)[8:]
+    plain = pa.decompress(packed, decompressed_size=int.from_bytes(size, "little"), codec="zstd")
+    older = (FORMAT - 1).to_bytes(8, "little") + bytes(plain)[8:]
+    with pytest.raises(BadCacheFile, match=f"this version reads {FORMAT}"):
+        decode_tree(size + pa.compress(older, codec="zstd", asbytes=True))
+
+
+def test_a_tuple_that_holds_itself_is_refused() -> None:
+    plain = json.dumps({"sizes": {}, "tuples": [[{"tuple": 0}]], "root": {"tuple": 0}}).encode()
+    plain = FORMAT.to_bytes(8, "little") + len(plain).to_bytes(8, "little") + plain
+    with pytest.raises(BadCacheFile, match="recursion"):
+        decode_tree(len(plain).to_bytes(8, "little") + pa.compress(plain, codec="zstd", asbytes=True))
 
 
 @pytest.mark.parametrize(
@@ -63,13 +89,13 @@ def test_an_array_that_stands_twice_is_stored_once() -> None:
 )
 def test_a_file_cannot_name_what_is_not_a_dataclass_of_ours(name: str) -> None:
     with pytest.raises(BadCacheFile):
-        decode_tree(forged({"format": FORMAT, "root": {"class": name, "members": {}}}))
+        decode_tree(forged({"class": name, "members": {}}))
 
 
 def test_a_file_makes_nobody_import_a_module_of_others() -> None:
     """An import runs code: `this` prints a poem, others may do worse."""
     with pytest.raises(BadCacheFile, match="not a class a cache file may name"):
-        decode_tree(forged({"format": FORMAT, "root": {"class": "this:Poem", "members": {}}}))
+        decode_tree(forged({"class": "this:Poem", "members": {}}))
     assert "this" not in sys.modules
 
 
