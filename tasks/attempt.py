@@ -50,7 +50,7 @@ from tasks.world.frames import (
     touching,
     wrap_angle,
 )
-from tasks.world.road_map import CenterlineFinder, RoadMap, Route, centerline_from
+from tasks.world.road_map import RoadMap, Route, centerline_finder
 from tasks.world.vocabulary import Vocabulary
 
 Timed = Callable[[str], AbstractContextManager[object]]
@@ -71,7 +71,8 @@ class Judged:
 def perturbed_scene(clip: Clip, stage_one: Rollout, steps: int = HORIZON_STEPS) -> Scene:
     """The world at T+H that a candidate's rollout leads to; or `steps` of 0.1 s after T, on its way there."""
     pose = stage_one.ego_states[steps, : HEADING + 1]
-    return next_scene(scene_of_clip(clip), stage_one, centerline_from(clip.road_map, clip.route, pose), steps)
+    line = centerline_finder(clip.road_map, clip.route).centerline_from(pose)
+    return next_scene(scene_of_clip(clip), stage_one, line, steps)
 
 
 def has_route(centerline: Array) -> bool:
@@ -236,7 +237,7 @@ def route_ahead_m(road_map: RoadMap, route: Route, pose: Array) -> float | None:
     from its polygon, or turned against its centreline by more than NEAR_RAD. Raises NoRoute where the map has none of
     the route's lanes.
     """
-    metres = CenterlineFinder(road_map, route).metres_ahead(pose, NEAR_M, NEAR_RAD, ONWARD_M)
+    metres = centerline_finder(road_map, route).metres_ahead(pose, NEAR_M, NEAR_RAD, ONWARD_M)
     return metres if metres is None or metres < ONWARD_M else math.inf
 
 

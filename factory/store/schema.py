@@ -104,10 +104,9 @@ def _build(column: Column, shape: tuple[Size, ...], values: Sequence[object], wh
         return _scalars(column, values, where)
     regular = column.dtype not in ("struct", "string", "binary") and not any(isinstance(s, str) for s in shape[1:])
     if regular:
-        arrays = [_checked(column, shape, value, where) for value in values]
-        flat = np.concatenate([a.ravel() for a in arrays]) if arrays else np.zeros(0, column.dtype)
+        arrays = [_shaped(shape, value, where) for value in values]
         lengths = [len(a) for a in arrays]
-        inner: pa.Array = pa.array(flat, _ARROW[column.dtype])
+        inner: pa.Array = _entries(column, arrays, where)
         for size in reversed(shape[1:]):
             assert isinstance(size, int)
             inner = pa.FixedSizeListArray.from_arrays(inner, size)
@@ -119,7 +118,9 @@ def _build(column: Column, shape: tuple[Size, ...], values: Sequence[object], wh
         if any(length != shape[0] for length in lengths):
             raise BadRow(f"{where}: {shape[0]} entries expected, got {lengths}")
         return pa.FixedSizeListArray.from_arrays(inner, shape[0])
-    return pa.ListArray.from_arrays(pa.array(np.concatenate([[0], np.cumsum(lengths)]), pa.int32()), inner)
+    offsets = np.zeros(len(lengths) + 1, np.int32)
+    np.cumsum(lengths, out=offsets[1:])
+    return pa.ListArray.from_arrays(pa.array(offsets), inner)
 
 
 def _sequence(value: object, where: str) -> Sequence[object]:
@@ -128,19 +129,26 @@ def _sequence(value: object, where: str) -> Sequence[object]:
     return value  # type: ignore[return-value]
 
 
-def _checked(column: Column, shape: tuple[Size, ...], value: object, where: str) -> NDArray[np.generic]:
-    wanted = np.dtype(column.dtype)
+def _shaped(shape: tuple[Size, ...], value: object, where: str) -> NDArray[np.generic]:
     array = np.asarray(value)
     if array.size == 0 and array.ndim < len(shape) and isinstance(shape[0], str):
         array = array.reshape(0, *(s for s in shape[1:] if isinstance(s, int)))
     fits = array.ndim == len(shape) and all(isinstance(s, str) or s == n for s, n in zip(shape, array.shape))
     if not fits:
         raise BadRow(f"{where}: shape {list(shape)} expected, got {list(array.shape)}")
-    if array.size and not np.can_cast(array.dtype, wanted, casting="same_kind"):
-        raise BadRow(f"{where}: {wanted} expected, got {array.dtype}")
-    if wanted.kind == "f" and not column.nan and not np.isfinite(array).all():
+    return array
+
+
+def _entries(column: Column, arrays: Sequence[NDArray[np.generic]], where: str) -> pa.Array:
+    """All entries of arrays, one behind the other; looked at together, as a row has hundreds of lanes."""
+    wanted = np.dtype(column.dtype)
+    each = [array.reshape(-1) for array in arrays if array.size]
+    flat = each[0] if len(each) == 1 else np.concatenate(each) if each else np.zeros(0, wanted)
+    if not np.can_cast(flat.dtype, wanted, casting="same_kind"):
+        raise BadRow(f"{where}: {wanted} expected, got {flat.dtype}")
+    if wanted.kind == "f" and not column.nan and not np.isfinite(flat).all():
         raise BadRow(f"{where}: holds NaN or infinity")
-    return np.ascontiguousarray(array, wanted)
+    return pa.array(np.ascontiguousarray(flat, wanted), _ARROW[column.dtype])
 
 
 def _scalars(column: Column, values: Sequence[object], where: str) -> pa.Array:
@@ -151,10 +159,7 @@ def _scalars(column: Column, values: Sequence[object], where: str) -> pa.Array:
     elif column.dtype == "binary":
         good = all(v is None or isinstance(v, bytes) for v in values)
     else:
-        return pa.array(
-            np.concatenate([np.zeros(0, column.dtype), *(_checked(column, (), v, where).reshape(1) for v in values)]),
-            _ARROW[column.dtype],
-        )
+        return _entries(column, [_shaped((), value, where) for value in values], where)
     if not good:
         raise BadRow(f"{where}: {column.dtype} expected, got {sorted({type(v).__name__ for v in values})}")
     return pa.array([str(v) for v in values] if column.dtype == "string" else list(values), _ARROW[column.dtype])

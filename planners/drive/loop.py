@@ -17,7 +17,7 @@ from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic,
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S, AgentTracks, Scene
 from tasks.world.frames import HEADING, to_local, to_world
-from tasks.world.road_map import CenterlineFinder
+from tasks.world.road_map import centerline_finder
 
 DRIVE_VERSION = 4  # raised by hand whenever the same start is driven otherwise
 PLAN_STEPS = 5  # of 0.1 s between two plans: 2 Hz
@@ -77,7 +77,7 @@ def drive(
     n_plans = min(settings.n_steps, log_steps) // PLAN_STEPS
     if n_plans < 1:
         raise ValueError(f"the log goes on for {log_steps * STEP_S:.1f} s: 0.5 s of it or more are driven")
-    finder = CenterlineFinder(scene.clip.road_map, scene.clip.route)
+    finder = centerline_finder(scene.clip.road_map, scene.clip.route)
     tracker, observer = _MpcTracker(start, settings.controller), Observer(seen)
     states, plans, images = [scene.ego_state], list[Array](), list[Images]()
     for _ in range(n_plans):

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
+from functools import lru_cache
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -456,9 +457,10 @@ class CenterlineFinder:
         return _backtrack(came_from, deepest)
 
 
-def centerline_from(road_map: RoadMap, route: Route, pose: Array) -> Array:
-    """(P, 3) centreline of the route ahead of one rear-axle pose (3,); for many poses keep a CenterlineFinder."""
-    return CenterlineFinder(road_map, route).centerline_from(pose)
+@lru_cache(maxsize=4)
+def centerline_finder(road_map: RoadMap, route: Route) -> CenterlineFinder:
+    """The same one again for the map and route of the last few clips: every attempt on a clip asks twice."""
+    return CenterlineFinder(road_map, route)
 
 
 def _refuse_without_roadblock(road_map: RoadMap, lane_ids: Iterable[str]) -> None:

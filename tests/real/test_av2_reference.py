@@ -13,7 +13,7 @@ from factory.datasets.av2.reader import AV2Log, AV2Reader, agents_at, ego_states
 from tasks.world.clip import MOVING_KINDS
 from tasks.world.frames import wrap_angle
 from tasks.world.repair.records import LEFT_OUT
-from tasks.world.road_map import centerline_from, polygons_near
+from tasks.world.road_map import polygons_near
 
 TWICE = "56d3999e"  # in the record of 7fab2350: one parked car is listed as this track and as KEPT, with one box
 KEPT = "0cf6355a"
@@ -56,9 +56,8 @@ def test_the_route_is_the_recorded_one(scene: Recorded) -> None:
 
 def test_the_centerline_is_the_recorded_one(scene: Recorded) -> None:
     pose = scene.arrays["ego_state0"][:3]
-    found = centerline_from(scene.log.road_map, scene.log.route, pose)
+    found = scene.log.finder.centerline_from(pose)
     assert np.abs(found - scene.arrays["centerline"]).max() < 1e-12
-    assert np.array_equal(found, scene.log.finder.centerline_from(pose))
 
 
 def test_the_lane_graph_is_the_recorded_one(scene: Recorded) -> None:

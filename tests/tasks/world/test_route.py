@@ -16,7 +16,6 @@ from tasks.world.road_map import (
     Rings,
     RoadMap,
     Route,
-    centerline_from,
     centerline_from_boundaries,
     driven_lanes,
     polygons_near,
@@ -134,7 +133,7 @@ def test_a_ring_road_does_not_extend_forever() -> None:
 def test_the_centerline_joins_lanes_with_their_shared_point_twice() -> None:
     road_map = two_lane_road()
     route = route_of_log(road_map, drive((5, -4), (60, -4)))
-    line = centerline_from(road_map, route, np.array([10.0, -4.0, 0.0]))
+    line = CenterlineFinder(road_map, route).centerline_from(np.array([10.0, -4.0, 0.0]))
     along = np.hypot(*np.diff(line[:, :2], axis=0).T)
     assert (along < 1e-9).sum() == 2
     assert np.isclose(along.sum(), 170.0)
@@ -145,7 +144,7 @@ def test_the_centerline_joins_lanes_with_their_shared_point_twice() -> None:
 def test_from_a_lane_that_does_not_lead_there_the_centerline_ends_where_it_can() -> None:
     road_map = two_lane_road()
     route = route_of_log(road_map, drive((5, -4), (60, -4)))
-    line = centerline_from(road_map, route, np.array([10.0, 0.0, 0.0]))  # lane a only leads left, off the route
+    line = CenterlineFinder(road_map, route).centerline_from(np.array([10.0, 0.0, 0.0]))  # lane a only leads left
     assert np.allclose(line[-1, :2], [50.0, 0.0])
 
 
@@ -177,8 +176,8 @@ def test_the_route_does_not_depend_on_where_the_world_lies() -> None:
     route = route_of_log(here, poses)
     moved_route = route_of_log(there, to_world(motion, poses))
     assert route == moved_route
-    line = centerline_from(here, route, poses[0])
-    moved_line = centerline_from(there, moved_route, to_world(motion, poses[0]))
+    line = CenterlineFinder(here, route).centerline_from(poses[0])
+    moved_line = CenterlineFinder(there, moved_route).centerline_from(to_world(motion, poses[0]))
     assert np.abs(to_world(motion, line)[:, :2] - moved_line[:, :2]).max() < 1e-6
 
 
