@@ -6,6 +6,7 @@ The stages behind the machine: what `factory.graph.steps.Work` asks for, with re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ from factory.store.schema import UNLISTED, RunIdentity, attempt_id
 from tasks.attempt import (
     ExpertGate,
     Judged,
+    ReadyScene,
     Timed,
     attempt,
     drive_under_log_replay,
@@ -53,7 +55,7 @@ from tasks.world.repair.records import first_repairs, repair_counts
 from tasks.world.vocabulary import Vocabulary
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PerturbedClip:
     """The payload of a prepared clip. It is cached without its sensor files: where data lies may change."""
 
@@ -283,8 +285,8 @@ class FactoryWork:
         chosen = payload.candidates[candidate]
         self._refuse_another_policy()
         with timed("rollout"):
-            scene = perturbed_scene(payload.clip, chosen.rollout)
-        result = attempt(scene, driver, self.gate, self.traffic, self.pdm, rng, timed)
+            ready = _ready_scene(payload, candidate, self.traffic, self.pdm)
+        result = attempt(ready, driver, self.gate, rng, timed)
         return Drive(payload.ref, chosen, *((None, result) if isinstance(result, Rejected) else result))
 
     # What the reward accepts is drawn.
@@ -437,6 +439,11 @@ def drive_of(driven: AcceptedDrive) -> Drive:
     """What FactoryWork drove."""
     assert isinstance(driven.payload, Drive)
     return driven.payload
+
+
+@lru_cache(maxsize=2)  # experts try a candidate one after the other, at most with another clip's between them
+def _ready_scene(clip: PerturbedClip, candidate: int, traffic: TrafficSettings, planner: PdmSettings) -> ReadyScene:
+    return ReadyScene(perturbed_scene(clip.clip, clip.candidates[candidate].rollout), traffic, planner)
 
 
 def _candidate_row(index: int, candidate: Candidate) -> CandidateRow:

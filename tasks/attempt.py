@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -145,27 +146,39 @@ def end_verdict(judged: Judged, traffic: TrafficScene, gate: ExpertGate) -> Reje
     return None
 
 
+class ReadyScene:
+    """A scene with what every drive from it meets and is held against, made when first asked for.
+
+    Experts that try the same candidate share it: to prepare traffic and PDM-Closed's plan costs more than a drive.
+    """
+
+    def __init__(self, scene: Scene, traffic: TrafficSettings, planner: PdmSettings) -> None:
+        self.scene, self.planner, self._settings = scene, planner, traffic
+
+    @cached_property
+    def traffic(self) -> TrafficScene:
+        return prepare_traffic(self.scene, self._settings)
+
+    @cached_property
+    def pdm_plan(self) -> PdmPlan:
+        return plan_for(self.scene, self.planner)
+
+
 def attempt(
-    scene: Scene,
-    expert: Expert,
-    gate: ExpertGate,
-    traffic: TrafficSettings,
-    planner: PdmSettings,
-    rng: np.random.Generator,
-    timed: Timed = nullcontext,
+    ready: ReadyScene, expert: Expert, gate: ExpertGate, rng: np.random.Generator, timed: Timed = nullcontext
 ) -> tuple[Judged, Rejected | None] | Rejected:
-    """Let `expert` plan from the perturbed scene, drive its plan and judge it; of several plans up to one that passes.
+    """Let `expert` plan from a perturbed scene, drive its plan and judge it; of several plans up to one that passes.
 
     Returns the judged drive and the verdict (None: accepted), where none passes that of the first; Rejected where the
     route ends or the expert has no plan.
     `timed(stage)` is entered around the work of each stage, for whoever wants to know where the time goes.
     """
+    scene = ready.scene
     if not has_route(scene.centerline):
         return Rejected("rollout", "route_ended", "the perturbed ego stands at the end of its route")
     with timed("expert"):  # which may be the very planner that progress is held against: it plans once
-        pdm_plan = plan_for(scene, planner) if expert == PdmClosed(planner) else None
-    plans = plans_of(expert, scene, rng) if pdm_plan is None else iter([Plan(pdm_plan.poses)])
-    ready: TrafficScene | None = None
+        is_planner = expert == PdmClosed(ready.planner)
+        plans = iter([Plan(ready.pdm_plan.poses)]) if is_planner else plans_of(expert, scene, rng)
     refused: tuple[Judged, Rejected] | Rejected | None = None
     while True:
         with timed("expert"):
@@ -173,14 +186,13 @@ def attempt(
         if plan is None or isinstance(plan, Rejected):
             refused = refused or plan
             break
-        if ready is None:
-            with timed("rollout"):
-                ready = prepare_traffic(scene, traffic)
-            with timed("reward"):
-                pdm_plan = pdm_plan or plan_for(scene, planner)
-        judged = _driven_among(ready, plan, planner, timed, pdm_plan)
+        with timed("rollout"):
+            traffic = ready.traffic
         with timed("reward"):
-            found = verdict(judged.scores, gate) or end_verdict(judged, ready, gate)
+            pdm_plan = ready.pdm_plan
+        judged = _driven_among(traffic, plan, ready.planner, timed, pdm_plan)
+        with timed("reward"):
+            found = verdict(judged.scores, gate) or end_verdict(judged, traffic, gate)
             found = found or _near_log_verdict(judged, gate) or _goal_verdict(judged)
         if found is None:
             return judged, None

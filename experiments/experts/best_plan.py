@@ -12,7 +12,7 @@ from factory.config.run import load_config
 from factory.graph.steps import PreparedClip
 from factory.pipeline import FactoryWork, perturbed_clip_of
 from factory.setup.settings import assemble
-from tasks.attempt import Judged, attempt, has_route, off_log, perturbed_scene
+from tasks.attempt import Judged, ReadyScene, attempt, has_route, off_log, perturbed_scene
 from tasks.experts.protocol import Plan, plans_of
 from tasks.stages import Rejected
 from tasks.world.clip import Scene, random_stream
@@ -48,7 +48,7 @@ def outcomes(work: FactoryWork, prepared: PreparedClip, candidate: int) -> list[
     plans = [plan for plan in plans_of(work.experts["recovery"], scene, rng) if not isinstance(plan, Rejected)]
     found = []
     for number, plan in enumerate(plans):
-        result = attempt(scene, OnePlan(plan), work.gate, work.traffic, work.pdm, rng)
+        result = attempt(ReadyScene(scene, work.traffic, work.pdm), OnePlan(plan), work.gate, rng)
         if not isinstance(result, Rejected) and result[1] is None:
             judged: Judged = result[0]
             end = off_log(judged)[-1]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import ClipReader
-from tasks.attempt import ExpertGate, Judged, attempt, drive_under_log_replay, end_verdict, perturbed_scene
+from tasks.attempt import ExpertGate, Judged, ReadyScene, attempt, drive_under_log_replay, end_verdict, perturbed_scene
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Human, Plan
 from tasks.experts.recovery import RecoveryExpert, RecoverySettings, RecoveryTable, make_feasible
@@ -75,7 +75,10 @@ def driven(clip: Clip, shared_root: Path) -> list[tuple[Judged, Rejected | None,
     expert, out = Smoothed(RecoveryTable(human), RecoverySettings(match="paper")), []
     for candidate in found.candidates:
         scene = perturbed_scene(clip, candidate.rollout)
-        pair = [attempt(scene, expert, gate, traffic, PDM, RNG) for gate in (PUBLISHED, ExpertGate(near_log=False))]
+        pair = [
+            attempt(ReadyScene(scene, traffic, PDM), expert, gate, RNG)
+            for gate in (PUBLISHED, ExpertGate(near_log=False))
+        ]
         if not isinstance(pair[0], Rejected) and not isinstance(pair[1], Rejected):
             out.append((pair[0][0], pair[0][1], pair[1][1]))
     return out

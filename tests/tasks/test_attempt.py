@@ -11,6 +11,7 @@ from tasks.attempt import (
     BRAKING_MPS2,
     ExpertGate,
     Judged,
+    ReadyScene,
     attempt,
     drive_under_log_replay,
     hit_after_s,
@@ -59,7 +60,7 @@ def table() -> RecoveryTable:
 
 
 def tried(scene: Scene, expert: Expert) -> tuple[Judged, Rejected | None]:
-    result = attempt(scene, expert, GATE, TrafficSettings(), PdmSettings(), RNG)
+    result = attempt(ReadyScene(scene, TrafficSettings(), PdmSettings()), expert, GATE, RNG)
     assert not isinstance(result, Rejected)
     return result
 
@@ -145,9 +146,23 @@ def test_both_experts_recover_from_beside_the_lane_s_middle(scene: Scene, table:
         assert abs(judged.rollout.ego_states[-1, 1]) < abs(scene.ego_state[1])
 
 
+def test_experts_that_share_a_scene_drive_and_score_as_each_would_alone(scene: Scene, table: RecoveryTable) -> None:
+    experts = (PdmClosed(), RecoveryExpert(table))
+    alone = [tried(scene, expert)[0] for expert in experts]
+    for order in ((0, 1, 0), (1, 0, 1)):
+        ready = ReadyScene(scene, TrafficSettings(), PdmSettings())
+        for i in order:
+            shared = attempt(ready, experts[i], GATE, RNG)
+            assert not isinstance(shared, Rejected)
+            assert np.array_equal(shared[0].rollout.agents.boxes, alone[i].rollout.agents.boxes, equal_nan=True)
+            assert np.array_equal(shared[0].rollout.ego_states, alone[i].rollout.ego_states)
+            assert np.array_equal(shared[0].reference, alone[i].reference)
+            assert np.array_equal(shared[0].scores.pdm_score, alone[i].scores.pdm_score)
+
+
 def test_a_route_that_has_ended_is_a_rejection_not_an_error(scene: Scene) -> None:
     at_the_end = replace(scene, centerline=np.repeat(scene.centerline[-1:], 2, axis=0))
-    result = attempt(at_the_end, PdmClosed(), GATE, TrafficSettings(), PdmSettings(), RNG)
+    result = attempt(ReadyScene(at_the_end, TrafficSettings(), PdmSettings()), PdmClosed(), GATE, RNG)
     assert isinstance(result, Rejected)
     assert (result.stage, result.reason) == ("rollout", "route_ended")
 
@@ -157,7 +172,7 @@ REPLAY = TrafficSettings(mode="replay")
 
 
 def ended(scene: Scene, expert: Expert, gate: ExpertGate) -> Rejected | None:
-    result = attempt(scene, expert, gate, REPLAY, PdmSettings(), RNG)
+    result = attempt(ReadyScene(scene, REPLAY, PdmSettings()), expert, gate, RNG)
     assert not isinstance(result, Rejected)
     return result[1]
 
@@ -201,7 +216,7 @@ def test_a_collision_that_braking_prevents_refuses_nothing(scene: Scene) -> None
     """The car ahead is 7.5 m farther on: at 10 m/s more than it the ego hits it still, braking it does not."""
     agents = scene.agents
     farther = replace(scene, agents=replace(agents, boxes=agents.boxes + np.array([7.5, 0.0, 0.0, 0.0, 0.0])))
-    result = attempt(farther, Close(), ASKS_FOR_ENDS, REPLAY, PdmSettings(), RNG)
+    result = attempt(ReadyScene(farther, REPLAY, PdmSettings()), Close(), ASKS_FOR_ENDS, RNG)
     assert not isinstance(result, Rejected)
     judged, rejected = result
     traffic = prepare_traffic(farther, REPLAY)
@@ -221,7 +236,7 @@ def test_what_an_end_leads_to_changes_neither_drive_nor_scores(scene: Scene, tab
     without = replace(GATE, off_route=False, after=False)
     for expert in (PdmClosed(), RecoveryExpert(table)):
         (a, _), (b, _) = (
-            attempt(scene, expert, gate, TrafficSettings(), PdmSettings(), RNG)  # type: ignore[misc]
+            attempt(ReadyScene(scene, TrafficSettings(), PdmSettings()), expert, gate, RNG)  # type: ignore[misc]
             for gate in (GATE, without)
         )
         np.testing.assert_array_equal(a.rollout.ego_states, b.rollout.ego_states, strict=True)
@@ -299,7 +314,7 @@ def test_of_several_plans_the_first_that_is_accepted_is_driven_and_of_none_the_f
     judged, rejected = tried(scene, Several((off, farther)))
     assert rejected is not None and judged.plan is off
     lost = Rejected("expert", "out_of_reach", "nowhere")
-    assert attempt(scene, Several((lost,)), GATE, TrafficSettings(), PdmSettings(), RNG) == lost
+    assert attempt(ReadyScene(scene, TrafficSettings(), PdmSettings()), Several((lost,)), GATE, RNG) == lost
 
 
 @pytest.mark.parametrize(
@@ -332,7 +347,7 @@ def test_a_drive_that_is_the_log_s_own_is_refused_unless_that_is_off(
         else None
     )
     open_gate = replace(GATE, near_log=False)
-    result = attempt(beside, Several((good,)), open_gate, TrafficSettings(), PdmSettings(), RNG)
+    result = attempt(ReadyScene(beside, TrafficSettings(), PdmSettings()), Several((good,)), open_gate, RNG)
     assert not isinstance(result, Rejected) and result[1] is None
 
 
