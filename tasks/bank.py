@@ -39,7 +39,7 @@ from tasks.reward.epdms import (
 from tasks.reward.map_index import Grid, assembled, touched_cells, window_around
 from tasks.reward.packing import MOST, packed, unpacked
 from tasks.rollout.corridor import Paths
-from tasks.rollout.idm import AgentStates, IdmDriver, Roles, Yielding
+from tasks.rollout.idm import AgentStates, IdmDriver, Roles, Yielding, empty_motion, empty_rows
 from tasks.rollout.lqr import follow
 from tasks.rollout.simulate import boxes_and_velocities, drive, idm_driver
 from tasks.settings import TrafficSettings
@@ -166,10 +166,11 @@ def _score_answered(
     if not _are_near(states):
         return NO_DRIVE
     context, table = _context_around(values, starts, states), np.empty((N_ROWS, len(scores)))
+    nothing = empty_rows(0, len(roles.path)), empty_motion(0, len(roles.path))
     pair, of_pair = states[:2].copy(), np.empty((N_ROWS, 2))
     areas, comfort = np.empty((2, N_TIMES, 3), np.bool_), np.empty((2, N_FLAGS), np.bool_)
     for k in range(len(scores)):
-        rows = drive(NOW, log, now, roles, paths, driver, ego_boxes[k], ego_velocities[k], yielding)[0]
+        rows = drive(NOW, log, now, roles, paths, driver, ego_boxes[k], ego_velocities[k], yielding, nothing)[0]
         obstacles = obstacles_of_tracks(rows.boxes, rows.velocities, rows.valid, collision_score, ego_boxes[k, 0])
         pair[1] = states[1 + k]
         if not score_all(context, obstacles, pair, True, NO_REFERENCE, of_pair, areas, comfort):

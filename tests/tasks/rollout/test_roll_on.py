@@ -40,12 +40,17 @@ def test_the_rows_of_a_rollout_do_not_change_by_a_bit_where_it_goes_on(seed: int
     rollout = roll_out(first, ego)
     second = prepare_traffic(next_scene(scene, rollout, scene.centerline), settings)
     (ego_after,) = worlds.random_egos(second.scene, seed + 100, 1)
-    for traffic, states in ((first, ego), (second, ego_after)):
+    for traffic, states, other in ((first, ego, ego_after), (second, ego_after, ego)):
+        whole = roll_out_longer(prepare_traffic(traffic.scene, settings), longer(states))
+        roll_out(traffic, other)
+        after_another = roll_out_longer(traffic, longer(states))
         shorter, on = roll_out(traffic, states).agents, roll_out_longer(traffic, longer(states))
         assert on.n_steps == LONG and on.track_ids == shorter.track_ids
         for name in PER_STEP:
-            kept = getattr(on, name)[: HORIZON_STEPS + 1]
+            kept = getattr(whole, name)[: HORIZON_STEPS + 1]
             np.testing.assert_array_equal(kept, getattr(shorter, name), strict=True)
+            for same in (on, after_another):  # one goes on from the rollout, one must not
+                np.testing.assert_array_equal(getattr(same, name), getattr(whole, name), strict=True)
 
 
 def test_the_public_traffic_goes_on_as_well() -> None:
