@@ -7,6 +7,7 @@ to the database).
 """
 
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,8 +16,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solveh_banded
-from scipy.ndimage import median_filter
+from scipy.linalg import lstsq, solveh_banded
+from scipy.ndimage import convolve1d, median_filter
 
 from factory.datasets.scenarionet.map import as_floats, road_map, traffic_lights
 from factory.datasets.scenarionet.photos import (
@@ -428,11 +429,8 @@ def smooth_drive(xy: Array, heading: Array, weight: Array, smoothing: float) -> 
     weight: (S,) 1 where a step was observed, 0 where it only lies between two that were, three or more of them 1;
     S >= 7. Steering and rates are 0.
     """
-    from scipy.signal import savgol_filter  # 0.4 s, and most processes of a run smooth no drive
-
     drive = _least_third_difference(np.column_stack([xy, heading]), weight, smoothing)
-    velocity = savgol_filter(drive[:, :2], FIT_STEPS, 2, deriv=1, delta=STEP_S, axis=0)
-    acceleration = savgol_filter(drive[:, :2], FIT_STEPS, 2, deriv=2, delta=STEP_S, axis=0)
+    velocity, acceleration = (fitted_derivative(drive[:, :2], order) for order in (1, 2))
     c, s = np.cos(drive[:, 2]), np.sin(drive[:, 2])
     states = np.zeros((len(xy), EGO_STATE_SIZE))
     states[:, X], states[:, Y], states[:, HEADING] = drive[:, 0], drive[:, 1], wrap_angle(drive[:, 2])
@@ -440,6 +438,26 @@ def smooth_drive(xy: Array, heading: Array, weight: Array, smoothing: float) -> 
         states[:, along] = c * vector[:, 0] + s * vector[:, 1]
         states[:, across] = -s * vector[:, 0] + c * vector[:, 1]
     return states
+
+
+def fitted_derivative(values: Array, order: int) -> Array:
+    """(S, C) derivative per second of parabolas through FIT_STEPS steps each: about a step, at the ends the outermost.
+
+    Savitzky and Golay's filter, to the bit scipy.signal's, whose import takes longer than to read most logs.
+    """
+    half, powers, steps = FIT_STEPS // 2, np.arange(3)[:, None], np.arange(FIT_STEPS)
+    wanted = math.factorial(order) / STEP_S**order * (powers[:, 0] == order)
+    weights = lstsq((half - steps) ** powers, wanted)[0]
+    found: Array = convolve1d(values, weights, axis=0, mode="constant")
+    for window, ends, at in (
+        (values[:FIT_STEPS], found[:half], steps[:half]),
+        (values[-FIT_STEPS:], found[-half:], steps[-half:]),
+    ):
+        parabola = np.polyfit(steps, window, 2)
+        for _ in range(order):
+            parabola = parabola[:-1] * np.arange(len(parabola) - 1, 0, -1)[:, None]
+        ends[:] = np.polyval(parabola, at[:, None]) / STEP_S**order
+    return found
 
 
 def _keyframe_weights(xy: Array) -> Array:

@@ -172,3 +172,19 @@ def test_what_is_taken_from_an_empty_stack_is_no_pickle() -> None:
     for stream in (b"\x80\x04\x85.", b"\x80\x04a.", b"\x80\x04(s.", b"\x80\x04h\x05.", b"0.", b"1."):
         with pytest.raises(BadClip, match="truncated or not a pickle"):
             load_plain(stream, "clip.pkl")
+
+
+@pytest.mark.parametrize("protocol", [2, 4, 5])
+def test_polylines_load_and_count_as_keys_and_references_like_any_values(protocol: int) -> None:
+    line = [(0.5 * i, -1.0, 2.5) for i in range(400)]
+    value = {"line": line, "again": line[7], "numbers": [0.25] * 500, "mixed": [1.5, line[3], None, 2, [3.5, 4.5]]}
+    got = roundtrip(value, protocol)
+    assert got == value and got["again"] is got["line"][7]
+    assert roundtrip({tuple(line[:200]): 1}, protocol) == {tuple(line[:200]): 1}  # 801 values
+    for key in (tuple(line[:300]), tuple(map(float, range(1200)))):
+        with pytest.raises(BadClip, match="a key of more than"):
+            roundtrip({key: 1}, protocol)
+    data = pickle.dumps(value, protocol)
+    for cut in range(40, len(data), 97):
+        with pytest.raises(BadClip):
+            load_plain(data[:cut], "clip.pkl")

@@ -3,20 +3,23 @@
 import numpy as np
 import pytest
 import shapely
+from scipy.signal import savgol_filter
 from shapely.geometry import Point, Polygon
 
 from factory.datasets.scenarionet.map import pieces
 from factory.datasets.scenarionet.reader import (
+    FIT_STEPS,
     SLOPE_STEPS,
     FrameClock,
     LoggedTrack,
     ScenarioNetReader,
+    fitted_derivative,
     fitted_velocities,
     read_log,
     resampled,
 )
 from factory.readers.base import ClipRef
-from tasks.world.clip import CLIP_STEPS, NOW, AgentKind
+from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, AgentKind
 from tasks.world.frames import AX, AY, HEADING, VX, VY, X, Y
 from tasks.world.road_map import LightState
 from tests.factory.datasets.scenarionet import scenarionet_scenarios as town
@@ -185,6 +188,14 @@ def test_a_constant_acceleration_is_a_fixed_point_of_the_smoothing(tmp_path):
     np.testing.assert_allclose(states[:, X], ego[:, 0], atol=1e-6)
     np.testing.assert_allclose(states[:, VX], 2.0 + 1.2 * t, atol=1e-6)
     np.testing.assert_allclose(states[:, AX], 1.2, atol=1e-5)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("n", [FIT_STEPS, FIT_STEPS + 1, 300])
+def test_derivatives_are_scipy_s_to_the_bit(n, order):
+    xy = np.cumsum(np.random.default_rng(n).normal(size=(n, 2)), axis=0) + np.array([4e5, 3e6])
+    wanted = savgol_filter(xy, FIT_STEPS, 2, deriv=order, delta=STEP_S, axis=0)
+    np.testing.assert_array_equal(fitted_derivative(xy, order), wanted)
 
 
 def test_a_lost_can_message_is_time_that_passed_and_no_acceleration(tmp_path):
