@@ -310,7 +310,7 @@ class LocalGraph(Graph):
 # limits, and its results come back as bytes that are not opened here. Those used last it keeps, and asks for others
 # again.
 
-KEPT = 16  # results that the process keeps opened
+KEPT_BYTES = 1 << 28  # of results that the process keeps opened: rows until their shard is written, and their clips
 END_S = 5.0  # for it to end by itself
 
 
@@ -441,16 +441,24 @@ def _serve_tasks(pipe: Connection, out: Location, stop: Any, notes: Path) -> Non
     ignore_terminal_signals()
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the run decides
     supplied = {"out": out, "stopped": stop.is_set}
-    kept: OrderedDict[int, Any] = OrderedDict()
+    kept: OrderedDict[int, tuple[Any, int]] = OrderedDict()  # with its size in bytes
+    left = KEPT_BYTES
 
     def value_of(arg: Any) -> Any:
         if not isinstance(arg, KeptResult):
             return arg
         if arg.number not in kept:
             pipe.send(arg)
-            kept[arg.number] = read_only(pickle.loads(pipe.recv()))  # noqa: S301 -- this process made it, or its like
+            data = pipe.recv()
+            keep(arg.number, pickle.loads(data), len(data))  # noqa: S301 -- this process made it, or its like
         kept.move_to_end(arg.number)
-        return kept[arg.number]
+        return kept[arg.number][0]
+
+    def keep(number: int, value: Any, n_bytes: int) -> None:
+        nonlocal left
+        kept[number], left = (read_only(value), n_bytes), left - n_bytes
+        while left < 0 and len(kept) > 1:
+            left += kept.popitem(last=False)[1][1]
 
     try:
         supplied["work"] = work = pipe.recv()
@@ -464,9 +472,9 @@ def _serve_tasks(pipe: Connection, out: Location, stop: Any, notes: Path) -> Non
             began = time.perf_counter()
             function, wants = STEPS[step]
             report, result = call_watched(notes, task, function, *(supplied[name] for name in wants), *given)
-            kept[number] = read_only(result)
-            while len(kept) > KEPT:
-                kept.popitem(last=False)
-            pipe.send((report, pickle.dumps(result, 5), time.perf_counter() - began))
+            data = pickle.dumps(result, 5)
+            if result is not None:
+                keep(number, result, len(data))
+            pipe.send((report, data, time.perf_counter() - began))
     except (EOFError, BrokenPipeError):  # the run was killed
         return

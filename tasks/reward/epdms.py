@@ -82,8 +82,9 @@ _NOBODY = read_only(np.full(5, np.nan))
 LANE_LAYERS = frozenset({MapLayer.LANE, MapLayer.LANE_CONNECTOR})
 
 
-# A scene is prepared several times among different objects: by a planner, for its score, for every rollout.
-_indexed_map = lru_cache(maxsize=4)(index_map)
+# A scene is prepared several times among different objects: by a planner, for its score, for every rollout. And many
+# of a clip's candidates have the same polygons within reach; an index is some 4 MB.
+_indexed_map = lru_cache(maxsize=12)(index_map)
 
 
 @lru_cache(maxsize=4)
