@@ -3,6 +3,7 @@
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -134,13 +135,23 @@ def fill(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     Raises ConfigError naming every key, below `where`, that is unknown or whose value has the wrong type.
     """
     need_run_extra("pydantic")
-    from pydantic import TypeAdapter, ValidationError
+    from pydantic import ValidationError
 
     refuse_unknown(cls, values, where)
+    kind: Any = cls
     try:
-        return TypeAdapter(cls).validate_python(_with_lists(cls, values))
+        filled: T = _adapter(kind).validate_python(_with_lists(cls, values))
+        return filled
     except ValidationError as error:
         raise ConfigError("; ".join(_faults(cls, where, error.errors()))) from error
+
+
+@cache
+def _adapter(cls: Any) -> Any:
+    """A tenth of a second for a run's settings, which are filled twice: given, and as the paper's."""
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(cls)
 
 
 def _with_lists(cls: type[Any], values: Mapping[str, Any]) -> dict[str, Any]:
