@@ -70,6 +70,9 @@ def test_the_docs_say_what_the_schema_is() -> None:
         ({"lable": 1}, "unknown columns"),
         ({"cameras": [{"name": "front"}]}, "cameras: members"),
         ({"lane_polygons": [np.zeros((4, 3))]}, r"lane_polygons: shape \['P', 2\] expected"),
+        ({"lane_polygons": [np.zeros((4, 2)), np.zeros((4, 3))]}, r"lane_polygons: shape \['P', 2\] expected"),
+        ({"lane_polygons": [np.zeros((4, 2)), np.full((4, 2), np.nan)]}, "lane_polygons: holds NaN"),
+        ({"lane_polygons": [np.zeros((4, 2)), np.full((4, 2), "a")]}, "lane_polygons: float32 expected"),
     ],
 )
 def test_a_row_that_does_not_fit_is_refused_by_column(change: dict[str, object], message: str) -> None:
