@@ -49,7 +49,7 @@ from tasks.rollout.simulate import TrafficSettings, check_same_policy
 from tasks.stages import FOLLOW_UP_BEFORE, HUMAN_BEFORE, Rejected
 from tasks.subscores import OF_ONE_PLAN
 from tasks.world.arrays import Array
-from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, random_stream, scene_of_clip
+from tasks.world.clip import HORIZON_STEPS, NOW, PER_STEP, STEP_S, Clip, random_stream, scene_of_clip
 from tasks.world.frames import HEADING
 from tasks.world.repair.records import first_repairs, repair_counts
 from tasks.world.vocabulary import Vocabulary
@@ -443,7 +443,10 @@ def drive_of(driven: AcceptedDrive) -> Drive:
 
 @lru_cache(maxsize=2)  # experts try a candidate one after the other, at most with another clip's between them
 def _ready_scene(clip: PerturbedClip, candidate: int, traffic: TrafficSettings, planner: PdmSettings) -> ReadyScene:
-    return ReadyScene(perturbed_scene(clip.clip, clip.candidates[candidate].rollout), traffic, planner)
+    scene = perturbed_scene(clip.clip, clip.candidates[candidate].rollout)
+    for array in (scene.ego_history, *(getattr(scene.agents, name) for name in PER_STEP)):
+        array.flags.writeable = False  # what one expert did to it, the next would drive in
+    return ReadyScene(scene, traffic, planner)
 
 
 def _candidate_row(index: int, candidate: Candidate) -> CandidateRow:

@@ -1,5 +1,6 @@
 """Vocabulary labels from the command line to the row: by default, of which vocabulary, among which traffic."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from factory.commands.table import COMMANDS
 from factory.config.run import load_config
 from factory.graph.steps import HUMAN_CANDIDATE, PreparedClip, SampleColumns, run_attempt
-from factory.pipeline import FactoryWork
+from factory.pipeline import FactoryWork, perturbed_clip_of
 from factory.run import main as run_main
 from factory.setup.calibrate import estimate_run_size, measure
 from factory.setup.settings import Run, assemble
@@ -18,10 +19,11 @@ from factory.store.reader import SampleTable, labels_of
 from factory.store.schema import LABEL_COLUMNS
 from factory.views.pictures import SCORE_COLOURS, sample_bev
 from tasks.attempt import Judged
+from tasks.experts.protocol import Plan
 from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.rollout.lqr import track
 from tasks.stages import HUMAN
-from tasks.world.clip import AgentTracks
+from tasks.world.clip import HORIZON_STEPS, NOW, AgentTracks, Scene
 from tasks.world.frames import to_world
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
@@ -155,3 +157,28 @@ def test_the_picture_draws_each_trajectory_in_the_colour_of_its_score(out: Path)
     drawn = [sample_bev(row, vocabulary=trajectories) for trajectories in (vocabulary.trajectories, None)]
     green = [(np.abs(image.astype(int) - SCORE_COLOURS[2]).max(axis=-1) < 12).sum() for image in drawn]
     assert labels_of(row).pdm_score().max() > 0.9 and green[0] > 50 > green[1]
+
+
+class Meddler:
+    name = "meddler"
+
+    def digest(self) -> str:
+        return "none"
+
+    def plan(self, scene: Scene, rng: np.random.Generator) -> Plan:
+        scene.agents.boxes[:] = 0.0
+        raise AssertionError("what the next expert drives in was overwritten")
+
+
+def test_experts_drive_from_the_scene_of_their_candidate_and_none_can_write_to_it() -> None:
+    work = replace(street().work, experts={**street().work.experts, "meddler": Meddler()})
+    payload = perturbed_clip_of(prepared())
+    for candidate in (0, 1, 0):
+        with pytest.raises(ValueError, match="read-only"):
+            work.trace(prepared(), candidate, "meddler")
+        judged = work.trace(prepared(), candidate, "pdm_closed").judged
+        assert judged is not None
+        scene, rollout = judged.scene, payload.candidates[candidate].rollout
+        np.testing.assert_array_equal(scene.ego_state, rollout.ego_states[-1])
+        now = slice(NOW, NOW + HORIZON_STEPS + 1)
+        np.testing.assert_array_equal(scene.agents.boxes[now], rollout.agents.boxes)
