@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from factory.graph.local import read_only
 from factory.graph.steps import (
     AcceptedDrive,
     BlockReport,
@@ -49,7 +50,7 @@ from tasks.rollout.simulate import TrafficSettings, check_same_policy
 from tasks.stages import FOLLOW_UP_BEFORE, HUMAN_BEFORE, Rejected
 from tasks.subscores import OF_ONE_PLAN
 from tasks.world.arrays import Array
-from tasks.world.clip import HORIZON_STEPS, NOW, PER_STEP, STEP_S, Clip, random_stream, scene_of_clip
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, random_stream, scene_of_clip
 from tasks.world.frames import HEADING
 from tasks.world.repair.records import first_repairs, repair_counts
 from tasks.world.vocabulary import Vocabulary
@@ -64,22 +65,18 @@ class PerturbedClip:
     candidates: tuple[Candidate, ...]
 
 
-def logged_clip(prepared: object) -> Clip | None:
-    """The clip of a prepared one, without its sensor files; None of what is none, or is another work's."""
-    if not isinstance(prepared, PreparedClip) or not isinstance(prepared.payload, PerturbedClip):
-        return None
-    return prepared.payload.clip
+def logged_poses(prepared: PreparedClip) -> Array | None:
+    """(81, 3) the log from T to T+2H, world frame, of a prepared clip; None of another work's."""
+    payload = prepared.payload
+    return _logged_poses(payload.clip.ego_states) if isinstance(payload, PerturbedClip) else None
 
 
-def logged_poses(prepared: object) -> Array | None:
-    """(81, 3) the log from T to T+2H, world frame, of a prepared clip; None as `logged_clip` has it."""
-    clip = logged_clip(prepared)
-    return None if clip is None else _logged_poses(clip.ego_states)
+CACHED_CLIP = ("payload", "clip")  # where in a prepared clip's file the clip is
 
 
 def cached_poses(cache: ClipCache, key: str) -> Array | None:
     """The same of a prepared clip in the cache, or none. Raises BadCacheFile."""
-    states = cache.load(key, within=("payload", "clip", "ego_states"))
+    states = cache.load(key, within=(*CACHED_CLIP, "ego_states"))
     return _logged_poses(states) if isinstance(states, np.ndarray) else None
 
 
@@ -444,8 +441,7 @@ def drive_of(driven: AcceptedDrive) -> Drive:
 @lru_cache(maxsize=2)  # experts try a candidate one after the other, at most with another clip's between them
 def _ready_scene(clip: PerturbedClip, candidate: int, traffic: TrafficSettings, planner: PdmSettings) -> ReadyScene:
     scene = perturbed_scene(clip.clip, clip.candidates[candidate].rollout)
-    for array in (scene.ego_history, *(getattr(scene.agents, name) for name in PER_STEP)):
-        array.flags.writeable = False  # what one expert did to it, the next would drive in
+    read_only((scene.ego_history, scene.agents))  # what one expert did to it, the next would drive in
     return ReadyScene(scene, traffic, planner)
 
 

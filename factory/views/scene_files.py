@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 
 from factory.graph.steps import cache_key
-from factory.pipeline import logged_clip
+from factory.pipeline import CACHED_CLIP
 from factory.readers.pickles import load_tensors
 from factory.stages.scene_file import BadScene, read_dtype, read_scene, scene_header
 from factory.store.location import CLIP_SUFFIX, BadCacheFile
@@ -173,7 +173,8 @@ def prepared_clip(store: "Store", clip_id: str, prepare_digest: str) -> Clip | N
     """Without its sensor files; None where the cache has it no more. Raises BadScene for a damaged file."""
     key = cache_key(clip_id, prepare_digest)
     try:
-        return logged_clip(store.cache.load(key))
+        found = store.cache.load(key, within=CACHED_CLIP)
+        return found if isinstance(found, Clip) else None
     except BadCacheFile as error:
         path = f"{store.cache.location.uri}/{key}{CLIP_SUFFIX}"
         raise BadScene(f"{path}: {error}; the next run makes it again") from error

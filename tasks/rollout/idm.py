@@ -209,6 +209,27 @@ def empty_motion(n_rows: int, n: int) -> Motion:
     )  # fmt: skip
 
 
+_NONE, _NO_INT, _NO_BOOL = np.empty((0, 1)), np.empty((0, 0), np.int64), np.empty((0, 0), np.bool_)
+NO_ROWS = (
+    RolloutRows(np.empty((0, 1, 5)), np.empty((0, 1, 2)), _NO_BOOL, _NONE, _NONE),
+    Motion(_NO_INT, _NO_INT, _NO_INT, _NONE, _NONE, _NONE, _NONE, _NONE, _NONE, _NO_BOOL),
+)
+
+
+@kernel
+def begin_with(rows: RolloutRows, motion: Motion, first: RolloutRows, moved: Motion) -> None:
+    """Take over the first rows of an answer to the same ego, or none."""
+    n = len(first.valid)
+    if n == 0:
+        return
+    rows.boxes[:n], rows.velocities[:n], rows.valid[:n] = first.boxes, first.velocities, first.valid
+    rows.center_z[:n], rows.radius[:n] = first.center_z, first.radius
+    motion.mode[:n], motion.path[:n], motion.clock[:n] = moved.mode, moved.path, moved.clock
+    motion.s[:n], motion.travelled[:n], motion.speed[:n] = moved.s, moved.travelled, moved.speed
+    motion.offset[:n], motion.turn[:n], motion.base_z[:n] = moved.offset, moved.turn, moved.base_z
+    motion.was_driven[:n] = moved.was_driven
+
+
 @hidden_kernel
 def moves_off_log(mode: int) -> bool:
     """Is one in that mode where the simulation has it?"""

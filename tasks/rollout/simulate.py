@@ -42,6 +42,7 @@ from tasks.rollout.idm import (
     ABSENT,
     DRIVEN,
     EGO,
+    NO_ROWS,
     REPLAYED,
     STANDING,
     TOWED,
@@ -53,6 +54,7 @@ from tasks.rollout.idm import (
     Yielding,
     acceleration_for_others,
     advance,
+    begin_with,
     empty_motion,
     empty_rows,
     far_from_ego,
@@ -182,19 +184,9 @@ LOG_STRIDE = 3  # every third logged pose tells a way
 _indexed_lanes = lru_cache(maxsize=4)(index_lanes)  # clips of one log share the map
 
 
-_NONE, _NO_INT, _NO_BOOL = np.empty((0, 1)), np.empty((0, 0), np.int64), np.empty((0, 0), np.bool_)
-NOTHING_KNOWN = (
-    RolloutRows(np.empty((0, 1, 5)), np.empty((0, 1, 2)), _NO_BOOL, _NONE, _NONE),
-    Motion(_NO_INT, _NO_INT, _NO_INT, _NONE, _NONE, _NONE, _NONE, _NONE, _NONE, _NO_BOOL),
-)
-
-
 @dataclass(frozen=True)
 class TrafficScene:
-    """Everything about a scene's traffic that does not depend on what the ego will do.
-
-    newest: the last answer of `roll_out`, and to which ego states; one to a drive that goes on from it begins there.
-    """
+    """Everything about a scene's traffic that does not depend on what the ego will do."""
 
     scene: Scene
     settings: TrafficSettings
@@ -202,6 +194,7 @@ class TrafficScene:
     paths: Paths | None
     navsim: NavsimAgents | None = None  # None: another mode
     yielding: Yielding | None = None  # None: drivers give way to nobody, or another mode
+    # The last answer of `roll_out`, and to which ego states: one to a drive that goes on from it begins there.
     newest: list[tuple[Array, RolloutRows, Motion]] = field(default_factory=list, init=False, repr=False, compare=False)
 
 
@@ -355,7 +348,7 @@ def _answer(traffic: TrafficScene, ego_states: Array, steps: int) -> tuple[Agent
     n, policy = len(window), traffic.settings.policy
     if policy is None:
         yielding = None if traffic.yielding is None else Yielding(*_writable(traffic.yielding))
-        known = NOTHING_KNOWN
+        known = NO_ROWS
         if traffic.newest and np.array_equal(traffic.newest[0][0], ego_states[: HORIZON_STEPS + 1]):
             known = traffic.newest[0][1:]
         rows, motion = drive(*_kernel_inputs(traffic, window), *boxes_and_velocities(ego_states), yielding, known)
@@ -528,33 +521,18 @@ def drive(
     """The traffic's answer to one ego: boxes (T, 5) (true centre) and world velocities (T, 2), T = 41.
 
     start: the clip's step of row 0; log: the clip's tracks over all its steps; now: the agents (1, N) at `start`;
-    yielding: None where drivers have no intent but their target speed, and give way to nobody; known: the first rows,
-    or none, of an answer to the same ego.
+    yielding: None where drivers have no intent but a target speed, and give way to nobody; known: see `begin_with`.
     """
     rows, motion = initial_rows(now, roles, ego_boxes, ego_velocities)
-    n_known = len(known[0].valid)
-    _begin_with(rows, motion, known[0], known[1])
+    begin_with(rows, motion, known[0], known[1])
     mode, scratch = np.empty(len(roles.path) + 1, np.int64), np.empty(len(roles.path) + 1, np.int64)
-    for t in range(max(n_known - 1, 0), ego_boxes.shape[0] - 1):
+    for t in range(max(len(known[0].valid) - 1, 0), ego_boxes.shape[0] - 1):
         _switch_to_idm(roles, paths, driver, t, rows, mode, scratch, motion, yielding)
         _drive_on(start, roles, paths, driver, t, rows, mode, scratch, motion, yielding)
         _tow(roles, driver, t, rows, mode, motion)
         _replay(log, roles, t, rows, mode, motion)
         _admit(start, log, roles, driver, t, rows, mode, scratch, motion, yielding)
     return rows, motion
-
-
-@kernel
-def _begin_with(rows: RolloutRows, motion: Motion, first: RolloutRows, moved: Motion) -> None:
-    n = len(first.valid)
-    if n == 0:
-        return
-    rows.boxes[:n], rows.velocities[:n], rows.valid[:n] = first.boxes, first.velocities, first.valid
-    rows.center_z[:n], rows.radius[:n] = first.center_z, first.radius
-    motion.mode[:n], motion.path[:n], motion.clock[:n] = moved.mode, moved.path, moved.clock
-    motion.s[:n], motion.travelled[:n], motion.speed[:n] = moved.s, moved.travelled, moved.speed
-    motion.offset[:n], motion.turn[:n], motion.base_z[:n] = moved.offset, moved.turn, moved.base_z
-    motion.was_driven[:n] = moved.was_driven
 
 
 @kernel
