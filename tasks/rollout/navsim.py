@@ -123,6 +123,7 @@ def _point(line: shapely.LineString, at: float) -> tuple[float, float]:
 SNAP_M = 3.0  # idm_snap_threshold
 STANDS_BELOW_MPS = 0.1
 MOST_SHAPES = 4096  # kept of a scene, some 2 kB each
+FORWARD, LEFTWARD = np.array([1.0, -1.0, -1.0, 1.0]), np.array([1.0, 1.0, -1.0, -1.0])  # corners of a box, in order
 WIDER = 1.05  # than half of what is as wide: GEOS simplifies a line before it widens it
 
 
@@ -163,9 +164,9 @@ class NavsimAgents:
     staying_bodies: NDArray[np.object_]  # (F,) their boxes
     staying_touch: Bools  # (F, F) whether two of them touch
     staying_meet: Bools  # (F, A) whether an agent can ever touch one; False: surely not
-    # What GEOS made of somebody in a place, by how often it was simplified: whom the ego does not disturb is in the
-    # same places around the next one.
-    shapes: dict[tuple[float, ...], dict[int, shapely.Geometry]] = field(default_factory=dict, compare=False)
+    # What GEOS made of somebody in a place, each simplified once more, up to the first that stays as it was: whom the
+    # ego does not disturb is in the same places around the next one.
+    shapes: dict[tuple[float, ...], list[shapely.Geometry]] = field(default_factory=dict, compare=False)
 
 
 @dataclass(frozen=True)
@@ -244,20 +245,13 @@ def _together(driven: list[IdmAgent], staying: list[int], stay: NDArray[np.objec
 
 def box_polygons(boxes: Array) -> NDArray[np.object_]:
     """(N,) polygons of boxes (N, 5), corners as nuPlan's `OrientedBox` has them."""
-    x, y, heading, length, width = boxes.T
-    quarter = np.pi / 2.0
-    cos, sin, across_x, across_y = (
-        np.cos(heading),
-        np.sin(heading),
-        np.cos(heading + quarter),
-        np.sin(heading + quarter),
-    )
-    corners = [
-        np.stack([x + (lat * across_x + lon * cos), y + (lat * across_y + lon * sin)], axis=-1)
-        for lon, lat in ((length, width), (-length, width), (-length, -width), (length, -width))
-        for lon, lat in ((lon / 2.0, lat / 2.0),)
-    ]
-    return np.asarray(shapely.polygons(np.stack(corners, axis=-2)), dtype=object).reshape(len(boxes))
+    x, y, heading, length, width = boxes.T[..., None]
+    turned = heading + np.pi / 2.0
+    lon, lat = length / 2.0 * FORWARD, width / 2.0 * LEFTWARD
+    corners = np.empty((len(boxes), 4, 2))
+    corners[..., 0] = x + (lat * np.cos(turned) + lon * np.cos(heading))
+    corners[..., 1] = y + (lat * np.sin(turned) + lon * np.sin(heading))
+    return np.asarray(shapely.polygons(corners), dtype=object).reshape(len(boxes))
 
 
 def _starting_lane(layers: _Layers, box: Array) -> tuple[Lane | None, bool]:
@@ -704,16 +698,13 @@ class _AskedOfGeos:
         if key not in (shapes := self.agents.shapes):
             if len(shapes) >= MOST_SHAPES:
                 shapes.clear()
-            shapes[key] = {0: self._footprint(j, at_start)}
+            shapes[key] = [self._footprint(j, at_start)]
         made, looks = shapes[key], int(self.now.looks[0] - self.now.made_at[j])
-        for times in range(1, looks + 1):
-            if times not in made:
-                simpler = shapely.simplify(made[times - 1], SIMPLE_M, preserve_topology=True)
-                fewer = shapely.get_num_coordinates(simpler) < shapely.get_num_coordinates(made[times - 1])
-                made[times] = simpler if fewer else made[times - 1]
-            if made[times] is made[times - 1]:
-                return made[times]
-        return made[looks]
+        while len(made) <= looks and not (len(made) > 1 and made[-1] is made[-2]):
+            simpler = shapely.simplify(made[-1], SIMPLE_M, preserve_topology=True)
+            fewer = shapely.get_num_coordinates(simpler) < shapely.get_num_coordinates(made[-1])
+            made.append(simpler if fewer else made[-1])
+        return made[min(looks, len(made) - 1)]
 
     def _footprint(self, j: int, at_start: bool) -> shapely.Geometry:
         """The body and the strip that is covered in the next headway; of the ego, and of all at first, the body."""
