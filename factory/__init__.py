@@ -1,11 +1,13 @@
 """The machine: clips in, committed samples out, exactly once."""
 
+import os
 import sys
 
 from factory.exits import exit_on_early_interrupt
 
 if sys.argv[:1] == ["-m"] and {"factory", "planners"} & {word.partition(".")[0] for word in sys.orig_argv}:
     exit_on_early_interrupt()  # `python -m factory ...` imports this package before all else
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # numpy's products are small: threads would wait busily for them
 
 import importlib
 import importlib.util

@@ -8,6 +8,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,9 +24,7 @@ from factory.graph.steps import (
     never_stop,
 )
 from factory.readers.base import BadClip, ClipReader, ClipRef, Unreadable, painter_of, read_clip
-from factory.stages.assets import running_fits
-from factory.stages.imaging import Imaging, scene_cache_counts
-from factory.stages.rows import label_columns, sample_row
+from factory.stages.rows import NO_IMAGES, label_columns, sample_row
 from factory.store.location import ClipCache
 from factory.store.remake import EarlierRows
 from factory.store.samples import CAMERA_LEFT_OUT, MOST_RECORDS, CandidateRow
@@ -54,6 +53,9 @@ from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, random_stream, sc
 from tasks.world.frames import HEADING
 from tasks.world.repair.records import first_repairs, repair_counts
 from tasks.world.vocabulary import Vocabulary
+
+if TYPE_CHECKING:  # else loaded by a run that draws: a third of a second
+    from factory.stages.imaging import Imaging
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +219,7 @@ class FactoryWork:
 
     def _perturbed(self, clip: Clip, watch: Stopwatch) -> WholeClip:
         with watch.timing("render"):  # before perturb work is spent; without a gate only a block that will be needed
-            asked = self.render.refuses_blocks or self._simulates
+            asked = self.render.mode is RenderMode.AUTO and (self.render.refuses_blocks or self._simulates)
             block = self.imaging.block_verdict(clip) if asked else None
         self._refuse_another_policy()
         with watch.timing("perturb"):
@@ -290,12 +292,13 @@ class FactoryWork:
 
     def draw(self, driven: Sequence[AcceptedDrive]) -> list[SampleColumns | RejectedAttempt]:
         """Of each of a clip's drives the pictures; RejectedAttempt where they are no sample's. Raises BadClip."""
-        drives, watch, before = [drive_of(one) for one in driven], Stopwatch(), scene_cache_counts()
+        drives, watch, before = [drive_of(one) for one in driven], Stopwatch(), self._scenes_in_memory()
         wanted = [drive for drive in drives if drive.pictures is None]
         with watch.timing("render"):
             made = iter(self._pictures(wanted) if wanted else ())
         seconds = {stage: spent / len(wanted) for stage, spent in watch.seconds.items() if wanted}
-        at_hand, found = _all_in_memory(before), list[SampleColumns | RejectedAttempt]()
+        (hits, misses), found = self._scenes_in_memory(), list[SampleColumns | RejectedAttempt]()
+        at_hand = None if (hits, misses) == before else misses == before[1]  # every scene wanted; None: none was
         for drive in drives:
             pictures = next(made) if drive.pictures is None else drive.pictures
             if isinstance(pictures, Rejected):
@@ -306,8 +309,18 @@ class FactoryWork:
                 found.append(SampleColumns(pictures))
         return found
 
+    def _scenes_in_memory(self) -> tuple[int, int]:
+        """How many scenes were in this process's memory when they were wanted, and how many were not."""
+        if self.render.mode is not RenderMode.AUTO:
+            return 0, 0
+        from factory.stages.imaging import scene_cache_counts
+
+        return scene_cache_counts()
+
     def _pictures(self, drives: Sequence[Drive]) -> list[Mapping[str, object] | Rejected]:
         """Of each of a clip's drives: those that are fit are drawn together."""
+        if self.render.mode is RenderMode.NONE:
+            return [NO_IMAGES for _ in drives]
         clips = [drive.sampled.scene.clip for drive in drives]
         if self.render.mode is RenderMode.AUTO:
             now = read_clip(self.reader, drives[0].ref)
@@ -367,6 +380,10 @@ class FactoryWork:
 
     def doing(self) -> str:
         """The fits that are going on here."""
+        if self.render.mode is not RenderMode.AUTO:
+            return ""
+        from factory.stages.assets import running_fits
+
         return "; ".join(running_fits(Path(self.cache_dir)))
 
     # What the machine asks beside.
@@ -410,15 +427,11 @@ class FactoryWork:
         return self.render.mode is RenderMode.AUTO and self.render.backend.on_gpu and self._simulates
 
     @property
-    def imaging(self) -> Imaging:
+    def imaging(self) -> "Imaging":
         """The render stage with this run's settings."""
+        from factory.stages.imaging import Imaging
+
         return Imaging(self.render, self.cache_dir, painter_of(self.reader))
-
-
-def _all_in_memory(before: tuple[int, int]) -> bool | None:
-    """Whether every scene wanted since `before` was in memory; None where none was."""
-    hits, misses = scene_cache_counts()
-    return None if (hits, misses) == before else misses == before[1]
 
 
 def without_sensors(clip: Clip) -> Clip:

@@ -9,6 +9,7 @@ What it would take: python -m factory plan. The same command again goes on where
 complete, 2 bad settings or no clip (nothing is written), 3 complete with failed attempts, 4 interrupted and resumable.
 """
 
+import gc
 import os
 import sys
 import time
@@ -155,6 +156,7 @@ def _run(
             return 0
         remake = _planned_remake(config, assembled.work, store, refs) if config.remake else None
         work = assembled.work if remake is None else replace(assembled.work, earlier=remake.earlier)
+        gc.freeze()  # what is loaded lives to the end
         since = time.monotonic() if began is None else began
         summary = rerun_on_new_clusters(
             lambda: execute(

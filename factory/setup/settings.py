@@ -26,15 +26,11 @@ from factory.setup.vocabulary import (
     save_recovery_table,
     train_windows,
 )
-from factory.stages.sensors import choose_cameras, masks_digest, refuse_unknown_masks
 from factory.store.schema import UNLISTED, RunIdentity, canonical_json
 from tasks.caches import user_cache, verify_checksum
 from tasks.experts.protocol import Expert, drives_once_per_clip
 from tasks.experts.recovery import RecoveryExpert, RecoverySettings, RecoveryTable
-from tasks.render.scene import engine
 from tasks.render.settings import RenderMode
-from tasks.render.splatting.gsplat_backend import BackendMissing
-from tasks.render.views import MAP_RIG
 from tasks.rollout.simulate import traffic_record
 from tasks.settings import PdmSettings
 from tasks.stages import FRAMES, stage_versions
@@ -98,8 +94,11 @@ def refuse_missing_backend(config: RunConfig) -> None:
     """Raises ConfigError where images are to be drawn with what this machine lacks; a cluster's nodes say so later."""
     if config.render.mode is not RenderMode.AUTO or (config.executor == "ray" and "RAY_ADDRESS" in os.environ):
         return
+    from tasks.render.scene.engine import require_backend
+    from tasks.render.splatting.gsplat_backend import BackendMissing
+
     try:
-        engine.require_backend(config.render.backend)
+        require_backend(config.render.backend)
     except BackendMissing as error:
         raise ConfigError(str(error)) from error
 
@@ -159,6 +158,9 @@ def refuse_unknown_cameras(config: RunConfig, reader: ClipReader, index: ClipInd
     wanted, masks = config.render.cameras, config.render.own_body
     if not (wanted or masks) or config.render.mode is RenderMode.NONE:
         return
+    from factory.stages.sensors import choose_cameras, refuse_unknown_masks
+    from tasks.render.views import MAP_RIG
+
     for ref in index.refs[:RIGS_LOOKED_AT]:
         try:
             rig = read_clip(reader, ref).cameras
@@ -251,7 +253,10 @@ def run_identity(
     if starts is not None:
         settings["perturb.starts"] = starts.digest
         digest = hashlib.sha256(canonical_json([digest, starts.digest]).encode()).hexdigest()[:16]
-    settings["render.own_body"] = masks_digest(config.render.own_body)
+    if config.render.own_body:
+        from factory.stages.sensors import masks_digest
+
+        settings["render.own_body"] = masks_digest(config.render.own_body)
     settings["reward.label_vocabulary"] = None if labels_of is None else labels_of.digest
     versions = stage_versions()
     early: dict[str, object] = {

@@ -24,7 +24,7 @@ from factory.stages.assets import (
     load_or_correct_rig,
     scene_path,
 )
-from factory.stages.rows import agent_columns
+from factory.stages.rows import NO_IMAGES, agent_columns
 from factory.stages.sensors import block_of, choose_cameras, files_of_cameras, load_photos
 from tasks.attempt import Judged
 from tasks.perturb import Candidate
@@ -51,7 +51,6 @@ from tasks.world.arrays import Array, Bytes
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentTracks, Camera, Clip, Scene, SensorFile
 from tasks.world.frames import HEADING, pose_on_ground
 
-NO_IMAGES: dict[str, object] = {"cameras": None, "images": None, "image_source": str(ImageSource.NONE)}
 PHOTOS_ONLY = "photos_only"  # tag: depth is guessed from parallax, markings shear off the photos' path
 LOW_PSNR = "low_psnr"  # tag: held-out photos of the block come out worse than psnr_min
 GATE_STRIDE = 5  # steps of 0.1 s between the pictures that are looked at: 2 Hz

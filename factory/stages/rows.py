@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from factory.store.schema import AGENT_STEPS, MAP_RADIUS_M, NOW_INDEX
 from tasks.attempt import Judged, off_log
 from tasks.perturb import Candidate, end_speed_mps
+from tasks.render.settings import ImageSource
 from tasks.reward.epdms import Scores
 from tasks.reward.label_bytes import VocabularyLabels, encode
 from tasks.subscores import OF_ONE_PLAN, SUBSCORES
@@ -22,6 +23,7 @@ from tasks.world.repair.records import repair_counts
 from tasks.world.road_map import Lane, RoadMap, driving_command
 
 NEAR_M = 30.0  # for the tags
+NO_IMAGES: dict[str, object] = {"cameras": None, "images": None, "image_source": str(ImageSource.NONE)}
 
 
 def sample_row(clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[str, object]:

@@ -33,7 +33,7 @@ from factory.files import matching
 from factory.graph.execute import RunSummary
 from factory.readers.base import BadClip, failures_as_bad_clip
 from factory.stages.benchmark import BENCHMARK_FILE, FORMAT
-from factory.stages.imaging import NO_IMAGES
+from factory.stages.rows import NO_IMAGES
 from factory.store.location import SceneFiles
 from factory.store.samples import Store
 from factory.store.schema import RunIdentity

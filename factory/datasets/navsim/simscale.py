@@ -34,8 +34,7 @@ from factory.files import folders_in, matching, matching_below
 from factory.graph.steps import HUMAN_CANDIDATE
 from factory.readers.base import BadClip
 from factory.readers.pickles import load_plain
-from factory.stages.imaging import NO_IMAGES
-from factory.stages.rows import label_columns
+from factory.stages.rows import NO_IMAGES, label_columns
 from factory.wording import shown
 from tasks.render.settings import ImageSource
 from tasks.reward.label_bytes import VocabularyLabels
