@@ -119,8 +119,8 @@ def _street_ways(shape: Sequence[int], camera: Camera, world_from_ego: Array) ->
     poses = world_from_ego @ camera.ego_from_camera
     for here, there in pairwise(poses):
         seen = points @ (there[:3, :3].T @ here[:3, :3]).T + there[:3, :3].T @ (here[:3, 3] - there[:3, 3])
-        ahead = seen * np.array([1.0, 1.0, 0.0]) + np.array([0.0, 0.0, 1.0]) * np.maximum(seen[:, 2:], 0.2)
-        by = cv2.projectPoints(ahead[:, None], np.zeros(3), np.zeros(3), lens, camera.distortion)[0][:, 0] - pixels
+        seen[:, 2] = np.maximum(seen[:, 2], 0.2)
+        by = _in_picture(seen, lens, camera.distortion) - pixels
         length = np.hypot(*by.T)
         angle = 2.0 * np.arctan2(by[:, 1], by[:, 0])
         twice += np.column_stack([np.cos(angle), np.sin(angle)]) * (length > MOVES_PX / 3.0)[:, None]
@@ -130,6 +130,13 @@ def _street_ways(shape: Sequence[int], camera: Camera, world_from_ego: Array) ->
     tells = (np.hypot(*twice.T) > ONE_WAY * n) & (moved > MOVES_PX * n)
     x, y, far, sure = (values.reshape(height, width) for values in (np.cos(way), np.sin(way), road_m, tells))
     return x, y, far, sure
+
+
+def _in_picture(points: Array, lens: Array, distortion: Array) -> Array:
+    """Where points (M, 3) before a camera are in its picture, (M, 2) [px]."""
+    if distortion.any():
+        return np.asarray(cv2.projectPoints(points[:, None], np.zeros(3), np.zeros(3), lens, distortion)[0][:, 0])
+    return points[:, :2] * (1.0 / points[:, 2:]) * lens.diagonal()[:2] + lens[:2, 2]  # the same bits, ten times as fast
 
 
 def _minimum_cut(for_first: Array, picture: F32, cost: float, free_at: float) -> Bools:

@@ -4,7 +4,7 @@ Inverse depth is linear on the image of a plane, so gaps are interpolated in inv
 above, below, left and right; across a depth edge only the side that the pixel's colour belongs to is used.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -39,15 +39,17 @@ COLOUR_SIGMA = 0.06  # rgb distance that makes a neighbour half as trustworthy
 
 
 def sparse_depth(
-    points: Array, labels: ShortInts, intrinsics: Array, world_from_camera: Array, width: int, height: int
+    parts: Iterable[tuple[int, Array]], intrinsics: Array, world_from_camera: Array, width: int, height: int
 ) -> tuple[F32, ShortInts]:
     """Depth [m] of the nearest point per pixel and its label; 0 and -2 where no point falls.
 
-    `points` (M, 3) world, `labels` (M,). Points that are seen only through gaps between nearer ones are removed.
+    `parts`: labels with their points (M, 3), world. Points that are seen only through gaps between nearer ones are
+    removed.
     """
-    depth, label = _zbuffer(
-        points, labels, np.ascontiguousarray(np.linalg.inv(world_from_camera)), intrinsics, width, height
-    )
+    depth, label = np.zeros((height, width), np.float32), np.full((height, width), -2, np.int32)
+    camera_from_world = np.ascontiguousarray(np.linalg.inv(world_from_camera))
+    for of, points in parts:
+        _zbuffer(np.ascontiguousarray(points), of, camera_from_world, intrinsics, depth, label)
     hidden = _occluded(depth)
     depth[hidden], label[hidden] = 0.0, -2
     return depth, label
@@ -66,9 +68,9 @@ def dense_depth(depth: F32, label: ShortInts, rgb: F32) -> tuple[F32, ShortInts]
 
 
 @kernel
-def _zbuffer(points: Any, labels: Any, camera_from_world: Any, k: Any, width: int, height: int) -> Any:
-    depth = np.zeros((height, width), np.float32)
-    label = np.full((height, width), -2, np.int32)
+def _zbuffer(points: Any, of: int, camera_from_world: Any, k: Any, depth: Any, label: Any) -> None:
+    """Points of one label into a picture's depth and labels (H, W), where nothing is as near."""
+    height, width = depth.shape
     r = camera_from_world
     for i in range(points.shape[0]):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
@@ -82,8 +84,7 @@ def _zbuffer(points: Any, labels: Any, camera_from_world: Any, k: Any, width: in
         x, y = int(u), int(v)
         if depth[y, x] == 0.0 or z < depth[y, x]:
             depth[y, x] = z
-            label[y, x] = labels[i]
-    return depth, label
+            label[y, x] = of
 
 
 @kernel
@@ -191,7 +192,8 @@ def _smooth(depth: Any, label: Any) -> Any:
 # Lidar gives sparse depth, gaps are closed along surfaces; what lidar does not reach gets its depth from other
 # photos.
 
-SHALLOW = -2  # label of a pixel without lidar
+STREET = -1  # label of a pixel that shows what stays
+SHALLOW = -2  # of one without lidar
 
 
 @dataclass(frozen=True)
@@ -199,7 +201,7 @@ class PhotoDepth:
     """What a photo shows, (H, W) each."""
 
     depth: F32  # [m]; 0: nothing known
-    label: ShortInts  # -1 background, row of a track, SHALLOW
+    label: ShortInts  # STREET, row of a track, SHALLOW
     sky: Bools
     passing: Bools  # pixels at or behind something that drives, or of the own body: no witnesses of the street
 
@@ -217,19 +219,16 @@ def estimate_photo_depth(
     rgb = photo.rgb.astype(np.float32) / 255.0
     boxes, valid = tracks.at(photo.time_s)
     poses = world_from_boxes(boxes)
-    points, labels = [known.dense], [np.full(len(known.dense), -1, np.int32)]
-    for j, mine in per_track.items():
-        if valid[j]:
-            points.append(mine @ poses[j, :3, :3].T + poses[j, :3, 3])
-            labels.append(np.full(len(mine), j, np.int32))
-    sparse, label = sparse_depth(
-        np.concatenate(points), np.concatenate(labels), photo.intrinsics, photo.world_from_camera, width, height
-    )
+    bodies = ((j, mine @ poses[j, :3, :3].T + poses[j, :3, 3]) for j, mine in per_track.items() if valid[j])
+    camera = photo.intrinsics, photo.world_from_camera
+    sparse, label = sparse_depth([(STREET, known.dense), *bodies], *camera, width, height)
     depth, label = dense_depth(sparse, label, rgb)
     rays = pixel_directions(photo.intrinsics, photo.world_from_camera, width, height)
     eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
 
     def behind(depth: F32, boxes: Array) -> Bools:
+        if not len(boxes):
+            return np.zeros(depth.shape, bool)
         return np.asarray(behind_boxes((rays * depth[..., None]).reshape(-1, 3) + eye, eye, boxes)).reshape(depth.shape)
 
     if not per_track:  # without lidar on them nothing but their boxes tells what hides the street behind it
@@ -239,11 +238,11 @@ def estimate_photo_depth(
     depth = np.where(own, np.float32(0.0), depth)
     unknown = (depth == 0.0) & ~own
     bright = may_be_sky(rgb)
-    hints, camera = _nearest_known_depths(depth), (photo.intrinsics, photo.world_from_camera)
+    hints = _nearest_known_depths(depth)
     if known.corners is None:
         neighbours, sweep = _stereo_neighbours(photo, others, stereo_photos), partial(plane_sweep_depth, rgb, hints)
     else:
-        anchors, _ = sparse_depth(known.corners, np.zeros(len(known.corners), np.int32), *camera, width, height)
+        anchors, _ = sparse_depth([(STREET, known.corners)], *camera, width, height)
         neighbours = choose_partners(photo, others, stereo_photos)
         sweep = partial(wide_baseline_depth, rgb, anchors, road_depth(known.dense, eye, rays))
     if neighbours:
@@ -279,7 +278,7 @@ def _nearest_known_depths(depth: F32) -> F32:
 def _stereo_neighbours(photo: Photo, others: Sequence[Photo], n: int) -> list[Compared]:
     """The n photos whose baseline is closest to 1 m and that look the same way."""
     candidates = []
-    for i, other in enumerate(others):
+    for i, other in enumerate(others if n else ()):
         baseline = float(np.linalg.norm(other.world_from_camera[:3, 3] - photo.world_from_camera[:3, 3]))
         same_way = float(other.world_from_camera[:3, 2] @ photo.world_from_camera[:3, 2]) > 0.9
         if MIN_BASELINE_M <= baseline <= MAX_BASELINE_M and same_way and other.rgb.shape == photo.rgb.shape:
@@ -290,7 +289,6 @@ def _stereo_neighbours(photo: Photo, others: Sequence[Photo], n: int) -> list[Co
 
 # Depths of photos that other photos' depths confirm: what two saw from two places is not a guess.
 
-STREET = -1  # label of a pixel that shows what stays
 ALIKE, ALIKE_PER_M = 0.03, 0.001  # two depths are one within this share, and this share more for each metre of it
 NEAREST_M = 0.5
 

@@ -76,20 +76,22 @@ def discs_of_photo(rgb: F32, depth: F32, label: ShortInts, intrinsics: Array, wo
                 free[rows + dy, columns + dx] = False
         cells = [(rows + dy, columns + dx) for dy in range(size) for dx in range(size)]
         middle = (rows + size // 2, columns + size // 2)
-        mean_point = np.mean([points[cell] for cell in cells], axis=0)
-        mean_across = np.mean([across[cell] for cell in cells], axis=0) * size
-        mean_down = np.mean([down[cell] for cell in cells], axis=0) * size
+        mean_point, mean_across, mean_down, mean_rgb = (_mean_of(cells, image) for image in (points, across, down, rgb))
         parts.append(
             Discs(
                 mean_point @ rotation.T + world_from_camera[:3, 3],
-                (mean_across @ rotation.T).astype(np.float32),
-                (mean_down @ rotation.T).astype(np.float32),
-                np.mean([rgb[cell] for cell in cells], axis=0).astype(np.float32),
+                ((mean_across * size) @ rotation.T).astype(np.float32),
+                ((mean_down * size) @ rotation.T).astype(np.float32),
+                mean_rgb.astype(np.float32),
                 (depth[middle] / intrinsics[0, 0]).astype(np.float32),
                 np.stack(middle, axis=1).astype(np.int32),
             )
         )
     return concatenate_discs(parts)
+
+
+def _mean_of(cells: Sequence[tuple[Indices, Indices]], image: NDArray[Any]) -> NDArray[Any]:
+    return image[cells[0]] if len(cells) == 1 else np.asarray(np.mean([image[cell] for cell in cells], axis=0))
 
 
 def _blocks(rgb: F32, depth: F32, label: ShortInts, free: Bools, size: int) -> tuple[Indices, Indices]:

@@ -56,7 +56,7 @@ def test_a_point_seen_through_a_nearer_surface_is_removed() -> None:
     behind = np.array([[(41.5 - 40) / 80 * 20.0, (31.5 - 30) / 80 * 20.0, 20.0]])
     beside = np.array([[(70.5 - 40) / 80 * 20.0, 0.0, 20.0]])
     points = np.concatenate([near, behind, beside])
-    depth, label = sparse_depth(points, np.arange(len(points), dtype=np.int32), INTRINSICS, np.eye(4), WIDTH, HEIGHT)
+    depth, label = sparse_depth([(i, one[None]) for i, one in enumerate(points)], INTRINSICS, np.eye(4), WIDTH, HEIGHT)
     assert depth[31, 41] == 0.0 and label[31, 41] == -2
     assert depth[30, 70] == pytest.approx(20.0) and label[30, 70] == len(points) - 1
 
