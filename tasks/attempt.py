@@ -332,9 +332,12 @@ def vocabulary_labels(
     trajectories = vocabulary.trajectories
     parts: list[Scores] = []
     reference_m = 0.0
+    states = np.empty((1 + min(len(trajectories), TRAJECTORIES_AT_ONCE), *reference.shape))
+    states[0] = reference
     for start in range(0, len(trajectories), TRAJECTORIES_AT_ONCE):
-        driven = track(scene.ego_state, trajectories[start : start + TRAJECTORIES_AT_ONCE], local=True)
-        scores = score(prepared, np.concatenate([reference[None], driven]), normalise="pairs")
+        block = trajectories[start : start + TRAJECTORIES_AT_ONCE]
+        track(scene.ego_state, block, local=True, out=states[1 : 1 + len(block)])
+        scores = score(prepared, states[: 1 + len(block)], normalise="pairs")
         reference_m = float(scores.ep_raw_m[0] * scores.multiplier[0])
         parts.append(select_rows(scores, slice(1, None)))
     kept = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}

@@ -256,20 +256,21 @@ def track(
     *,
     planned_pose0: Array | None = None,
     local: bool = False,
+    out: Array | None = None,
 ) -> Array:
     """Simulated ego states (K, 41, 11), world frame, that follow each plan; row 0 is `ego_state0`.
 
     ego_state0: (11,) columns tasks.world.frames; poses: (K, 40, 3) x, y, heading at 0.1 .. 4.0 s, in the world or, if
     `local`, in the frame of `ego_state0`, as a vocabulary holds them.
     planned_pose0: (K, 3) where each plan says the ego is now, when that is not the ego's own pose: the proposals of
-    PDM-Closed start on their path, beside the ego.
+    PDM-Closed start on their path, beside the ego. out: filled and returned instead of a new array.
     Raises ValueError, with the field's name, on other shapes or values that are not finite.
     """
     name = "trajectories" if local else "poses"
     plans = _shaped(name, poses, (ANY, HORIZON_STEPS, 3))
     starts = _NO_STARTS if planned_pose0 is None else _shaped("planned_pose0", planned_pose0, (len(plans), 3))
     ego = _shaped("ego_state0", ego_state0, (EGO_STATE_SIZE,))
-    states = np.empty((len(plans), HORIZON_STEPS + 1, EGO_STATE_SIZE))
+    states = np.empty((len(plans), HORIZON_STEPS + 1, EGO_STATE_SIZE)) if out is None else out
     given = read_only(ego), read_only(starts), read_only(plans)
     if not follow(*given, local, float(vehicle.wheel_base), states):
         for what, array in (("ego_state0", ego), (name, plans), ("planned_pose0", starts)):
