@@ -11,7 +11,7 @@ import pytest
 from factory.datasets.town.reader import SyntheticReader
 from factory.datasets.town.settings import TownSettings
 from factory.stages.sensors import NOBODY, own_body_masks
-from tasks.render.rig.own_body import LEAST_PHOTOS, choose_photos, find_own_body, shrink
+from tasks.render.rig.own_body import LEAST_PHOTOS, _in_picture, choose_photos, find_own_body, shrink
 from tasks.world.arrays import Bools, Bytes
 from tasks.world.clip import Block, Camera, SensorFile
 
@@ -104,3 +104,11 @@ def test_of_an_ego_that_stands_nothing_is_said(drive: tuple[tuple[Camera, ...], 
     barely = poses.copy()
     barely[:, :3, 3] = poses[0, :3, 3] + (poses[:, :3, 3] - poses[0, :3, 3]) * 0.01
     assert not len(choose_photos(barely))
+
+
+def test_a_lens_projects_as_opencv_s_and_without_distortion_to_the_bit() -> None:
+    points = np.random.default_rng(0).normal(size=(1000, 3)) * [4.0, 2.0, 1.0] + [0.0, 0.0, 8.0]
+    lens = np.array([[211.3, 0.0, 119.2], [0.0, 207.9, 66.6], [0.0, 0.0, 1.0]])
+    for distortion in (np.zeros(5), np.array([-0.1, 0.02, 0.001, -0.002, 0.003])):
+        theirs, _ = cv2.projectPoints(points[:, None], np.zeros(3), np.zeros(3), lens, distortion)
+        assert np.array_equal(_in_picture(points, lens, distortion), theirs[:, 0])

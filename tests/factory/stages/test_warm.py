@@ -138,9 +138,22 @@ def test_the_public_traffic_needs_kernels_of_its_own_and_no_idm(tmp_path: Path, 
     assert not any(name.startswith("tasks/rollout/simulate") for name in after)
 
 
-def test_replayed_traffic_needs_no_idm(tmp_path: Path, towns: str) -> None:
-    replay = ("traffic=replay", "reward.labels=none")
-    before, after = run_with_these(["judge", "plan"], tmp_path, *TOWN, *BLIND, *replay, towns, "executor=local")
+BLINDLY = """
+import sys
+from factory.run import main
+
+assert main({words!r}) == 0
+others = ("tasks.render.scene", "tasks.render.rig", "tasks.render.fit", "factory.stages.imaging", "numba.np.arrayobj")
+assert not (loaded := [name for name in sys.modules if name.startswith(others)]), loaded
+"""
+
+
+def test_replayed_traffic_needs_no_idm_and_a_run_without_pictures_loads_nothing_that_draws(
+    tmp_path: Path, towns: str
+) -> None:
+    replay = ("traffic=replay", "reward.labels=none", "executor=local", f"out={tmp_path / 'out'}")
+    told = BLINDLY.format(words=[*TOWN, *BLIND, *replay, towns])
+    before, after = done_with_these(["judge", "plan"], tmp_path, "-c", told)
     assert after == before
     assert not any(name.startswith("tasks/rollout/simulate") for name in after)
 
