@@ -13,8 +13,8 @@ import gc
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
@@ -55,6 +55,16 @@ def interleave_by_log(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
     queues = list(logs.values())
     groups = [queues[i : i + hands] for i in range(0, len(queues), hands)]
     return [ref for group in groups for turn in zip_longest(*group) for ref in turn if ref is not None]
+
+
+@contextmanager
+def out_of_collections() -> Iterator[None]:
+    """What is loaded is not looked through for garbage, again and again, while the run goes on."""
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def needed_kernel_parts(config: RunConfig) -> list[str]:
@@ -156,35 +166,35 @@ def _run(
             return 0
         remake = _planned_remake(config, assembled.work, store, refs) if config.remake else None
         work = assembled.work if remake is None else replace(assembled.work, earlier=remake.earlier)
-        gc.freeze()  # what is loaded lives to the end
         since = time.monotonic() if began is None else began
-        summary = rerun_on_new_clusters(
-            lambda: execute(
-                work,
-                refs,
-                config.experts,
-                config.rounds,
-                store,
-                Execution(
-                    config.executor,
-                    config.workers,
-                    claims=Claims(config.gpu_share if assembled.work.draws_on_gpu else 0.0, config.graph.memory_gb),
-                    isolated=needs_own_process(config),
-                    limits=Limits(config.graph.limit_s, config.graph.limit_gb),
-                    on_change=config.on_change if remake is None else "redo",
-                    remade=None if remake is None else remake.record,
-                    retry=config.retry_failed,
-                    shard_seconds=config.shard_seconds,
-                    minutes=config.minutes and max(0.0, config.minutes - (time.monotonic() - since) / 60.0),
-                    episodes=EpisodeSettings(config.one_episode_in, prepared_episode)
-                    if config.one_episode_in
-                    else None,
-                    command=asked.words,
+        with out_of_collections():
+            summary = rerun_on_new_clusters(
+                lambda: execute(
+                    work,
+                    refs,
+                    config.experts,
+                    config.rounds,
+                    store,
+                    Execution(
+                        config.executor,
+                        config.workers,
+                        claims=Claims(config.gpu_share if assembled.work.draws_on_gpu else 0.0, config.graph.memory_gb),
+                        isolated=needs_own_process(config),
+                        limits=Limits(config.graph.limit_s, config.graph.limit_gb),
+                        on_change=config.on_change if remake is None else "redo",
+                        remade=None if remake is None else remake.record,
+                        retry=config.retry_failed,
+                        shard_seconds=config.shard_seconds,
+                        minutes=config.minutes and max(0.0, config.minutes - (time.monotonic() - since) / 60.0),
+                        episodes=EpisodeSettings(config.one_episode_in, prepared_episode)
+                        if config.one_episode_in
+                        else None,
+                        command=asked.words,
+                    ),
                 ),
-            ),
-            say,
-            begun,
-        )
+                say,
+                begun,
+            )
     if summary.exit_code == BAD_CONFIG:
         raise ConfigError(summary.message)
     if summary.message:

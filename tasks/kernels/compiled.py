@@ -190,7 +190,8 @@ class _Kept(pickle.Unpickler):
     """Reads what save_overload wrote; of numba's functions that are compiled in not even the modules are loaded."""
 
     def find_class(self, module: str, name: str) -> Any:
-        return _environment if name == "_rebuild_env" else super().find_class(module, name)
+        is_environment = (module, name) == ("numba.core.environment", "_rebuild_env")
+        return _environment if is_environment else super().find_class(module, name)
 
 
 def _environment(module: str, constants: list[Any], name: str) -> Environment:

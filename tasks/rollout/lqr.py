@@ -270,7 +270,10 @@ def track(
     plans = _shaped(name, poses, (ANY, HORIZON_STEPS, 3))
     starts = _NO_STARTS if planned_pose0 is None else _shaped("planned_pose0", planned_pose0, (len(plans), 3))
     ego = _shaped("ego_state0", ego_state0, (EGO_STATE_SIZE,))
-    states = np.empty((len(plans), HORIZON_STEPS + 1, EGO_STATE_SIZE)) if out is None else out
+    shape = (len(plans), HORIZON_STEPS + 1, EGO_STATE_SIZE)
+    states = np.empty(shape) if out is None else out
+    if states.shape != shape or not states.flags.c_contiguous:
+        raise ValueError(f"out must be contiguous, of the shape {shape}, got {states.shape}")
     given = read_only(ego), read_only(starts), read_only(plans)
     if not follow(*given, local, float(vehicle.wheel_base), states):
         for what, array in (("ego_state0", ego), (name, plans), ("planned_pose0", starts)):

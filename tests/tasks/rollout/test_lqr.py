@@ -79,3 +79,13 @@ def test_a_bad_value_is_named_with_its_place():
     trajectories[3, 7, 1] = np.nan
     with pytest.raises(ValueError, match=r"trajectories must be finite and at most 1e\+08, element \[3, 7, 1\] is not"):
         track(np.zeros(11), trajectories, local=True)
+
+
+def test_states_go_where_they_are_wanted_and_nowhere_else():
+    plans, ego = np.stack([arc(6.0, curvature) for curvature in (0.01, 0.05, -0.05)]), ego_at(0.0, 0.0, 0.0, 6.0)
+    into = np.full((4, 41, 11), 7.0)
+    assert np.array_equal(track(ego, plans, local=True, out=into[1:]), track(ego, plans, local=True))
+    assert np.array_equal(into[1:], track(ego, plans, local=True)) and (into[0] == 7.0).all()
+    for wrong in (into, into[1:3], np.zeros((41, 3, 11)).swapaxes(0, 1)):
+        with pytest.raises(ValueError, match="out must be contiguous"):
+            track(ego, plans, local=True, out=wrong)
