@@ -194,7 +194,7 @@ def test_a_run_finds_the_cluster_as_the_page_says(head: Head, tmp_path: Path, sh
         time.sleep(1.0)
     assert len(re.findall(r"^ 1 node_[0-9a-f]+$", status, re.M)) == 1 and "/2.0 CPU" in status
     given = {"clips.root": str(shared_root / "data" / "scenarionet" / "nuscenes"), "out": str(tmp_path / "out")}
-    given |= {"limit": "1", "experts": "[human]"}
+    given |= {"limit": "1", "experts": "[human]", "render": "none"}
     words = [*(word for word in RUN[1:] if word.partition("=")[0] not in given), *map("=".join, given.items())]
     ran = subprocess.run(
         [sys.executable, *words], cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=200

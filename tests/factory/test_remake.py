@@ -24,11 +24,12 @@ from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
 pytestmark = pytest.mark.slow
 
 # Two clips of the town with photos and lidar, so that there are photos, renderings and pictures that are refused.
-WORDS = ["clips=synthetic", "clips.n_clips=2", "clips.settings.width=160", "clips.settings.height=90", "rounds=2"]
+WORDS = ["clips=synthetic", "clips.n_clips=2", "clips.settings.cameras=[ring_front_center]", "clips.settings.width=96"]
+WORDS += ["clips.settings.height=54", "clips.settings.lidar_beams=32", "clips.settings.lidar_azimuths=450", "rounds=2"]
 WORDS += ["render.scene=discs", "render.psnr_min=10", "render.camera_psnr_min=0", "render.width=96", "render.height=54"]
 WORDS += ["render.frames=now", "vocabulary.k=512", "executor=local"]
 CHANGED = {
-    "render": ["render.width=64", "render.height=48", "render.cameras=[ring_front_center]"],
+    "render": ["render.width=64", "render.height=48"],
     "label": ["vocabulary.k=512"],  # and the file of the fixture
     "gate": ["reward.near_log=false", "reward.after=false", "reward.progress_above=0.8"],
 }
