@@ -192,7 +192,7 @@ def test_a_terminal_that_closes_ends_a_run_as_sigterm_does(tmp_path: Path, town:
             os.read(ours, 65536)  # a terminal shows what it is given
         return shards(out)
 
-    words = ("run", "clips.n_clips=45", *BLIND, *QUICK, town, f"out={out}")
+    words = ("run", "clips.n_clips=24", *BLIND, *QUICK, town, f"out={out}")
     how: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), theirs)
     with started(*words, **how, preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0)) as command:
         os.close(theirs)
@@ -207,7 +207,7 @@ def test_a_terminal_that_closes_ends_a_run_as_sigterm_does(tmp_path: Path, town:
 @pytest.mark.slow
 def test_a_run_outlives_its_guard_and_ends_by_a_signal_as_ever(tmp_path: Path, town: str) -> None:
     out = tmp_path / "out"
-    with started("run", "clips.n_clips=45", *BLIND, *QUICK, town, f"out={out}") as command:
+    with started("run", "clips.n_clips=24", *BLIND, *QUICK, town, f"out={out}") as command:
         os.kill(until(lambda: child_of(command, "guard.py"), command), signal.SIGKILL)
         before = shards(out)
         until(lambda: shards(out) > before + 2, command)
