@@ -41,6 +41,7 @@ def test_every_step_on_a_stored_table_is_measured(tmp_path: Path) -> None:
 
 
 @pytest.mark.ray
+@pytest.mark.bench
 def test_a_run_of_waiting_stages_is_made_and_then_found(capsys: pytest.CaptureFixture[str]) -> None:
     bench_scale.main(bench_scale.Request(nodes="1", attempts=64, wait_ms=0, row_kb=0))
     head, row = (line.split() for line in capsys.readouterr().out.splitlines()[-2:])
@@ -67,6 +68,7 @@ def test_a_run_s_parts_come_to_its_whole(tmp_path: Path, capsys: pytest.CaptureF
 
 
 ONE_TOWN = ("clips=synthetic", "clips.n_clips=1", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0")
+LONG = pytest.mark.bench
 STEPS_OF = partial(bench_planner_steps.main, ["gtrs_dense_public"], torch.device("cpu"), 1, 1, 8, 0.3, True)
 
 
@@ -75,12 +77,14 @@ STEPS_OF = partial(bench_planner_steps.main, ["gtrs_dense_public"], torch.device
     [
         pytest.param(lambda at: bank_of_few(at), 1, "2,000 scenes opened", id="bank"),
         pytest.param(lambda at: bench_decoding.main(2, 1, 3, 128, 32), 5, "a kept picture: 0.01 MB", id="decoding"),
-        pytest.param(lambda at: STEPS_OF(), 3, "`gtrs_dense_public` | H100 SXM", id="planner_steps"),
+        pytest.param(lambda at: STEPS_OF(), 3, "`gtrs_dense_public` | H100 SXM", id="planner_steps", marks=LONG),
         pytest.param(lambda at: bench_label_ends.main([*ONE_TOWN, "experts=[human]"]), 1, "| human |", id="label_ends"),
         pytest.param(lambda at: bench_render.main(None, 1, 500, 1), 2, "| seeded | 500 |", id="render"),
         pytest.param(lambda at: bench_reward.main(at, (2,)), 1, "| synthetic town | 2 |", id="reward"),
         pytest.param(lambda at: rollout_of_a_town(at), 4, "| idm |", id="rollout"),
-        pytest.param(lambda at: traversals_of_a_town(at), 6, "| a drive that was not seen |", id="traversals"),
+        pytest.param(
+            lambda at: traversals_of_a_town(at), 6, "| a drive that was not seen |", id="traversals", marks=LONG
+        ),
         pytest.param(lambda at: bench_validation.main(["ego_mlp"], 1, 1), 1, "| `ego_mlp` |", id="validation"),
     ],
 )
@@ -119,6 +123,7 @@ def test_labels_of_a_real_log_are_made_and_read(shared_root: Path, capsys: pytes
     assert "2 samples, K = 256" in said and said.count("\n| ") == 6, said
 
 
+@LONG
 def test_a_block_of_eight_cameras_is_measured_by_size(
     shared_root: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
