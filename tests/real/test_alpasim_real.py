@@ -16,9 +16,9 @@ from planners.drive.drive import main
 def test_the_log_s_own_drive_scores_one(dataset: str, folder: str, shared_root: Path, tmp_path: Path) -> None:
     """Followed by the MPC it stays within a metre of the log, on the road and apart from all others."""
     words = [f"clips={dataset}", f"clips.root={shared_root / 'data' / folder}", "planner=human", "bounds=false"]
-    assert main([*words, "seconds=20", "limit=12", f"out={tmp_path}"]) == COMPLETE
+    assert main([*words, "seconds=20", "limit=6", f"out={tmp_path}"]) == COMPLETE
     told = json.loads((tmp_path / "results-summary.json").read_text())["rollouts"]
-    assert len(told) >= 10
+    assert len(told) >= 5
     for entry in told:
         assert (entry["score"], entry["metrics"]["collision_any"]) == (1.0, 0.0), entry
         assert entry["metrics"]["dist_to_gt_trajectory"] < 1.0, entry

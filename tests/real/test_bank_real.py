@@ -1,4 +1,4 @@
-"""Plans among the answering traffic of a bank of recorded logs get the factory's own scores, on every clip here."""
+"""Plans among the answering traffic of a bank of recorded logs get the factory's own scores, on every fourth clip here."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ def reader(request: pytest.FixtureRequest, shared_root: Path) -> ClipReader:
 def test_plans_among_recorded_cars_get_the_factory_s_scores(reader: ClipReader, tmp_path: Path) -> None:
     assert write_bank(tmp_path, reader, traffic=IDM) == {}
     bank, poses = SceneBank(tmp_path), plans(3, 5)
-    for ref in reader.index().refs:
+    for ref in reader.index().refs[::4]:
         expect_the_factory_s(bank, [reader.read(ref)], poses)
     ids, many = bank.clip_ids, poses[None].repeat(len(bank), 0)
     assert (bank.score(ids, many).score != bank.score(ids, many, traffic="idm").score).any()

@@ -69,7 +69,7 @@ def test_a_run_ends_with_photos_and_with_colour_pictures_where_nobody_drove(fold
         "clips=scenarionet", f"clips.root={folder / f'{LOG}.pkl'}", f"clips.cameras={folder}", "clips.split=train",
         f"vocabulary.file={folder.parent / 'vocabulary/human_8192x40x3.npy'}", "experts=[pdm_closed,human]", "limit=1",
         "reward.labels=none", f"render.width={SIZE[0]}", f"render.height={SIZE[1]}", "render.scene=discs",
-        "render.psnr_min=0", "render.gate.enabled=false", f"out={tmp_path}",
+        "render.rig.adjust=off", "render.psnr_min=0", "render.gate.enabled=false", f"out={tmp_path}",
     ]  # fmt: skip
     run = assemble(load_config(settings))
     store = Store(tmp_path)
