@@ -25,9 +25,9 @@ TOWN = ("clips=synthetic", "clips.n_clips=1", "vocabulary.k=64")
 BLIND = ("clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none")
 
 
-@pytest.fixture
-def towns(tmp_path: Path) -> str:
-    return f"clips.cache_dir={tmp_path / 'towns'}"
+@pytest.fixture(scope="module")
+def towns(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return f"clips.cache_dir={tmp_path_factory.mktemp('towns')}"
 
 
 def kept(cache: Path) -> set[str]:
