@@ -116,8 +116,7 @@ class TrafficSettings:
 class PdmSettings:
     """PDM-Closed as published with NAVSIM (docs/reward.md 4); raises ValueError where a value makes no sense.
 
-    The three switches at the end are faults of the published planner, kept so that plans and progress compare with
-    everything published; False corrects each. The fixed numbers are the published IDM's: another expert has others.
+    The fixed numbers are the published IDM's: another expert has others.
     """
 
     speed_fractions: tuple[float, ...] = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the lane's speed limit
@@ -128,9 +127,6 @@ class PdmSettings:
     accel_max_mps2: float = constant(1.5)
     decel_max_mps2: float = constant(3.0)
     exponent: int = constant(10)  # of IDM's free-road term
-    shared_lead_memory: bool = True  # within one path, a speed inherits lead fields its own search did not write
-    brakes_at_first_step: bool = True  # no lead is looked for before 0.2 s: until then one seems to stand at the bumper
-    speed_below_zero: bool = True  # a stop before an oncoming car overshoots into creeping backwards
 
     def __post_init__(self) -> None:
         for name in ("speed_fractions", "lateral_offsets_m"):

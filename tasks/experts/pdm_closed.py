@@ -452,16 +452,13 @@ class Proposals:
 
 
 class PdmDriver(NamedTuple):
-    """The intelligent driver model's constants, and the faults it keeps (tasks.settings)."""
+    """The intelligent driver model's constants."""
 
     min_gap_m: float
     headway_s: float
     accel_max_mps2: float
     decel_max_mps2: float
     exponent: float
-    shared_lead_memory: bool
-    brakes_at_first_step: bool
-    speed_below_zero: bool
 
 
 def proposals(
@@ -501,14 +498,15 @@ def idm_step(progress: float, speed: float, lead: Array, target_mps: float, idm:
     """One Euler step of 0.1 s of the intelligent driver model (Treiber et al. 2000): progress [m], speed [m/s].
 
     s* = gap + v T + v (v - v_lead) / (2 sqrt(a b));  dv/dt = a (1 - (v / v0)^n - (s* / s)^2), clipped to [-b, a].
-    lead: (3,) its arc length [m], velocity [m/s], and what is kept off the gap to it [m].
+    lead: (3,) its arc length [m], velocity [m/s], and what is kept off the gap to it [m]. Speeds are not clipped at 0,
+    as published: a stop before an oncoming car overshoots into creeping backwards.
     """
     closing = speed * (speed - lead[1]) / (2.0 * math.sqrt(idm.accel_max_mps2 * idm.decel_max_mps2))
     wanted = idm.min_gap_m + speed * idm.headway_s + closing
     gap = max(lead[0] - progress - lead[2], idm.min_gap_m)
     accel = idm.accel_max_mps2 * (1.0 - (speed / target_mps) ** idm.exponent - (wanted / gap) ** 2)
     after = speed + STEP_S * min(max(accel, -idm.decel_max_mps2), idm.accel_max_mps2)
-    return progress + STEP_S * speed, after if idm.speed_below_zero else max(after, 0.0)
+    return progress + STEP_S * speed, after
 
 
 @kernel
@@ -533,8 +531,10 @@ def _drive(
             motion[p, 0, 0], motion[p, 0, 1] = start_m[path], speed0_mps
             poses[p, 0, 0], poses[p, 0, 1], poses[p, 0, 2] = pose_at(paths, path, start_m[path])
         for step in range(1, PROPOSAL_STEPS + 1):
-            looks = step % SAMPLE_STEPS == 0 or (step == 1 and not idm.brakes_at_first_step)
-            shared = idm.shared_lead_memory and step <= SCORED_STEPS  # beyond, the chosen one is driven alone
+            looks = step % SAMPLE_STEPS == 0
+            # As published, a speed inherits the lead fields that a slower one of its path wrote and its own search
+            # does not; beyond the scored steps the chosen one is driven alone.
+            shared = step <= SCORED_STEPS
             written = np.zeros(3)
             for p in range(first, first + n_speeds):
                 progress, speed = motion[p, step - 1, 0], motion[p, step - 1, 1]

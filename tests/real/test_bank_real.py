@@ -1,4 +1,4 @@
-"""Plans among the answering traffic of a bank of recorded logs get the factory's own scores, on every fourth clip here."""
+"""Plans among the answering traffic of real logs get the factory's own scores from a bank, on a fourth of the clips."""
 
 from pathlib import Path
 

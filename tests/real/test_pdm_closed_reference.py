@@ -7,17 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tasks.experts.pdm_closed import PdmPlan, PdmSettings, plan_pdm_closed
+from tasks.experts.pdm_closed import PdmPlan, plan_pdm_closed
 from tasks.world.clip import AgentKind, AgentTracks
 from tasks.world.frames import wrap_angle
 from tasks.world.road_map import MapLayer, MapPolygon
 
 SCENES = ("7fab2350_20", "7fab2350_44", "7fab2350_104", "adcf7d18_64", "adcf7d18_80")
-PUBLISHED = PdmSettings()
 STEPS = 41  # the recorded arrays hold the 5 s extension as zeros
 
 
-def plan_of(folder: Path, settings: PdmSettings = PUBLISHED) -> PdmPlan:
+def plan_of(folder: Path) -> PdmPlan:
     arrays = np.load(folder / "inputs.npz")
     names = json.loads((folder / "inputs.json").read_text())
     n = len(names["object_tokens"])
@@ -41,7 +40,6 @@ def plan_of(folder: Path, settings: PdmSettings = PUBLISHED) -> PdmPlan:
             for token, layer, ring in zip(names["map_tokens"], names["map_layers"], rings)
         ],
         route_lane_ids=frozenset(names["route_lane_ids"]),
-        settings=settings,
     )
 
 
@@ -73,12 +71,3 @@ def test_proposals_states_scores_and_choice_equal_the_recorded_ones(shared_root:
     # The public one reads its own chosen proposal back at times truncated to microseconds: up to 7e-6 m away from it.
     np.testing.assert_allclose(plan.poses, recorded["proposals"][plan.chosen, 1:STEPS, :3], rtol=0.0, atol=1e-6)
     np.testing.assert_allclose(plan.poses, recorded["chosen_poses_40"], rtol=0.0, atol=1e-5)
-
-
-def test_the_shared_lead_memory_of_the_public_planner_shows_in_the_recorded_leads(shared_root: Path) -> None:
-    folder = shared_root / "reference" / "7fab2350_44"
-    recorded = np.load(folder / "pdm_closed.npz")["leading_agent"][:, :STEPS]
-    clean = plan_of(folder, PdmSettings(shared_lead_memory=False)).proposals.leads[:, :STEPS]
-    free_road = recorded[..., 2] > 0.0
-    assert (recorded[free_road][:, 1] != 0.0).sum() == 6, "a free road with the velocity of another speed's lead"
-    assert (clean[clean[..., 2] > 0.0][:, 1] == 0.0).all()

@@ -176,8 +176,8 @@ def proposals(
     motion[:, 0, 0], motion[:, 0, 1] = start[lateral], ego_state[VX]
     poses[:, 0] = _on_paths(paths, lateral, motion[:, 0, 0])
     for step in range(1, PROPOSAL_STEPS + 1):
-        if step % SAMPLE_STEPS == 0 or (step == 1 and not settings.brakes_at_first_step):
-            memory = settings.shared_lead_memory and step <= SCORED_STEPS  # beyond, the chosen one is driven alone
+        if step % SAMPLE_STEPS == 0:
+            memory = step <= SCORED_STEPS  # beyond, the chosen one is driven alone
             before = motion[:, step - 1], poses[:, step - 1]
             found = _leads(paths, lateral, traffic, step // SAMPLE_STEPS, *before, vehicle)
             leads[:, step] = _remembered(found, len(settings.speed_fractions)) if memory else np.nan_to_num(found)
@@ -192,7 +192,7 @@ def idm_step(motion: Array, leads: Array, target_mps: Array, settings: PdmSettin
     """One Euler step of 0.1 s of the intelligent driver model (Treiber et al. 2000), rows (P, 2) progress, speed.
 
     s* = gap + v T + v (v - v_lead) / (2 sqrt(a b));  dv/dt = a (1 - (v / v0)^n - (s* / s)^2), clipped to [-b, a].
-    The speed is not clipped at 0 where settings.speed_below_zero.
+    The speed is not clipped at 0.
     """
     progress, speed = motion[:, 0], motion[:, 1]
     closing = speed * (speed - leads[:, 1]) / (2.0 * np.sqrt(settings.accel_max_mps2 * settings.decel_max_mps2))
@@ -200,10 +200,7 @@ def idm_step(motion: Array, leads: Array, target_mps: Array, settings: PdmSettin
     gap = np.maximum(leads[:, 0] - progress - leads[:, 2], settings.min_gap_m)
     accel = settings.accel_max_mps2 * (1.0 - (speed / target_mps) ** settings.exponent - (wanted / gap) ** 2)
     accel = np.clip(accel, -settings.decel_max_mps2, settings.accel_max_mps2)
-    after = speed + STEP_S * accel
-    return np.stack(
-        [progress + STEP_S * speed, after if settings.speed_below_zero else np.maximum(after, 0.0)], axis=-1
-    )
+    return np.stack([progress + STEP_S * speed, speed + STEP_S * accel], axis=-1)
 
 
 def _on_paths(paths: list[DrivePath], lateral: NDArray[np.intp], progress: Array) -> Array:

@@ -20,7 +20,6 @@ Array = NDArray[np.float64]
 SHAPES = ("straight", "curved", "hairpin", "loop", "two points", "short")
 SETTINGS = (
     PdmSettings(),
-    PdmSettings(shared_lead_memory=False, brakes_at_first_step=False, speed_below_zero=False),
     PdmSettings(speed_fractions=(0.5, 1.0), lateral_offsets_m=(0.5,), exponent=4, headway_s=0.8),
 )
 
