@@ -85,13 +85,14 @@ def match_corners(a: PhotoCorners, b: PhotoCorners) -> tuple[Indices, Indices]:
     best = alike.argmax(axis=1)
     rows = np.arange(len(best))
     first = alike[rows, best]
-    mutual = alike.argmax(axis=0)[best] == rows
+    mutual = first == alike.max(axis=0)[best]  # the row of a column's largest itself would take ten times as long
     alike[rows, best] = -1.0
     second = alike.max(axis=1)
     norms = [(c.descriptors**2).sum(axis=1) for c in (a, b)]
     near = norms[0] + norms[1][best] - 2.0 * first
     next_near = norms[0] + UNIT**2 - 2.0 * second
     keep = np.flatnonzero(mutual & (near < RATIO**2 * next_near))
+    keep = np.sort(keep[np.unique(best[keep], return_index=True)[1]])  # of rows that are equally near the first
     if len(keep) < LEAST_MATCHES:
         return nobody
     pairs = [c.at[r] / c.pixel for c, r in ((a, keep), (b, best[keep]))]
