@@ -34,7 +34,7 @@ sys.exit(sys.version.split()[0] != sys.argv[1])
 endef
 export FITS IS_WHOLE
 
-.PHONY: install demo first-planner warm test unit lint format docs chaos mutants bench bench-check gpu-check locks dist clean
+.PHONY: install demo first-planner warm test unit lint format docs chaos mutants bench long gpu-check locks dist clean
 
 install: $(VENV)/.installed
 
@@ -73,11 +73,11 @@ warm: $(VENV)/.run
 
 test:
 	@$(MAKE) --no-print-directory -j 2 install warm
-	$(PY) -m pytest -n 2 --dist loadfile -m "not bench"
+	$(PY) -m pytest -n 2 --dist loadfile -m "not long"
 
 unit:
 	@$(MAKE) --no-print-directory -j 2 install warm
-	$(PY) -m pytest -n 2 --dist loadfile --ignore tests/real --ignore tests/chaos -m "not ray and not slow and not bench"
+	$(PY) -m pytest -n 2 --dist loadfile --ignore tests/real --ignore tests/chaos -m "not ray and not slow and not long"
 
 lint: install
 	$(PY) -m ruff check .
@@ -120,9 +120,10 @@ mutants: install warm
 bench: install
 	$(if $(filter reward,$(NAME)),OMP_NUM_THREADS=1) $(PY) -m tests.bench$(if $(NAME),.bench_$(NAME)) $(ARGS)
 
-# Whether the benches that take long still run and print what the pages quote.
-bench-check: install
-	$(PY) -m pytest -n 2 --dist loadfile -m bench
+# Whether the longer benches still run, kept tables are made of their rows, and chaos finds nothing at its smallest.
+long:
+	@$(MAKE) --no-print-directory -j 2 install warm
+	$(PY) -m pytest -n 2 --dist loadfile -m long
 
 # Where there is a GPU: whether render.backend=gsplat agrees with the CPU, and how fast it is beside plain gsplat.
 # Installed with TORCH="-r locks/planners.lock"; gsplat compiles its kernels the first time (needs nvcc, some minutes).

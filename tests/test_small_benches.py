@@ -41,7 +41,7 @@ def test_every_step_on_a_stored_table_is_measured(tmp_path: Path) -> None:
 
 
 @pytest.mark.ray
-@pytest.mark.bench
+@pytest.mark.long
 def test_a_run_of_waiting_stages_is_made_and_then_found(capsys: pytest.CaptureFixture[str]) -> None:
     bench_scale.main(bench_scale.Request(nodes="1", attempts=64, wait_ms=0, row_kb=0))
     head, row = (line.split() for line in capsys.readouterr().out.splitlines()[-2:])
@@ -68,7 +68,7 @@ def test_a_run_s_parts_come_to_its_whole(tmp_path: Path, capsys: pytest.CaptureF
 
 
 ONE_TOWN = ("clips=synthetic", "clips.n_clips=1", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0")
-LONG = pytest.mark.bench
+LONG = pytest.mark.long
 STEPS_OF = partial(bench_planner_steps.main, ["gtrs_dense_public"], torch.device("cpu"), 1, 1, 8, 0.3, True)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from tests.bench import bench_gate, bench_guess, bench_kitti, bench_scenes, bench_town
 
-pytestmark = pytest.mark.bench
+pytestmark = pytest.mark.long
 
 Printed = Callable[..., list[str]]
 FEW = ("iterations=2", "start_gaussians=2000", "most_gaussians=2000")

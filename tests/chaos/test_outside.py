@@ -11,7 +11,7 @@ from tests.pages import REPOSITORY
 ROWS = ("no-reader:status", "ascii:vocabulary", "full-output:vocabulary", "sigquit:vocabulary", "dashboard-clients")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_commands_hold_their_promises_in_trouble_that_is_made_outside_them() -> None:
     words = [sys.executable, "-m", "experiments.chaos.outside", f"rows={','.join(ROWS)}", "trials=1"]
     done = subprocess.run(words, cwd=REPOSITORY, capture_output=True, text=True, timeout=500)

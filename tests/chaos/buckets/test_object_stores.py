@@ -9,7 +9,7 @@ import pytest
 from tests.chaos.buckets.bad_store import BUCKET, BadStore, Fault, What, bad_store, environment_of
 from tests.pages import REPOSITORY
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 LOG = "_delta_log/0.*json"
 COMMIT = """
 import sys

@@ -25,7 +25,10 @@ KEPT = {  # door and number: the attack that it stands for; it did harm once, or
 }
 
 
-@pytest.mark.parametrize("cases", [[(door, n) for door in SHORT for n in range(16)], [*KEPT]], ids=["some", "kept"])
+SOME = [(door, n) for door in SHORT for n in range(16)]
+
+
+@pytest.mark.parametrize("cases", [pytest.param(SOME, marks=pytest.mark.long), [*KEPT]], ids=["some", "kept"])
 def test_crafted_files_hurt_nobody(cases: list[tuple[str, int]], tmp_path: Path) -> None:
     only = ",".join(f"{door}:{n}" for door, n in cases)
     command = [sys.executable, "-m", "tests.chaos.hostile_files", f"to={tmp_path}", f"only={only}"]

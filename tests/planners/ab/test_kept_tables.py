@@ -10,7 +10,7 @@ from planners.ab.report import write_report
 
 ROOT = Path(__file__).parents[3]
 KEPT = ROOT / "experiments" / "ab"
-PARTS = ("towns", "acceleration", "drives", "drives_acceleration", "looking")
+LONG = ("towns", "acceleration", "drives", "drives_acceleration")
 
 
 def differences(part: str, against: str = "real") -> dict[tuple[str, str], dict[str, str]]:
@@ -20,7 +20,7 @@ def differences(part: str, against: str = "real") -> dict[tuple[str, str], dict[
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("part", [*(pytest.param(part, marks=pytest.mark.long) for part in LONG), "looking"])
 def test_tables_verdict_and_picture_are_made_of_the_kept_rows(part: str, tmp_path: Path) -> None:
     for name in ("frames.parquet", "drives.parquet"):
         shutil.copy(KEPT / part / name, tmp_path / name)
