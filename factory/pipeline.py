@@ -40,7 +40,6 @@ from tasks.attempt import (
     perturbed_scene,
     vocabulary_labels,
 )
-from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Expert, Human, drives_once_per_clip
 from tasks.hard_scenes import BEFORE_STEPS, BenchmarkClip, drive_follow_up, frame_digest, seen_half_a_second_earlier
 from tasks.perturb import NO_STARTS, Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
@@ -164,7 +163,6 @@ class FactoryWork:
     experts: Mapping[str, Expert]
     perturb: PerturbSettings
     traffic: TrafficSettings
-    pdm: PdmSettings
     gate: ExpertGate
     labels_of: Vocabulary | None  # whose trajectories samples are labelled with; None: they have no vocabulary labels
     render: RenderSettings
@@ -228,7 +226,7 @@ class FactoryWork:
             if block is not None and block.fault is not None:
                 found = Rejected("render", "psnr", block.fault)
             else:
-                found = perturb(clip, self.vocabulary, self.perturb, self.traffic, self.pdm, rng, starts)
+                found = perturb(clip, self.vocabulary, self.perturb, self.traffic, rng, starts)
         left_out = tuple(block.left_out) if block is not None else ()
         return WholeClip(clip, found, watch.seconds, cameras_left_out=left_out)
 
@@ -279,12 +277,12 @@ class FactoryWork:
         payload, driver = perturbed_clip_of(prepared), self.experts[expert]
         rng = random_stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
         if drives_once_per_clip(driver):
-            judged = drive_under_log_replay(scene_of_clip(payload.clip), driver, self.pdm, rng, timed)
+            judged = drive_under_log_replay(scene_of_clip(payload.clip), driver, rng, timed)
             return Drive(payload.ref, None, judged, None)
         chosen = payload.candidates[candidate]
         self._refuse_another_policy()
         with timed("rollout"):
-            ready = _ready_scene(payload, candidate, self.traffic, self.pdm)
+            ready = _ready_scene(payload, candidate, self.traffic)
         result = attempt(ready, driver, self.gate, rng, timed)
         return Drive(payload.ref, chosen, *((None, result) if isinstance(result, Rejected) else result))
 
@@ -452,10 +450,10 @@ def drive_of(driven: AcceptedDrive) -> Drive:
 
 
 @lru_cache(maxsize=2)  # experts try a candidate one after the other, at most with another clip's between them
-def _ready_scene(clip: PerturbedClip, candidate: int, traffic: TrafficSettings, planner: PdmSettings) -> ReadyScene:
+def _ready_scene(clip: PerturbedClip, candidate: int, traffic: TrafficSettings) -> ReadyScene:
     scene = perturbed_scene(clip.clip, clip.candidates[candidate].rollout)
     read_only((scene.ego_history, scene.agents))  # what one expert did to it, the next would drive in
-    return ReadyScene(scene, traffic, planner)
+    return ReadyScene(scene, traffic)
 
 
 def _candidate_row(index: int, candidate: Candidate) -> CandidateRow:
@@ -517,7 +515,7 @@ class BenchmarkWork(FactoryWork):
 
     def expert_digest(self, expert: str) -> str:
         """Of the expert's or frame's inputs and settings."""
-        return frame_digest(expert, self.pdm) if expert in self.frames else super().expert_digest(expert)
+        return frame_digest(expert) if expert in self.frames else super().expert_digest(expert)
 
     def read_and_perturb(self, ref: ClipRef) -> WholeClipPair | Rejected:
         """With the earlier window; Rejected also where there is none."""
@@ -560,7 +558,7 @@ class BenchmarkWork(FactoryWork):
         if expert == HUMAN_BEFORE:
             assert prepared.scenes is not None, "prepared by a run without frames"
             rng = random_stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
-            judged = drive_under_log_replay(scene_of_clip(prepared.scenes.before), Human(), self.pdm, rng, timed)
+            judged = drive_under_log_replay(scene_of_clip(prepared.scenes.before), Human(), rng, timed)
             overrides = {  # what its row says about the clip, instead of the earlier window that it was read from
                 "clip_id": payload.clip.clip_id,
                 "clip_start_s": payload.clip.start_s,
@@ -569,10 +567,10 @@ class BenchmarkWork(FactoryWork):
             }
             return Drive(_earlier_ref(payload.ref), None, judged, None, row_overrides=overrides)
         chosen = payload.candidates[candidate]
-        led_to = drive_follow_up(payload.clip, chosen.rollout, self.traffic, self.pdm, timed)
+        led_to = drive_follow_up(payload.clip, chosen.rollout, self.traffic, timed)
         if isinstance(led_to, Rejected):
             return Drive(payload.ref, chosen, None, led_to)
-        shown = seen_half_a_second_earlier(led_to, chosen.rollout, self.pdm) if expert == FOLLOW_UP_BEFORE else None
+        shown = seen_half_a_second_earlier(led_to, chosen.rollout) if expert == FOLLOW_UP_BEFORE else None
         now = led_to.scene.step
         return Drive(payload.ref, chosen, led_to, None, shared=(now - BEFORE_STEPS, now), sampled_instead=shown)
 

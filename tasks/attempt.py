@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from tasks.experts.pdm_closed import MIN_PROGRESS_M, PdmClosed, PdmPlan, PdmSettings, path_length_m, plan_for
+from tasks.experts.pdm_closed import MIN_PROGRESS_M, PdmClosed, PdmPlan, path_length_m, plan_for
 from tasks.experts.protocol import Expert, Plan, plans_of
 from tasks.kernels.compiled import kernel
 from tasks.reward.areas import N_POINTS, empty_places, set_area_flags
@@ -85,27 +85,24 @@ def drive_and_judge(
     scene: Scene,
     plan: Plan,
     traffic: TrafficSettings,
-    planner: PdmSettings,
     timed: Timed = nullcontext,
     pdm_plan: PdmPlan | None = None,
 ) -> Judged:
     """Simulate the plan with the traffic and score it in the two-row batch [PDM-Closed, plan].
 
-    pdm_plan: plan_for(scene, planner), where it is known already.
+    pdm_plan: plan_for(scene), where it is known already.
     """
     with timed("rollout"):
         ready = prepare_traffic(scene, traffic)
-    return _driven_among(ready, plan, planner, timed, pdm_plan)
+    return _driven_among(ready, plan, timed, pdm_plan)
 
 
-def _driven_among(
-    traffic: TrafficScene, plan: Plan, planner: PdmSettings, timed: Timed, pdm_plan: PdmPlan | None
-) -> Judged:
+def _driven_among(traffic: TrafficScene, plan: Plan, timed: Timed, pdm_plan: PdmPlan | None) -> Judged:
     scene = traffic.scene
     with timed("rollout"):
         rollout = roll_out(traffic, track(scene.ego_state, np.asarray(plan.poses)[None])[0])
     with timed("reward"):
-        pdm_plan = pdm_plan or plan_for(scene, planner)
+        pdm_plan = pdm_plan or plan_for(scene)
         return judge(scene, plan, rollout, pdm_plan, traffic.settings.leaves_out_touching)
 
 
@@ -152,8 +149,8 @@ class ReadyScene:
     Experts that try the same candidate share it: to prepare traffic and PDM-Closed's plan costs more than a drive.
     """
 
-    def __init__(self, scene: Scene, traffic: TrafficSettings, planner: PdmSettings) -> None:
-        self.scene, self.planner, self._settings = scene, planner, traffic
+    def __init__(self, scene: Scene, traffic: TrafficSettings) -> None:
+        self.scene, self._settings = scene, traffic
 
     @cached_property
     def traffic(self) -> TrafficScene:
@@ -161,7 +158,7 @@ class ReadyScene:
 
     @cached_property
     def pdm_plan(self) -> PdmPlan:
-        return plan_for(self.scene, self.planner)
+        return plan_for(self.scene)
 
 
 def attempt(
@@ -177,7 +174,7 @@ def attempt(
     if not has_route(scene.centerline):
         return Rejected("rollout", "route_ended", "the perturbed ego stands at the end of its route")
     with timed("expert"):  # which may be the very planner that progress is held against: it plans once
-        is_planner = expert == PdmClosed(ready.planner)
+        is_planner = expert == PdmClosed()
         plans = iter([Plan(ready.pdm_plan.poses)]) if is_planner else plans_of(expert, scene, rng)
     refused: tuple[Judged, Rejected] | Rejected | None = None
     while True:
@@ -190,7 +187,7 @@ def attempt(
             traffic = ready.traffic
         with timed("reward"):
             pdm_plan = ready.pdm_plan
-        judged = _driven_among(traffic, plan, ready.planner, timed, pdm_plan)
+        judged = _driven_among(traffic, plan, timed, pdm_plan)
         with timed("reward"):
             found = verdict(judged.scores, gate) or end_verdict(judged, traffic, gate)
             found = found or _near_log_verdict(judged, gate) or _goal_verdict(judged)
@@ -228,12 +225,12 @@ def _goal_verdict(judged: Judged) -> Rejected | None:
 
 
 def drive_under_log_replay(
-    scene: Scene, expert: Expert, planner: PdmSettings, rng: np.random.Generator, timed: Timed = nullcontext
+    scene: Scene, expert: Expert, rng: np.random.Generator, timed: Timed = nullcontext
 ) -> Judged:
     """The drive from the log at T, scored under log replay and never filtered."""
     plan = expert.plan(scene, rng)
     assert isinstance(plan, Plan), "an expert that drives once a clip always has a plan"
-    return drive_and_judge(scene, plan, TrafficSettings(mode="replay"), planner, timed)
+    return drive_and_judge(scene, plan, TrafficSettings(mode="replay"), timed)
 
 
 # Whether the route goes on where a drive ends (docs/reward.md 2m).

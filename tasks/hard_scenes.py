@@ -4,14 +4,13 @@ Stage one is the log at T, stage two where candidates' rollouts lead at T+H (doc
 0.5 s earlier, so that extended comfort is defined.
 """
 
-import hashlib
 from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
 
 from tasks.attempt import Judged, Timed, drive_and_judge, has_route, judge, perturbed_scene
-from tasks.experts.pdm_closed import PdmSettings, plan_for
+from tasks.experts.pdm_closed import plan_for
 from tasks.experts.protocol import Plan
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import FOLLOW_UP_BEFORE, HUMAN_BEFORE, Rejected
@@ -69,15 +68,15 @@ class OneStageClip:
         return scene_of_clip(self.clip)
 
 
-def frame_digest(frame: str, planner: PdmSettings) -> str:
+def frame_digest(frame: str) -> str:
     """Of what a frame (one of tasks.stages.FRAMES) is made by, as an expert's."""
     if frame == HUMAN_BEFORE:
         return "human"
-    return hashlib.sha256(repr((planner, frame == FOLLOW_UP_BEFORE)).encode()).hexdigest()[:16]
+    return "published, earlier" if frame == FOLLOW_UP_BEFORE else "published"
 
 
 def drive_follow_up(
-    clip: Clip, stage_one: Rollout, traffic: TrafficSettings, planner: PdmSettings, timed: Timed = nullcontext
+    clip: Clip, stage_one: Rollout, traffic: TrafficSettings, timed: Timed = nullcontext
 ) -> Judged | Rejected:
     """PDM-Closed from T+H of a candidate's rollout, scored and never filtered.
 
@@ -90,11 +89,11 @@ def drive_follow_up(
     if not (has_route(scene.centerline) and has_route(before.centerline)):
         return Rejected("rollout", "route_ended", "the perturbed ego stands at the end of its route")
     with timed("expert"):
-        pdm_plan = plan_for(scene, planner)
-    return drive_and_judge(scene, Plan(pdm_plan.poses), traffic, planner, timed, pdm_plan)
+        pdm_plan = plan_for(scene)
+    return drive_and_judge(scene, Plan(pdm_plan.poses), traffic, timed, pdm_plan)
 
 
-def seen_half_a_second_earlier(judged: Judged, stage_one: Rollout, planner: PdmSettings) -> Judged:
+def seen_half_a_second_earlier(judged: Judged, stage_one: Rollout) -> Judged:
     """A follow-up's drive seen from its earlier frame: the last 0.5 s of the perturbation, then what came of it."""
     kept = HORIZON_STEPS - BEFORE_STEPS
     scene = perturbed_scene(judged.scene.clip, stage_one, kept)
@@ -102,4 +101,4 @@ def seen_half_a_second_earlier(judged: Judged, stage_one: Rollout, planner: PdmS
     world = judged.scene.agents.overwritten(judged.scene.step, judged.rollout.agents)
     agents = world.window(NOW + kept, NOW + kept + HORIZON_STEPS + 1)
     rollout = Rollout(scene.step, states, agents, stage_one.simulated | judged.rollout.simulated)
-    return judge(scene, Plan(states[1:, : HEADING + 1]), rollout, plan_for(scene, planner))
+    return judge(scene, Plan(states[1:, : HEADING + 1]), rollout, plan_for(scene))

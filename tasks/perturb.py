@@ -15,7 +15,7 @@ from itertools import islice
 
 import numpy as np
 
-from tasks.experts.pdm_closed import PdmSettings, plan_for
+from tasks.experts.pdm_closed import plan_for
 from tasks.kernels.simd import LANES
 from tasks.reward.epdms import Scores, prepare_scene, score, with_objects
 from tasks.rollout.lqr import track
@@ -134,18 +134,17 @@ def perturb(
     vocabulary: Vocabulary,
     settings: PerturbSettings,
     traffic: TrafficSettings,
-    planner: PdmSettings,
     rng: np.random.Generator,
     starts: Array = NO_STARTS,
 ) -> Perturbation | Rejected:
     """The ordered candidates of a clip, or Rejected "no_gated_candidate" or "no_good_candidate".
 
-    traffic: of the reactive check; planner: PDM-Closed, the first row of every two-row batch that normalises progress;
+    traffic: of the reactive check; PDM-Closed is the first row of every two-row batch that normalises progress;
     rng: the clip's `perturb` stream, which draws one permutation of the vocabulary; starts: (S, 40, 3) of this clip, as
     a vocabulary's.
     """
     if settings.at_log:
-        return log_as_candidate(clip, traffic, planner)
+        return log_as_candidate(clip, traffic)
     scene = scene_of_clip(clip)
     start = scene.ego_state
     target = clip.ego_states[NOW + HORIZON_STEPS, : HEADING + 1]  # the logged pose at T+H
@@ -175,7 +174,7 @@ def perturb(
     counts["white_cell"] = int((reached & ~black).sum())
 
     replay = prepare_scene(scene, scene.agents.window(NOW, NOW + HORIZON_STEPS + 1))
-    pdm_states = plan_for(scene, planner).driven[None]
+    pdm_states = plan_for(scene).driven[None]
     scores = np.full(len(index), np.nan)
 
     def passes_replay(members: Ints) -> Bools:
@@ -233,10 +232,10 @@ def perturb(
     return Perturbation(tuple(candidates), counts, ConsideredTrajectories(index, ends, tuple(fate), scores))
 
 
-def log_as_candidate(clip: Clip, traffic: TrafficSettings, planner: PdmSettings) -> Perturbation:
+def log_as_candidate(clip: Clip, traffic: TrafficSettings) -> Perturbation:
     """The log's own drive as the only candidate, among the traffic that answers to it; no score keeps it out."""
     scene, states = scene_of_clip(clip), clip.ego_states[NOW : NOW + HORIZON_STEPS + 1]
-    pdm_states = plan_for(scene, planner).driven[None]
+    pdm_states = plan_for(scene).driven[None]
     replay = prepare_scene(scene, scene.agents.window(NOW, NOW + HORIZON_STEPS + 1))
     rollout = roll_out(prepare_traffic(scene, traffic), states.copy())
     touched_from = scene.ego_state if traffic.leaves_out_touching else None

@@ -113,39 +113,6 @@ class TrafficSettings:
 
 
 @dataclass(frozen=True)
-class PdmSettings:
-    """PDM-Closed as published with NAVSIM (docs/reward.md 4); raises ValueError where a value makes no sense.
-
-    The fixed numbers are the published IDM's: another expert has others.
-    """
-
-    speed_fractions: tuple[float, ...] = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the lane's speed limit
-    lateral_offsets_m: tuple[float, ...] = (0.0, -1.0, 1.0)  # + is to the left
-    fallback_speed_mps: float = constant(15.0)  # where the lane has no speed limit
-    min_gap_m: float = constant(1.0)
-    headway_s: float = 1.5
-    accel_max_mps2: float = constant(1.5)
-    decel_max_mps2: float = constant(3.0)
-    exponent: int = constant(10)  # of IDM's free-road term
-
-    def __post_init__(self) -> None:
-        for name in ("speed_fractions", "lateral_offsets_m"):
-            values = getattr(self, name)
-            if not values or not all(map(math.isfinite, values)):
-                raise ValueError(f"pdm {name} must be finite numbers, at least one, not {list(values)}")
-        if min(self.speed_fractions) <= 0.0:
-            raise ValueError(f"pdm speed_fractions must be positive, not {list(self.speed_fractions)}")
-        for name in ("fallback_speed_mps", "min_gap_m", "accel_max_mps2", "decel_max_mps2", "exponent"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"pdm {name} must be positive and finite, not {getattr(self, name)}")
-        if not 0.0 <= self.headway_s < math.inf:
-            raise ValueError(f"pdm headway_s must be finite and not negative, not {self.headway_s}")
-
-
-PDM_DEFAULTS = PdmSettings()
-
-
-@dataclass(frozen=True)
 class FeasibleSettings:
     """Limits and weights of the two QPs."""
 

@@ -48,7 +48,7 @@ def outcomes(work: FactoryWork, prepared: PreparedClip, candidate: int) -> list[
     plans = [plan for plan in plans_of(work.experts["recovery"], scene, rng) if not isinstance(plan, Rejected)]
     found = []
     for number, plan in enumerate(plans):
-        result = attempt(ReadyScene(scene, work.traffic, work.pdm), OnePlan(plan), work.gate, rng)
+        result = attempt(ReadyScene(scene, work.traffic), OnePlan(plan), work.gate, rng)
         if not isinstance(result, Rejected) and result[1] is None:
             judged: Judged = result[0]
             end = off_log(judged)[-1]

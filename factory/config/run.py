@@ -16,7 +16,7 @@ from factory.config.shapes import deep_merge, defaults_of, setting_keys
 from factory.config.words import ConfigError, did_you_mean
 from factory.files import broken_link, in_submitted_job, matching
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
-from tasks.settings import ExpertGate, PdmSettings, PerturbSettings, RecoverySettings, TrafficSettings
+from tasks.settings import ExpertGate, PerturbSettings, RecoverySettings, TrafficSettings
 from tasks.stages import FRAMES, HUMAN, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
@@ -140,7 +140,6 @@ class RunConfig:
     vocabulary: VocabularyChoice = field(default_factory=VocabularyChoice)
     perturb: PerturbSources = field(default_factory=PerturbSources)
     traffic: TrafficSettings = field(default_factory=TrafficSettings)
-    pdm: PdmSettings = field(default_factory=PdmSettings)
     reward: RewardSettings = field(default_factory=RewardSettings)
     render: RenderSettings = field(default_factory=RenderSettings)
     benchmark: BenchmarkSettings = field(default_factory=BenchmarkSettings)

@@ -35,7 +35,6 @@ KINEMATIC_LABELS = (
 WATCHED = (
     "perturb",
     "traffic",
-    "pdm",
     "reward.full",
     "reward.progress_above",
     "reward.off_route",

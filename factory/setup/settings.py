@@ -32,7 +32,6 @@ from tasks.experts.protocol import Expert, drives_once_per_clip
 from tasks.experts.recovery import RecoveryExpert, RecoverySettings, RecoveryTable
 from tasks.render.settings import RenderMode
 from tasks.rollout.simulate import traffic_record
-from tasks.settings import PdmSettings
 from tasks.stages import FRAMES, stage_versions
 from tasks.world.vocabulary import Vocabulary, kinematic_trajectories, refuse_other_meaning
 
@@ -62,11 +61,6 @@ class RunContext:
     config: RunConfig
     name: str  # of the expert
     clips: Callable[[], tuple[ClipReader, ClipIndex]]  # opens them when it is first called
-
-    @property
-    def pdm(self) -> PdmSettings:
-        """Constants of PDM-Closed."""
-        return self.config.pdm
 
 
 def open_reader(clips: Mapping[str, Any], repairs: Repairs = "make") -> tuple[ClipReader, ClipIndex]:
@@ -137,7 +131,6 @@ def assemble(config: RunConfig) -> Run:
         experts=experts,
         perturb=config.perturb,
         traffic=config.traffic,
-        pdm=config.pdm,
         gate=config.reward,
         labels_of=labels_of,
         render=config.render,
@@ -240,7 +233,6 @@ def run_identity(
     """
     science: dict[str, Any] = {
         "perturb": config.perturb,
-        "pdm": config.pdm,
         "reward": config.reward,
         "render": config.render,
     }

@@ -26,7 +26,6 @@ from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.sh import rotate_coefficients
 from tasks.reward.epdms import INDEX_FROM_ROWS, prepare_scene, score
 from tasks.rollout.simulate import SeenTraffic, TrafficSettings, prepare_traffic, simulate
-from tasks.settings import PdmSettings
 from tasks.world.arrays import Array
 from tasks.world.clip import (
     CLIP_STEPS,
@@ -56,7 +55,7 @@ def enter_judge() -> None:
     prepared = prepare_scene(scene, scene.agents.window(scene.step, scene.step + HORIZON_STEPS + 1))
     standing = np.tile(scene.ego_state, (INDEX_FROM_ROWS, HORIZON_STEPS + 1, 1))
     score(prepared, standing, normalise="pairs")
-    judged = drive_and_judge(scene, Plan(ahead), REPLAY, PdmSettings())
+    judged = drive_and_judge(scene, Plan(ahead), REPLAY)
     vocabulary_labels(Vocabulary(kinematic_trajectories(2, 0)), scene, judged.prepared, judged.reference)
     hit_after_s(prepare_traffic(scene, REPLAY), judged.prepared, judged.rollout.ego_states)
 
@@ -66,7 +65,7 @@ def enter_plan() -> None:
     scene, ahead = _tiny_scene()
     simulate(scene, ahead, REPLAY)
     seen = forecast(scene.ego_state, scene.agents.window(scene.step, scene.step + 1))
-    proposals(scene.ego_state, scene.centerline, seen, None, PdmSettings())
+    proposals(scene.ego_state, scene.centerline, seen, None)
 
 
 def enter_drive() -> None:

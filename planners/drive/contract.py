@@ -26,7 +26,6 @@ from planners.alpasim.session import SECOND_US, STEP_US
 from planners.drive.drivers import Driver, MakeSample, PlannerDriver, make_driver
 from planners.drive.loop import FIRST_QUESTION_S, first_pose
 from planners.evaluation.planner_names import EvaluatedPlanner, needs_of
-from tasks.settings import PdmSettings
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, Scene
 from tasks.world.commands import SENT_M, route_points
@@ -92,9 +91,9 @@ class Peer:
     service: SceneService | None = None  # that is to be shown the scene
 
 
-def peer_in_process(one: EvaluatedPlanner, changed: Mapping[str, Any], pdm: PdmSettings, device: str = "cpu") -> Peer:
+def peer_in_process(one: EvaluatedPlanner, changed: Mapping[str, Any], device: str = "cpu") -> Peer:
     """A planner in this process. changed: settings of a trained one. Raises ConfigError."""
-    driver = make_driver(one, pdm, device)
+    driver = make_driver(one, device)
     needs = getattr(driver.made, "needs_to_plan", needs_of(driver.made)) if isinstance(driver, PlannerDriver) else None
     if needs is not None and needs.bev is None and not needs.n_agents:
         return Peer(AlpasimDriver(one.spec, device, changed=changed).service.answer, driver.needs_pictures)

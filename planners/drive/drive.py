@@ -100,7 +100,7 @@ def _requested_drives(settings: DriveSettings) -> RequestedDrives:
 
     planners: list[tuple[DrivingPlanner, tuple[Pictures, ...]]] = []  # and which pictures each is shown
     for one in _asked(settings):
-        looks = one.spec.startswith(WIRE) or make_driver(one, settings.pdm).needs_pictures
+        looks = one.spec.startswith(WIRE) or make_driver(one).needs_pictures
         planners.append((DrivingPlanner(one.label, one.spec, one.digest), settings.pictures if looks else ("none",)))
     reader, index = open_reader(settings.clips)
     if any("truth" in kinds for _, kinds in planners) and painter_of(reader) is None:

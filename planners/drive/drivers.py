@@ -12,7 +12,6 @@ from planners.evaluation.planning import plan_samples
 from planners.evaluation.scoring import human_plans, pdm_plans
 from tasks.experts.pdm_closed import PdmClosed
 from tasks.experts.protocol import Plan
-from tasks.settings import PdmSettings
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene, random_stream
 from tasks.world.frames import HEADING, VX, to_world
@@ -52,12 +51,11 @@ class HumanDriver:
 class PdmClosedDriver:
     """The privileged planner: sees the world's boxes and lights as they are now."""
 
-    settings: PdmSettings
     needs_pictures: bool = False
 
     def plan(self, scene: Scene, look: MakeSample) -> Array | None:
         """None where the route ahead has no length."""
-        made = PdmClosed(self.settings).plan(scene, random_stream(0, scene.clip.clip_id, "drive"))
+        made = PdmClosed().plan(scene, random_stream(0, scene.clip.clip_id, "drive"))
         return made.poses if isinstance(made, Plan) else None
 
 
@@ -79,11 +77,11 @@ class PlannerDriver:
         return to_world(scene.ego_state[: HEADING + 1], plan_samples(self.made, [look()], self.device)[0])
 
 
-def make_driver(one: EvaluatedPlanner, pdm: PdmSettings, device: str = "cpu") -> Driver:
+def make_driver(one: EvaluatedPlanner, device: str = "cpu") -> Driver:
     """The driver that an evaluated planner is, its weights read. Raises ConfigError for plans of a submission."""
     if one.privileged is human_plans:
         return HumanDriver()
     if one.privileged is pdm_plans:
-        return PdmClosedDriver(pdm)
+        return PdmClosedDriver()
     made = one.made()
     return PlannerDriver(made.to(device) if hasattr(made, "to") else made, device)

@@ -12,7 +12,7 @@ from planners.drive.loop import LoopSettings
 from planners.drive.mpc import ControllerName
 from planners.evaluation.planner_names import compose_with_planner
 from tasks.render.settings import RenderSettings
-from tasks.settings import PdmSettings, PerturbSettings, TrafficSettings
+from tasks.settings import PerturbSettings, TrafficSettings
 
 Pictures = Literal["truth", "engine", "renderer", "none"]
 
@@ -46,7 +46,6 @@ class DriveSettings:
     vocabulary: VocabularyChoice = field(default_factory=VocabularyChoice)
     perturb: PerturbSettings = field(default_factory=PerturbSettings)
     traffic: TrafficSettings = field(default_factory=TrafficSettings)
-    pdm: PdmSettings = field(default_factory=PdmSettings)
     render: RenderSettings = field(default_factory=RenderSettings)
 
     def __post_init__(self) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from planners.evaluation.frames import NO_CANDIDATE
 from tasks.attempt import drive_and_judge, has_route, perturbed_scene
-from tasks.experts.pdm_closed import PdmSettings, plan_for
+from tasks.experts.pdm_closed import plan_for
 from tasks.experts.protocol import Plan
 from tasks.perturb import Perturbation
 from tasks.rollout.lane_following import stands_always
@@ -77,7 +77,7 @@ def logged_start(clip: Clip) -> DriveStart:
 
 
 def perturbed_starts(
-    clip: Clip, perturbation: Perturbation, at_most: int, traffic: TrafficSettings, pdm: PdmSettings
+    clip: Clip, perturbation: Perturbation, at_most: int, traffic: TrafficSettings
 ) -> tuple[DriveStart, ...]:
     """From where the first candidates lead at T+H that PDM-Closed can drive on from.
 
@@ -92,8 +92,8 @@ def perturbed_starts(
         scene = perturbed_scene(clip, candidate.rollout)
         if not has_route(scene.centerline):
             continue
-        plan = plan_for(scene, pdm)
-        scores = drive_and_judge(scene, Plan(plan.poses), traffic, pdm, pdm_plan=plan).scores
+        plan = plan_for(scene)
+        scores = drive_and_judge(scene, Plan(plan.poses), traffic, pdm_plan=plan).scores
         if scores.nc[1] == 1.0 and scores.dac[1] == 1.0:
             found.append(DriveStart(scene, index, len(found)))
     return tuple(found)

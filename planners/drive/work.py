@@ -35,7 +35,6 @@ from planners.drive.starts import LOGGED, DriveStart, extend_clip, logged_start,
 from planners.evaluation.planner_names import EvaluatedPlanner, find_planner
 from tasks.perturb import Perturbation, perturb
 from tasks.rollout.simulate import traffic_record
-from tasks.settings import PdmSettings
 from tasks.stages import stage_versions
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, random_stream
 from tasks.world.vocabulary import Vocabulary
@@ -187,8 +186,6 @@ class DriveWork:
         }
         if start != LOGGED:
             found |= {"seed": s.seed, "vocabulary": self.vocabulary.digest, "perturb": asdict(s.perturb)}
-        if start != LOGGED or who.spec == "pdm_closed":
-            found["pdm"] = asdict(s.pdm)
         if pictures != "none":
             found["render"] = asdict(s.render)
         if pictures == "renderer":
@@ -232,10 +229,8 @@ class DriveWork:
         if at_most > 0:
             rng = random_stream(self.settings.seed, clip.clip_id, "perturb")
             s = self.settings
-            listed = perturb(clip, self.vocabulary, s.perturb, s.traffic, s.pdm, rng)
-            found += (
-                perturbed_starts(clip, listed, at_most, s.traffic, s.pdm) if isinstance(listed, Perturbation) else []
-            )
+            listed = perturb(clip, self.vocabulary, s.perturb, s.traffic, rng)
+            found += perturbed_starts(clip, listed, at_most, s.traffic) if isinstance(listed, Perturbation) else []
         return {start.number: start for start in found}
 
     def _cameras(self, clip: Clip, pictures: Pictures) -> DriveCameras:
@@ -261,7 +256,7 @@ class DriveWork:
 
     def _peer(self, who: DrivingPlanner) -> Peer:
         s = self.settings
-        return cached_peer(who, canonical_json(s.settings), s.pdm, s.device)
+        return cached_peer(who, canonical_json(s.settings), s.device)
 
     def _film(
         self, who: DrivingPlanner, key: DriveKey, made: ClosedLoopDrive, columns: AlpasimColumns, rig: Rig
@@ -300,11 +295,11 @@ class DriveWork:
 
 
 @lru_cache(maxsize=8)
-def cached_peer(who: DrivingPlanner, changed: str, pdm: PdmSettings, device: str) -> Peer:
+def cached_peer(who: DrivingPlanner, changed: str, device: str) -> Peer:
     """A worker's own, read once. Raises ValueError where it is another than was named when the command began."""
     if not who.spec.startswith(WIRE):
         settings = json.loads(changed)
-        return peer_in_process(_same(find_planner(who.spec, who.label, settings), who), settings, pdm, device)
+        return peer_in_process(_same(find_planner(who.spec, who.label, settings), who), settings, device)
     address = who.spec.removeprefix(WIRE)
     _same(planner_over_the_wire(address), who)
     return Peer(ask_over_the_wire(address), needs_pictures=True)

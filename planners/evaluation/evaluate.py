@@ -76,7 +76,6 @@ from planners.evaluation.scoring import (
     score_clip,
     score_lone,
 )
-from tasks.experts.pdm_closed import PdmSettings
 from tasks.reward.aggregate import follow_up_weights, has_uniform_weights
 from tasks.rollout.simulate import TrafficSettings, traffic_record
 from tasks.stages import stage_versions
@@ -102,7 +101,6 @@ class EvaluateSettings:
     bounds: bool = True  # human, pdm_closed and constant_velocity too
     one_stage_traffic: TrafficSettings = field(default_factory=lambda: TrafficSettings(mode="replay"))  # as NAVSIM's
     two_stage_traffic: TrafficSettings = field(default_factory=TrafficSettings)  # both of navhard's stages are reactive
-    pdm: PdmSettings = field(default_factory=PdmSettings)  # row 0 of the batch that progress is held against
     batch_size: int = 16
     planners_at_once: int = 8  # in memory, planning from one reading of the samples
     device: str = "cpu"  # or cuda
@@ -124,7 +122,7 @@ class EvaluateSettings:
     @property
     def rules(self) -> Rules:
         """What the scores depend on beside planner and benchmark."""
-        return Rules(self.one_stage_traffic, self.two_stage_traffic, self.pdm)
+        return Rules(self.one_stage_traffic, self.two_stage_traffic)
 
 
 def _told(rules: Rules) -> dict[str, object]:

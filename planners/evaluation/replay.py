@@ -33,7 +33,6 @@ from planners.evaluation.frames import FrameKey, Pair
 from planners.evaluation.planner_names import EvaluatedPlanner, compose_with_planner, find_planner
 from planners.evaluation.planning import plan_samples
 from planners.evaluation.scoring import ClipFrames, PreparedPair, Rules, prepare_clip, score_pair
-from tasks.experts.pdm_closed import PdmSettings
 from tasks.reward.aggregate import COLUMNS, FrameScores
 from tasks.rollout.simulate import TrafficSettings, roll_out
 from tasks.world.arrays import Array, Image
@@ -55,7 +54,6 @@ class ReplaySettings:
     clip: int | str = 0  # clip id or its beginning, or the clip's place
     follow_up: int | None = None  # a candidate; null: the one that starts nearest to where the plan ends
     two_stage_traffic: TrafficSettings = field(default_factory=TrafficSettings)
-    pdm: PdmSettings = field(default_factory=PdmSettings)
 
 
 @dataclass(frozen=True)
@@ -193,6 +191,6 @@ def main(argv: Sequence[str]) -> None:
     one = find_planner(settings.planner)
     clip_id = find_clip(benchmark, str(settings.clip))
     check_needs(benchmark, [key for key in benchmark.keys if key.clip_id == clip_id], [one])
-    rules = Rules(two_stage=settings.two_stage_traffic, pdm=settings.pdm)
+    rules = Rules(two_stage=settings.two_stage_traffic)
     write_mp4(Path(settings.out), replay(benchmark, one, clip_id, rules, settings.follow_up))
     print(f"look at {settings.out}")

@@ -13,7 +13,7 @@ import numpy as np
 
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair, Pair
 from planners.evaluation.score_rows import FrameRow, ScoreStage
-from tasks.experts.pdm_closed import PdmSettings, plan_for
+from tasks.experts.pdm_closed import plan_for
 from tasks.reward.aggregate import COLUMNS, FrameScores, follow_up_weights, frame_scores
 from tasks.reward.comfort import extended_comfort
 from tasks.reward.epdms import N_TIMES, PreparedScene, Scores, prepare_scene, score, select_rows, with_objects
@@ -34,7 +34,6 @@ class Rules:
 
     one_stage: TrafficSettings = field(default_factory=lambda: TrafficSettings(mode="replay"))
     two_stage: TrafficSettings = field(default_factory=TrafficSettings)
-    pdm: PdmSettings = field(default_factory=PdmSettings)
 
 
 @dataclass(frozen=True)
@@ -61,9 +60,9 @@ class ScoredDrive:
     scores: Scores  # one row
 
 
-def prepare_frame(scene: Scene, traffic: TrafficSettings, pdm: PdmSettings, logged: bool) -> PreparedFrame:
+def prepare_frame(scene: Scene, traffic: TrafficSettings, logged: bool) -> PreparedFrame:
     """Everything of a frame that does not depend on a plan. logged: whether the scene is the log's own."""
-    plan = plan_for(scene, pdm)
+    plan = plan_for(scene)
     now = scene.agents.window(scene.step, scene.step + N_TIMES)
     frame = PreparedFrame(
         scene=scene,
@@ -147,7 +146,7 @@ class LoneFrame:
 def prepare_lone(clip_id: str, scene: Scene, rules: Rules) -> LoneFrame:
     """Everything of a logged frame that does not depend on a plan. Raises ValueError naming the clip."""
     try:
-        return LoneFrame(FrameKey.logged(clip_id).now, prepare_frame(scene, rules.one_stage, rules.pdm, logged=True))
+        return LoneFrame(FrameKey.logged(clip_id).now, prepare_frame(scene, rules.one_stage, logged=True))
     except ValueError as error:
         raise ValueError(f"clip {clip_id}: {error}") from error
 
@@ -157,7 +156,7 @@ def prepare_clip(scenes: ClipScenes, rules: Rules) -> ClipFrames:
 
     def pair(frames: FramePair, logged: bool, name: str) -> PreparedPair:
         try:
-            return PreparedPair(*(prepare_frame(scene, rules.two_stage, rules.pdm, logged) for scene in frames))
+            return PreparedPair(*(prepare_frame(scene, rules.two_stage, logged) for scene in frames))
         except ValueError as error:
             raise ValueError(f"clip {scenes.clip_id}, {name}: {error}") from error
 

@@ -6,7 +6,6 @@ now is kept red; its polygon is a standing lead unless the ego's footprint lies 
 the proposal fail traffic light compliance, as in nuPlan's PDM.
 """
 
-import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,12 +15,11 @@ import numpy as np
 import shapely
 import shapely.ops
 
-from tasks.experts.protocol import Plan, RunContext
+from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import hidden_kernel, kernel
 from tasks.reward.epdms import Scores, prepare, score
 from tasks.rollout.corridor import least_and_largest
 from tasks.rollout.lqr import track
-from tasks.settings import PDM_DEFAULTS, PdmSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bools, Indices, Ints
 from tasks.world.clip import AgentKind, AgentTracks, Scene
@@ -437,6 +435,13 @@ def _edges_around(swept: Corridors, path: int, x: float, y: float, squares: Arra
 # stands in a path's corridor when, and how far along) was found for all forecast samples; each is driven in steps of
 # 0.1 s, a path's speeds side by side from slow to fast.
 
+# As published with NAVSIM; those of the intelligent driver model are of the planner alone, traffic has others.
+SPEED_FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the lane's speed limit
+LATERAL_OFFSETS_M = (0.0, -1.0, 1.0)  # + is to the left
+FALLBACK_SPEED_MPS = 15.0  # where the lane has no speed limit
+MIN_GAP_M, HEADWAY_S = 1.0, 1.5
+ACCEL_MAX_MPS2, DECEL_MAX_MPS2 = 1.5, 3.0
+EXPONENT = 10.0  # of the free-road term
 SCORED_STEPS = 40
 PROPOSAL_STEPS = 50  # the chosen one is driven on to 5 s
 SAMPLES = PROPOSAL_STEPS // SAMPLE_STEPS + 1
@@ -451,22 +456,11 @@ class Proposals:
     leads: Array  # (P, 51, 3) lead's arc length [m], velocity [m/s], own half length on a free road [m]
 
 
-class PdmDriver(NamedTuple):
-    """The intelligent driver model's constants."""
-
-    min_gap_m: float
-    headway_s: float
-    accel_max_mps2: float
-    decel_max_mps2: float
-    exponent: float
-
-
 def proposals(
     ego_state: Array,
     centerline: Array,
     seen: Forecast,
     speed_limit_mps: float | None,
-    settings: PdmSettings = PDM_DEFAULTS,
 ) -> Proposals:
     """The proposals from `ego_state` (11,) along `centerline` (N, 3) through the forecast traffic.
 
@@ -477,35 +471,28 @@ def proposals(
         raise ValueError(
             f"speed_limit_mps: {speed_limit_mps} m/s cannot be driven; it must be positive and finite, None is unknown"
         )
-    paths = drive_paths(centerline, settings.lateral_offsets_m)
-    limit = settings.fallback_speed_mps if speed_limit_mps is None else speed_limit_mps
-    targets = np.array(settings.speed_fractions) * limit
-    start = np.array([project(paths, i, ego_state[X], ego_state[Y]) for i in range(len(settings.lateral_offsets_m))])
+    paths = drive_paths(centerline, LATERAL_OFFSETS_M)
+    targets = np.array(SPEED_FRACTIONS) * (FALLBACK_SPEED_MPS if speed_limit_mps is None else speed_limit_mps)
+    start = np.array([project(paths, i, ego_state[X], ego_state[Y]) for i in range(len(LATERAL_OFFSETS_M))])
     things = seen.things(SAMPLES)
     swept = corridors(paths, start, targets.max() * PROPOSAL_STEPS * STEP_S, HALF_WIDTH)
     progress = lead_progress(paths, swept, things)
-    return Proposals(*_drive(paths, things, progress, start, ego_state[VX], targets, driver(settings)))
-
-
-def driver(settings: PdmSettings) -> PdmDriver:
-    """The settings that each step needs."""
-    each = {name: getattr(settings, name) for name in PdmDriver._fields}
-    return PdmDriver(**(each | {"exponent": float(settings.exponent)}))
+    return Proposals(*_drive(paths, things, progress, start, ego_state[VX], targets))
 
 
 @kernel
-def idm_step(progress: float, speed: float, lead: Array, target_mps: float, idm: PdmDriver) -> tuple[float, float]:
+def idm_step(progress: float, speed: float, lead: Array, target_mps: float) -> tuple[float, float]:
     """One Euler step of 0.1 s of the intelligent driver model (Treiber et al. 2000): progress [m], speed [m/s].
 
     s* = gap + v T + v (v - v_lead) / (2 sqrt(a b));  dv/dt = a (1 - (v / v0)^n - (s* / s)^2), clipped to [-b, a].
     lead: (3,) its arc length [m], velocity [m/s], and what is kept off the gap to it [m]. Speeds are not clipped at 0,
     as published: a stop before an oncoming car overshoots into creeping backwards.
     """
-    closing = speed * (speed - lead[1]) / (2.0 * math.sqrt(idm.accel_max_mps2 * idm.decel_max_mps2))
-    wanted = idm.min_gap_m + speed * idm.headway_s + closing
-    gap = max(lead[0] - progress - lead[2], idm.min_gap_m)
-    accel = idm.accel_max_mps2 * (1.0 - (speed / target_mps) ** idm.exponent - (wanted / gap) ** 2)
-    after = speed + STEP_S * min(max(accel, -idm.decel_max_mps2), idm.accel_max_mps2)
+    closing = speed * (speed - lead[1]) / (2.0 * math.sqrt(ACCEL_MAX_MPS2 * DECEL_MAX_MPS2))
+    wanted = MIN_GAP_M + speed * HEADWAY_S + closing
+    gap = max(lead[0] - progress - lead[2], MIN_GAP_M)
+    accel = ACCEL_MAX_MPS2 * (1.0 - (speed / target_mps) ** EXPONENT - (wanted / gap) ** 2)
+    after = speed + STEP_S * min(max(accel, -DECEL_MAX_MPS2), ACCEL_MAX_MPS2)
     return progress + STEP_S * speed, after
 
 
@@ -517,7 +504,6 @@ def _drive(
     start_m: Array,
     speed0_mps: float,
     targets_mps: Array,
-    idm: PdmDriver,
 ) -> tuple[Array, Array, Array]:
     """poses (P, 51, 3), motion (P, 51, 2) and leads (P, 51, 3) of Proposals. lead_progress_m: (L, S, M)."""
     n_paths, n_speeds = start_m.shape[0], targets_mps.shape[0]
@@ -547,7 +533,7 @@ def _drive(
                     write_lead(paths, path, things, nearest, progress, poses[p, step - 1, 2], written)
                 for k in range(3):  # before the first search all zeros: no gap, so it brakes hard
                     leads[p, step, k] = written[k] if looks else leads[p, step - 1, k]
-                after = idm_step(progress, speed, leads[p, step], targets_mps[p - first], idm)
+                after = idm_step(progress, speed, leads[p, step], targets_mps[p - first])
                 motion[p, step, 0], motion[p, step, 1] = after
                 poses[p, step, 0], poses[p, step, 1], poses[p, step, 2] = pose_at(paths, path, after[0])
     return poses, motion, leads
@@ -640,7 +626,6 @@ def plan_pdm_closed(
     route_lane_ids: frozenset[str],
     red_lane_ids: frozenset[str] = frozenset(),
     speed_limit_mps: float | None = None,
-    settings: PdmSettings = PDM_DEFAULTS,
 ) -> PdmPlan:
     """Plan from `ego_state` (11,) along `centerline` (N, 3).
 
@@ -653,7 +638,7 @@ def plan_pdm_closed(
     red = tuple(one.token for one in connectors)
     lights = tuple(shapely.Polygon(one.ring[:, :2]) for one in connectors)
     seen = forecast(ego_state, agents, lights)
-    candidates = proposals(ego_state, centerline, seen, speed_limit_mps, settings)
+    candidates = proposals(ego_state, centerline, seen, speed_limit_mps)
     driven = candidates.poses[:, : SCORED_STEPS + 1]
     simulated = track(ego_state, driven[:, 1:], planned_pose0=driven[:, 0])
     prepared = prepare(
@@ -669,7 +654,7 @@ def plan_pdm_closed(
     return PdmPlan(candidates, simulated, scores, int(np.argmax(scores.pdm_score)))
 
 
-def plan_for(scene: Scene, settings: PdmSettings = PDM_DEFAULTS) -> PdmPlan:
+def plan_for(scene: Scene) -> PdmPlan:
     """PDM-Closed from a scene, seeing its agents and lights at the scene's step only."""
     clip = scene.clip
     center = ego_boxes(scene.ego_state, PACIFICA)[:2]
@@ -684,7 +669,6 @@ def plan_for(scene: Scene, settings: PdmSettings = PDM_DEFAULTS) -> PdmPlan:
         route_lane_ids=clip.route.lane_ids,
         red_lane_ids=red_lane_ids(scene),
         speed_limit_mps=None if first is None else first.speed_limit_mps,
-        settings=settings,
     )
 
 
@@ -699,21 +683,15 @@ def red_lane_ids(scene: Scene) -> frozenset[str]:
 class PdmClosed:
     """PDM-Closed as an expert."""
 
-    settings: PdmSettings = PDM_DEFAULTS
     name: str = "pdm_closed"
 
-    @classmethod
-    def of_run(cls, run: RunContext) -> "PdmClosed":
-        """With the constants of the run."""
-        return cls(run.pdm)
-
     def digest(self) -> str:
-        """Of every setting."""
-        return hashlib.sha256(repr(self.settings).encode()).hexdigest()[:16]
+        """It has no settings."""
+        return "published"
 
     def plan(self, scene: Scene, rng: np.random.Generator) -> Plan | Rejected:
         """The best proposal; "no_plan" where the route ahead has no length to drive along."""
         length_m = path_length_m(scene.centerline)
         if length_m <= MIN_PROGRESS_M:
             return Rejected("expert", "no_plan", f"the route ahead is {length_m:g} m long")
-        return Plan(plan_for(scene, self.settings).poses)
+        return Plan(plan_for(scene).poses)

@@ -10,7 +10,6 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from tasks.settings import PdmSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
 from tasks.world.clip import Scene
@@ -82,13 +81,6 @@ def drives_once_per_clip(expert: object) -> bool:
     Any other is tried from where candidates lead, until it has a sample for every round.
     """
     return bool(getattr(expert, "once", False))
-
-
-class RunContext(Protocol):
-    """What an expert is told of its run; factory.setup.settings has more of it."""
-
-    @property
-    def pdm(self) -> PdmSettings: ...
 
 
 @dataclass(frozen=True)

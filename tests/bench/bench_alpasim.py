@@ -34,7 +34,7 @@ from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.splatting.classic import made_classic
 from tasks.render.splatting.project import CLASSIC
 from tasks.render.views import render_views
-from tasks.settings import PdmSettings, TrafficSettings
+from tasks.settings import TrafficSettings
 from tasks.world.arrays import Bytes
 from tasks.world.clip import NOW, STEP_S, Pinhole
 from tests.factory.alpasim.asked import asked, cameras, shot
@@ -46,7 +46,7 @@ def driving() -> float:
     with TemporaryDirectory() as folder:
         reader = SyntheticReader(Path(folder), 1, settings=TownSettings(cameras=(), lidar_beams=0))
         start = logged_start(extend_clip(reader.read(reader.index().refs[0]), settings.clip_steps(NOW)))
-    peer, taken = peer_in_process(find_planner("constant_velocity"), {}, PdmSettings()), []
+    peer, taken = peer_in_process(find_planner("constant_velocity"), {}), []
     for _ in range(4):
         cpu = time.process_time()
         with DriverSession(peer, start.scene, None) as session:

@@ -15,7 +15,6 @@ from factory.store.samples import Store
 from factory.store.schema import COLUMNS, SAMPLES, sample_rows_to_table
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair
 from tasks.attempt import drive_and_judge
-from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.hard_scenes import BEFORE_STEPS, BenchmarkClip
 from tasks.rollout.simulate import TrafficSettings, simulate
@@ -117,7 +116,7 @@ class StreetBenchmark:
 def sample(key: FrameKey, scene: Scene) -> dict[str, Any]:
     """The row of a frame."""
     plan = Plan(to_world(scene.ego_state[: HEADING + 1], straight(8.0)))
-    judged = drive_and_judge(scene, plan, TrafficSettings(mode="replay"), PdmSettings())
+    judged = drive_and_judge(scene, plan, TrafficSettings(mode="replay"))
     row = dict.fromkeys(COLUMNS) | sample_row(scene.clip, None, judged)
     return row | {
         "attempt_id": f"{key.clip_id}-{key.kind}-{key.candidate_index}",

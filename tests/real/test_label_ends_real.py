@@ -11,7 +11,6 @@ from factory.datasets.av2.reader import AV2Reader
 from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.readers.base import ClipReader
 from tasks.attempt import ExpertGate, Judged, ReadyScene, attempt, drive_under_log_replay, end_verdict, perturbed_scene
-from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Human, Plan
 from tasks.experts.recovery import RecoveryExpert, RecoverySettings, RecoveryTable, make_feasible
 from tasks.perturb import Perturbation, PerturbSettings, perturb
@@ -25,7 +24,7 @@ from tasks.world.vocabulary import Vocabulary
 AV2 = ("data", "av2", "sensor", "val")
 LOG, START_MS = "7fab2350-7eaf-3b7e-a39d-6937a4c1bede", 1000  # the route turns left at a junction
 PUBLISHED = ExpertGate(off_route=False, after=False, near_log=False)
-PDM, RNG = PdmSettings(), np.random.default_rng(0)  # who drives here draws nothing
+RNG = np.random.default_rng(0)  # who drives here draws nothing
 
 
 @pytest.mark.slow
@@ -39,7 +38,7 @@ def test_no_human_drive_is_one_that_would_be_refused(
     refs = logs.index().refs
     assert len(refs) in (14, 61)
     for ref in refs:
-        judged = drive_under_log_replay(scene_of_clip(logs.read(ref)), Human(), PDM, RNG)
+        judged = drive_under_log_replay(scene_of_clip(logs.read(ref)), Human(), RNG)
         replayed = prepare_traffic(judged.scene, TrafficSettings(mode="replay"))
         assert end_verdict(judged, replayed, ExpertGate()) is None, ref
 
@@ -70,14 +69,13 @@ def driven(clip: Clip, shared_root: Path) -> list[tuple[Judged, Rejected | None,
     """Attempts of such a recovery: drive, the published gate's verdict, and that with the gates on ends."""
     human: NDArray[np.float64] = np.load(shared_root / "data" / "vocabulary" / "human_8192x40x3.npy")
     rng, traffic = random_stream(0, clip.clip_id, "perturb"), TrafficSettings()
-    found = perturb(clip, Vocabulary(human), PerturbSettings(), traffic, PDM, rng)
+    found = perturb(clip, Vocabulary(human), PerturbSettings(), traffic, rng)
     assert isinstance(found, Perturbation)
     expert, out = Smoothed(RecoveryTable(human), RecoverySettings(match="paper")), []
     for candidate in found.candidates:
         scene = perturbed_scene(clip, candidate.rollout)
         pair = [
-            attempt(ReadyScene(scene, traffic, PDM), expert, gate, RNG)
-            for gate in (PUBLISHED, ExpertGate(near_log=False))
+            attempt(ReadyScene(scene, traffic), expert, gate, RNG) for gate in (PUBLISHED, ExpertGate(near_log=False))
         ]
         if not isinstance(pair[0], Rejected) and not isinstance(pair[1], Rejected):
             out.append((pair[0][0], pair[0][1], pair[1][1]))

@@ -14,7 +14,7 @@ from reference_scenes import loader
 from factory.datasets.av2.reader import AV2Reader, log_folders
 from factory.readers.base import ClipRef
 from planners.evaluation.frames import Pair
-from planners.evaluation.scoring import PreparedFrame, Rules, prepare_frame, score_pair
+from planners.evaluation.scoring import PreparedFrame, prepare_frame, score_pair
 from tasks.reward.aggregate import COLUMNS
 from tasks.rollout.simulate import TrafficSettings
 from tasks.world.clip import NOW, STEP_S, scene_of_clip
@@ -31,7 +31,7 @@ def frame_of(root: Path, name: str, earlier_steps: int = 0) -> PreparedFrame:
     reader = AV2Reader(root / "data/av2/sensor/val")
     log_id = next(log_id for log_id in log_folders(reader.root) if log_id.startswith(log))
     start = round(1000 * STEP_S) * (int(step) - NOW - earlier_steps)
-    return prepare_frame(scene_of_clip(reader.read(ClipRef("av2", log_id, start))), REPLAY, Rules().pdm, logged=True)
+    return prepare_frame(scene_of_clip(reader.read(ClipRef("av2", log_id, start))), REPLAY, logged=True)
 
 
 @pytest.mark.parametrize("name", WHOLE[:2])

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed import PdmSettings
 from tasks.perturb import Perturbation, PerturbSettings, perturb
 from tasks.rollout.simulate import TrafficSettings
 from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, AgentKind, AgentTracks, Clip, random_stream
@@ -142,7 +141,7 @@ def same_poses(a: Array, b: Array, tolerance: float = 1e-6) -> bool:
 def perturbed(clip: Clip, size: int = 150) -> Perturbation:
     """The clip's list of candidates, from so many trajectories."""
     listed = perturb(
-        clip, Vocabulary(kinematic_trajectories(size, 0)), PerturbSettings(), TrafficSettings(), PdmSettings(),
+        clip, Vocabulary(kinematic_trajectories(size, 0)), PerturbSettings(), TrafficSettings(),
         random_stream(0, clip.clip_id, "perturb"),
     )  # fmt: skip
     assert isinstance(listed, Perturbation)

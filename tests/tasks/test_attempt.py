@@ -18,7 +18,7 @@ from tasks.attempt import (
     perturbed_scene,
     verdict,
 )
-from tasks.experts.pdm_closed import PdmClosed, PdmSettings
+from tasks.experts.pdm_closed import PdmClosed
 from tasks.experts.protocol import Expert, Goal, Human, Plan
 from tasks.experts.recovery import RecoveryExpert, RecoveryTable
 from tasks.reward.epdms import Scores
@@ -60,7 +60,7 @@ def table() -> RecoveryTable:
 
 
 def tried(scene: Scene, expert: Expert) -> tuple[Judged, Rejected | None]:
-    result = attempt(ReadyScene(scene, TrafficSettings(), PdmSettings()), expert, GATE, RNG)
+    result = attempt(ReadyScene(scene, TrafficSettings()), expert, GATE, RNG)
     assert not isinstance(result, Rejected)
     return result
 
@@ -150,7 +150,7 @@ def test_experts_that_share_a_scene_drive_and_score_as_each_would_alone(scene: S
     experts = (PdmClosed(), RecoveryExpert(table))
     alone = [tried(scene, expert)[0] for expert in experts]
     for order in ((0, 1, 0), (1, 0, 1)):
-        ready = ReadyScene(scene, TrafficSettings(), PdmSettings())
+        ready = ReadyScene(scene, TrafficSettings())
         for i in order:
             shared = attempt(ready, experts[i], GATE, RNG)
             assert not isinstance(shared, Rejected)
@@ -162,7 +162,7 @@ def test_experts_that_share_a_scene_drive_and_score_as_each_would_alone(scene: S
 
 def test_a_route_that_has_ended_is_a_rejection_not_an_error(scene: Scene) -> None:
     at_the_end = replace(scene, centerline=np.repeat(scene.centerline[-1:], 2, axis=0))
-    result = attempt(ReadyScene(at_the_end, TrafficSettings(), PdmSettings()), PdmClosed(), GATE, RNG)
+    result = attempt(ReadyScene(at_the_end, TrafficSettings()), PdmClosed(), GATE, RNG)
     assert isinstance(result, Rejected)
     assert (result.stage, result.reason) == ("rollout", "route_ended")
 
@@ -172,7 +172,7 @@ REPLAY = TrafficSettings(mode="replay")
 
 
 def ended(scene: Scene, expert: Expert, gate: ExpertGate) -> Rejected | None:
-    result = attempt(ReadyScene(scene, REPLAY, PdmSettings()), expert, gate, RNG)
+    result = attempt(ReadyScene(scene, REPLAY), expert, gate, RNG)
     assert not isinstance(result, Rejected)
     return result[1]
 
@@ -216,7 +216,7 @@ def test_a_collision_that_braking_prevents_refuses_nothing(scene: Scene) -> None
     """The car ahead is 7.5 m farther on: at 10 m/s more than it the ego hits it still, braking it does not."""
     agents = scene.agents
     farther = replace(scene, agents=replace(agents, boxes=agents.boxes + np.array([7.5, 0.0, 0.0, 0.0, 0.0])))
-    result = attempt(ReadyScene(farther, REPLAY, PdmSettings()), Close(), ASKS_FOR_ENDS, RNG)
+    result = attempt(ReadyScene(farther, REPLAY), Close(), ASKS_FOR_ENDS, RNG)
     assert not isinstance(result, Rejected)
     judged, rejected = result
     traffic = prepare_traffic(farther, REPLAY)
@@ -236,7 +236,7 @@ def test_what_an_end_leads_to_changes_neither_drive_nor_scores(scene: Scene, tab
     without = replace(GATE, off_route=False, after=False)
     for expert in (PdmClosed(), RecoveryExpert(table)):
         (a, _), (b, _) = (
-            attempt(ReadyScene(scene, TrafficSettings(), PdmSettings()), expert, gate, RNG)  # type: ignore[misc]
+            attempt(ReadyScene(scene, TrafficSettings()), expert, gate, RNG)  # type: ignore[misc]
             for gate in (GATE, without)
         )
         np.testing.assert_array_equal(a.rollout.ego_states, b.rollout.ego_states, strict=True)
@@ -259,7 +259,7 @@ class OffTheRoad:
 
 def test_a_human_drive_is_scored_and_never_filtered() -> None:
     clip = street_clip()
-    judged = drive_under_log_replay(scene_of_clip(clip), OffTheRoad(), PdmSettings(), RNG)
+    judged = drive_under_log_replay(scene_of_clip(clip), OffTheRoad(), RNG)
     assert verdict(judged.scores, GATE) is not None
     assert judged.scores.dac[1] == 0.0
     assert judged.scene.step == NOW
@@ -267,7 +267,7 @@ def test_a_human_drive_is_scored_and_never_filtered() -> None:
 
 def test_around_the_human_everybody_does_what_the_log_says() -> None:
     clip = street_clip()
-    judged = drive_under_log_replay(scene_of_clip(clip), Human(), PdmSettings(), RNG)
+    judged = drive_under_log_replay(scene_of_clip(clip), Human(), RNG)
     np.testing.assert_array_equal(judged.plan.poses, clip.ego_states[NOW + 1 : NOW + 41, :3])
     np.testing.assert_array_equal(judged.rollout.agents.boxes, clip.agents.boxes[NOW : NOW + 41])
     assert not judged.rollout.simulated.any()
@@ -314,7 +314,7 @@ def test_of_several_plans_the_first_that_is_accepted_is_driven_and_of_none_the_f
     judged, rejected = tried(scene, Several((off, farther)))
     assert rejected is not None and judged.plan is off
     lost = Rejected("expert", "out_of_reach", "nowhere")
-    assert attempt(ReadyScene(scene, TrafficSettings(), PdmSettings()), Several((lost,)), GATE, RNG) == lost
+    assert attempt(ReadyScene(scene, TrafficSettings()), Several((lost,)), GATE, RNG) == lost
 
 
 @pytest.mark.parametrize(
@@ -347,7 +347,7 @@ def test_a_drive_that_is_the_log_s_own_is_refused_unless_that_is_off(
         else None
     )
     open_gate = replace(GATE, near_log=False)
-    result = attempt(ReadyScene(beside, TrafficSettings(), PdmSettings()), Several((good,)), open_gate, RNG)
+    result = attempt(ReadyScene(beside, TrafficSettings()), Several((good,)), open_gate, RNG)
     assert not isinstance(result, Rejected) and result[1] is None
 
 

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from tasks.attempt import Judged, perturbed_scene
-from tasks.experts.pdm_closed import PdmSettings
-from tasks.experts.protocol import Human
 from tasks.hard_scenes import BenchmarkClip, drive_follow_up, frame_digest, seen_half_a_second_earlier
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import FRAMES, Rejected
@@ -36,7 +34,7 @@ def scenes(clip: Clip, stage_one: Rollout) -> BenchmarkClip:
 
 @pytest.fixture(scope="module")
 def judged(clip: Clip, stage_one: Rollout) -> Judged:
-    result = drive_follow_up(clip, stage_one, TrafficSettings(), PdmSettings())
+    result = drive_follow_up(clip, stage_one, TrafficSettings())
     assert isinstance(result, Judged)
     return result
 
@@ -68,7 +66,7 @@ def test_the_four_kinds_of_scenes(scenes: BenchmarkClip, clip: Clip, stage_one: 
 def test_the_earlier_frame_drives_the_end_of_the_perturbation_and_then_the_same_drive(
     judged: Judged, stage_one: Rollout, scenes: BenchmarkClip
 ) -> None:
-    before = seen_half_a_second_earlier(judged, stage_one, PdmSettings())
+    before = seen_half_a_second_earlier(judged, stage_one)
     states = before.rollout.ego_states
     assert np.array_equal(states[:6], stage_one.ego_states[35:])
     assert np.array_equal(states[5:], judged.rollout.ego_states[:36])
@@ -82,7 +80,7 @@ def test_the_earlier_frame_drives_the_end_of_the_perturbation_and_then_the_same_
 
 def test_a_bad_drive_is_a_follow_up_too(clip: Clip, stage_one: Rollout) -> None:
     nowhere = replace(clip, road_map=replace(clip.road_map, drivable_areas=()))
-    judged = drive_follow_up(nowhere, stage_one, TrafficSettings(), PdmSettings())
+    judged = drive_follow_up(nowhere, stage_one, TrafficSettings())
     assert isinstance(judged, Judged) and judged.scores.dac[1] == 0.0
 
 
@@ -95,15 +93,10 @@ def test_a_route_that_has_ended_at_either_frame_drops_both(
         return replace(scene, centerline=scene.centerline[[-1, -1]]) if scene.step == ended_at else scene
 
     monkeypatch.setattr("tasks.hard_scenes.perturbed_scene", perturbed)
-    lost = drive_follow_up(clip, stage_one, TrafficSettings(), PdmSettings())
+    lost = drive_follow_up(clip, stage_one, TrafficSettings())
     assert isinstance(lost, Rejected)
     assert (lost.stage, lost.reason) == ("rollout", "route_ended")
 
 
 def test_the_two_of_a_pair_have_digests_of_their_own() -> None:
-    plain, slow = PdmSettings(), PdmSettings(headway_s=2.0)
-    four = [frame_digest(frame, settings) for frame in FRAMES[1:] for settings in (plain, slow)]
-    assert len(set(four)) == 4
-    assert four[::2] == ["ec60687d0de515e2", "bc2dc65fb6c61aaa"]  # attempt ids hold them, and tables go on
-    assert frame_digest("follow_up", PdmSettings(headway_s=2.0)) == frame_digest("follow_up", slow)
-    assert frame_digest("human_before", plain) == frame_digest("human_before", slow) == Human().digest()
+    assert len({frame_digest(frame) for frame in FRAMES}) == 3

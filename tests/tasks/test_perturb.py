@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed import PdmSettings, plan_for
+from tasks.experts.pdm_closed import plan_for
 from tasks.perturb import (
     Perturbation,
     PerturbSettings,
@@ -39,7 +39,7 @@ def perturbed(
     traffic: TrafficSettings = TRAFFIC,
 ) -> Perturbation | Rejected:
     rng = random_stream(seed, clip.clip_id, "perturb")
-    return perturb(clip, Vocabulary(trajectories), settings, traffic, PdmSettings(), rng)
+    return perturb(clip, Vocabulary(trajectories), settings, traffic, rng)
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +148,7 @@ def test_a_perturbation_that_only_the_log_makes_room_for_is_dropped(trajectories
     assert counts["reactive_score"] > 3
     assert isinstance(found, Perturbation)
     scene, considered = scene_of_clip(clip), found.considered
-    rival = plan_for(scene, PdmSettings()).driven
+    rival = plan_for(scene).driven
     by_index = {candidate.vocabulary_index: candidate for candidate in found.candidates}
     for index, fate, replayed in zip(considered.vocabulary_index.tolist(), considered.fate, considered.score):
         assert not np.isfinite(replayed) or (replayed >= SETTINGS.epdms_min) == (fate != "score")

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from tasks.experts.pdm_closed import PdmSettings
 from tasks.perturb import NO_STARTS, Candidate, Perturbation, PerturbSettings, perturb
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import Rejected
@@ -22,7 +21,7 @@ def perturbed(
 ) -> Perturbation | Rejected:
     clip = street_clip()
     rng, chosen = random_stream(0, clip.clip_id, "perturb"), settings or PerturbSettings()
-    return perturb(clip, Vocabulary(trajectories), chosen, TrafficSettings(), PdmSettings(), rng, starts)
+    return perturb(clip, Vocabulary(trajectories), chosen, TrafficSettings(), rng, starts)
 
 
 @pytest.fixture(scope="module")

@@ -37,7 +37,7 @@ from factory.stages.rows import NO_IMAGES
 from factory.store.location import SceneFiles
 from factory.store.samples import Store
 from factory.store.schema import RunIdentity
-from tasks.experts.pdm_closed import PdmSettings, plan_for
+from tasks.experts.pdm_closed import plan_for
 from tasks.hard_scenes import GivenScenes, OneStageClip
 from tasks.render.settings import ImageSource
 from tasks.stages import FOLLOW_UP, FOLLOW_UP_BEFORE, HUMAN, HUMAN_BEFORE
@@ -169,7 +169,7 @@ class FrameImporter:
         road = road_around(self.places.maps, now, xy, now.pose, str(path), HISTORY_FRAMES - 1)
         origin = self._origin(str(path), group.log_id, group.clip_id, token)
         scene = scene_of_frames(found.frames, road, origin, HISTORY_FRAMES)
-        label = label_columns_of(scene, plan_for(scene, PdmSettings()).driven[1:, : HEADING + 1])
+        label = label_columns_of(scene, plan_for(scene).driven[1:, : HEADING + 1])
         seen: Row = dict(NO_IMAGES)
         if self.places.sensors is not None:
             seen = picture_columns(history, self.places.scenes / "sensor_blobs", ImageSource.RENDER, str(path))

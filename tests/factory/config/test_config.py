@@ -23,7 +23,6 @@ from factory.setup.settings import (
     refuse_missing_backend,
     simulates,
 )
-from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.render.settings import RenderMode, RenderSettings, SceneDtype
 from tasks.rollout.simulate import TrafficSettings
 from tests.factory.data_folders import add_companions
@@ -142,7 +141,7 @@ def test_render_settings_out_of_range_are_refused(name: str, values: tuple[float
             fill(RenderSettings, {name: value}, "render")
 
 
-PDM = "+expert.mine._target_=tasks.experts.pdm_closed.PdmClosed.of_run"
+PDM = "+expert.mine._target_=tasks.experts.pdm_closed.PdmClosed"
 RECOVERY = "+expert.mine._target_=factory.setup.settings.recovery_expert"
 
 
@@ -173,11 +172,6 @@ def test_an_expert_is_added_by_its_target_with_all_its_arguments() -> None:
 def test_an_expert_that_cannot_be_made_is_an_error_that_names_what(overrides: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         built(*overrides)
-
-
-def test_an_expert_that_asks_for_the_run_is_told_of_it() -> None:
-    expert = built(PDM, "pdm.headway_s=2.5")
-    assert isinstance(expert, PdmClosed) and expert.settings == PdmSettings(headway_s=2.5)
 
 
 def test_experts_that_are_tried_once_say_so_themselves() -> None:

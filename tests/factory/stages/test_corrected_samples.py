@@ -19,7 +19,6 @@ from tasks.experts.protocol import Human
 from tasks.perturb import Candidate
 from tasks.render.rig.adjust import motions_of_twists, twists_of
 from tasks.render.settings import Adjust, RenderSettings, RigSettings, SceneFrom
-from tasks.settings import PdmSettings
 from tasks.world.clip import NOW, STEP_S, Camera, Clip, SensorFile, scene_of_clip
 from tests.tasks.streets import street_clip
 
@@ -41,7 +40,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
 
 @pytest.fixture(scope="module")
 def judged(clip: Clip) -> Judged:
-    return drive_under_log_replay(scene_of_clip(clip), Human(), PdmSettings(), np.random.default_rng(0))
+    return drive_under_log_replay(scene_of_clip(clip), Human(), np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")

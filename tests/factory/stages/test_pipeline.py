@@ -215,7 +215,7 @@ def test_a_clip_s_candidates_are_drawn_from_a_stream_of_the_run_s_seed_and_its_o
 
     def drawn(seed: int, clip_id: str) -> list[int]:
         rng = random_stream(seed, clip_id, "perturb")
-        found = perturb(clip, work.vocabulary, work.perturb, work.traffic, work.pdm, rng)
+        found = perturb(clip, work.vocabulary, work.perturb, work.traffic, rng)
         assert isinstance(found, Perturbation)
         return [candidate.vocabulary_index for candidate in found.candidates]
 

@@ -9,7 +9,7 @@ from factory.stages.rows import sample_row
 from factory.store.schema import BOOKKEEPING, COLUMNS, MAP_RADIUS_M, sample_rows_to_table
 from tasks.attempt import Judged, drive_under_log_replay, perturbed_scene
 from tasks.attempt import drive_and_judge as judge
-from tasks.experts.pdm_closed import PdmClosed, PdmSettings
+from tasks.experts.pdm_closed import PdmClosed
 from tasks.experts.protocol import Human
 from tasks.perturb import Candidate
 from tasks.rollout.simulate import TrafficSettings
@@ -26,14 +26,14 @@ POSE_COLUMNS -= {"off_log_end", "off_log_most"}  # distances
 
 
 def human(clip: Clip) -> dict[str, object]:
-    return sample_row(clip, None, drive_under_log_replay(scene_of_clip(clip), Human(), PdmSettings(), RNG))
+    return sample_row(clip, None, drive_under_log_replay(scene_of_clip(clip), Human(), RNG))
 
 
 def simulated(clip: Clip) -> tuple[Candidate, Judged]:
     candidate = perturbed(clip).candidates[0]
     scene = perturbed_scene(clip, candidate.rollout)
     plan = PdmClosed().plan(scene, RNG)
-    return candidate, judge(scene, plan, TrafficSettings(yields=False), PdmSettings())  # type: ignore[arg-type]
+    return candidate, judge(scene, plan, TrafficSettings(yields=False))  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")

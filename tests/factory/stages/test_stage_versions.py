@@ -18,7 +18,7 @@ from factory.datasets.scenarionet.reader import ScenarioNetReader
 from factory.stages.rows import label_columns, sample_row
 from factory.store.schema import SCHEMA
 from tasks.attempt import BRAKING_MPS2, Judged, hit_after_s, perturbed_scene, route_ahead_m
-from tasks.experts.pdm_closed import PdmClosed, PdmSettings
+from tasks.experts.pdm_closed import PdmClosed
 from tasks.experts.protocol import Human, Plan
 from tasks.experts.recovery import RecoveryExpert, RecoveryTable
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
@@ -80,7 +80,7 @@ def perturbed_street() -> dict[str, object]:
     clip = street_clip()
     rng = random_stream(0, clip.clip_id, "perturb")
     vocabulary = Vocabulary(kinematic_trajectories(120, 0))
-    found = perturb(clip, vocabulary, PerturbSettings(), TrafficSettings(), PdmSettings(), rng)
+    found = perturb(clip, vocabulary, PerturbSettings(), TrafficSettings(), rng)
     assert isinstance(found, Perturbation)
     listed = found.candidates
     return {

@@ -29,7 +29,7 @@ from planners.drive.loop import ClosedLoopDrive, LoopSettings, drive
 from planners.drive.starts import DriveStart, extend_clip, logged_start
 from planners.evaluation.planner_names import find_planner
 from planners.evaluation.planning import plan_samples
-from tasks.settings import PdmSettings, TrafficSettings
+from tasks.settings import TrafficSettings
 from tasks.world.clip import NOW
 from tasks.world.frames import HEADING, to_world
 from tests.planners.drive.streets import Steady, car, start_on, street_with
@@ -39,7 +39,7 @@ from tests.planners.drive.test_painted import LOOKING
 from tests.planners.navsim.trained import made, saved
 
 TRACK = LoopSettings(seconds=3.1, traffic=TrafficSettings(mode="replay"))
-BLIND = peer_in_process(find_planner("constant_velocity"), {}, PdmSettings())
+BLIND = peer_in_process(find_planner("constant_velocity"), {})
 
 
 def driven(start: DriveStart, peer: Peer, settings: LoopSettings = TRACK) -> ClosedLoopDrive:
@@ -70,7 +70,7 @@ def test_in_process_and_over_the_wire_the_town_is_driven_to_the_same_bits(
     town: DriveStart, name: str, mode: Any
 ) -> None:
     settings = LoopSettings(seconds=6.0, traffic=TrafficSettings(mode=mode))
-    peer = peer_in_process(find_planner(name), {}, PdmSettings())
+    peer = peer_in_process(find_planner(name), {})
     here = driven(town, peer, settings)
     with over_the_wire(peer) as wire:
         there = driven(town, wire, settings)

@@ -9,14 +9,14 @@ from planners.drive.drivers import HumanDriver, make_driver
 from planners.drive.loop import LoopSettings, drive
 from planners.drive.starts import logged_start
 from planners.evaluation.planner_names import find_planner
-from tasks.settings import PdmSettings, TrafficSettings
+from tasks.settings import TrafficSettings
 from tasks.world.clip import NOW
 from tasks.world.frames import PACIFICA, VX, X, Y
 from tests.planners.drive.streets import Steady, car, nobody, start_on, street_with
 from tests.tasks.streets import moved, street_clip
 
 LONG = LoopSettings(seconds=60.0)  # as long as the log
-CONSTANT_VELOCITY = make_driver(find_planner("constant_velocity"), PdmSettings())
+CONSTANT_VELOCITY = make_driver(find_planner("constant_velocity"))
 
 
 def test_constant_velocity_keeps_its_speed() -> None:
@@ -50,7 +50,7 @@ def test_the_human_drives_as_its_log() -> None:
 
 
 def test_pdm_closed_keeps_clear_of_who_stands_ahead() -> None:
-    pdm = make_driver(find_planner("pdm_closed"), PdmSettings())
+    pdm = make_driver(find_planner("pdm_closed"))
     made = drive(start_on(street_with(car(50.0)), LONG), pdm, LONG)
     assert made.ego_states[-1, VX] < 2.0
     assert made.ego_states[-1, X] + PACIFICA.front_length < 50.0 - 2.3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from planners.drive.starts import extend_clip, perturbed_starts
-from tasks.settings import PdmSettings, TrafficSettings
+from tasks.settings import TrafficSettings
 from tasks.world.clip import CLIP_STEPS, NOW, Block
 from tasks.world.road_map import LightState
 from tests.tasks.streets import perturbed, street_clip
@@ -45,7 +45,7 @@ def test_perturbed_starts_are_those_that_pdm_closed_can_drive_on_from() -> None:
     """In the order of the candidates; more are not there than asked for."""
     clip = extend_clip(street_clip(), 300)
     listed = perturbed(clip, 400)
-    found = perturbed_starts(clip, listed, 2, TrafficSettings(), PdmSettings())
+    found = perturbed_starts(clip, listed, 2, TrafficSettings())
     assert [start.number for start in found] == list(range(len(found)))
     assert 0 < len(found) <= 2
     for start in found:

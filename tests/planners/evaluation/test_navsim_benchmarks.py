@@ -19,7 +19,6 @@ from planners.evaluation.planner_names import find_planner
 from planners.evaluation.planning import read_plans
 from planners.navsim.submit import submission_bytes
 from tasks.reward.aggregate import COLUMNS
-from tasks.settings import PdmSettings
 from tasks.subscores import OF_ONE_PLAN
 from tests.factory.datasets.navsim.navsim_town import NOW, TOKENS, frames_of, write_installation
 
@@ -106,7 +105,7 @@ def test_the_plans_that_an_agent_of_navsim_s_submitted_are_scored_as_the_agent(
     assert main([*asked, f"planner={submission}"]) == 2
     assert f"no plan for 1 of {len(made)} frames, such as token {lacking}" in capsys.readouterr().err
     with pytest.raises(ConfigError, match="plans nothing but what it holds"):
-        make_driver(find_planner(str(submission)), PdmSettings())
+        make_driver(find_planner(str(submission)))
 
 
 def test_a_benchmark_of_other_files_is_not_taken_for_this_one(

@@ -21,7 +21,6 @@ from planners.evaluation.scoring import (
     score_pair,
 )
 from tasks.attempt import drive_and_judge
-from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.reward.aggregate import COLUMNS
 from tasks.rollout.simulate import TrafficSettings
@@ -42,9 +41,9 @@ def clip() -> ClipFrames:
 @pytest.mark.parametrize("mode", ["idm", "replay"])
 @pytest.mark.parametrize("poses", [straight(8.0), straight(14.0), straight(6.0, -3.0)], ids=["log", "fast", "aside"])
 def test_a_drive_scores_as_the_factory_scores_an_experts(mode: str, poses: np.ndarray) -> None:
-    scene, traffic, pdm = clip_scenes().logged.now, TrafficSettings(mode=mode), PdmSettings()
-    judged = drive_and_judge(scene, Plan(to_world(scene.ego_state[: HEADING + 1], poses)), traffic, pdm)
-    ours = drive(prepare_frame(scene, traffic, pdm, logged=True), poses)
+    scene, traffic = clip_scenes().logged.now, TrafficSettings(mode=mode)
+    judged = drive_and_judge(scene, Plan(to_world(scene.ego_state[: HEADING + 1], poses)), traffic)
+    ours = drive(prepare_frame(scene, traffic, logged=True), poses)
     np.testing.assert_array_equal(ours.states, judged.rollout.ego_states)
     for name in ("nc", "dac", "ddc", "tlc", "ep", "ttc", "lk", "hc", "ep_raw_m", "pdm_score"):
         assert getattr(ours.scores, name)[0] == getattr(judged.scores, name)[1], name
@@ -54,7 +53,7 @@ def test_who_comes_from_behind_answers_to_the_plan_that_moves_over_in_front() ->
     """PDM-Closed, the reference, keeps its lane: for it nobody would have to brake."""
     scene, moves_over = clip_scenes().logged.now, straight(3.0, 2.0)
     answers, goes_on = (
-        drive(prepare_frame(scene, TrafficSettings(mode=mode), PdmSettings(), logged=True), moves_over).scores
+        drive(prepare_frame(scene, TrafficSettings(mode=mode), logged=True), moves_over).scores
         for mode in ("idm", "replay")
     )
     assert (answers.nc[0], answers.ttc[0]) == (1.0, 1.0)

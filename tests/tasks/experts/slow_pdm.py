@@ -10,7 +10,6 @@ import shapely
 import shapely.ops
 from numpy.typing import NDArray
 
-from tasks.settings import PDM_DEFAULTS, PdmSettings
 from tasks.world.clip import MOVING_KINDS, AgentKind, AgentTracks
 from tasks.world.frames import PACIFICA, VX, Vehicle, X, Y, box_corners, ego_boxes, wrap_angle
 
@@ -20,6 +19,7 @@ SAMPLE_STEPS = 2  # one forecast per 0.2 s: step i of the plan sees sample i // 
 RADIUS_M = 100.0  # from the ego centre
 NEAREST = {AgentKind.VEHICLE: 50, AgentKind.PEDESTRIAN: 25, AgentKind.BICYCLE: 10}
 NEAREST_STATIC = 50
+SPEED_FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)
 MIN_PROGRESS_M = 1e-5  # interpolation never asks for the very first point: joints may repeat it
 SCORED_STEPS = 40
 PROPOSAL_STEPS = 50  # the chosen one is driven on to 5 s
@@ -154,17 +154,16 @@ def proposals(
     centerline: Array,
     seen: Forecast,
     speed_limit_mps: float | None,
-    settings: PdmSettings = PDM_DEFAULTS,
     vehicle: Vehicle = PACIFICA,
 ) -> Proposals:
     """The proposals from `ego_state` (11,) along `centerline` (N, 3) through the forecast traffic.
 
     Each starts at the projection of the rear axle on its path with the ego's longitudinal speed.
     """
-    paths = [drive_path(parallel(centerline, offset)) for offset in settings.lateral_offsets_m]
-    limit = settings.fallback_speed_mps if speed_limit_mps is None else speed_limit_mps
-    targets = np.tile(np.array(settings.speed_fractions) * limit, len(paths))
-    lateral = np.repeat(np.arange(len(paths)), len(settings.speed_fractions))
+    paths = [drive_path(parallel(centerline, offset)) for offset in (0.0, -1.0, 1.0)]
+    limit = 15.0 if speed_limit_mps is None else speed_limit_mps
+    targets = np.tile(np.array(SPEED_FRACTIONS) * limit, len(paths))
+    lateral = np.repeat(np.arange(len(paths)), len(SPEED_FRACTIONS))
     start = np.array([float(path.project(ego_state[[X, Y]])) for path in paths])
     reach_m = abs(targets).max() * PROPOSAL_STEPS * STEP_S
     traffic = _traffic(paths, start, reach_m, seen, vehicle)
@@ -180,26 +179,26 @@ def proposals(
             memory = step <= SCORED_STEPS  # beyond, the chosen one is driven alone
             before = motion[:, step - 1], poses[:, step - 1]
             found = _leads(paths, lateral, traffic, step // SAMPLE_STEPS, *before, vehicle)
-            leads[:, step] = _remembered(found, len(settings.speed_fractions)) if memory else np.nan_to_num(found)
+            leads[:, step] = _remembered(found, len(SPEED_FRACTIONS)) if memory else np.nan_to_num(found)
         else:
             leads[:, step] = leads[:, step - 1]  # at step 1 all zeros: every proposal first brakes at its hardest
-        motion[:, step] = idm_step(motion[:, step - 1], leads[:, step], targets, settings)
+        motion[:, step] = idm_step(motion[:, step - 1], leads[:, step], targets)
         poses[:, step] = _on_paths(paths, lateral, motion[:, step, 0])
     return Proposals(poses, motion, leads)
 
 
-def idm_step(motion: Array, leads: Array, target_mps: Array, settings: PdmSettings) -> Array:
+def idm_step(motion: Array, leads: Array, target_mps: Array) -> Array:
     """One Euler step of 0.1 s of the intelligent driver model (Treiber et al. 2000), rows (P, 2) progress, speed.
 
     s* = gap + v T + v (v - v_lead) / (2 sqrt(a b));  dv/dt = a (1 - (v / v0)^n - (s* / s)^2), clipped to [-b, a].
     The speed is not clipped at 0.
     """
     progress, speed = motion[:, 0], motion[:, 1]
-    closing = speed * (speed - leads[:, 1]) / (2.0 * np.sqrt(settings.accel_max_mps2 * settings.decel_max_mps2))
-    wanted = settings.min_gap_m + speed * settings.headway_s + closing
-    gap = np.maximum(leads[:, 0] - progress - leads[:, 2], settings.min_gap_m)
-    accel = settings.accel_max_mps2 * (1.0 - (speed / target_mps) ** settings.exponent - (wanted / gap) ** 2)
-    accel = np.clip(accel, -settings.decel_max_mps2, settings.accel_max_mps2)
+    closing = speed * (speed - leads[:, 1]) / (2.0 * np.sqrt(1.5 * 3.0))
+    wanted = 1.0 + speed * 1.5 + closing
+    gap = np.maximum(leads[:, 0] - progress - leads[:, 2], 1.0)
+    accel = 1.5 * (1.0 - (speed / target_mps) ** 10 - (wanted / gap) ** 2)
+    accel = np.clip(accel, -3.0, 1.5)
     return np.stack([progress + STEP_S * speed, speed + STEP_S * accel], axis=-1)
 
 

@@ -2,12 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from tasks.experts.pdm_closed import PdmClosed, PdmSettings, driver, forecast, idm_step, plan_for, proposals
+from tasks.experts.pdm_closed import SPEED_FRACTIONS, PdmClosed, forecast, idm_step, plan_for, proposals
 from tasks.experts.protocol import Plan
 from tasks.stages import Rejected
 from tasks.world.clip import AgentKind, AgentTracks, Scene
@@ -22,7 +21,7 @@ CAR = (4.5, 1.9)
 def test_a_proposal_brakes_for_a_tenth_of_a_second_and_then_follows_the_model_on_the_road_it_sees(
     road: Road,
 ) -> None:
-    start, limit, fractions = 8.0, 10.0, np.array(PdmSettings().speed_fractions)
+    start, limit, fractions = 8.0, 10.0, np.array(SPEED_FRACTIONS)
     speed = plan_for(road(speed=start, limit=limit)).proposals.progress_velocity[:5, :, 1]
     np.testing.assert_allclose(speed[:, 1], start - 0.3, atol=1e-12)
     gap = 400.0 - 50.0 - 0.1 * start - PACIFICA.half_length  # to the end of the route
@@ -33,17 +32,16 @@ def test_a_proposal_brakes_for_a_tenth_of_a_second_and_then_follows_the_model_on
 
 def test_a_stop_before_an_oncoming_car_overshoots(road: Road, objects: Objects) -> None:
     near = np.array([1.0, -10.0, 0.0])  # at the least gap: the hardest braking, 0.3 m/s in a step
-    np.testing.assert_allclose(idm_step(0.0, 0.2, near, 15.0, driver(PdmSettings())), [0.02, -0.1], atol=1e-12)
+    np.testing.assert_allclose(idm_step(0.0, 0.2, near, 15.0), [0.02, -0.1], atol=1e-12)
     scene = road(speed=3.0, agents=objects([[85.0, 0.0, np.pi, *CAR]], [8.0], [AgentKind.VEHICLE]))
     assert plan_for(scene).proposals.progress_velocity[..., 1].min() < 0.0
 
 
 def test_idm_keeps_the_speed_where_the_closed_form_says_so() -> None:
-    settings = PdmSettings()
     speed, target = 8.0, 15.0
-    wanted = settings.min_gap_m + speed * settings.headway_s
-    gap = wanted / np.sqrt(1.0 - (speed / target) ** settings.exponent)  # equal speeds: dv/dt = 0 at this gap
-    after = idm_step(3.0, speed, np.array([3.0 + gap, speed, 0.0]), target, driver(settings))
+    wanted = 1.0 + speed * 1.5
+    gap = wanted / np.sqrt(1.0 - (speed / target) ** 10)  # equal speeds: dv/dt = 0 at this gap
+    after = idm_step(3.0, speed, np.array([3.0 + gap, speed, 0.0]), target)
     np.testing.assert_allclose(after, [3.8, speed], atol=1e-12)
 
 
@@ -124,19 +122,3 @@ def test_a_route_without_length_is_a_rejection(road: Road) -> None:
 def test_a_speed_limit_of_zero_is_an_error_and_not_a_division(road: Road) -> None:
     with pytest.raises(ValueError, match=r"speed_limit_mps: 0\.0 m/s cannot be driven"):
         plan_for(road(limit=0.0))
-
-
-@pytest.mark.parametrize(
-    ("wrong", "named"),
-    [
-        ({"speed_fractions": ()}, "speed_fractions"),
-        ({"speed_fractions": (0.5, -0.1)}, "speed_fractions"),
-        ({"lateral_offsets_m": (0.0, np.nan)}, "lateral_offsets_m"),
-        ({"min_gap_m": 0.0}, "min_gap_m"),
-        ({"fallback_speed_mps": np.inf}, "fallback_speed_mps"),
-        ({"headway_s": -1.0}, "headway_s"),
-    ],
-)
-def test_settings_that_make_no_sense_are_named(wrong: dict[str, Any], named: str) -> None:
-    with pytest.raises(ValueError, match=f"pdm {named} must be"):
-        PdmSettings(**wrong)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed import PdmSettings, forecast, proposals
+from tasks.experts.pdm_closed import forecast, proposals
 from tasks.world.clip import AgentKind, AgentTracks
 from tasks.world.frames import HEADING, VX, X, Y, box_corners
 from tasks.world.geometry import rings_distance, rings_touch
@@ -18,10 +18,6 @@ from tests.tasks.experts import slow_pdm
 
 Array = NDArray[np.float64]
 SHAPES = ("straight", "curved", "hairpin", "loop", "two points", "short")
-SETTINGS = (
-    PdmSettings(),
-    PdmSettings(speed_fractions=(0.5, 1.0), lateral_offsets_m=(0.5,), exponent=4, headway_s=0.8),
-)
 
 
 class World(NamedTuple):
@@ -95,7 +91,7 @@ def red_light(pose: Array, rng: np.random.Generator) -> shapely.Polygon:
     return shapely.Polygon(pose[:2] + ring - ring[0])
 
 
-def assert_equals_its_slow_twin(world: World, limit: float | None, chosen: PdmSettings) -> None:
+def assert_equals_its_slow_twin(world: World, limit: float | None) -> None:
     seen = forecast(world.ego_state, world.agents, world.lights)
     slow_seen = slow_pdm.forecast(world.ego_state, world.agents, world.lights)
     for field in fields(slow_seen):
@@ -105,8 +101,8 @@ def assert_equals_its_slow_twin(world: World, limit: float | None, chosen: PdmSe
         else:
             np.testing.assert_array_equal(one, other, err_msg=field.name)
 
-    fast = proposals(world.ego_state, world.centerline, seen, limit, chosen)
-    slow = slow_pdm.proposals(world.ego_state, world.centerline, slow_seen, limit, chosen)
+    fast = proposals(world.ego_state, world.centerline, seen, limit)
+    slow = slow_pdm.proposals(world.ego_state, world.centerline, slow_seen, limit)
     np.testing.assert_allclose(fast.leads, slow.leads, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(fast.progress_velocity, slow.progress_velocity, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(fast.poses, slow.poses, rtol=0.0, atol=1e-9)
@@ -120,7 +116,6 @@ def assert_equals_its_slow_twin(world: World, limit: float | None, chosen: PdmSe
     standing=st.booleans(),
     past_the_end=st.booleans(),
     limit=st.sampled_from([None, 4.0, 30.0]),
-    chosen=st.sampled_from(SETTINGS),
     seed=st.integers(0, 2**32 - 1),
 )
 def test_proposals_equal_their_slow_twin(
@@ -129,15 +124,14 @@ def test_proposals_equal_their_slow_twin(
     standing: bool,
     past_the_end: bool,
     limit: float | None,
-    chosen: PdmSettings,
     seed: int,
 ) -> None:
-    assert_equals_its_slow_twin(world_of(shape, n_objects, standing, past_the_end, seed), limit, chosen)
+    assert_equals_its_slow_twin(world_of(shape, n_objects, standing, past_the_end, seed), limit)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_hundred_objects_around_every_shape_of_path_equal_their_slow_twin(shape: str) -> None:
-    assert_equals_its_slow_twin(world_of(shape, 100, False, False, seed=3), None, PdmSettings())
+    assert_equals_its_slow_twin(world_of(shape, 100, False, False, seed=3), None)
 
 
 @settings(max_examples=100)

@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 
 from tasks.attempt import Judged, drive_and_judge, drive_under_log_replay, perturbed_scene, vocabulary_labels
-from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Human, Plan
 from tasks.reward.epdms import Scores, prepare_scene, score
 from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
@@ -34,12 +33,12 @@ def simulated() -> Judged:
     """Four seconds at half the log's speed, which the traffic behind answered to, then four more."""
     first = scene_of_clip(street_clip())
     scene = perturbed_scene(street_clip(), simulate(first, ahead(first, 4.0), IDM))
-    return drive_and_judge(scene, Plan(ahead(scene, 6.0)), IDM, PdmSettings())
+    return drive_and_judge(scene, Plan(ahead(scene, 6.0)), IDM)
 
 
 @pytest.fixture(scope="module")
 def human() -> Judged:
-    return drive_under_log_replay(scene_of_clip(street_clip()), Human(), PdmSettings(), np.random.default_rng(0))
+    return drive_under_log_replay(scene_of_clip(street_clip()), Human(), np.random.default_rng(0))
 
 
 def labelled(judged: Judged, vocabulary: Vocabulary = VOCABULARY) -> VocabularyLabels:

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tasks.attempt import drive_and_judge
-from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.rollout.idm import IdmDriver
 from tasks.rollout.navsim import drive_agents, idm_acceleration
@@ -218,7 +217,7 @@ def test_who_touches_the_ego_at_the_start_counts_in_the_public_reactive_evaluati
     plan = Plan(worlds.straight_plan(scene))
     for mode, nc in (("idm", 1.0), ("navsim", 0.5)):
         traffic = TrafficSettings(mode=mode)  # type: ignore[arg-type]
-        judged = drive_and_judge(scene, plan, traffic, PdmSettings())
+        judged = drive_and_judge(scene, plan, traffic)
         assert judged.scores.nc[1] == nc, mode
 
 

@@ -15,7 +15,7 @@ from factory.datasets.town.settings import MOUNTS
 from factory.stages.rows import sample_row
 from factory.store.samples import Store
 from tasks.attempt import drive_and_judge, drive_under_log_replay, perturbed_scene
-from tasks.experts.pdm_closed import PdmClosed, PdmSettings
+from tasks.experts.pdm_closed import PdmClosed
 from tasks.experts.protocol import Human
 from tasks.rollout.simulate import TrafficSettings
 from tasks.world.clip import Clip, scene_of_clip
@@ -43,8 +43,8 @@ def driven() -> tuple[dict[str, Any], dict[str, Any]]:
     clip = street()
     candidate = perturbed(clip).candidates[0]
     scene = perturbed_scene(clip, candidate.rollout)
-    judged = drive_and_judge(scene, PdmClosed().plan(scene, RNG), TrafficSettings(), PdmSettings())
-    human = drive_under_log_replay(scene_of_clip(clip), Human(), PdmSettings(), RNG)
+    judged = drive_and_judge(scene, PdmClosed().plan(scene, RNG), TrafficSettings())
+    human = drive_under_log_replay(scene_of_clip(clip), Human(), RNG)
     return sample_row(clip, None, human), sample_row(clip, candidate, judged)
 
 
