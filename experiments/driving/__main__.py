@@ -31,7 +31,7 @@ SAMPLES = (
 # One drive of each clip is asked for, so that its scene is built; whether it is a good label does not matter.
 SCENES = (
     f"{PICTURES} experts=[logged] rounds=1 reward.labels=none reward.full=[] reward.progress_above=-1 "
-    "reward.off_route=false reward.after=false reward.near_log=false render.psnr_gate=mark render.gate.enabled=false"
+    "reward.off_route=false reward.after=false reward.near_log=false render.psnr_min=0 render.gate.enabled=false"
 )
 TOWNS = (
     "clips=synthetic_towns clips.split=test clips.first_seed=241 clips.n_towns=20 clips.logs_per_town=1 "

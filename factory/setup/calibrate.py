@@ -47,7 +47,6 @@ WATCHED = (
     "render.height",
     "render.psnr_min",
     "render.camera_psnr_min",
-    "render.psnr_gate",
     "render.gate.enabled",
 )
 

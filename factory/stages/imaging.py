@@ -44,7 +44,7 @@ from tasks.render.scene.engine import encode_jpeg, render_jpegs
 from tasks.render.scene.movers import agents_at_time
 from tasks.render.scene.sensed import Photo
 from tasks.render.seen import PhotoSights, photo_sights
-from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
+from tasks.render.settings import STEPS_OF, ImageSource, RenderMode, RenderSettings
 from tasks.render.views import MAP_RIG, draw_map_views, instants_of_views
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bytes
@@ -52,7 +52,6 @@ from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, AgentTracks, Camera, Cl
 from tasks.world.frames import HEADING, pose_on_ground
 
 PHOTOS_ONLY = "photos_only"  # tag: depth is guessed from parallax, markings shear off the photos' path
-LOW_PSNR = "low_psnr"  # tag: held-out photos of the block come out worse than psnr_min
 GATE_STRIDE = 5  # steps of 0.1 s between the pictures that are looked at: 2 Hz
 PHOTO_SLACK_S = 0.06  # a photo belongs to an instant of the 2 Hz grid when it was taken this close to it
 
@@ -87,12 +86,12 @@ class Imaging:
         return said.exists() == before
 
     def block_verdict(self, clip: Clip) -> BlockVerdict:
-        """Build the clip's block, once, and say what it is good for: `psnr_gate=mark` leaves nothing out.
+        """Build the clip's block, once, and say what it is good for.
 
         Raises BadClip for a broken sensor file.
         """
         fit_for_all = BlockVerdict({}, float("nan"), None)
-        if self.settings.mode is not RenderMode.AUTO or self.settings.psnr_gate is PsnrGate.MARK:
+        if self.settings.mode is not RenderMode.AUTO:
             return fit_for_all
         if block_sensing(clip, self.settings) is Sensing.NOTHING:
             return fit_for_all
@@ -133,10 +132,6 @@ class Imaging:
         said, tags = judge_block(asset, cameras, self.settings), list[str]()
         if block_sensing(clip, self.settings) is Sensing.PHOTOS_ONLY:
             tags.append(PHOTOS_ONLY)
-        if self.settings.psnr_gate is PsnrGate.MARK:
-            if said.fault is not None or said.left_out:
-                tags.append(LOW_PSNR)
-            said = BlockVerdict({}, asset.psnr_db, None)
         psnr = said.psnr_db if np.isfinite(said.psnr_db) else None
         left_out = [{"camera": name, "why": why} for name, why in said.left_out.items()]
         block = {"tags": tags, "psnr": psnr, "cameras_left_out": left_out, "asset_digest": asset.digest}

@@ -17,7 +17,7 @@ from factory.store.reader import Sample
 from factory.store.schema import COLUMNS
 from tasks.render.gate import judge_block
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderSettings
+from tasks.render.settings import STEPS_OF, ImageSource, RenderSettings
 from tasks.render.views import render_views
 from tasks.world.arrays import Array
 from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS, STEP_S, Camera, Clip, Scene
@@ -176,13 +176,13 @@ def open_rendered_cameras(clip: Clip, settings: RenderSettings, cache_dir: str) 
     """The scene is built where the cache does not hold it, in minutes.
 
     Raises BadClip for a clip without anything to build it from, for a broken sensor file, and for a scene whose
-    held-out photos are below psnr_min where `render.psnr_gate` rejects such.
+    held-out photos are below what the settings ask for.
     """
     built = load_or_build_scene(clip, settings, cache_dir)
     if built is None:
         raise BadClip(f"log {clip.log_id}", "cameras", "no photos and no lidar to build a scene from: pictures=none")
     rig = choose_cameras(clip.cameras, settings.cameras)
-    if settings.psnr_gate is PsnrGate.REJECT and (why := judge_block(built, rig, settings).fault) is not None:
-        raise BadClip(f"log {clip.log_id}", "scene", f"{why}; render.psnr_gate=mark drives in it all the same")
+    if (why := judge_block(built, rig, settings).fault) is not None:
+        raise BadClip(f"log {clip.log_id}", "scene", f"{why}; render.psnr_min=0 drives in it all the same")
     asset = scene_in_clip_time(clip, built)
     return RenderedCameras(clip, settings, asset, tuple(asset.as_corrected(rig)))

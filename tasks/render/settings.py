@@ -144,11 +144,6 @@ class SceneFrom(StrEnum):
     FIT = "fit"  # the same, then fitted to the photos: render.fit says how long
 
 
-class PsnrGate(StrEnum):
-    REJECT = "reject"  # before perturb work is spent on the block
-    MARK = "mark"  # samples are kept, tagged low_psnr
-
-
 class ImageSource(StrEnum):
     """Where a sample's images come from."""
 
@@ -214,7 +209,6 @@ class RenderSettings:
     jpeg_quality: int = 90  # 1 to 100
     camera_psnr_min: float = 20.0  # [dB] a camera whose held-out photos come out worse is left out; 0: none
     psnr_min: float = 24.0  # [dB] what those of the others must come out with, else the block is refused; 0: anything
-    psnr_gate: PsnrGate = PsnrGate.REJECT  # what becomes of a block that comes up to neither
     gate: GateSettings = field(default_factory=GateSettings)  # what every rendered picture of a drive must come up to
     scene: SceneFrom = SceneFrom.FIT  # discs: built in one go, seconds a block; fit: then fitted to its photos, minutes
     scene_dtype: SceneDtype = constant(SceneDtype.FLOAT16)  # of scenes' files; float16: all but the places of Gaussians
@@ -236,4 +230,4 @@ class RenderSettings:
     @property
     def refuses_blocks(self) -> bool:
         """Whether a block can be too poor for any of its clips to be perturbed."""
-        return self.mode is RenderMode.AUTO and self.psnr_min > 0.0 and self.psnr_gate is PsnrGate.REJECT
+        return self.mode is RenderMode.AUTO and self.psnr_min > 0.0

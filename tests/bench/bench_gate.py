@@ -57,7 +57,7 @@ def labelled(
     seed: int, clips: int, most: int, every: int, share_min: float, out: Path, fit: Sequence[str]
 ) -> list[Labelled]:
     """Runs the seed's towns; fit: settings of their scenes."""
-    overrides = [*fit, f"clips.seed={seed}", f"clips.n_clips={clips}", f"out={out}/town{seed}", "render.psnr_gate=mark"]
+    overrides = [*fit, f"clips.seed={seed}", f"clips.n_clips={clips}", f"out={out}/town{seed}", "render.psnr_min=0"]
     config = load_config(["preset=demo", *overrides])
     gate = replace(config.render.gate, vehicle_share=share_min)
     work = assemble(replace(config, render=replace(config.render, gate=gate))).work

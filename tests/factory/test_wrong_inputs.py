@@ -78,7 +78,7 @@ MISTYPED = [  # told before anything heavy is imported
     run("reward.full=[nc,comfort]", says=["full names comfort"]),
     run("traffic.headway_s=-1", says=["headway_s must be positive"]),
     run("render.gate.vehicle_min=2", says=["render gate vehicle_min must be from 0 to 1"]),
-    run("render.psnr_gate=rejct", says=["render.psnr_gate: must be reject or mark; did you mean"]),
+    run("render.scene=disc", says=["render.scene: must be discs or fit; did you mean"]),
     run("expert.recovery.match=maybe", says=["expert.recovery.match: must be log or paper (got 'maybe')"]),
     run("expert.recovery.mach=log", says=["did you mean expert.recovery.match=?"]),
     run("clips.n_clisp=3", says=["clips.n_clisp: there is no such setting", "did you mean clips.n_clips=?"]),

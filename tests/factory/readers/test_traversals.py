@@ -14,7 +14,7 @@ from factory.readers.settings import LogClips
 from factory.stages.assets import block_id, load_or_build_scene
 from factory.stages.sensors import block_cameras, block_of, choose_cameras, load_photos
 from tasks.render.scene.build import held_out_rows
-from tasks.render.settings import PsnrGate, RenderSettings, SceneFrom
+from tasks.render.settings import RenderSettings, SceneFrom
 from tasks.world.clip import (
     DRIVES_APART_S,
     STEP_S,
@@ -167,9 +167,7 @@ def test_another_log_that_changes_changes_the_digest(logs: Path, tmp_path: Path)
 
 @pytest.mark.slow
 def test_a_scene_of_two_drives_keeps_what_is_of_the_street_and_of_its_own_log(logs: Path, tmp_path: Path) -> None:
-    settings = RenderSettings(
-        width=64, height=36, scene=SceneFrom.DISCS, psnr_min=0.0, camera_psnr_min=0.0, psnr_gate=PsnrGate.MARK
-    )
+    settings = RenderSettings(width=64, height=36, scene=SceneFrom.DISCS, psnr_min=0.0, camera_psnr_min=0.0)
     alone, both = (load_or_build_scene(clip_and_ref(logs, n)[2], settings, tmp_path / str(n)) for n in (0, 1))
     assert alone is not None and both is not None
     assert len(both.background) > len(alone.background)

@@ -82,7 +82,6 @@ def test_every_setting_of_the_paper_s_table_is_watched(vocabulary: Vocabulary) -
         "reward.off_route=true": "reward.off_route=True (False)",
         "reward.progress_above=-1": "reward.progress_above=-1.0 (0.5)",
         "traffic=replay": "traffic.mode=replay (idm)",
-        "render.psnr_gate=mark": "render.psnr_gate=mark (reject)",
         "render.frames=now": "render.frames=now (all)",
     }
     assert set(others.values()) <= set(differences_from_paper(paper(*others), vocabulary))

@@ -65,17 +65,6 @@ def test_a_block_below_the_gate_drops_the_experts_and_keeps_the_human(small_town
 
 
 @pytest.mark.slow
-def test_a_marked_block_keeps_its_candidates_and_tags_its_samples(small_town: Path, tmp_path: Path) -> None:
-    work = work_on(small_town, tmp_path, "render.psnr_min=60", "render.psnr_gate=mark")
-    prepared = prepared_by(work)
-    assert prepared.dropped is None
-    marked = first_sample(work, prepared)
-    assert marked.row["image_source"] == "render" and "low_psnr" in marked.row["tags"]  # type: ignore[operator]
-    human = run_attempt(work, prepared, HUMAN_CANDIDATE, HUMAN)
-    assert isinstance(human, SampleColumns) and "low_psnr" not in human.row["tags"]  # type: ignore[operator]
-
-
-@pytest.mark.slow
 def test_a_camera_too_poor_is_left_out_of_what_is_drawn_and_the_human_s_photos_are_all_there(tmp_path: Path) -> None:
     cameras = ("ring_front_center", "ring_front_left")
     town = SyntheticReader(tmp_path / "town", 1, 0, TownSettings(cameras, 64, 36, lidar_beams=32, lidar_azimuths=300))
@@ -256,14 +245,6 @@ def test_without_a_gate_the_block_s_settings_are_no_part_of_what_is_prepared() -
     for free in (["render.psnr_min=0"], ["render=none"]):
         small, large = (run_identity(load_config([*free, f"render.width={w}"]), VOCABULARY, None) for w in (64, 128))
         assert small.prepare_digest == large.prepare_digest
-
-
-def test_a_gate_that_only_marks_prepares_nothing_anew() -> None:
-    plain, marking = (
-        run_identity(load_config(overrides), VOCABULARY, None).prepare_digest
-        for overrides in (["render.psnr_min=0"], ["render.psnr_gate=mark"])
-    )
-    assert plain == marking
 
 
 @pytest.mark.parametrize("stage", ["clip", "perturb", "rollout", "expert", "reward"])

@@ -11,13 +11,13 @@ from factory.readers.base import BadClip
 from planners.drive.cameras import RenderedCameras, open_rendered_cameras
 from planners.drive.starts import extend_clip, logged_start
 from tasks.render.scene.asset import psnr
-from tasks.render.settings import Frames, PsnrGate, RenderSettings, SceneFrom
+from tasks.render.settings import Frames, RenderSettings, SceneFrom
 from tasks.world.clip import NOW, Clip
 from tests.planners.drive.test_painted import front, unit
 from tests.tasks.streets import street_clip
 
 DISCS = RenderSettings(
-    width=96, height=54, frames=Frames.NOW, scene=SceneFrom.DISCS, psnr_gate=PsnrGate.MARK, jpeg_quality=95
+    width=96, height=54, frames=Frames.NOW, scene=SceneFrom.DISCS, psnr_min=0.0, jpeg_quality=95
 )  # fmt: skip
 
 
@@ -51,8 +51,8 @@ def test_vehicles_are_where_the_simulation_has_them(clip: Clip, cameras: Rendere
 
 
 @pytest.mark.slow
-def test_a_scene_that_is_too_poor_is_refused_unless_it_is_marked(clip: Clip, tmp_path: Path) -> None:
-    strict = replace(DISCS, psnr_gate=PsnrGate.REJECT, psnr_min=60.0)
+def test_a_scene_that_is_too_poor_is_refused(clip: Clip, tmp_path: Path) -> None:
+    strict = replace(DISCS, psnr_min=60.0)
     with pytest.raises(BadClip, match="below 60"):
         open_rendered_cameras(clip, strict, str(tmp_path))
 
