@@ -13,7 +13,7 @@ from tasks.attempt import Judged, Timed, drive_and_judge, has_route, judge, pert
 from tasks.experts.pdm_closed import plan_for
 from tasks.experts.protocol import Plan
 from tasks.rollout.simulate import TrafficSettings
-from tasks.stages import FOLLOW_UP_BEFORE, HUMAN_BEFORE, Rejected
+from tasks.stages import FOLLOW_UP, FOLLOW_UP_BEFORE, HUMAN_BEFORE, Rejected
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.frames import HEADING
 
@@ -72,7 +72,7 @@ def frame_digest(frame: str) -> str:
     """Of what a frame (one of tasks.stages.FRAMES) is made by, as an expert's."""
     if frame == HUMAN_BEFORE:
         return "human"
-    return "published, earlier" if frame == FOLLOW_UP_BEFORE else "published"
+    return {FOLLOW_UP: "ec60687d0de515e2", FOLLOW_UP_BEFORE: "bc2dc65fb6c61aaa"}[frame]  # attempt ids hold them
 
 
 def drive_follow_up(

@@ -686,8 +686,8 @@ class PdmClosed:
     name: str = "pdm_closed"
 
     def digest(self) -> str:
-        """It has no settings."""
-        return "published"
+        """Of the planner as published. Attempt ids hold it: with another, tables would not go on."""
+        return "4fac618d98e870fc"
 
     def plan(self, scene: Scene, rng: np.random.Generator) -> Plan | Rejected:
         """The best proposal; "no_plan" where the route ahead has no length to drive along."""
