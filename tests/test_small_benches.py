@@ -75,7 +75,7 @@ STEPS_OF = partial(bench_planner_steps.main, ["gtrs_dense_public"], torch.device
 @pytest.mark.parametrize(
     ("bench", "rows", "says"),
     [
-        pytest.param(lambda at: bank_of_few(at), 1, "2,000 scenes opened", id="bank"),
+        pytest.param(lambda at: bank_of_few(at), 1, "2,000 scenes opened", id="bank", marks=LONG),
         pytest.param(lambda at: bench_decoding.main(2, 1, 3, 128, 32), 5, "a kept picture: 0.01 MB", id="decoding"),
         pytest.param(lambda at: STEPS_OF(), 3, "`gtrs_dense_public` | H100 SXM", id="planner_steps", marks=LONG),
         pytest.param(lambda at: bench_label_ends.main([*ONE_TOWN, "experts=[human]"]), 1, "| human |", id="label_ends"),
