@@ -120,7 +120,8 @@ mutants: install warm
 bench: install
 	$(if $(filter reward,$(NAME)),OMP_NUM_THREADS=1) $(PY) -m tests.bench$(if $(NAME),.bench_$(NAME)) $(ARGS)
 
-# Whether the longer benches still run, kept tables are made of their rows, and chaos finds nothing at its smallest.
+# Whether the longer benches still run, kept tables are made of their rows, more clips of the real logs keep what some
+# do, and chaos finds nothing at its smallest.
 long:
 	@$(MAKE) --no-print-directory -j 2 install warm
 	$(PY) -m pytest -n 2 --dist loadfile -m long

@@ -1,4 +1,4 @@
-"""Plans among the answering traffic of real logs get the factory's own scores from a bank, on a fourth of the clips."""
+"""Plans among the answering traffic of real logs get the factory's own scores from a bank; make long: on every clip."""
 
 from pathlib import Path
 
@@ -21,10 +21,11 @@ def reader(request: pytest.FixtureRequest, shared_root: Path) -> ClipReader:
     return ScenarioNetReader(data / "scenarionet" / "nuscenes")
 
 
-def test_plans_among_recorded_cars_get_the_factory_s_scores(reader: ClipReader, tmp_path: Path) -> None:
+@pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.long)])
+def test_plans_among_recorded_cars_get_the_factory_s_scores(reader: ClipReader, every: int, tmp_path: Path) -> None:
     assert write_bank(tmp_path, reader, traffic=IDM) == {}
     bank, poses = SceneBank(tmp_path), plans(3, 5)
-    for ref in reader.index().refs[::4]:
+    for ref in reader.index().refs[::every]:
         expect_the_factory_s(bank, [reader.read(ref)], poses)
     ids, many = bank.clip_ids, poses[None].repeat(len(bank), 0)
     assert (bank.score(ids, many).score != bank.score(ids, many, traffic="idm").score).any()

@@ -148,14 +148,14 @@ def test_a_perturbation_that_only_the_log_makes_room_for_is_dropped(trajectories
     assert counts["reactive_score"] > 3
     assert isinstance(found, Perturbation)
     scene, considered = scene_of_clip(clip), found.considered
-    rival = plan_for(scene).driven
+    reference = plan_for(scene).driven
     by_index = {candidate.vocabulary_index: candidate for candidate in found.candidates}
     for index, fate, replayed in zip(considered.vocabulary_index.tolist(), considered.fate, considered.score):
         assert not np.isfinite(replayed) or (replayed >= SETTINGS.epdms_min) == (fate != "score")
         if fate not in ("kept", "reactive"):
             continue
         rollout = simulate(scene, to_world(scene.ego_state[:3], trajectories[index]), traffic)
-        pair = np.stack([rival, rollout.ego_states])
+        pair = np.stack([reference, rollout.ego_states])
         reacting = score(prepare_scene(scene, rollout.agents), pair, normalise="pairs").pdm_score[1]
         assert (reacting >= SETTINGS.epdms_min) == (fate == "kept")
         if fate == "kept":
