@@ -7,7 +7,7 @@ At the end what the reward asks of traffic that answers anew: what a drive's end
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,9 +15,16 @@ import numpy as np
 from tasks.experts.pdm_closed import MIN_PROGRESS_M, PdmClosed, PdmPlan, path_length_m, plan_for
 from tasks.experts.protocol import Expert, Plan, plans_of
 from tasks.kernels.compiled import kernel
-from tasks.reward.areas import N_POINTS, empty_places, set_area_flags
+from tasks.reward.areas import N_CORNERS, empty_places, set_area_flags
 from tasks.reward.centerline import empty_body, place_body
-from tasks.reward.collisions import STOPPED_SPEED_MPS, empty_looks, first_contacts, obstacles_of
+from tasks.reward.collisions import (
+    CIRCUMRADIUS,
+    STOPPED_SPEED_MPS,
+    empty_looks,
+    first_contacts,
+    obstacles_of,
+    set_looks,
+)
 from tasks.reward.epdms import (
     PreparedScene,
     RuleContext,
@@ -26,9 +33,9 @@ from tasks.reward.epdms import (
     prepare_scene,
     rule_context,
     score,
-    select_rows,
 )
 from tasks.reward.label_bytes import ARRAYS, VocabularyLabels
+from tasks.reward.map_index import with_clearance
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, next_scene, prepare_traffic, roll_out, roll_out_longer
 from tasks.settings import ExpertGate
@@ -306,10 +313,11 @@ def extrapolate(states: Array, braking_mps2: float = 0.0) -> Array:
 def _first_hit(context: RuleContext, boxes: Array, is_stopped: Bools, collision_score: Array, states: Array) -> float:
     """Index of the first collision at fault of states (T, 11) with boxes (T, N, 5), inf: none."""
     n_times, n_objects = states.shape[0], len(is_stopped)
-    body, places = empty_body(n_times), empty_places(context.map_index, N_POINTS * n_times)
+    body, places = empty_body(n_times), empty_places(context.map_index, N_CORNERS * n_times)
     place_body(states, REAR_AXLE_TO_CENTER, body)
     set_area_flags(context.map_index, body, HALF_LENGTH, HALF_WIDTH, places)
     obstacles, looks = obstacles_of(boxes, is_stopped, collision_score), empty_looks(n_times, n_times, n_objects)
+    set_looks(body, looks)
     return first_contacts(obstacles, states, body, looks, 0, context.map_index, places)[1]
 
 
@@ -326,8 +334,9 @@ def vocabulary_labels(
     prepared: the scene with the objects that the sample was judged among; reference: (41, 11) PDM-Closed as the tracker
     drives it, to which every trajectory's progress is related.
     """
-    trajectories = vocabulary.trajectories
-    parts: list[Scores] = []
+    rows, trajectories = vocabulary.along_strips
+    prepared = replace(prepared, map_index=with_clearance(prepared.map_index, CIRCUMRADIUS))
+    found = {name: np.empty(len(trajectories)) for name in ARRAYS}
     reference_m = 0.0
     states = np.empty((1 + min(len(trajectories), TRAJECTORIES_AT_ONCE), *reference.shape))
     states[0] = reference
@@ -336,6 +345,9 @@ def vocabulary_labels(
         track(scene.ego_state, block, local=True, out=states[1 : 1 + len(block)])
         scores = score(prepared, states[: 1 + len(block)], normalise="pairs")
         reference_m = float(scores.ep_raw_m[0] * scores.multiplier[0])
-        parts.append(select_rows(scores, slice(1, None)))
-    kept = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
+        for name, values in found.items():
+            values[start : start + len(block)] = getattr(scores, name)[1:]
+    kept = {name: np.empty_like(values) for name, values in found.items()}
+    for name, values in kept.items():
+        values[rows] = found[name]
     return VocabularyLabels(vocabulary.digest, reference_m, **kept)

@@ -141,9 +141,9 @@ def _score_packed(data: Bytes, poses: Array, in_batch: bool, subscores: Array, s
         return NO_DRIVE
     context = _context_around(values, starts, states)
     table = np.empty((N_ROWS, len(states)))
-    areas, comfort = np.empty((len(states), N_TIMES, 3), np.bool_), np.empty((len(states), N_FLAGS), np.bool_)
+    comfort = np.empty((len(states), N_FLAGS), np.bool_)
     beside = NO_REFERENCE if in_batch else floats[starts[PLACE] + 3]
-    if not score_all(context, obstacles, states, False, beside, table, areas, comfort):
+    if not score_all(context, obstacles, states, False, beside, table, comfort):
         return NO_DRIVE
     _show(table, subscores, scores)
     return OK
@@ -168,12 +168,12 @@ def _score_answered(
     context, table = _context_around(values, starts, states), np.empty((N_ROWS, len(scores)))
     nothing = empty_rows(0, len(roles.path)), empty_motion(0, len(roles.path))
     pair, of_pair = states[:2].copy(), np.empty((N_ROWS, 2))
-    areas, comfort = np.empty((2, N_TIMES, 3), np.bool_), np.empty((2, N_FLAGS), np.bool_)
+    comfort = np.empty((2, N_FLAGS), np.bool_)
     for k in range(len(scores)):
         rows = drive(NOW, log, now, roles, paths, driver, ego_boxes[k], ego_velocities[k], yielding, nothing)[0]
         obstacles = obstacles_of_tracks(rows.boxes, rows.velocities, rows.valid, collision_score, ego_boxes[k, 0])
         pair[1] = states[1 + k]
-        if not score_all(context, obstacles, pair, True, NO_REFERENCE, of_pair, areas, comfort):
+        if not score_all(context, obstacles, pair, True, NO_REFERENCE, of_pair, comfort):
             return NO_DRIVE
         table[:, k] = of_pair[:, 1]
     if in_batch:

@@ -8,7 +8,15 @@ import numpy as np
 from numba.extending import register_jitable
 
 from tasks.kernels.compiled import hidden_kernel, inlined, kernel
-from tasks.reward.centerline import CENTER_IN_INTERSECTION, MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, Body
+from tasks.reward.centerline import (
+    CENTER_IN_INTERSECTION,
+    LANES_KNOWN,
+    MULTIPLE_LANES,
+    NON_DRIVABLE,
+    OFF_LANE,
+    ONCOMING,
+    Body,
+)
 from tasks.reward.map_index import (
     DRIVABLE,
     EDGE,
@@ -32,10 +40,12 @@ from tasks.world.arrays import Array, Bools, Bytes, Ints, ShortInts
 from tasks.world.road_map import MapPolygon
 
 # The flags of a body. What can run many points wide is a loop of its own over all points of a trajectory; one by one go
-# those in crossed cells, which are listed first: branches that nobody can foresee cost more than the work.
+# those in crossed cells, which are listed first: branches that nobody can foresee cost more than the work. Corners are
+# looked up where the centre's cell does not say that the body is on the road.
 
 
-N_POINTS = 5  # of a body: corners FL, RL, RR, FR and centre
+CORNERS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))  # FL, RL, RR, FR: half lengths ahead, half widths aside
+N_CORNERS = len(CORNERS)
 
 
 class Places(NamedTuple):
@@ -47,31 +57,75 @@ class Places(NamedTuple):
     others: Bits  # (P, W) sets without a number; used up to as many as there are
     parts: Bytes  # (P,) bits of the parts that these regions play
     listed: ShortInts  # (P,) points that are yet to be looked at
+    instants: ShortInts  # (P,) those whose corners are looked up
 
 
 @register_jitable
 def empty_places(index: MapIndex, n_points: int) -> Places:
     """Scratch for that many points of a map."""
-    number, listed = np.empty(n_points, np.int32), np.empty(n_points, np.int32)
+    number, listed, instants = np.empty(n_points, np.int32), np.empty(n_points, np.int32), np.empty(n_points, np.int32)
     others, parts = np.empty((n_points, index.sets.shape[1]), np.uint64), np.empty(n_points, np.uint8)
-    return Places(np.empty(n_points), np.empty(n_points), number, others, parts, listed)
+    return Places(np.empty(n_points), np.empty(n_points), number, others, parts, listed, instants)
 
 
 @hidden_kernel
 def set_area_flags(index: MapIndex, body: Body, half_length: float, half_width: float, places: Places) -> None:
-    """Fill the flags of a placed body. A point on a region's boundary is outside of it, up to rounding.
+    """Fill the flags of a placed body but for its lanes', see `is_off_lane`.
 
-    places: scratch for five times as many points as the body has instants.
+    A point on a region's boundary is outside of it, up to rounding.
+
+    places: scratch for N_CORNERS times as many points as the body has instants.
     """
-    _set_points(body, half_length, half_width, places)
-    find_regions(index, places)
-    _set_flags(index, places, body.flags)
+    centers, n, flags = _first(places, body.x.size), 0, body.flags
+    for t in range(body.x.size):
+        centers.x[t], centers.y[t] = body.x[t], body.y[t]
+    _set_cells(index, centers)
+    for t in range(flags.size):
+        places.instants[n] = t
+        n += index.clear.size == 0 or index.clear[centers.number[t]] == 0
+    find_regions(index, centers)
+    for t in range(flags.size):
+        flags[t] = 0 if _plays(centers.parts[t], ON_ROUTE) else ONCOMING
+        flags[t] |= CENTER_IN_INTERSECTION if _plays(centers.parts[t], INTERSECTION) else 0
+
+    corners = _first(places, N_CORNERS * n)
+    for k, (ahead, aside) in enumerate(CORNERS):
+        for i in range(n):
+            t = places.instants[i]
+            corners.x[k * n + i], corners.y[k * n + i] = _corner(body, t, ahead * half_length, aside * half_width)
+    find_regions(index, corners)
+    parts = corners.parts
+    for i in range(n):
+        at_corners = parts[i] & parts[n + i] & parts[2 * n + i] & parts[3 * n + i]
+        flags[places.instants[i]] |= 0 if _plays(at_corners, DRIVABLE) else NON_DRIVABLE
+
+
+@hidden_kernel
+def is_off_lane(index: MapIndex, body: Body, t: int, half_length: float, half_width: float, places: Places) -> bool:
+    """Whether a body is not on the road or in more than one lane at an instant; its lanes are looked up when needed.
+
+    places: scratch for N_CORNERS points.
+    """
+    if body.flags[t] & (NON_DRIVABLE | LANES_KNOWN) == 0:
+        corners = _first(places, N_CORNERS)
+        for k, (ahead, aside) in enumerate(CORNERS):
+            corners.x[k], corners.y[k] = _corner(body, t, ahead * half_length, aside * half_width)
+        find_regions(index, corners)
+        body.flags[t] |= LANES_KNOWN | (MULTIPLE_LANES if _in_several_lanes(index, corners) else 0)
+    return body.flags[t] & OFF_LANE != 0
+
+
+@inlined
+def _first(places: Places, n: int) -> Places:
+    """The scratch for the first n points."""
+    x, y, number, parts = places.x[:n], places.y[:n], places.number[:n], places.parts[:n]
+    return Places(x, y, number, places.others, parts, places.listed, places.instants)
 
 
 @hidden_kernel
 def in_intersection(index: MapIndex, x: float, y: float, places: Places) -> bool:
     """Whether a point is in an intersection. places: scratch."""
-    one = Places(places.x[:1], places.y[:1], places.number[:1], places.others, places.parts, places.listed)
+    one = _first(places, 1)
     one.x[0], one.y[0] = x, y
     find_regions(index, one)
     return _plays(one.parts[0], INTERSECTION)
@@ -83,15 +137,9 @@ def _plays(parts: int, part: int) -> bool:
 
 
 @inlined
-def _set_points(body: Body, half_length: float, half_width: float, places: Places) -> None:
-    """The corners FL, RL, RR, FR and the centre (5 T,); those of one kind follow each other."""
-    n = body.x.size
-    for kind, ahead, aside in ((0, 1.0, 1.0), (1, -1.0, 1.0), (2, -1.0, -1.0), (3, 1.0, -1.0), (4, 0.0, 0.0)):
-        along, across = ahead * half_length, aside * half_width
-        x, y = places.x[kind * n : (kind + 1) * n], places.y[kind * n : (kind + 1) * n]
-        for t in range(n):
-            x[t] = body.x[t] + body.cos[t] * along - body.sin[t] * across
-            y[t] = body.y[t] + body.sin[t] * along + body.cos[t] * across
+def _corner(body: Body, t: int, along: float, across: float) -> tuple[float, float]:
+    cos, sin = body.cos[t], body.sin[t]
+    return body.x[t] + cos * along - sin * across, body.y[t] + sin * along + cos * across
 
 
 @hidden_kernel
@@ -100,7 +148,10 @@ def find_regions(index: MapIndex, places: Places) -> None:
     low_x, low_y, cell_m = index.low_x, index.low_y, index.cell_m
     crossed, entry, edges = index.crossed, index.entry, index.edges
     x, y, number, parts, listed = places.x, places.y, places.number, places.parts, places.listed
-    _look_up(index, places)
+    _set_cells(index, places)
+    cells = index.cells.reshape(-1)
+    for p in range(x.size):
+        number[p] = cells[number[p]]
     n_listed = n_left = 0
     for p in range(x.size):
         listed[n_listed] = p
@@ -130,8 +181,8 @@ def find_regions(index: MapIndex, places: Places) -> None:
 
 
 @inlined
-def _look_up(index: MapIndex, places: Places) -> None:
-    """What the index says of the points' cells; its outermost cells, which are empty, stand for all beyond."""
+def _set_cells(index: MapIndex, places: Places) -> None:
+    """The points' cells, as numbers; the outermost cells, which are empty, stand for all beyond."""
     x, y, found = places.x, places.y, places.number
     low_x, low_y, cell_m = index.low_x, index.low_y, index.cell_m
     first_row, first_column, (n_rows, n_columns) = index.first_row, index.first_column, index.cells.shape
@@ -141,9 +192,6 @@ def _look_up(index: MapIndex, places: Places) -> None:
         column = np.int32(min(max((x[p] - low_x) / cell_m, first_column), last_column))
         row = np.int32(min(max((y[p] - low_y) / cell_m, first_row), last_row))
         found[p] = row * np.int32(n_columns) + column - first
-    cells = index.cells.reshape(-1)
-    for p in range(x.size):
-        found[p] = cells[found[p]]
 
 
 @inlined
@@ -174,30 +222,21 @@ def _find_apart(index: MapIndex, p: int, new: int, places: Places) -> None:
 
 
 @inlined
-def _set_flags(index: MapIndex, places: Places, flags: Bytes) -> None:
-    sets, lanes, n_words = index.sets, index.playing[LANE], index.n_lane_words
-    number, others, parts, n = places.number, places.others, places.parts, flags.size
-    for t in range(n):
-        at_center = parts[4 * n + t]
-        at_corners = parts[t] & parts[n + t] & parts[2 * n + t] & parts[3 * n + t]
-        flag = 0 if _plays(at_center, ON_ROUTE) else ONCOMING
-        flag |= CENTER_IN_INTERSECTION if _plays(at_center, INTERSECTION) else 0
-        flag |= 0 if _plays(at_corners, DRIVABLE) else NON_DRIVABLE
-        flags[t] = flag
-    for t in range(n):
-        fl, rl, rr, fr = number[t], number[n + t], number[2 * n + t], number[3 * n + t]
-        if fl != rl or fl != rr or fl != fr:
-            n_touched = 0
-            holds_all = False
-            for w in range(n_words):
-                a = sets[fl, w] if fl >= 0 else others[-1 - fl, w]
-                b = sets[rl, w] if rl >= 0 else others[-1 - rl, w]
-                c = sets[rr, w] if rr >= 0 else others[-1 - rr, w]
-                d = sets[fr, w] if fr >= 0 else others[-1 - fr, w]
-                touched = (a | b | c | d) & lanes[w]
-                n_touched += (touched != 0) + (touched & (touched - np.uint64(1)) != 0)
-                holds_all |= a & b & c & d & lanes[w] != 0
-            flags[t] |= MULTIPLE_LANES if n_touched > 1 and not holds_all else 0
+def _in_several_lanes(index: MapIndex, corners: Places) -> bool:
+    """Whether the four points are in more than one lane, none of which holds all."""
+    sets, lanes, others = index.sets, index.playing[LANE], corners.others
+    fl, rl, rr, fr = corners.number[0], corners.number[1], corners.number[2], corners.number[3]
+    n_touched = 0
+    holds_all = False
+    for w in range(index.n_lane_words):
+        a = sets[fl, w] if fl >= 0 else others[-1 - fl, w]
+        b = sets[rl, w] if rl >= 0 else others[-1 - rl, w]
+        c = sets[rr, w] if rr >= 0 else others[-1 - rr, w]
+        d = sets[fr, w] if fr >= 0 else others[-1 - fr, w]
+        touched = (a | b | c | d) & lanes[w]
+        n_touched += (touched != 0) + (touched & (touched - np.uint64(1)) != 0)
+        holds_all |= a & b & c & d & lanes[w] != 0
+    return n_touched > 1 and not holds_all
 
 
 # Whether the ego's body is on a lane connector whose light is red (docs/reward.md 2d).

@@ -17,6 +17,7 @@ MULTIPLE_LANES = 1  # corners in more than one lane, and no lane holds all four
 NON_DRIVABLE = 2  # some corner is in no drivable polygon
 ONCOMING = 4  # the centre is in no lane of the route
 CENTER_IN_INTERSECTION = 8
+LANES_KNOWN = 16  # MULTIPLE_LANES holds
 OFF_LANE = MULTIPLE_LANES | NON_DRIVABLE  # where a lateral contact is the ego's fault
 
 

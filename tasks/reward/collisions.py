@@ -11,10 +11,11 @@ import numpy as np
 from numba.extending import register_jitable
 
 from tasks.kernels.compiled import hidden_kernel, inlined, kernel
-from tasks.reward.areas import Places, in_intersection
-from tasks.reward.centerline import OFF_LANE, Body
+from tasks.kernels.simd import prefetch
+from tasks.reward.areas import Places, in_intersection, is_off_lane
+from tasks.reward.centerline import Body
 from tasks.reward.map_index import MapIndex
-from tasks.world.arrays import Array, Bools, Bytes, ShortInts
+from tasks.world.arrays import Array, Bools, Bytes, Rows, ShortInts
 from tasks.world.clip import HORIZON_STEPS
 from tasks.world.frames import HALF_LENGTH, HALF_WIDTH, HEADING, X, Y
 
@@ -102,6 +103,7 @@ LENGTH, WIDTH = 2.0 * HALF_LENGTH, 2.0 * HALF_WIDTH  # of the ego [m]
 CIRCUMRADIUS = math.hypot(HALF_LENGTH, HALF_WIDTH)  # of the ego [m]
 CELL_M = 2.0
 CELLS_PER_SIDE = 64  # a power of two
+_PLACED = 6  # numbers of an object at an instant
 
 
 class Cells(NamedTuple):
@@ -111,8 +113,8 @@ class Cells(NamedTuple):
     apart by the boxes themselves.
     """
 
-    starts: ShortInts  # items[starts[c]:starts[c + 1]] are the objects of cell c, times outermost; (2,): one for all
-    items: ShortInts
+    starts: Rows  # rows[starts[c]:starts[c + 1]] are of cell c, times outermost
+    rows: Rows  # t * N + object
 
 
 class Obstacles(NamedTuple):
@@ -122,41 +124,43 @@ class Obstacles(NamedTuple):
     is_stopped: Bools  # (N,) no road user, or at most 0.05 m/s when first seen
     collision_score: Array  # (N,) what an at-fault collision leaves of NC: 0 for road users, else 0.5
     spans: Array  # (N, 5) see extents_over_time
-    axes: Array  # (T, N, 2) cos, sin of the headings; (0, N, 2) without an index
+    placed: Array  # (T * N, 6) centre x, y [m], length, width [m], cos, sin of the heading; empty without an index
     cells: Cells  # the index; empty without one
 
 
 @kernel
 def obstacles_of(boxes: Array, is_stopped: Bools, collision_score: Array) -> Obstacles:
     """Obstacles from boxes (T, N, 5), is_stopped (N,) and collision_score (N,)."""
-    no_axes, no_cells = np.empty((0, len(is_stopped), 2)), Cells(np.empty(0, np.int32), np.empty(0, np.int32))
-    return Obstacles(boxes, is_stopped, collision_score, extents_over_time(boxes), no_axes, no_cells)
+    no_cells = Cells(np.empty(0, np.uint32), np.empty(0, np.uint32))
+    return Obstacles(boxes, is_stopped, collision_score, extents_over_time(boxes), np.empty((0, _PLACED)), no_cells)
 
 
 @kernel
 def with_index(obstacles: Obstacles) -> Obstacles:
     """The same obstacles, quicker to look up: only many trajectories repay it."""
     n_times, n_items = obstacles.boxes.shape[:2]
-    axes = np.empty((n_times, n_items, 2))
-    starts, items = np.zeros(n_times * CELLS_PER_SIDE * CELLS_PER_SIDE + 1, np.int32), np.empty(0, np.int32)
+    placed = np.empty((n_times * n_items, _PLACED))
+    starts, rows = np.zeros(n_times * CELLS_PER_SIDE * CELLS_PER_SIDE + 1, np.uint32), np.empty(0, np.uint32)
     for fill in (False, True):  # counted, summed to the cells' ends, filled from there
         for t in range(n_times):
             for item in range(n_items):
                 box = box_at(obstacles, t, item)
-                axes[t, item, 0], axes[t, item, 1] = box.cos, box.sin
-                _register(box, t, item, fill, starts, items)
+                row = t * n_items + item
+                placed[row, 0], placed[row, 1], placed[row, 2] = box.x, box.y, box.length
+                placed[row, 3], placed[row, 4], placed[row, 5] = box.width, box.cos, box.sin
+                _register(box, t, row, fill, starts, rows)
         if not fill:
             end = 0
             for cell in range(len(starts)):
                 end += starts[cell]
                 starts[cell] = end
-            items = np.empty(end, np.int32)
+            rows = np.empty(end, np.uint32)
     boxes, is_stopped, collision_score = obstacles.boxes, obstacles.is_stopped, obstacles.collision_score
-    return Obstacles(boxes, is_stopped, collision_score, obstacles.spans, axes, Cells(starts, items))
+    return Obstacles(boxes, is_stopped, collision_score, obstacles.spans, placed, Cells(starts, rows))
 
 
 @hidden_kernel
-def _register(box: Box, t: int, item: int, fill: bool, starts: ShortInts, items: ShortInts) -> None:
+def _register(box: Box, t: int, row: int, fill: bool, starts: Rows, rows: Rows) -> None:
     """Count an object in, or write it into, the cells that come within the ego's circumradius of its box at step t."""
     margin = CIRCUMRADIUS + ROUNDING_M
     reach_x = 0.5 * (box.length * abs(box.cos) + box.width * abs(box.sin)) + margin
@@ -168,17 +172,17 @@ def _register(box: Box, t: int, item: int, fill: bool, starts: ShortInts, items:
     high = min(math.floor((box.y + reach_y) / CELL_M), low + CELLS_PER_SIDE - 1)
     everywhere = right - left == CELLS_PER_SIDE - 1 or high - low == CELLS_PER_SIDE - 1
     center_reach = margin + math.sqrt(0.5) * CELL_M  # from the box to a cell's centre
-    for row in range(low, high + 1):
-        dy = (row + 0.5) * CELL_M - box.y
+    for up in range(low, high + 1):
+        dy = (up + 0.5) * CELL_M - box.y
         for column in range(left, right + 1):
             dx = (column + 0.5) * CELL_M - box.x
             along = max(abs(box.cos * dx + box.sin * dy) - 0.5 * box.length, 0.0)
             across = max(abs(box.cos * dy - box.sin * dx) - 0.5 * box.width, 0.0)
             if everywhere or along * along + across * across <= center_reach * center_reach:
-                cell = _cell(t, row, column)
+                cell = _cell(t, up, column)
                 if fill:
                     starts[cell] -= 1
-                    items[starts[cell]] = item
+                    rows[starts[cell]] = row
                 else:
                     starts[cell] += 1
 
@@ -186,14 +190,6 @@ def _register(box: Box, t: int, item: int, fill: bool, starts: ShortInts, items:
 @inlined
 def _cell(t: int, row: int, column: int) -> int:
     return (t * CELLS_PER_SIDE + (row & (CELLS_PER_SIDE - 1))) * CELLS_PER_SIDE + (column & (CELLS_PER_SIDE - 1))
-
-
-@kernel
-def cell_of(cells: Cells, t: int, x: float, y: float) -> int:
-    """The cell whose items are all the objects that an ego body centred on (x, y) [m] at step t may touch."""
-    if len(cells.starts) == 2:
-        return 0
-    return _cell(t, math.floor(y / CELL_M), math.floor(x / CELL_M))
 
 
 @kernel
@@ -261,8 +257,8 @@ def extents_over_time(boxes: Array) -> Array:
 
 
 @inlined
-def list_within_reach(obstacles: Obstacles, body: Body, one: Cells) -> None:
-    """Fill a single cell with who is not out of reach of a placed body all along where the rules look."""
+def list_within_reach(obstacles: Obstacles, body: Body, within_reach: Rows) -> int:
+    """List who is not out of reach of a placed body all along where the rules look. How many there are."""
     least_x, least_y, most_x, most_y = _looked_at(body)
     spans, n = obstacles.spans, 0
     for item in range(len(spans)):
@@ -274,9 +270,9 @@ def list_within_reach(obstacles: Obstacles, body: Body, one: Cells) -> None:
             and spans[item, 1] - reach <= most_y
             and spans[item, 3] + reach >= least_y
         ):
-            one.items[n] = item
+            within_reach[n] = item
             n += 1
-    one.starts[1] = n
+    return n
 
 
 @inlined
@@ -284,8 +280,9 @@ def box_at(obstacles: Obstacles, t: int, item: int) -> Box:
     """Where an object is at step t; NaN when absent."""
     x, y, heading = obstacles.boxes[t, item, 0], obstacles.boxes[t, item, 1], obstacles.boxes[t, item, 2]
     length, width = obstacles.boxes[t, item, 3], obstacles.boxes[t, item, 4]
-    if len(obstacles.axes) > 0:
-        return Box(x, y, heading, obstacles.axes[t, item, 0], obstacles.axes[t, item, 1], length, width)
+    if len(obstacles.placed) > 0:
+        row = t * obstacles.boxes.shape[1] + item
+        return Box(x, y, heading, obstacles.placed[row, 4], obstacles.placed[row, 5], length, width)
     return Box(x, y, heading, math.cos(heading), math.sin(heading), length, width)
 
 
@@ -305,50 +302,134 @@ STOPPED_EGO_MPS = 0.05
 STOPPED_EGO_TTC_MPS = 5e-3
 BEHIND_RAD = math.radians(150.0)
 AHEAD_RAD = math.radians(30.0)
-TTC_STEPS = (0, 3, 6, 9)  # projections 0, 0.3, 0.6, 0.9 s ahead
+_STEPS_BETWEEN = 3
+TTC_STEPS = tuple(range(0, 10, _STEPS_BETWEEN))  # projections 0, 0.3, 0.6, 0.9 s ahead
+_N_AHEAD = len(TTC_STEPS)
 
 
 class Looks(NamedTuple):
-    """Scratch for the contacts of trajectories of T instants each, P in all."""
+    """Scratch for the contacts of trajectories of T instants each, P in all, with N objects.
+
+    A look is 4 * t + its place in TTC_STEPS, a pair a look and an object that is asked about there.
+    """
 
     cell: ShortInts  # (4, P) of where the ego looks at each of TTC_STEPS, times left out
-    listed: ShortInts  # (2, 4 T) see `_list_looks`
-    one: Cells  # of obstacles without an index
+    x: Array  # (4, P) where its body's centre is there [m]
+    y: Array  # (4, P)
+    listed: Rows  # (3, 4 T) looks, and of which rows of the index on up to which
+    within_reach: Rows  # (N,) objects without an index
+    look: Rows  # (M,) of a pair
+    item: Rows  # (M,) its object
+    beside: Array  # (8, M) what gap_m takes of the two
     asking: Bytes  # (N,) bits below: the rules that still look at an object
 
 
 NC, TTC = 1, 2
+PAIRS_AT_ONCE = 48
 
 
 @register_jitable
 def empty_looks(n_instants: int, n_times: int, n_items: int) -> Looks:
     """Room for trajectories of T instants each, P in all, among N objects."""
-    cell, listed = np.empty((len(TTC_STEPS), n_instants), np.int32), np.empty((2, len(TTC_STEPS) * n_times), np.int32)
-    one = Cells(np.zeros(2, np.int32), np.empty(n_items, np.int32))
-    return Looks(cell, listed, one, np.empty(n_items, np.uint8))
+    cell, listed = np.empty((_N_AHEAD, n_instants), np.int32), np.empty((3, _N_AHEAD * n_times), np.uint32)
+    x, y, n_pairs = np.empty((_N_AHEAD, n_instants)), np.empty((_N_AHEAD, n_instants)), PAIRS_AT_ONCE + n_items
+    within_reach, look, item = np.empty(n_items, np.uint32), np.empty(n_pairs, np.uint32), np.empty(n_pairs, np.uint32)
+    return Looks(cell, x, y, listed, within_reach, look, item, np.empty((8, n_pairs)), np.empty(n_items, np.uint8))
 
 
 @inlined
 def set_looks(body: Body, looks: Looks) -> None:
-    """Fill in the cells of a placed body."""
+    """Fill in where a placed body looks."""
     for k, step in enumerate(TTC_STEPS):
-        cell = looks.cell[k]
+        cell, x, y = looks.cell[k], looks.x[k], looks.y[k]
         for t in range(len(body.x)):
             gone = body.speed[t] * (step * 0.1)
-            row, column = (body.y[t] + body.sin[t] * gone) / CELL_M, (body.x[t] + body.cos[t] * gone) / CELL_M
-            cell[t] = _cell(0, math.floor(row), math.floor(column))
+            x[t], y[t] = body.x[t] + body.cos[t] * gone, body.y[t] + body.sin[t] * gone
+            cell[t] = _cell(0, math.floor(y[t] / CELL_M), math.floor(x[t] / CELL_M))
 
 
 @inlined
-def _list_looks(cells: Cells, looks: Looks, start: int, n_times: int) -> int:
-    """List looks with somebody in the cell, in time: 4 * t + place in TTC_STEPS, and the cell. How many there are."""
-    one, n = len(cells.starts) == 2, 0
+def _list_looks(obstacles: Obstacles, looks: Looks, start: int, n_times: int) -> int:
+    """List looks in time, with an index those with somebody in the cell. How many there are."""
+    n, starts, indexed = 0, obstacles.cells.starts, len(obstacles.placed) > 0
     for t in range(n_times):
-        for k in range(len(TTC_STEPS) if t < n_times - max(TTC_STEPS) else 1):
-            cell = 0 if one else _cell(t + TTC_STEPS[k], 0, 0) + looks.cell[k, start + t]
-            looks.listed[0, n], looks.listed[1, n] = len(TTC_STEPS) * t + k, cell
-            n += cells.starts[cell + 1] > cells.starts[cell]
+        for k in range(_N_AHEAD if t < n_times - max(TTC_STEPS) else 1):
+            looks.listed[0, n] = _N_AHEAD * t + k
+            if indexed:
+                cell = _cell(t + TTC_STEPS[k], 0, 0) + looks.cell[k, start + t]
+                looks.listed[1, n], looks.listed[2, n] = starts[cell], starts[cell + 1]
+                prefetch(obstacles.cells.rows, np.uint64(starts[cell]))
+                n += starts[cell + 1] > starts[cell]
+            else:
+                n += 1
     return n
+
+
+@inlined
+def _ego_at(body: Body, looks: Looks, start: int, states: Array, look: int) -> Box:
+    t, k = look // _N_AHEAD, look % _N_AHEAD
+    x, y = looks.x[k, start + t], looks.y[k, start + t]
+    return Box(x, y, states[t, HEADING], body.cos[t], body.sin[t], LENGTH, WIDTH)
+
+
+@inlined
+def _pairs_within_reach(
+    obstacles: Obstacles, n_near: int, body: Body, looks: Looks, start: int, states: Array, first: int, n_listed: int,
+    ahead: bool,
+) -> tuple[int, int]:  # fmt: skip
+    """As `_pairs_that_may_touch`, of the first `n_near` objects `within_reach`."""
+    i, n, room, listed = first, 0, len(looks.look) - len(looks.asking), looks.listed[0].view(np.int32)
+    while i < n_listed and n <= room:
+        look = listed[i]
+        i += 1
+        if ahead or look % _N_AHEAD == 0:
+            ego, step = _ego_at(body, looks, start, states, look), look // _N_AHEAD + _STEPS_BETWEEN * (look % _N_AHEAD)
+            for near in range(n_near):
+                looks.look[n], looks.item[n] = look, looks.within_reach[near]
+                n += not out_of_reach(obstacles, step, looks.within_reach[near], ego)
+    return i, n
+
+
+@inlined
+def _pairs_that_may_touch(
+    obstacles: Obstacles, body: Body, looks: Looks, start: int, first: int, n_listed: int, ahead: bool
+) -> tuple[int, int]:
+    """List the pairs that may touch, of the listed looks from `first` on and as many as there is room for.
+
+    The first look that is left, and how many pairs there are. ahead: not only of looks at the instant itself.
+    """
+    placed, rows, one = obstacles.placed, obstacles.cells.rows, np.uint64(1)
+    gap, dy, cos, sin = looks.beside[0], looks.beside[1], looks.beside[2], looks.beside[3]
+    length, width, ego_cos, ego_sin = looks.beside[4], looks.beside[5], looks.beside[6], looks.beside[7]
+    i, n, n_items = first, np.uint64(0), np.uint64(len(looks.asking))
+    room = np.uint64(len(looks.look)) - n_items
+    while i < n_listed and n <= room:
+        look, entry, last = looks.listed[0, i], np.uint64(looks.listed[1, i]), np.uint64(looks.listed[2, i])
+        i += 1
+        if ahead or look & np.uint32(3) == 0:
+            while entry < last:
+                row = np.uint64(rows[entry])
+                prefetch(placed, row * np.uint64(_PLACED))
+                looks.look[n], looks.item[n] = look, row
+                n += one
+                entry += one
+    for p in range(n):
+        look, row = looks.look[p], looks.item[p]
+        t, k = look >> np.uint32(2), look & np.uint32(3)
+        at = np.uint32(start) + t
+        gap[p], dy[p] = placed[row, 0] - looks.x[k, at], placed[row, 1] - looks.y[k, at]
+        length[p], width[p], cos[p], sin[p] = placed[row, 2], placed[row, 3], placed[row, 4], placed[row, 5]
+        ego_cos[p], ego_sin[p] = body.cos[t], body.sin[t]
+    for p in range(n):
+        ego = Box(0.0, 0.0, 0.0, ego_cos[p], ego_sin[p], LENGTH, WIDTH)
+        gap[p] = gap_m(ego, Box(gap[p], dy[p], 0.0, cos[p], sin[p], length[p], width[p]))
+    n_kept = 0
+    for p in range(n):
+        look = looks.look[p]
+        step = (look >> np.uint32(2)) + np.uint32(_STEPS_BETWEEN) * (look & np.uint32(3))
+        looks.look[n_kept], looks.item[n_kept] = look, looks.item[p] - step * n_items
+        n_kept += gap[p] <= ROUNDING_M
+    return i, n_kept
 
 
 @hidden_kernel
@@ -361,42 +442,47 @@ def first_contacts(
     there is none. states: (T, 11) of one trajectory; body: placed there, with its flags; looks: set by `set_looks`,
     from `start` on for this one; map_index: within its intersections contacts beside the ego count for TTC too.
     """
-    cells = looks.one if len(obstacles.axes) == 0 else obstacles.cells
-    one = len(cells.starts) == 2
-    if one:
-        list_within_reach(obstacles, body, looks.one)
+    indexed = len(obstacles.placed) > 0
+    n_near = 0 if indexed else list_within_reach(obstacles, body, looks.within_reach)
+    pair_look, pair_item = looks.look.view(np.int32), looks.item.view(np.int32)
     nc, hit, violated, ends = 1.0, math.inf, math.inf, states.shape[0] - max(TTC_STEPS)
     for item in range(len(looks.asking)):
         looks.asking[item] = NC | TTC
-    for i in range(_list_looks(cells, looks, start, states.shape[0])):
-        t, k, cell = looks.listed[0, i] // len(TTC_STEPS), looks.listed[0, i] % len(TTC_STEPS), looks.listed[1, i]
-        asks = NC if k == 0 and nc > 0.0 else 0
-        asks |= TTC if violated == math.inf and t < ends and body.speed[t] >= STOPPED_EGO_TTC_MPS else 0
-        if asks == 0:
-            continue
-        step, c, s = TTC_STEPS[k], body.cos[t], body.sin[t]
-        gone = body.speed[t] * (step * 0.1)
-        ego = Box(body.x[t] + c * gone, body.y[t] + s * gone, states[t, HEADING], c, s, LENGTH, WIDTH)
-        for entry in range(cells.starts[cell], cells.starts[cell + 1]):
-            item = cells.items[entry]
-            if not looks.asking[item] & asks or (one and out_of_reach(obstacles, t + step, item, ego)):
+    i, n_listed = 0, _list_looks(obstacles, looks, start, states.shape[0])
+    while i < n_listed and (nc > 0.0 or violated == math.inf):
+        ahead = violated == math.inf
+        if indexed:
+            i, n = _pairs_that_may_touch(obstacles, body, looks, start, i, n_listed, ahead)
+        else:
+            i, n = _pairs_within_reach(obstacles, n_near, body, looks, start, states, i, n_listed, ahead)
+        for p in range(n):
+            look, item = pair_look[p], pair_item[p]
+            t, k = look // _N_AHEAD, look % _N_AHEAD
+            asks = NC if k == 0 and nc > 0.0 else 0
+            asks |= TTC if violated == math.inf and t < ends and body.speed[t] >= STOPPED_EGO_TTC_MPS else 0
+            asks &= looks.asking[item]
+            if asks == 0:
                 continue
-            other = box_at(obstacles, t + step, item)
+            ego, other = _ego_at(body, looks, start, states, look), box_at(obstacles, t + TTC_STEPS[k], item)
             gap = gap_m(ego, other)
             if gap > ROUNDING_M or not (gap < -ROUNDING_M or touching(ego, other)):
                 continue
             rear_x, rear_y = states[t, X], states[t, Y]
-            off_lane, stopped = (body.flags[t] & OFF_LANE) != 0, obstacles.is_stopped[item]
-            if looks.asking[item] & asks & NC:
-                if _at_fault(ego, rear_x, rear_y, body.speed[t], off_lane, other, stopped):
+            if asks & NC:
+                if _at_fault(ego, rear_x, rear_y, body, t, other, obstacles.is_stopped[item], map_index, places):
                     nc, hit = min(nc, obstacles.collision_score[item]), min(hit, float(t))
                 else:
                     looks.asking[item] &= TTC
-            if looks.asking[item] & asks & TTC:
+            if asks & TTC:
                 angle = _angle_to(rear_x, rear_y, ego.heading, other)  # the ego as it is now
-                beside = not angle > BEHIND_RAD and (off_lane or in_intersection(map_index, rear_x, rear_y, places))
-                if angle < AHEAD_RAD or beside:
-                    violated, asks = float(t), asks & NC
+                if angle < AHEAD_RAD or (
+                    not angle > BEHIND_RAD
+                    and (
+                        is_off_lane(map_index, body, t, HALF_LENGTH, HALF_WIDTH, places)
+                        or in_intersection(map_index, rear_x, rear_y, places)
+                    )
+                ):
+                    violated = float(t)
                 looks.asking[item] &= NC
     return nc, hit, violated
 
@@ -415,9 +501,19 @@ def _looked_at(body: Body) -> tuple[float, float, float, float]:
 
 
 @hidden_kernel
-def _at_fault(ego: Box, rear_x: float, rear_y: float, speed: float, off_lane: bool, other: Box, stopped: bool) -> bool:
+def _at_fault(
+    ego: Box,
+    rear_x: float,
+    rear_y: float,
+    body: Body,
+    t: int,
+    other: Box,
+    stopped: bool,
+    map_index: MapIndex,
+    places: Places,
+) -> bool:
     """Whether the ego, its rear axle at (rear_x, rear_y) [m], is to blame for touching another box."""
-    if speed <= STOPPED_EGO_MPS:
+    if body.speed[t] <= STOPPED_EGO_MPS:
         return False
     if stopped:
         return True
@@ -425,7 +521,8 @@ def _at_fault(ego: Box, rear_x: float, rear_y: float, speed: float, off_lane: bo
         return False
     half_length = ego.length / 2.0
     front_x, front_y = ego.x + half_length * ego.cos, ego.y + half_length * ego.sin
-    return off_lane or touching(Box(front_x, front_y, ego.heading, ego.cos, ego.sin, 0.0, ego.width), other)
+    front = Box(front_x, front_y, ego.heading, ego.cos, ego.sin, 0.0, ego.width)
+    return touching(front, other) or is_off_lane(map_index, body, t, HALF_LENGTH, HALF_WIDTH, places)
 
 
 @hidden_kernel

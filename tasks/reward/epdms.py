@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tasks.kernels.compiled import hidden_kernel, inlined, kernel, read_only
 from tasks.reward.areas import (
-    N_POINTS,
+    N_CORNERS,
     NEVER_RED,
     Places,
     RedLanes,
@@ -23,9 +23,7 @@ from tasks.reward.areas import (
 )
 from tasks.reward.centerline import (
     DDC_WINDOW,
-    MULTIPLE_LANES,
     NON_DRIVABLE,
-    ONCOMING,
     Body,
     Centerline,
     as_states,
@@ -231,7 +229,6 @@ class Verdicts(NamedTuple):
     scores: Array  # (S + 1, K) by LABELLED; of EP nothing, which compares trajectories
     fails: Array  # (S, K) by JUDGED: the time index (0.1 s) at which it first fails, inf: never
     ep_raw_m: Array  # (K,) progress along the centreline [m]
-    ego_areas: Bools  # (K, 41, 3)
     comfort: Bools  # (K, 6)
 
 
@@ -265,7 +262,7 @@ def rule_context(prepared: PreparedScene, with_history: bool) -> RuleContext:
 def empty_scratch(context: RuleContext, n_objects: int, n_block: int) -> Scratch:
     """Room for that many trajectories at once among N objects."""
     n = n_block * N_TIMES
-    places, looks = empty_places(context.map_index, N_POINTS * n), empty_looks(n, N_TIMES, n_objects)
+    places, looks = empty_places(context.map_index, N_CORNERS * n), empty_looks(n, N_TIMES, n_objects)
     comfort, begun = comfort_scratch(len(context.history) + N_TIMES), np.empty(3)
     begun[0] = math.nan  # nowhere yet
     return Scratch(empty_body(n), places, looks, np.empty(DDC_WINDOW - 1 + N_TIMES), begun, comfort)
@@ -309,7 +306,6 @@ def judge_one(
     out: Verdicts,
 ) -> None:
     """All rules but comfort on one trajectory (41, 11) of a block, whose instants begin at `start`; to row k."""
-    _spread_flags(body.flags, out.ego_areas[k])
     out.scores[NC, k], out.fails[NC, k], out.fails[TTC, k] = first_contacts(
         obstacles, states, body, scratch.looks, start, context.map_index, scratch.places
     )
@@ -324,14 +320,6 @@ def judge_one(
         out.comfort[k] = True
     for row in _WHOLES:
         out.scores[row, k] = 1.0 if out.fails[row, k] == math.inf else 0.0
-
-
-@hidden_kernel
-def _spread_flags(flags: Bytes, out: Bools) -> None:
-    for t in range(len(flags)):
-        out[t, 0] = flags[t] & MULTIPLE_LANES != 0
-        out[t, 1] = flags[t] & NON_DRIVABLE != 0
-        out[t, 2] = flags[t] & ONCOMING != 0
 
 
 @hidden_kernel
@@ -368,7 +356,6 @@ class Scores(_Columns):
     ep_raw_m: Array  # (K,) progress along the centreline [m]
     multiplier: Array  # (K,) what the weighted mean is multiplied by
     pdm_score: Array  # (K,) multiplier times weighted mean, without EC
-    ego_areas: Bools  # (K, 41, 3) multiple lanes, non-drivable, oncoming
     comfort: Bools  # (K, 6) flags of history comfort, see comfort.history_comfort
 
     def __len__(self) -> int:
@@ -394,12 +381,12 @@ def score(
         raise ValueError(f"normalise must be one of {_NORMALISE}, got {normalise!r}")
     states = as_states("states", states)
     table = np.empty((N_ROWS, len(states)))
-    areas, comfort = np.empty((len(states), N_TIMES, 3), np.bool_), np.empty((len(states), N_FLAGS), np.bool_)
+    comfort = np.empty((len(states), N_FLAGS), np.bool_)
     context, in_pairs = rule_context(prepared, with_history), normalise == "pairs"
     obstacles = prepared.indexed_obstacles if len(states) >= INDEX_FROM_ROWS else prepared.obstacles
-    if not score_all(context, obstacles, states, in_pairs, NO_REFERENCE, table, areas, comfort):
+    if not score_all(context, obstacles, states, in_pairs, NO_REFERENCE, table, comfort):
         raise ValueError(f"states must be finite and at most {LARGEST:g}: leave out what is not a drive")
-    return Scores(*[*table, areas, comfort])
+    return Scores(*[*table, comfort])
 
 
 def score_with_ec(scores: Scores, ec: Array) -> Array:
@@ -438,15 +425,14 @@ def score_all(
     in_pairs: bool,
     reference_m: float,  # compliant progress of a reference that is not among the states; NO_REFERENCE: there is none
     table: Array,
-    areas: Bools,
     comfort: Bools,
 ) -> bool:
     """All rules and sums. One call: on two trajectories entering it takes as long as the rules.
 
-    table: (N_ROWS, K), areas: (K, 41, 3), comfort: (K, 6), all out. False where a state is not finite or above LARGEST.
+    table: (N_ROWS, K), comfort: (K, 6), both out. False where a state is not finite or above LARGEST.
     """
     table[:] = math.nan  # what no rule says
-    out = Verdicts(table[:_N_SCORES], table[_N_SCORES:_EP_RAW_M], table[_EP_RAW_M], areas, comfort)
+    out = Verdicts(table[:_N_SCORES], table[_N_SCORES:_EP_RAW_M], table[_EP_RAW_M], comfort)
     n = min(LANES, len(states))
     scratch = empty_scratch(context, obstacles.boxes.shape[1], n)
     for first in range(0, len(states), n):  # the last block is a whole one too, some of it judged again

@@ -314,6 +314,7 @@ class MapIndex(NamedTuple):
     parts: Bytes  # (S,) bits of the parts that some region of the set plays
     playing: Bits  # (4, W) the regions that play each part
     n_lane_words: int  # the first words, which hold all lanes
+    clear: Bytes  # (rows * columns,) see with_clearance; empty without
 
 
 def index_map(polygons: Sequence[MapPolygon], route_lane_ids: frozenset[str]) -> MapIndex:
@@ -355,7 +356,41 @@ def assembled(grid: Grid, touched: Ints, edges: Array, bounded: Bits, playing: B
         parts,
         playing,
         n_lane_words,
+        np.empty(0, np.uint8),
     )
+
+
+def with_clearance(index: MapIndex, reach_m: float) -> MapIndex:
+    """The same index, with a 1 in `clear` for cells around which all is drivable as far as `reach_m` goes.
+
+    Only many trajectories repay it.
+    """
+    return index._replace(clear=_clear_cells(index, int(reach_m / index.cell_m) + 1))
+
+
+@kernel
+def _clear_cells(index: MapIndex, reach: int) -> Bytes:
+    """Cells whose square of 2 `reach` + 1 cells each way lies in drivable regions, boundaries in it included."""
+    cells, crossed, wide = index.cells, index.crossed, 2 * reach + 1
+    is_road, crossed_is_road = index.parts & 1 << DRIVABLE != 0, np.zeros(len(crossed), np.bool_)
+    for q in range(len(crossed)):
+        for w in range(index.sets.shape[1]):
+            kept = index.sets[crossed[q, NEAR], w]  # in all of the cell, on the edges themselves too
+            for i in range(crossed[q, FIRST], crossed[q, LAST]):
+                kept &= ~index.bounded[index.entry[i] >> EDGE, w]
+            crossed_is_road[q] |= kept & index.playing[DRIVABLE, w] != 0
+    clear, tall = np.zeros(cells.shape, np.uint8), np.zeros(cells.shape[1], np.int32)
+    for row in range(cells.shape[0]):
+        run = 0
+        for column in range(cells.shape[1]):
+            cell = cells[row, column]
+            run = run + 1 if (is_road[cell] if cell >= 0 else crossed_is_road[-1 - cell]) else 0
+            middle = column - reach
+            if middle >= 0:
+                tall[middle] = tall[middle] + 1 if run >= wide else 0
+                if row >= reach:
+                    clear[row - reach, middle] = tall[middle] >= wide
+    return clear.reshape(-1)
 
 
 @kernel

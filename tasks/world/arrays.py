@@ -10,6 +10,7 @@ F32 = NDArray[np.float32]
 FloatArray = NDArray[np.floating[Any]]  # of either precision
 Ints = NDArray[np.int64]
 ShortInts = NDArray[np.int32]
+Rows = NDArray[np.uint32]  # indices that never count from the end, which compiled code need not ask about
 Indices = NDArray[np.intp]  # of another array: what np.flatnonzero and np.argsort give
 Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]

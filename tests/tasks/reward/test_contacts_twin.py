@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tasks.kernels.compiled import inner_kernel
 from tasks.reward.areas import Places, empty_places
-from tasks.reward.centerline import MULTIPLE_LANES, NON_DRIVABLE, Body, empty_body, instants_of, place_body
+from tasks.reward.centerline import LANES_KNOWN, MULTIPLE_LANES, NON_DRIVABLE, Body, empty_body, instants_of, place_body
 from tasks.reward.collisions import (
     Looks,
     Obstacles,
@@ -51,7 +51,7 @@ def contacts(world: World, obstacles: Obstacles) -> np.ndarray:
     map_index = index_map([MapPolygon("crossing", MapLayer.INTERSECTION, world.crossing)], frozenset())
     body, looks = empty_body(world.flags.size), empty_looks(world.flags.size, 41, obstacles.boxes.shape[1])
     place_body(world.states.reshape(-1, 11), PACIFICA.rear_axle_to_center, body)
-    body.flags[:] = world.flags.ravel()
+    body.flags[:] = world.flags.ravel() | LANES_KNOWN
     _contacts(obstacles, world.states, body, looks, map_index, empty_places(map_index, 1), found)
     return found
 
@@ -73,8 +73,8 @@ def _contacts(
 
 
 @inner_kernel
-def _list_within_reach(obstacles: Obstacles, body: Body, looks: Looks) -> None:
-    list_within_reach(obstacles, body, looks.one)
+def _list_within_reach(obstacles: Obstacles, body: Body, found: np.ndarray) -> int:
+    return list_within_reach(obstacles, body, found)
 
 
 def slow_contacts(world: World) -> np.ndarray:
@@ -222,8 +222,8 @@ def test_objects_left_out_along_a_path_are_those_that_nothing_on_it_touches() ->
     states[:, X] = np.arange(41.0) - PACIFICA.rear_axle_to_center
     body = empty_body(41)
     place_body(states, PACIFICA.rear_axle_to_center, body)
-    looks = empty_looks(41, 41, 7)
-    _list_within_reach(obstacles_of(boxes, np.zeros(7, dtype=bool), np.zeros(7)), body, looks)
-    assert looks.one.items[: looks.one.starts[1]].tolist() == [0, 1, 2, 6]
+    found = np.empty(7, np.uint32)
+    n = _list_within_reach(obstacles_of(boxes, np.zeros(7, dtype=bool), np.zeros(7)), body, found)
+    assert found[:n].tolist() == [0, 1, 2, 6]
     ego = np.array([40.0, 0.0, 0.0, PACIFICA.length, PACIFICA.width])
     assert [i for i in range(7) if touching(ego, boxes[:, i]).any()] == [2, 6]  # from the path's end

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from tasks.reward.centerline import CENTER_IN_INTERSECTION, MULTIPLE_LANES, NON_DRIVABLE, ONCOMING
+from tasks.reward.map_index import index_map
 from tasks.world.frames import PACIFICA, X, Y
 from tasks.world.road_map import MapLayer
+from tests.tasks.reward.body_flags import flags_along
 from tests.tasks.reward.straight_street import rectangle
-from tests.tasks.reward.test_areas_twin import flags_along
 
 MAP = [
     rectangle("own", MapLayer.LANE, (0.0, -2.0), (50.0, 2.0)),
@@ -35,4 +36,4 @@ MAP = [
 def test_layers_of_a_nuplan_map(x: float, y: float, wanted: int) -> None:
     states = np.zeros((1, 41, 11))
     states[..., X], states[..., Y] = x, y
-    assert (flags_along(MAP, frozenset({"own", "turn"}), states, PACIFICA) == wanted).all()
+    assert (flags_along(index_map(MAP, frozenset({"own", "turn"})), states) == wanted).all()

@@ -10,8 +10,7 @@ from tasks.reward.collisions import (
     CELL_M,
     CELLS_PER_SIDE,
     CIRCUMRADIUS,
-    Cells,
-    cell_of,
+    Obstacles,
     obstacles_of,
     with_index,
 )
@@ -20,14 +19,16 @@ from tasks.world.frames import PACIFICA, touching
 PERIOD_M = CELLS_PER_SIDE * CELL_M
 
 
-def indexed(boxes: np.ndarray) -> Cells:
+def indexed(boxes: np.ndarray) -> Obstacles:
     n_items = boxes.shape[1]
-    return with_index(obstacles_of(boxes, np.zeros(n_items, dtype=bool), np.zeros(n_items))).cells
+    return with_index(obstacles_of(boxes, np.zeros(n_items, dtype=bool), np.zeros(n_items)))
 
 
-def seen_from(cells: Cells, t: int, x: float, y: float) -> np.ndarray:
-    cell = cell_of(cells, t, x, y)
-    return cells.items[cells.starts[cell] : cells.starts[cell + 1]]
+def seen_from(obstacles: Obstacles, t: int, x: float, y: float) -> np.ndarray:
+    row, column = (math.floor(place / CELL_M) % CELLS_PER_SIDE for place in (y, x))
+    cell = (t * CELLS_PER_SIDE + row) * CELLS_PER_SIDE + column
+    starts, rows = obstacles.cells
+    return rows[starts[cell] : starts[cell + 1]].astype(np.int64) - t * obstacles.boxes.shape[1]
 
 
 @settings(max_examples=60)
@@ -45,24 +46,24 @@ def test_whatever_touches_an_ego_is_in_the_cell_of_its_centre(seed, n_items, spr
     boxes[..., 2] = rng.choice([0.0, np.pi / 2, 1.0, -2.5], (3, n_items))
     boxes[..., 3:] = rng.uniform(0.0, longest_m, (3, n_items, 2))
     boxes[rng.random((3, n_items)) < 0.2] = np.nan
-    cells = indexed(boxes)
+    obstacles = indexed(boxes)
     near = origin_m + np.round(rng.uniform(-spread_m, spread_m, (60, 2)), rng.integers(0, 3))
     for x, y in np.concatenate([near, boxes[0, np.isfinite(boxes[0, :, 0]), :2]]):
         t, heading = rng.integers(3), rng.uniform(-4.0, 4.0)
         ego = np.array([x, y, heading, PACIFICA.length, PACIFICA.width])
-        assert np.isin(np.nonzero(touching(ego, boxes[t]))[0], seen_from(cells, t, x, y)).all()
+        assert np.isin(np.nonzero(touching(ego, boxes[t]))[0], seen_from(obstacles, t, x, y)).all()
 
 
 def test_an_ego_too_far_away_to_touch_anything_sees_nothing() -> None:
-    cells = indexed(np.array([[[3.0, 4.0, 0.3, 4.5, 2.0]]]))
-    assert seen_from(cells, 0, 3.0, 4.0).tolist() == [0]
+    obstacles = indexed(np.array([[[3.0, 4.0, 0.3, 4.5, 2.0]]]))
+    assert seen_from(obstacles, 0, 3.0, 4.0).tolist() == [0]
     reach = math.sqrt(2.0) * (math.hypot(4.5, 2.0) / 2 + CIRCUMRADIUS + CELL_M)
     for angle in np.linspace(0.0, 6.0, 20):
-        assert seen_from(cells, 0, 3.0 + reach * np.cos(angle), 4.0 + reach * np.sin(angle)).size == 0
+        assert seen_from(obstacles, 0, 3.0 + reach * np.cos(angle), 4.0 + reach * np.sin(angle)).size == 0
 
 
 def test_an_object_is_listed_at_its_own_times_and_once() -> None:
     boxes = np.full((3, 1, 5), np.nan)
     boxes[1, 0] = [0.0, 0.0, 0.0, 1000.0, 1000.0]  # longer than the grid's period
-    cells = indexed(boxes)
-    assert [seen_from(cells, t, 77.0, -310.0).tolist() for t in range(3)] == [[], [0], []]
+    obstacles = indexed(boxes)
+    assert [seen_from(obstacles, t, 77.0, -310.0).tolist() for t in range(3)] == [[], [0], []]

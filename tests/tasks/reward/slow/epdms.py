@@ -56,6 +56,5 @@ def _rules(prepared: PreparedScene, states: Array, with_history: bool) -> dict[s
         "ttc_index": ttc_index,
         "lk_index": lk_index,
         "hc_index": hc_index,
-        "ego_areas": np.stack([areas.multiple_lanes, areas.non_drivable, areas.oncoming], axis=-1),
         "comfort": comfort,
     }
