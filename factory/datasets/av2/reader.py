@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -564,6 +564,24 @@ class AV2Log(WholeLog):
     sweeps: tuple[SensorFile, ...]
 
 
+class Moved(NamedTuple):
+    """What moved in a log, and where it was every 0.1 s, steps S."""
+
+    motion: LogMotion
+    ego_states: Array  # (S, 11)
+    agents: AgentTracks
+
+
+MOVED_KEPT = 16  # logs, some megabytes each at most
+
+
+def moved_in(folder: Path) -> Moved:
+    """Of the log in this folder. Raises BadClip."""
+    motion = read_motion(folder)
+    times_s = step_times(0, motion.n_steps)
+    return Moved(motion, ego_states_at(motion, times_s), agents_at(motion, times_s))
+
+
 class AV2Reader(LogReader[AV2Log]):
     """Clips of a folder of Argoverse 2 sensor logs, of one of its train/val/test folders, or of one log."""
 
@@ -583,15 +601,27 @@ class AV2Reader(LogReader[AV2Log]):
         if not is_named(path / ANNOTATIONS):
             return f"no {ANNOTATIONS}"
         map_file(path)
-        motion = read_motion(path)
-        times_s = step_times(0, motion.n_steps)
-        states = ego_states_at(motion, times_s)
-        segment = np.where(observed_at(motion, times_s) & np.isfinite(states).all(axis=1), 0, -1)
-        return LoggedDrive(states, agents_at(motion, times_s), segment)
+        key = _as_it_lies(path)
+        moved = moved_in(path)
+        if len(self._moved) < MOVED_KEPT:
+            self._moved[key] = moved
+        times_s, states = step_times(0, moved.motion.n_steps), moved.ego_states
+        segment = np.where(observed_at(moved.motion, times_s) & np.isfinite(states).all(axis=1), 0, -1)
+        return LoggedDrive(states, moved.agents, segment)
 
     def load(self, path: Path) -> AV2Log:
         """The log in this folder. Raises BadClip."""
-        return read_log(path)
+        return read_log(path, self._moved.pop(_as_it_lies(path), None))
+
+    @cached_property
+    def _moved(self) -> dict[tuple[object, ...], Moved]:
+        """Of some of the logs that are indexed and not yet loaded; half of a log's time is reading it."""
+        return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        held = super().__getstate__()
+        held.pop("_moved", None)
+        return held
 
     def digest(self, ref: ClipRef) -> str:
         """The clip's content digest, from the bytes of its log's files alone. Raises BadClip."""
@@ -625,11 +655,16 @@ class AV2Reader(LogReader[AV2Log]):
         return WindowSensors(poses, log.cameras, *sensed, block)
 
 
-def read_log(folder: Path) -> AV2Log:
-    """The whole log, resampled to 0.1 s. Raises BadClip."""
-    motion = read_motion(folder)
+def _as_it_lies(folder: Path) -> tuple[object, ...]:
+    """What changes with the files that `moved_in` reads."""
+    files = [folder / name for name in (ANNOTATIONS, POSES)]
+    return folder, *[(file.stat().st_mtime_ns, file.stat().st_size) if file.is_file() else None for file in files]
+
+
+def read_log(folder: Path, moved: Moved | None = None) -> AV2Log:
+    """The whole log, resampled to 0.1 s; moved: what moved in it, where that is known. Raises BadClip."""
+    motion, ego_states, agents = moved or moved_in(folder)
     times_s = step_times(0, motion.n_steps)
-    ego_states = ego_states_at(motion, times_s)
     vector_map = map_file(folder)
     road_map, map_repairs = read_map(vector_map)
     every_light, state_repairs = read_lights(folder, motion, times_s)
@@ -640,7 +675,7 @@ def read_log(folder: Path) -> AV2Log:
         file=str(folder),
         motion=motion,
         ego_states=ego_states,
-        agents=agents_at(motion, times_s),
+        agents=agents,
         road_map=road_map,
         route=route_of_drive(road_map, ego_states[np.isfinite(ego_states[:, X]), :3], str(vector_map), "lane_segments"),
         lights=lights,

@@ -350,6 +350,18 @@ def test_clip_ids_and_digest_know_the_content_but_not_the_place(log: Path, tmp_p
     assert changed.clip_id == one.clip_id and changed.content_digest != one.content_digest
 
 
+def test_a_log_is_read_as_it_is_now_and_not_as_the_index_met_it(log: Path) -> None:
+    reader = AV2Reader(log)
+    first = reader.index().refs[0]
+    as_indexed, sent = pickle.loads(pickle.dumps(reader)).read(first), len(pickle.dumps(reader))
+    assert sent < 5_000, "what the index read does not travel to workers"
+
+    edit(log / "annotations.feather", lambda columns: columns.update(length_m=[9.0] * len(columns["length_m"])))
+    clip = reader.read(first)
+    assert clip.content_digest != as_indexed.content_digest
+    assert (clip.agents.boxes[NOW, :, 3] == 9.0).all() and not (as_indexed.agents.boxes[NOW, :, 3] == 9.0).any()
+
+
 def test_name_and_licence_are_the_log_s_own(log: Path) -> None:
     reader = AV2Reader(log, name="synthetic")
     assert "Argoverse" in reader.read(reader.index().refs[0]).licence
