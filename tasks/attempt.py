@@ -324,6 +324,7 @@ def _first_hit(context: RuleContext, boxes: Array, is_stopped: Bools, collision_
 # A vocabulary's labels.
 
 TRAJECTORIES_AT_ONCE = 512  # 2 MB of states, which stay in the caches
+CLEARANCE_FROM_ROWS = 2048  # it takes 1.3 ms, what it saves on half as many
 
 
 def vocabulary_labels(
@@ -335,7 +336,8 @@ def vocabulary_labels(
     drives it, to which every trajectory's progress is related.
     """
     rows, trajectories = vocabulary.along_strips
-    prepared = replace(prepared, map_index=with_clearance(prepared.map_index, CIRCUMRADIUS))
+    if len(trajectories) >= CLEARANCE_FROM_ROWS:
+        prepared = replace(prepared, map_index=with_clearance(prepared.map_index, CIRCUMRADIUS))
     found = {name: np.empty(len(trajectories)) for name in ARRAYS}
     reference_m = 0.0
     states = np.empty((1 + min(len(trajectories), TRAJECTORIES_AT_ONCE), *reference.shape))
