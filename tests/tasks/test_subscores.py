@@ -66,7 +66,7 @@ def test_orders_and_bits_are_those_that_were_written() -> None:
 def test_a_record_without_a_rule_is_no_score(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(epdms, "N_ROWS", N_ROWS + 1)
     monkeypatch.setattr(epdms, "Scores", lambda *columns: columns)
-    *known, new, _, _ = score(street(), drive(8.0))  # type: ignore[misc]
+    *known, new, _ = score(street(), drive(8.0))  # type: ignore[misc]
     assert np.isnan(new).all() and not np.isnan(known).any()
 
 
