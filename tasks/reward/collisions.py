@@ -374,20 +374,23 @@ def _ego_at(body: Body, looks: Looks, start: int, states: Array, look: int) -> B
 
 @inlined
 def _pairs_within_reach(
-    obstacles: Obstacles, n_near: int, body: Body, looks: Looks, start: int, states: Array, first: int, n_listed: int,
-    ahead: bool,
-) -> tuple[int, int]:  # fmt: skip
+    obstacles: Obstacles, n_near: int, body: Body, looks: Looks, start: int, first: int, n_listed: int, ahead: bool
+) -> tuple[int, int]:
     """As `_pairs_that_may_touch`, of the first `n_near` objects `within_reach`."""
-    i, n, room, listed = first, 0, len(looks.look) - len(looks.asking), looks.listed[0].view(np.int32)
+    i, n, one, room = first, np.uint64(0), np.uint64(1), np.uint64(len(looks.look) - len(looks.asking))
     while i < n_listed and n <= room:
-        look = listed[i]
+        look = looks.listed[0, i]
         i += 1
-        if ahead or look % _N_AHEAD == 0:
-            ego, step = _ego_at(body, looks, start, states, look), look // _N_AHEAD + _STEPS_BETWEEN * (look % _N_AHEAD)
+        t, k = look // np.uint32(_N_AHEAD), look % np.uint32(_N_AHEAD)
+        if ahead or k == 0:
+            at, step = np.uint32(start) + t, t + np.uint32(_STEPS_BETWEEN) * k
+            ego = Box(looks.x[k, at], looks.y[k, at], 0.0, body.cos[t], body.sin[t], LENGTH, WIDTH)
             for near in range(n_near):
-                looks.look[n], looks.item[n] = look, looks.within_reach[near]
-                n += not out_of_reach(obstacles, step, looks.within_reach[near], ego)
-    return i, n
+                item = looks.within_reach[near]
+                looks.look[n], looks.item[n] = look, item
+                if not out_of_reach(obstacles, step, item, ego):
+                    n += one
+    return i, int(n)
 
 
 @inlined
@@ -406,7 +409,7 @@ def _pairs_that_may_touch(
     while i < n_listed and n <= room:
         look, entry, last = looks.listed[0, i], np.uint64(looks.listed[1, i]), np.uint64(looks.listed[2, i])
         i += 1
-        if ahead or look & np.uint32(3) == 0:
+        if ahead or look % np.uint32(_N_AHEAD) == 0:
             while entry < last:
                 row = np.uint64(rows[entry])
                 prefetch(placed, row * np.uint64(_PLACED))
@@ -415,7 +418,7 @@ def _pairs_that_may_touch(
                 entry += one
     for p in range(n):
         look, row = looks.look[p], looks.item[p]
-        t, k = look >> np.uint32(2), look & np.uint32(3)
+        t, k = look // np.uint32(_N_AHEAD), look % np.uint32(_N_AHEAD)
         at = np.uint32(start) + t
         gap[p], dy[p] = placed[row, 0] - looks.x[k, at], placed[row, 1] - looks.y[k, at]
         length[p], width[p], cos[p], sin[p] = placed[row, 2], placed[row, 3], placed[row, 4], placed[row, 5]
@@ -426,7 +429,7 @@ def _pairs_that_may_touch(
     n_kept = 0
     for p in range(n):
         look = looks.look[p]
-        step = (look >> np.uint32(2)) + np.uint32(_STEPS_BETWEEN) * (look & np.uint32(3))
+        step = look // np.uint32(_N_AHEAD) + np.uint32(_STEPS_BETWEEN) * (look % np.uint32(_N_AHEAD))
         looks.look[n_kept], looks.item[n_kept] = look, looks.item[p] - step * n_items
         n_kept += gap[p] <= ROUNDING_M
     return i, n_kept
@@ -454,7 +457,7 @@ def first_contacts(
         if indexed:
             i, n = _pairs_that_may_touch(obstacles, body, looks, start, i, n_listed, ahead)
         else:
-            i, n = _pairs_within_reach(obstacles, n_near, body, looks, start, states, i, n_listed, ahead)
+            i, n = _pairs_within_reach(obstacles, n_near, body, looks, start, i, n_listed, ahead)
         for p in range(n):
             look, item = pair_look[p], pair_item[p]
             t, k = look // _N_AHEAD, look % _N_AHEAD
