@@ -24,9 +24,7 @@ from tasks.render.seen import guessed_pixels, photo_sights, street_views
 from tasks.render.settings import FitSettings, GateSettings
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.sh import rotate_coefficients
-from tasks.reward.collisions import CIRCUMRADIUS
 from tasks.reward.epdms import INDEX_FROM_ROWS, prepare_scene, score
-from tasks.reward.map_index import with_clearance
 from tasks.rollout.simulate import SeenTraffic, TrafficSettings, prepare_traffic, simulate
 from tasks.world.arrays import Array
 from tasks.world.clip import (
@@ -59,7 +57,6 @@ def enter_judge() -> None:
     score(prepared, standing, normalise="pairs")
     judged = drive_and_judge(scene, Plan(ahead), REPLAY)
     vocabulary_labels(Vocabulary(kinematic_trajectories(2, 0)), scene, judged.prepared, judged.reference)
-    with_clearance(judged.prepared.map_index, CIRCUMRADIUS)
     hit_after_s(prepare_traffic(scene, REPLAY), judged.prepared, judged.rollout.ego_states)
 
 

@@ -5,6 +5,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property
+from itertools import accumulate
 from typing import Any, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -118,9 +119,8 @@ def _build(column: Column, shape: tuple[Size, ...], values: Sequence[object], wh
         if any(length != shape[0] for length in lengths):
             raise BadRow(f"{where}: {shape[0]} entries expected, got {lengths}")
         return pa.FixedSizeListArray.from_arrays(inner, shape[0])
-    offsets = np.zeros(len(lengths) + 1, np.int32)
-    np.cumsum(lengths, out=offsets[1:])
-    return pa.ListArray.from_arrays(pa.array(offsets), inner)
+    offsets = np.array([0, *accumulate(lengths)], np.int32)
+    return pa.Array.from_buffers(pa.list_(inner.type), len(lengths), [None, pa.py_buffer(offsets)], children=[inner])
 
 
 def _sequence(value: object, where: str) -> Sequence[object]:
@@ -148,7 +148,10 @@ def _entries(column: Column, arrays: Sequence[NDArray[np.generic]], where: str) 
         raise BadRow(f"{where}: {wanted} expected, got {flat.dtype}")
     if wanted.kind == "f" and not column.nan and not np.isfinite(flat).all():
         raise BadRow(f"{where}: holds NaN or infinity")
-    return pa.array(np.ascontiguousarray(flat, wanted), _ARROW[column.dtype])
+    if wanted.kind == "b":  # Arrow packs eight into a byte
+        return pa.array(np.ascontiguousarray(flat, wanted), _ARROW[column.dtype])
+    buffer = pa.py_buffer(np.ascontiguousarray(flat, wanted))
+    return pa.Array.from_buffers(_ARROW[column.dtype], len(flat), [None, buffer])  # `pa.array` takes 8 us longer
 
 
 def _scalars(column: Column, values: Sequence[object], where: str) -> pa.Array:

@@ -36,6 +36,7 @@ from tasks.reward.centerline import (
     progress_m,
 )
 from tasks.reward.collisions import (
+    CIRCUMRADIUS,
     N_TIMES,
     Looks,
     Obstacles,
@@ -46,7 +47,7 @@ from tasks.reward.collisions import (
     with_index,
 )
 from tasks.reward.comfort import LANES, N_FLAGS, comfort_scratch, first_uncomfortable_steps, interpolated_history
-from tasks.reward.map_index import MapIndex, index_map
+from tasks.reward.map_index import MapIndex, index_map, with_clearance
 from tasks.subscores import (
     EC_WEIGHT,
     INDEX,
@@ -82,7 +83,9 @@ LANE_LAYERS = frozenset({MapLayer.LANE, MapLayer.LANE_CONNECTOR})
 
 # A scene is prepared several times among different objects: by a planner, for its score, for every rollout. And many
 # of a clip's candidates have the same polygons within reach; an index is some 4 MB.
-_indexed_map = lru_cache(maxsize=12)(index_map)
+@lru_cache(maxsize=12)
+def _indexed_map(polygons: tuple[MapPolygon, ...], route_lane_ids: frozenset[str]) -> MapIndex:
+    return with_clearance(index_map(polygons, route_lane_ids), CIRCUMRADIUS)
 
 
 @lru_cache(maxsize=4)

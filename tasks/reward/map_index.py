@@ -361,10 +361,7 @@ def assembled(grid: Grid, touched: Ints, edges: Array, bounded: Bits, playing: B
 
 
 def with_clearance(index: MapIndex, reach_m: float) -> MapIndex:
-    """The same index, with a 1 in `clear` for cells around which all is drivable as far as `reach_m` goes.
-
-    Only many trajectories repay it.
-    """
+    """The same index, with a 1 in `clear` for cells around which all is drivable as far as `reach_m` goes."""
     return index._replace(clear=_clear_cells(index, int(reach_m / index.cell_m) + 1))
 
 

@@ -115,15 +115,20 @@ MAP_RADIUS_M = 100.0  # docs/reward.md 0
 
 def arc_lengths(polyline: Array) -> Array:
     """Arc length [m] at each point of a polyline (P, 2+), measured in x, y; starts at 0."""
-    steps = np.hypot(*np.diff(polyline[:, :2], axis=0).T)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    along = np.zeros(len(polyline))
+    x, y = polyline[:, 0], polyline[:, 1]
+    np.cumsum(np.hypot(x[1:] - x[:-1], y[1:] - y[:-1]), out=along[1:])
+    return along
 
 
-def resample(polyline: Array, n_points: int) -> Array:
-    """A polyline (P, C) resampled uniformly by arc length in x, y to (n_points, C)."""
-    along = arc_lengths(polyline)
+def resample(polyline: Array, n_points: int, along: Array | None = None) -> Array:
+    """A polyline (P, C) resampled uniformly by arc length in x, y to (n_points, C); along: arc lengths, if known."""
+    along = arc_lengths(polyline) if along is None else along
     at = np.linspace(0.0, along[-1], n_points)
-    return np.stack([np.interp(at, along, column) for column in polyline.T], axis=1)
+    resampled = np.empty((n_points, polyline.shape[1]))
+    for column in range(polyline.shape[1]):
+        resampled[:, column] = np.interp(at, along, polyline[:, column])
+    return resampled
 
 
 def n_spaced(length_m: float) -> int:
@@ -146,9 +151,10 @@ def centerline_from_boundaries(left: Array, right: Array) -> Array:
     L is the mean of the two lengths; each boundary is resampled uniformly by arc length (docs/reward.md 0). Raises
     ValueError where L is beyond MAX_LANE_M.
     """
-    length = (arc_lengths(left)[-1] + arc_lengths(right)[-1]) / 2.0
-    n_points = n_spaced(length)
-    return with_headings((resample(left[:, :2], n_points) + resample(right[:, :2], n_points)) / 2.0)
+    along = arc_lengths(left), arc_lengths(right)
+    n_points = n_spaced((along[0][-1] + along[1][-1]) / 2.0)
+    sides = resample(left[:, :2], n_points, along[0]), resample(right[:, :2], n_points, along[1])
+    return with_headings((sides[0] + sides[1]) / 2.0)
 
 
 def ring_from_boundaries(left: Array, right: Array) -> Array:

@@ -572,7 +572,7 @@ class Moved(NamedTuple):
     agents: AgentTracks
 
 
-MOVED_KEPT = 16  # logs, some megabytes each at most
+MOVED_KEPT = 32  # logs, some megabytes each at most; more are indexed by other processes
 
 
 def moved_in(folder: Path) -> Moved:

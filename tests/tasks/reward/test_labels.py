@@ -88,12 +88,9 @@ def test_a_human_sample_meets_the_log(human: Judged) -> None:
     assert_labels_are(labelled(human), in_pairs(human, "log"))
 
 
-def test_chunks_and_a_map_with_clearance_leave_every_label_as_it_is(
-    simulated: Judged, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunks_leave_every_label_as_it_is(simulated: Judged, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = labelled(simulated)
     monkeypatch.setattr("tasks.attempt.TRAJECTORIES_AT_ONCE", 7)
-    monkeypatch.setattr("tasks.attempt.CLEARANCE_FROM_ROWS", 1)
     chunked = labelled(simulated)
     for name in KEPT:
         np.testing.assert_array_equal(getattr(chunked, name), getattr(whole, name))
