@@ -6,7 +6,7 @@ poses are is the loop's, and the same with every backend.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,7 +19,7 @@ from tasks.render.fit.state import FitState
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.movers import SHIFT_SIZE, interpolate_knots, shift_boxes, world_from_boxes
 from tasks.render.scene.sensed import Photo, boxes_in_view
-from tasks.render.scene.sky import COLUMNS, ROWS, SkyCells, put_sky_behind, sky_cells
+from tasks.render.scene.sky import COLUMNS, ROWS, SkyCells, put_sky_behind, sky_cells, upper_cells
 from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.render.splatting.gradient import Gradients, backward, untransformed_gradients
@@ -75,14 +75,15 @@ class OwnedGaussians:
 def visible_parts(problem: FitProblem, owner: ShortInts, off: F32, photo: Photo) -> list[OwnedGaussians]:
     """The parts of the scene that a photo (pose local) may show, the background first; `owner` (N,) and `off`, what
     boxes are off by, (tracks * knots, SHIFT_SIZE), as of the state."""
-    n = int(np.searchsorted(owner, 0))
-    parts = [OwnedGaussians(0, np.arange(n), None)]
     boxes, valid = problem.tracks.at(photo.time_s)
+    starts = np.searchsorted(owner, np.arange(len(boxes) + 1, dtype=owner.dtype))  # else all owners are converted
+    n = int(starts[0])
+    parts = [OwnedGaussians(0, np.arange(n), None)]
     shifts = interpolate_knots(off.reshape(len(boxes), problem.tracks.n_knots, SHIFT_SIZE), photo.time_s)
     boxes = shift_boxes(boxes, shifts)
     frames = world_from_boxes(boxes)
     for j in np.flatnonzero(valid & boxes_in_view(boxes, photo)):
-        first, last = np.searchsorted(owner, [j, j + 1])
+        first, last = starts[j], starts[j + 1]
         if first < last:
             parts.append(OwnedGaussians(n, np.arange(first, last), frames[j], int(j), shifts[j]))
             n += int(last - first)
@@ -114,15 +115,15 @@ def _scatter(d_rgb: Any, alpha: Any, corners: Any, shares: Any, sums: Any, touch
         for column in range(alpha.shape[1]):
             if alpha[row, column] > HIDDEN:
                 continue
-            light = 1.0 - alpha[row, column]
-            v, left, right = corners[row, column, 0], corners[row, column, 1], corners[row, column, 2]
+            light = np.float32(1.0) - alpha[row, column]
             fu, fv = shares[row, column, 0], shares[row, column, 1]
+            upper = upper_cells(corners[row, column])
             for side in range(4):
-                cell = (v + side // 2) * COLUMNS + (right if side % 2 else left)
-                share = (fu if side % 2 else 1.0 - fu) * (fv if side // 2 else 1.0 - fv)
+                cell = upper[side % 2] + side // 2 * COLUMNS
+                share = light * (fu if side % 2 else np.float32(1.0) - fu) * (fv if side // 2 else np.float32(1.0) - fv)
                 touched[cell] = True
                 for c in range(3):
-                    sums[cell, c] += share * light * d_rgb[row, column, c]
+                    sums[cell, c] += share * d_rgb[row, column, c]
 
 
 def backdrop_gradient(d_rgb: F32, alpha: F32, where: SkyCells) -> tuple[Ints, F32]:
@@ -141,13 +142,15 @@ def backdrop_gradient(d_rgb: F32, alpha: F32, where: SkyCells) -> tuple[Ints, F3
 # number of threads.
 
 _PER_GAUSSIAN = ("index", "means", "quats", "log_scales", "logits", "colours", "screen")
+SKY_KEPT = 5_000_000  # pixels, of 12 bytes, of which is kept where they look: it stays until poses are corrected
 
 
 @dataclass(frozen=True)
 class CpuBackend:
-    """The state is worked on where it is."""
+    """The state is worked on where it is. Of one fit."""
 
     threads: int = 1
+    _skies: dict[int, tuple[Array, SkyCells]] = field(default_factory=dict, repr=False)
 
     def load(self, state: FitState) -> FitState:
         """The state itself."""
@@ -162,7 +165,7 @@ class CpuBackend:
         compared = shot.compared
         camera = corrected_pose(shot.photo.world_from_camera, state.learned["poses"].values[row])
         scene, parts = compose_scene(problem, state, state.learned["boxes"].values, shot.photo)
-        seen, sky = draw_with_sky(state, scene, shot.photo, camera, self.threads)
+        seen, sky = draw_with_sky(state, scene, shot.photo, camera, self.threads, self._sky_of(row, shot.photo, camera))
         colours = state.learned["exposure"].values[row]
         aligned = settings.exposure_rate > 0.0  # else all rows are zero, and stay so
         picture = apply_exposure(seen.view.rgb, colours) if aligned else seen.view.rgb
@@ -183,6 +186,16 @@ class CpuBackend:
         depths = seen.splats.projected[:, DEPTH]
         return Derivatives(loss, score, d_colours, back.camera, cells, d_cells, rows, mine, depths, tracks, boxes)
 
+    def _sky_of(self, row: int, photo: Photo, camera: Array) -> SkyCells | None:
+        """Where all pixels of a photo look, while it is taken from where it was and there is room; else None."""
+        if row not in self._skies:
+            height, width = photo.rgb.shape[:2]
+            if height * width * (len(self._skies) + 1) > SKY_KEPT:
+                return None
+            self._skies[row] = camera, sky_cells(photo.intrinsics, camera, width, height, self.threads)
+        at, kept = self._skies[row]
+        return kept if np.array_equal(at, camera) else None
+
 
 def compose_scene(
     problem: FitProblem, state: FitState, off: F32, photo: Photo
@@ -201,13 +214,14 @@ def compose_scene(
 
 
 def draw_with_sky(
-    state: FitState, scene: Gaussians, photo: Photo, camera: Array, threads: int
+    state: FitState, scene: Gaussians, photo: Photo, camera: Array, threads: int, sky: SkyCells | None = None
 ) -> tuple[ForwardPass, SkyCells]:
-    """The photo's picture from `camera` (4, 4), and where its sky comes from."""
+    """The photo's picture from `camera` (4, 4), and where its sky comes from; `sky`: that, where it is known."""
     height, width = photo.rgb.shape[:2]
     black = np.zeros(3, np.float32)
     seen = forward(scene, photo.intrinsics, camera, width, height, black, threads, with_depth=False)
-    sky = sky_cells(photo.intrinsics, camera, width, height, threads, seen.view.alpha)
+    if sky is None:
+        sky = sky_cells(photo.intrinsics, camera, width, height, threads, seen.view.alpha)
     put_sky_behind(seen.view.rgb, seen.view.alpha, state.learned["sky"].values, sky, threads)
     return seen, sky
 

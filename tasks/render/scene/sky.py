@@ -7,11 +7,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from tasks.kernels.compiled import inlined, kernel, numpy_division_kernel
 from tasks.kernels.threads import run_in_chunks
-from tasks.world.arrays import F32, Array, Bools, ShortInts
+from tasks.world.arrays import F32, Array, Bools
 
 # Where in the sky map each pixel of a camera looks, and what it sees there.
 
@@ -26,8 +27,8 @@ class SkyCells:
     Of pixels that hide the sky nothing is known.
     """
 
-    corners: ShortInts  # (H, W, 3) row of the upper two, columns of the left and of the right two
-    shares: Array  # (H, W, 2) of the right and of the lower ones
+    corners: NDArray[np.int16]  # (H, W, 2) row of the upper two, column of the left two
+    shares: F32  # (H, W, 2) of the right and of the lower ones
 
 
 LEAST_LIGHT = 1.0 / 1024.0  # that passes, for the sky to be looked up: what less adds is a quarter of a step of 8 bits
@@ -37,7 +38,7 @@ def sky_cells(
     intrinsics: Array, scene_from_camera: Array, width: int, height: int, threads: int = 1, alpha: F32 | None = None
 ) -> SkyCells:
     """Where a camera looks, of those pixels where `alpha` (H, W) lets light pass; None: nothing is in the way."""
-    found = SkyCells(np.zeros((height, width, 3), np.int32), np.zeros((height, width, 2)))
+    found = SkyCells(np.zeros((height, width, 2), np.int16), np.zeros((height, width, 2), np.float32))
     camera = np.array(intrinsics, np.float64), np.array(scene_from_camera, np.float64)
     before = np.zeros((height, width), np.float32) if alpha is None else alpha
     run_in_chunks(partial(_find, *camera, before, found.corners, found.shares), height, ROWS_CHUNK, threads)
@@ -97,14 +98,13 @@ def _find(k: Any, turn: Any, alpha: Any, corners: Any, shares: Any, first: int, 
             v0, u0 = min(max(int(np.floor(v)), 0), ROWS - 2), int(np.floor(u))
             corners[row, column, 0] = v0
             corners[row, column, 1] = u0 & (COLUMNS - 1)
-            corners[row, column, 2] = (u0 + 1) & (COLUMNS - 1)
             shares[row, column, 0] = u - u0
             shares[row, column, 1] = min(max(v - v0, 0.0), 1.0)
 
 
 def look_up_sky(cells: F32, where: SkyCells, threads: int = 1) -> F32:
     """The sky (H, W, 3), linear between its `cells` (ROWS * COLUMNS, 3)."""
-    out = np.zeros(where.corners.shape, np.float32)
+    out = np.zeros((*where.corners.shape[:2], 3), np.float32)
     put_sky_behind(out, np.zeros(out.shape[:2], np.float32), cells, where, threads)
     return out
 
@@ -121,12 +121,25 @@ def _add_sky(cells: Any, corners: Any, shares: Any, alpha: Any, rgb: Any, first:
             light = np.float32(1.0) - alpha[row, column]
             if light <= LEAST_LIGHT:
                 continue
-            v, left, right = corners[row, column, 0], corners[row, column, 1], corners[row, column, 2]
             fu, fv = shares[row, column, 0], shares[row, column, 1]
+            left, right = upper_cells(corners[row, column])
             for c in range(3):
-                top = cells[v * COLUMNS + left, c] * (1.0 - fu) + cells[v * COLUMNS + right, c] * fu
-                low = cells[(v + 1) * COLUMNS + left, c] * (1.0 - fu) + cells[(v + 1) * COLUMNS + right, c] * fu
-                rgb[row, column, c] += light * (top * (1.0 - fv) + low * fv)
+                rgb[row, column, c] += _between(cells, left, right, fu, fv, c) * light
+
+
+@inlined
+def upper_cells(corner: Any) -> Any:
+    """The upper left and the upper right one of four cells of the sky; the lower ones are a row further on."""
+    row, column = int(corner[0]) * COLUMNS, int(corner[1])
+    return row + column, row + ((column + 1) & (COLUMNS - 1))
+
+
+@inlined
+def _between(cells: Any, left: int, right: int, fu: Any, fv: Any, c: int) -> Any:
+    """A channel of the sky between four cells, of which the upper two are given."""
+    high = cells[left, c] + (cells[right, c] - cells[left, c]) * fu
+    low = cells[left + COLUMNS, c] + (cells[right + COLUMNS, c] - cells[left + COLUMNS, c]) * fu
+    return high + (low - high) * fv
 
 
 @inlined
@@ -155,9 +168,7 @@ def _finish(cells: Any, k: Any, turn: Any, affine: Any, alpha: Any, rgb: Any, fi
             fu, fv = np.float32(u - u0), np.float32(v - v0)
             left, right = v0 * COLUMNS + (u0 & (COLUMNS - 1)), v0 * COLUMNS + ((u0 + 1) & (COLUMNS - 1))
             for c in range(3):
-                high = cells[left, c] + (cells[right, c] - cells[left, c]) * fu
-                low = cells[left + COLUMNS, c] + (cells[right + COLUMNS, c] - cells[left + COLUMNS, c]) * fu
-                rgb[row, column, c] += light * (high + (low - high) * fv)
+                rgb[row, column, c] += light * _between(cells, left, right, fu, fv, c)
         for column in range(rgb.shape[1]):
             colour = rgb[row, column, 0], rgb[row, column, 1], rgb[row, column, 2]
             rgb[row, column, 0] = _mix(to_red, *colour)

@@ -8,6 +8,7 @@ import pytest
 import street
 from numpy.typing import NDArray
 
+from tasks.render.fit.backend import CpuBackend
 from tasks.render.fit.reconstruct import (
     REFINE_UNTIL,
     draw_photo,
@@ -66,6 +67,21 @@ def test_a_held_out_photo_comes_out_better_with_every_round(prepared: tuple[FitP
     assert scores[2] > scores[1]
     assert len(state) > len(prepared[1])
     assert finish_scene(problem, state).psnr_db == pytest.approx(scores[2], abs=0.02)  # the camera's mean colours
+
+
+def test_where_photos_look_is_kept_only_while_they_are_taken_from_there(
+    prepared: tuple[FitProblem, FitState], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, state, keeping = prepared[0], fresh(prepared[1]), CpuBackend()
+    for turn in (0.0, 0.0, 0.02):
+        state.learned["poses"].values[1, 3:] = turn
+        found = keeping.derivatives(problem, state, 1, SETTINGS)
+        with monkeypatch.context() as patched:
+            patched.setattr("tasks.render.fit.backend.SKY_KEPT", 0)
+            looked_up = CpuBackend().derivatives(problem, state, 1, SETTINGS)
+        assert len(found.cells) > 100 and found.loss == looked_up.loss
+        for name in ("camera", "cells", "sky"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(looked_up, name))
 
 
 def test_a_fit_that_was_stored_and_resumed_equals_the_uninterrupted_one_bit_for_bit(
