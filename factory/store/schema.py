@@ -151,7 +151,7 @@ def _entries(column: Column, arrays: Sequence[NDArray[np.generic]], where: str) 
     if wanted.kind == "b":  # Arrow packs eight into a byte
         return pa.array(np.ascontiguousarray(flat, wanted), _ARROW[column.dtype])
     buffer = pa.py_buffer(np.ascontiguousarray(flat, wanted))
-    return pa.Array.from_buffers(_ARROW[column.dtype], len(flat), [None, buffer])  # `pa.array` takes 8 us longer
+    return pa.Array.from_buffers(_ARROW[column.dtype], len(flat), [None, buffer])  # a row 1.5 ms, by `pa.array` 2.0
 
 
 def _scalars(column: Column, values: Sequence[object], where: str) -> pa.Array:
