@@ -118,7 +118,7 @@ def scores(pictures: list[F32], photos: list[Photo]) -> str:
     """Mean PSNR and SSIM."""
     targets = [photo_target(p.rgb) for p in photos]
     clipped = [np.clip(image, 0.0, 1.0) for image in pictures]
-    both = [(psnr(image, t.rgb), ssim(image, t)[0]) for image, t in zip(clipped, targets)]
+    both = [(psnr(image, t.rgb), ssim(image, t)) for image, t in zip(clipped, targets)]
     return "{:.2f} / {:.3f}".format(*np.mean(both, axis=0))
 
 

@@ -47,7 +47,7 @@ class Compared:
         target = photo_target(
             np.rint(255.0 * self.truth).astype(np.uint8), None if self.inside is None else ~self.inside
         )
-        return ssim(self.picture, target)[0]
+        return ssim(self.picture, target)
 
 
 def beside(photo: Photo, left_m: float = 0.0, left_rad: float = 0.0) -> Photo:

@@ -16,7 +16,7 @@ from tasks.render.fit.corrections import apply_exposure, apply_exposure_gradient
 from tasks.render.fit.losses import opaque_loss, photo_loss
 from tasks.render.fit.start import FitProblem
 from tasks.render.fit.state import FitState
-from tasks.render.scene.asset import psnr
+from tasks.render.scene.asset import decibels
 from tasks.render.scene.movers import SHIFT_SIZE, interpolate_knots, shift_boxes, world_from_boxes
 from tasks.render.scene.sensed import Photo, boxes_in_view
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyCells, put_sky_behind, sky_cells, upper_cells
@@ -169,7 +169,7 @@ class CpuBackend:
         colours = state.learned["exposure"].values[row]
         aligned = settings.exposure_rate > 0.0  # else all rows are zero, and stay so
         picture = apply_exposure(seen.view.rgb, colours) if aligned else seen.view.rgb
-        loss, d_picture = photo_loss(picture, compared.target, settings.ssim_weight)
+        loss, d_picture, off_by = photo_loss(picture, compared.target, settings.ssim_weight)
         d_rgb, d_colours = d_picture, np.zeros_like(colours)
         if aligned:
             d_rgb, d_colours = apply_exposure_gradient(seen.view.rgb, colours, d_picture)
@@ -182,8 +182,8 @@ class CpuBackend:
         rows, mine = _gradients_in_owner_frames(back, parts)
         moving = parts if held.iteration >= settings.pose_from else []  # before it no box is asked
         tracks, boxes = _box_gradients(state, moving, rows, mine)
-        score = psnr(np.clip(picture, 0.0, 1.0), compared.target.rgb)
         depths = seen.splats.projected[:, DEPTH]
+        score = decibels(off_by)
         return Derivatives(loss, score, d_colours, back.camera, cells, d_cells, rows, mine, depths, tracks, boxes)
 
     def _sky_of(self, row: int, photo: Photo, camera: Array) -> SkyCells | None:

@@ -120,7 +120,7 @@ class SelfAdjointBlur(torch.autograd.Function):
 
 
 def _blur(image: Tensor) -> Tensor:
-    """`losses._blur`, (H, W, C), by one pass an axis. cuDNN would keep ten bits (TF32), and variances need more."""
+    """`losses`' windowed mean (H, W, C), a pass an axis. cuDNN would keep ten bits (TF32), and variances need more."""
     taps = torch.as_tensor(cv2.getGaussianKernel(WINDOW, SIGMA, cv2.CV_32F), device=image.device)
     planes, n = image.permute(2, 0, 1)[None].contiguous(), image.shape[-1]
     with torch.backends.cudnn.flags(enabled=False):
@@ -401,7 +401,7 @@ class TorchBackend:
         if id(shot) in self._photos:
             return self._photos[id(shot)][1]
         compared = shot.compared
-        weight = (compared.target.share[..., 0] > 0.0).astype(np.float32)
+        weight = compared.target.counted.astype(np.float32)
         sent = self._sent(shot.photo.rgb), self._sent(weight), self._sent(compared.ground)
         if sum(tensor.nbytes for _, kept in self._photos.values() for tensor in kept) < KEPT_BYTES:
             self._photos[id(shot)] = shot, sent

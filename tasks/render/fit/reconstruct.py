@@ -73,7 +73,7 @@ def measure_photo(
     boxes, valid = boxes_at_photo(asset, problem, photo)
     vehicles = boxes[[j for j in np.flatnonzero(valid) if problem.tracks.kinds[j] == AgentKind.VEHICLE]]
     classes = pixel_classes(photo, vehicles, problem.road)
-    alike, counted = similarity(picture, target), target.share[..., 0] > 0.0
+    alike, counted = similarity(picture, target), target.counted
     found = [_class_quality(name, picture, target, alike, inside & counted) for name, inside in classes.items()]
     return ViewQuality(
         photo.camera,

@@ -40,7 +40,7 @@ from tasks.world.clip import AgentKind, AgentTracks
 
 ROAD_TOP_M = 0.08  # a Gaussian that starts no further from the road's surface belongs to it
 START_WIDTH = 640  # pixels of a photo across, more of which say no better where surfaces are
-COMPARED_BYTES, KEPT_BYTES = 49, 10**9  # of a pixel in `PhotoTarget`, and of all that are kept
+COMPARED_BYTES, KEPT_BYTES = 50, 10**9  # of a pixel in `PhotoTarget`, and of all that are kept
 LOOKS_DOWN = 0.05  # sine of the angle below the horizon from which on a ray meets the ground
 UPRIGHT = 0.5  # unless it stands: the least vertical part of its normal
 

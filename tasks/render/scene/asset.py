@@ -212,8 +212,12 @@ def psnr(a: NDArray[np.generic], b: NDArray[np.generic]) -> float:
     """Peak signal-to-noise ratio [dB] of two images of the same type: uint8 (peak 255) or float (peak 1)."""
     peak = 255.0 if a.dtype == np.uint8 else 1.0
     apart = np.subtract(a, b, dtype=np.float64)
-    error = float(np.mean(np.square(apart, out=apart)))
-    return float("inf") if error == 0.0 else 10.0 * float(np.log10(peak**2 / error))
+    return decibels(float(np.mean(np.square(apart, out=apart))) / peak**2)
+
+
+def decibels(mean_square: float) -> float:
+    """Peak signal-to-noise ratio [dB] of what is off by so much, for a peak of 1."""
+    return float("inf") if mean_square == 0.0 else -10.0 * float(np.log10(mean_square))
 
 
 def apply_affine(rgb: F32, affine: F32) -> F32:

@@ -32,15 +32,15 @@ def slow_ssim(x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np
 def test_ssim_is_what_its_definition_says() -> None:
     target = photo_target(PHOTO)
     expected = slow_ssim(PICTURE.astype(np.float64), PHOTO / 255.0, np.ones(PHOTO.shape[:2]))
-    assert ssim(PICTURE, target)[0] == pytest.approx(expected, abs=1e-5)
-    assert ssim(target.rgb, target)[0] == pytest.approx(1.0, abs=1e-5)
+    assert ssim(PICTURE, target) == pytest.approx(expected, abs=1e-5)
+    assert ssim(target.rgb, target) == pytest.approx(1.0, abs=1e-5)
 
 
 def test_ssim_gradient_agrees_with_finite_differences() -> None:
     ignored = np.zeros(PHOTO.shape[:2], bool)
     ignored[4:9, 3:7] = True
     target = photo_target(PHOTO, ignored)
-    gradient = ssim(PICTURE, target)[1]
+    gradient = -photo_loss(PICTURE, target, 1.0)[1]
     x, y, weight = PICTURE.astype(np.float64), PHOTO / 255.0, (~ignored).astype(np.float64)
     for at in [(0, 0, 0), (5, 4, 1), (8, 11, 2), (16, 22, 0), (3, 7, 1)]:
         up, down = x.copy(), x.copy()
@@ -57,9 +57,12 @@ def test_a_picture_that_equals_the_photo_loses_nothing_and_ignored_pixels_do_not
     assert photo_loss(target.rgb, target, 0.2)[0] == pytest.approx(0.0, abs=1e-5)
     painted = target.rgb.copy()
     painted[:, :5] = 0.0
-    loss, gradient = photo_loss(painted, target, 0.0)
+    loss, gradient, off_by = photo_loss(painted, target, 0.0)
     assert loss == 0.0
     assert not gradient.any()
+    assert off_by == pytest.approx(np.mean((painted - target.rgb) ** 2))
+    beyond = np.where(target.rgb > 0.5, np.float32(1.5), target.rgb - np.float32(0.5))  # as a photo has it: 1 and 0
+    assert photo_loss(beyond, target, 0.2)[2] == pytest.approx(np.mean((np.clip(beyond, 0.0, 1.0) - target.rgb) ** 2))
 
 
 def test_light_that_passes_where_there_is_ground_is_lost() -> None:
