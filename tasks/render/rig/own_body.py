@@ -11,6 +11,7 @@ What a body mirrors comes and goes on it, so of a car that shines much is left o
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
@@ -66,7 +67,7 @@ def find_own_body(small: Sequence[Bytes], camera: Camera, world_from_ego: Array)
     small: (N, h, w, 3) photos that `choose_photos` chose, shrunk; world_from_ego: (N, 4, 4) poses of the ego then.
     """
     pictures = np.stack(small).astype(np.float32) / np.float32(255.0)
-    median = np.median(pictures, axis=0)
+    median = _median(pictures)
     stays, comes_and_goes, road_m = _evidence(pictures, median, camera, world_from_ego)
     far_road = (road_m > FAR_ROAD_M) & np.isfinite(road_m)
     for_body = BODY * stays - STREET * comes_and_goes - NEITHER - FAR_ROAD * far_road
@@ -86,16 +87,22 @@ def _evidence(pictures: F32, median: F32, camera: Camera, world_from_ego: Array)
     infinite where it is not seen."""
     along, across, road_m, tells = _street_ways(pictures.shape[1:3], camera, world_from_ego)
     tells &= np.isfinite(road_m) | ~may_be_sky(median)  # clouds stay, too
-    grey = pictures.mean(axis=-1)
+    grey = (pictures[..., 0] + pictures[..., 1] + pictures[..., 2]) / np.float32(3.0)
     x, y = (np.stack([cv2.Sobel(one, cv2.CV_32F, *way, scale=1.0 / 8.0) for one in grey]) for way in ((1, 0), (0, 1)))
     on_way, aside = x * along + y * across, y * along - x * across
-    median_square, mean_square = _around(np.median(on_way, axis=0) ** 2), _around((on_way**2).mean(axis=0))
-    median_square -= LEANS * _around(np.median(aside, axis=0) ** 2)
+    median_square, mean_square = _around(_median(on_way) ** 2), _around((on_way**2).mean(axis=0))
+    median_square -= LEANS * _around(_median(aside) ** 2)
     stays = np.maximum(median_square - STAYS * mean_square, 0.0) / (mean_square + FAINT**2) / (1.0 - STAYS)
-    median_square = _around(np.median(x, axis=0) ** 2 + np.median(y, axis=0) ** 2)
+    median_square = _around(_median(x) ** 2 + _median(y) ** 2)
     mean_square = _around((x**2 + y**2).mean(axis=0))
     goes = np.maximum(STAYS * mean_square - median_square, 0.0) / (mean_square + FAINT_STREET**2) / STAYS
     return stays * tells, goes, road_m
+
+
+def _median(pictures: Any) -> Any:
+    """Over the first axis, in the kind of numbers it is given; numpy's takes three times as long."""
+    ordered, n = np.sort(pictures, axis=0), len(pictures)
+    return 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
 
 
 def _around(values: F32 | Array) -> F32:
@@ -115,21 +122,23 @@ def _street_ways(shape: Sequence[int], camera: Camera, world_from_ego: Array) ->
     with np.errstate(divide="ignore"):
         road_m = np.where(rise < -1e-3, max(camera.ego_from_camera[2, 3], LEAST_HEIGHT_M) / -rise, np.inf)
     points = rays * np.minimum(road_m, STREET_M)[:, None]
-    twice, moved = np.zeros((len(rays), 2)), np.zeros(len(rays))  # a way and its opposite are one
+    twice_x, twice_y, moved = np.zeros((3, len(rays)))  # by the way's double angle: a way and its opposite are one
     poses = world_from_ego @ camera.ego_from_camera
     for here, there in pairwise(poses):
         seen = points @ (there[:3, :3].T @ here[:3, :3]).T + there[:3, :3].T @ (here[:3, 3] - there[:3, 3])
         seen[:, 2] = np.maximum(seen[:, 2], 0.2)
-        by = _in_picture(seen, lens, camera.distortion) - pixels
-        length = np.hypot(*by.T)
-        angle = 2.0 * np.arctan2(by[:, 1], by[:, 0])
-        twice += np.column_stack([np.cos(angle), np.sin(angle)]) * (length > MOVES_PX / 3.0)[:, None]
+        x, y = np.ascontiguousarray((_in_picture(seen, lens, camera.distortion) - pixels).T)
+        square = x * x + y * y
+        length = np.sqrt(square)
+        told = (length > MOVES_PX / 3.0) / np.maximum(square, 1e-12)
+        twice_x += (x * x - y * y) * told
+        twice_y += 2.0 * x * y * told
         moved += length
     n = len(poses) - 1
-    way = 0.5 * np.arctan2(twice[:, 1], twice[:, 0])
-    tells = (np.hypot(*twice.T) > ONE_WAY * n) & (moved > MOVES_PX * n)
-    x, y, far, sure = (values.reshape(height, width) for values in (np.cos(way), np.sin(way), road_m, tells))
-    return x, y, far, sure
+    way = 0.5 * np.arctan2(twice_y, twice_x)
+    tells = (np.hypot(twice_x, twice_y) > ONE_WAY * n) & (moved > MOVES_PX * n)
+    along_x, along_y = (np.asarray(part(way).reshape(shape), np.float64) for part in (np.cos, np.sin))
+    return along_x, along_y, road_m.reshape(shape), tells.reshape(shape)
 
 
 def _in_picture(points: Array, lens: Array, distortion: Array) -> Array:

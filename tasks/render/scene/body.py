@@ -181,6 +181,8 @@ def _distance_before(
     for n, i in enumerate(rows):
         for axis in range(3):
             rays[n, axis] = points[i, axis] - eye[axis]
+    _, driving = nearest_box_along_rays(rays, eye, bodies[drives])  # most bodies stand, and most rays meet none
+    rows, rays = rows[driving >= 0], rays[driving >= 0]
     along, first = nearest_box_along_rays(rays, eye, bodies)
     before_m = np.full(points.shape[0], np.nan)
     for n, i in enumerate(rows):

@@ -14,7 +14,7 @@ import numpy as np
 from tasks.kernels.compiled import kernel
 from tasks.render.scene.features import SurfacePoints, road_depth
 from tasks.render.scene.movers import behind_boxes, world_from_boxes
-from tasks.render.scene.sensed import Photo, Tracks
+from tasks.render.scene.sensed import Photo, Tracks, boxes_in_view
 from tasks.render.scene.sky import may_be_sky, pixel_directions, sky_agrees
 from tasks.render.scene.stereo import (
     FAR_M,
@@ -251,7 +251,9 @@ def estimate_photo_depth(
     else:
         guess, sky = hints[0], unknown & (bright | (hints[0] == 0.0))
     depth = np.where(unknown & ~sky, guess, depth).astype(np.float32)
-    passing = behind(np.where(depth > 0, depth, np.float32(FAR_M)), boxes[valid & tracks.driving]) | own
+    driving = boxes[valid & tracks.driving]
+    driving = driving[boxes_in_view(driving, photo)]  # of a street's few a camera sees one or none
+    passing = behind(np.where(depth > 0, depth, np.float32(FAR_M)), driving) | own
     return PhotoDepth(depth, label, sky, passing)
 
 

@@ -254,36 +254,30 @@ class PhotoDiscs:
 
 def choose_discs(looks: Sequence[PhotoDiscs]) -> dict[int, Discs]:
     """Kept discs by owner: the background's in the scene, a track's in its box's frame."""
-    kept: dict[int, list[Discs]] = {}
+    kept: list[tuple[int, Discs]] = []  # by owner
+    covered, marked = [np.zeros(look.depth.shape, np.bool_) for look in looks], np.zeros(len(looks), np.int64)
     for band in range(len(BANDS_M) + 2):
-        for look in looks:
+        for i, look in enumerate(looks):
             depth = look.discs.spacing * look.intrinsics[0, 0]
             mine = np.where(look.late, len(BANDS_M) + 1, np.searchsorted(BANDS_M, depth)) == band
             if not mine.any():
                 continue
-            covered, reach = np.zeros(look.depth.shape, np.bool_), (float(depth[mine].min()), float(depth[mine].max()))
-            for owner, parts in kept.items():
+            for owner, part in kept[marked[i] :]:
                 pose = np.eye(4) if owner == BACKGROUND else look.scene_from_box.get(owner)
-                if pose is None:
-                    continue
-                photo = np.ascontiguousarray(np.linalg.inv(look.scene_from_camera) @ pose), look.intrinsics, look.depth
-                for part in parts:
-                    _mark_covered(part.points, part.across, part.down, part.spacing, *photo, *reach, covered)
+                if pose is not None:
+                    camera_from_part = np.ascontiguousarray(np.linalg.inv(look.scene_from_camera) @ pose)
+                    disc = part.points, part.across, part.down, part.spacing
+                    _mark_covered(*disc, camera_from_part, look.intrinsics, look.depth, covered[i])
+            marked[i] = len(kept)
             rows, columns = look.discs.pixels.T
-            new = np.flatnonzero(mine & ~covered[rows, columns])
+            new = np.flatnonzero(mine & ~covered[i][rows, columns])
             for owner in np.unique(look.owner[new]):
                 part = look.discs.take(new[look.owner[new] == owner])
                 if owner != BACKGROUND:
                     part = part.moved(np.linalg.inv(look.scene_from_box[int(owner)]).astype(np.float64))
-                _append(kept.setdefault(int(owner), []), part)
-    return {owner: concatenate_discs(parts) for owner, parts in sorted(kept.items())}
-
-
-def _append(parts: list[Discs], part: Discs) -> None:
-    """Keeps the parts few and each disc copied few times: a part joins the one before unless that is twice as large."""
-    while parts and len(parts[-1].points) < 2 * len(part.points):
-        part = concatenate_discs([parts.pop(), part])
-    parts.append(part)
+                kept.append((int(owner), part))
+    owners = sorted({owner for owner, _ in kept})
+    return {mine: concatenate_discs([part for owner, part in kept if owner == mine]) for mine in owners}
 
 
 def with_mirror_image(discs: Discs) -> Discs:
@@ -302,12 +296,9 @@ def _mark_covered(
     camera_from_scene: Any,
     k: Any,
     depth: Any,
-    nearest: float,
-    farthest: float,
     covered: Any,
 ) -> None:
-    """Marks the pixels (H, W) whose surface a disc shows about as finely as the photo does, all of those from `nearest`
-    to `farthest` [m] and maybe others."""
+    """Marks the pixels (H, W) whose surface a disc shows about as finely as the photo does."""
     height, width = depth.shape
     r = camera_from_scene
     fx, fy = k[0, 0], k[1, 1]
@@ -319,11 +310,6 @@ def _mark_covered(
         ax, ay, az = float(across[i, 0]), float(across[i, 1]), float(across[i, 2])
         bx, by, bz = float(down[i, 0]), float(down[i, 1]), float(down[i, 2])
         cz, dz = r[2, 0] * ax + r[2, 1] * ay + r[2, 2] * az, r[2, 0] * bx + r[2, 1] * by + r[2, 2] * bz
-        deep = 0.5 * (abs(cz) + abs(dz))  # the disc reaches no further to either side
-        if (1.0 + SAME_DEPTH) * (z + deep) + SAME_DEPTH_M < nearest:
-            continue
-        if (1.0 - SAME_DEPTH) * (z - deep) - SAME_DEPTH_M > farthest:
-            continue
         x = (r[0, 0] * px + r[0, 1] * py + r[0, 2] * pz + r[0, 3]) / z
         y = (r[1, 0] * px + r[1, 1] * py + r[1, 2] * pz + r[1, 3]) / z
         u, v = fx * x + k[0, 2], fy * y + k[1, 2]

@@ -1,5 +1,7 @@
 """Dense depth from sparse returns; thinning; sky."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from slow_raster import covariances_of
@@ -86,22 +88,27 @@ def test_a_second_photo_from_the_same_place_adds_nothing() -> None:
     assert len(choose_discs([first, first])[BACKGROUND].points) == len(first.discs.points)
 
 
-def test_discs_too_near_or_too_far_for_a_band_are_passed_over_without_a_difference(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A ramp seen from two places, whose discs cross every band: the same are kept where all are looked at."""
+def test_kept_discs_are_those_that_nothing_kept_before_shows_as_finely() -> None:
+    """A ramp seen from two places, whose discs cross every band: held against all that is kept, each time anew."""
     depth = (np.linspace(3.0, 90.0, WIDTH) * np.ones((HEIGHT, 1))).astype(np.float32)
     rgb = np.random.default_rng(3).uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
-    looks = []
+    looks, expected = [], []
     for ahead in (0.0, 2.5):
         pose, zs = np.eye(4), depth - np.float32(ahead)
         pose[:3, 3] = 0.1, 0.0, ahead
         discs = discs_of_photo(rgb, zs, np.full(zs.shape, -1, np.int32), INTRINSICS, pose)
         n = len(discs.points)
         looks.append(PhotoDiscs(discs, np.full(n, BACKGROUND, np.int32), np.zeros(n, bool), zs, INTRINSICS, pose, {}))
-    kept, mark = choose_discs(looks)[BACKGROUND], surfels._mark_covered
-    monkeypatch.setattr(surfels, "_mark_covered", lambda *a: mark(*a[:-3], 0.0, np.inf, a[-1]))
-    np.testing.assert_array_equal(kept.points, choose_discs(looks)[BACKGROUND].points)
+    for nearest, farthest in pairwise((0.0, *surfels.BANDS_M, np.inf)):
+        for one in looks:
+            covered, away = np.zeros(depth.shape, bool), one.discs.spacing * INTRINSICS[0, 0]
+            for part in expected:
+                disc = part.points, part.across, part.down, part.spacing
+                surfels._mark_covered(*disc, np.linalg.inv(one.scene_from_camera), INTRINSICS, one.depth, covered)
+            in_band = (away > nearest) & (away <= farthest)
+            expected.append(one.discs.take(np.flatnonzero(in_band & ~covered[tuple(one.discs.pixels.T)])))
+    kept = choose_discs(looks)[BACKGROUND]
+    np.testing.assert_array_equal(kept.points, np.concatenate([part.points for part in expected]))
     assert len(looks[0].discs.points) < len(kept.points) < sum(len(look.discs.points) for look in looks)
 
 
