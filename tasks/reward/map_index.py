@@ -376,17 +376,25 @@ def _clear_cells(index: MapIndex, reach: int) -> Bytes:
             for i in range(crossed[q, FIRST], crossed[q, LAST]):
                 kept &= ~index.bounded[index.entry[i] >> EDGE, w]
             crossed_is_road[q] |= kept & index.playing[DRIVABLE, w] != 0
-    clear, tall = np.zeros(cells.shape, np.uint8), np.zeros(cells.shape[1], np.int32)
+    clear, tall = np.zeros(cells.shape, np.uint8), np.zeros((2, cells.shape[1]), np.int32)  # rows so far, all road
     for row in range(cells.shape[0]):
-        run = 0
-        for column in range(cells.shape[1]):
-            cell = cells[row, column]
-            run = run + 1 if (is_road[cell] if cell >= 0 else crossed_is_road[-1 - cell]) else 0
-            middle = column - reach
-            if middle >= 0:
-                tall[middle] = tall[middle] + 1 if run >= wide else 0
-                if row >= reach:
-                    clear[row - reach, middle] = tall[middle] >= wide
+        above, here, first, last = tall[row % 2], tall[1 - row % 2], 0, wide - 1
+        here[:] = 0
+        while last < cells.shape[1]:  # the cells from `first` to `last`: most are not all road, as any of them tells
+            at = last
+            while at >= first:
+                cell = cells[row, at]
+                if not (is_road[cell] if cell >= 0 else crossed_is_road[-1 - cell]):
+                    break
+                at -= 1
+            if at >= first:
+                first, last = at + 1, at + wide
+                continue
+            middle = last - reach
+            here[middle] = above[middle] + 1
+            if here[middle] >= wide:
+                clear[row - reach, middle] = 1
+            first, last = last + 1, last + 1
     return clear.reshape(-1)
 
 

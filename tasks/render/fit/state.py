@@ -44,7 +44,7 @@ class AdamArray:
     def step(self, rows: Ints, gradient: F32, rate: float, scale: F32 | None = None) -> None:
         """Moves `rows` (M,), none twice, against `gradient` (M, C) by `rate`, times `scale` (M,) where given."""
         sizes = np.ones(len(rows), np.float32) if scale is None else scale
-        unbiased = _unbiased(int(self.steps[rows].max(initial=0) + 1).bit_length())
+        unbiased = _unbiased(int(self.steps.max(initial=0) + 1).bit_length())
         adam_step(self.values, self.first, self.second, self.steps, rows, gradient, np.float32(rate), sizes, unbiased)
 
     def take(self, rows: Ints) -> "AdamArray":

@@ -321,6 +321,7 @@ def project_gradient(
     means: Any,
     quats: Any,
     log_scales: Any,
+    colours: Any,
     camera_from_scene: Any,
     intrinsics: Any,
     width: int,
@@ -335,11 +336,12 @@ def project_gradient(
     d_quats: Any,
     d_log_scales: Any,
     d_logits: Any,
+    d_colours: Any,
     d_screen: Any,
     d_pose: Any,
 ) -> None:
-    """Fills the derivatives by mean, quaternion as given (any length), log-scale, opacity's logit and place on the
-    picture, each (M, ...) float32, for rows `first` to `last`.
+    """Fills the derivatives by mean, quaternion as given (any length), log-scale, opacity's logit, colour and place on
+    the picture, each (M, ...) float32, for rows `first` to `last`. A colour below 0 is drawn as 0, and has none.
 
     Scene, camera, `index` and `projected` as for and from `project`; `sums` (M, 16) as pixels_gradient has them.
     Adds to `d_pose` (6,) float64 the derivative by a small motion of the camera: x' = x + v + w cross x in camera
@@ -361,6 +363,9 @@ def project_gradient(
             d_screen[row, 0] = cxx * sums[row, Q_X] + cxy * sums[row, Q_Y]
             d_screen[row, 1] = cxy * sums[row, Q_X] + cyy * sums[row, Q_Y]
             d_logits[row] = sums[row, Q] * (np.float32(1.0) - projected[row, OPACITY])
+            for c in range(3):
+                shown = colours[index[row], c] >= np.float32(0.0)
+                d_colours[row, c] = sums[row, W_RED + c] if shown else np.float32(0.0)
             if keeps_light:
                 block[BY_PEAK + lane] = sums[row, Q]
             block[CXX + lane], block[CXY + lane], block[CYY + lane] = cxx, cxy, cyy
@@ -414,11 +419,11 @@ def backward(
     pair_start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     pairs = _pairs(forward, pair_start, d_rgb, d_depth, d_alpha, threads)
     sums = np.empty((n, SUMS_SIZE), np.float32)
-    sizes = ((n, 3), (n, 4), (n, 3), (n,), (n, 2))
-    means, quats, log_scales, logits, screen = (np.empty(size, np.float32) for size in sizes)
-    shapes = (means, quats, log_scales, logits, screen)
-    camera_from_scene, view = splats.camera_from_scene, (splats.width, splats.height, splats.screen.keeps_light)
-    scene = (gaussians.means, gaussians.quats, gaussians.log_scales, camera_from_scene, splats.intrinsics, *view)
+    sizes = ((n, 3), (n, 4), (n, 3), (n,), (n, 3), (n, 2))
+    means, quats, log_scales, logits, colours, screen = (np.empty(size, np.float32) for size in sizes)
+    shapes = (means, quats, log_scales, logits, colours, screen)
+    view = splats.camera_from_scene, splats.intrinsics, splats.width, splats.height, splats.screen.keeps_light
+    scene = gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.colours, *view
 
     def run(first: int, last: int) -> Array:
         camera = np.zeros(6)
@@ -427,7 +432,6 @@ def backward(
         return camera
 
     camera = np.sum([np.zeros(6), *run_in_chunks(run, n, GAUSSIANS_CHUNK, threads)], axis=0)
-    colours = np.where(gaussians.colours[splats.index] >= 0.0, sums[:, W_RED : W_BLUE + 1], np.float32(0.0))
     return Gradients(splats.index, means, quats, log_scales, logits, colours, screen, camera)
 
 

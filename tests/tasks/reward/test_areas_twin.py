@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import minimum_filter
 
 from tasks.kernels.compiled import kernel
 from tasks.reward.areas import empty_places, in_intersection
@@ -101,6 +102,15 @@ def test_a_body_is_known_to_be_on_the_road_where_no_boundary_is_near() -> None:
     covered = [*touching, road("whole", -20.0, 20.0)]
     assert is_clear(touching, 0.0, 10.0) and not is_clear(touching, 0.0, 1.0) and is_clear(covered, 0.0, 1.0)
     assert not is_clear(covered, 0.0, 17.5) and not is_clear(covered, 48.0, 0.0) and not is_clear(covered, 50.2, 0.0)
+
+
+@settings(max_examples=40)
+@given(small_maps(step=0.0), st.floats(0.0, 8.0))
+def test_cells_are_clear_where_all_around_them_are_clear_of_less(polygons: list[MapPolygon], more_m: float) -> None:
+    index = index_map(polygons, frozenset())
+    least, cells = with_clearance(index, 0.0).clear.reshape(index.cells.shape), int(more_m / index.cell_m)
+    expected = minimum_filter(least, size=2 * cells + 1, mode="constant", cval=0)
+    assert np.array_equal(with_clearance(index, more_m).clear.reshape(index.cells.shape), expected)
 
 
 @settings(max_examples=40)
