@@ -269,16 +269,16 @@ def sky_of_views(views: Iterable[tuple[Array, F32, Bools]]) -> SkyMap:
     Each is directions (M, 3), their colours (M, 3) from 0 on, and whether it was sky (M,). Cells nobody looked at take
     the colour of the nearest one that was; plain grey without any view.
     """
-    sums = np.zeros((ROWS * COLUMNS, 4))
+    sums = np.zeros((4, ROWS * COLUMNS))
     for rays, rgb, is_sky in views:
         weight = np.where(is_sky, SKY_WEIGHT, 1.0)
         rows, columns = _cells(rays)
         cell = np.clip(np.rint(rows), 0, ROWS - 1).astype(np.intp) * COLUMNS
         cell += np.rint(columns).astype(np.intp) % COLUMNS
         for channel in range(3):
-            sums[:, channel] += np.bincount(cell, weight * rgb[:, channel], ROWS * COLUMNS)
-        sums[:, 3] += np.bincount(cell, weight, ROWS * COLUMNS)
-    cells = sums.reshape(ROWS, COLUMNS, 4)
+            sums[channel] += np.bincount(cell, weight * rgb[:, channel], ROWS * COLUMNS)
+        sums[3] += np.bincount(cell, weight, ROWS * COLUMNS)
+    cells = sums.T.reshape(ROWS, COLUMNS, 4)
     seen = cells[..., 3] > 0
     if not seen.any():
         return SkyMap(np.full((ROWS, COLUMNS, 3), 0.7, np.float32))

@@ -91,7 +91,7 @@ def discs_of_photo(rgb: F32, depth: F32, label: ShortInts, intrinsics: Array, wo
 
 
 def _mean_of(cells: Sequence[tuple[Indices, Indices]], image: NDArray[Any]) -> NDArray[Any]:
-    return image[cells[0]] if len(cells) == 1 else np.asarray(np.mean([image[cell] for cell in cells], axis=0))
+    return np.asarray(reduce(np.add, (image[cell] for cell in cells)) / len(cells))
 
 
 def _blocks(rgb: F32, depth: F32, label: ShortInts, free: Bools, size: int) -> tuple[Indices, Indices]:
@@ -133,7 +133,7 @@ def _tangents(points: Array, depth: F32, axis: int, flat: Array) -> Array:
     mean = 0.5 * (np.roll(points, -1, axis) - np.roll(points, 1, axis))
     facing = flat * depth[..., None]
     step = np.where(smooth[..., None], mean, facing)
-    length, shortest = np.linalg.norm(step, axis=-1), np.linalg.norm(facing, axis=-1)
+    length, shortest = np.sqrt(np.einsum("hwc,hwc->hw", step, step)), np.linalg.norm(flat) * depth
     return np.asarray(step * (np.minimum(length, MAX_ELONGATION * shortest) / np.maximum(length, 1e-9))[..., None])
 
 
