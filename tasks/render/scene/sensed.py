@@ -87,6 +87,7 @@ class Tracks:
         self.kinds = agents.kinds if agents is not None else ()
         self.driving = ever_moves(agents) if agents is not None else np.zeros(0, bool)
         self._movable = np.array([kind in MOVING_KINDS for kind in self.kinds], bool)
+        self._known: dict[float, tuple[Array, Bools]] = {}  # by time: each photo's is asked for again and again
 
     @property
     def n_knots(self) -> int:
@@ -98,9 +99,12 @@ class Tracks:
         """Boxes (N, 7) local, and which of them are there and movable (N,)."""
         if self._agents is None:
             return np.zeros((0, 7)), np.zeros(0, bool)
-        boxes, valid = boxes_at(self._agents, time_s)
-        boxes[:, :3] -= self._origin
-        return boxes, valid & self._movable
+        if time_s not in self._known:
+            boxes, valid = boxes_at(self._agents, time_s)
+            boxes[:, :3] -= self._origin
+            self._known[time_s] = boxes, valid & self._movable
+        boxes, there = self._known[time_s]
+        return boxes.copy(), there.copy()
 
 
 VIEW_MARGIN_M = 0.5  # how far Gaussians of a track may reach beyond its box
