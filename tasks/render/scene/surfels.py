@@ -254,30 +254,42 @@ class PhotoDiscs:
 
 def choose_discs(looks: Sequence[PhotoDiscs]) -> dict[int, Discs]:
     """Kept discs by owner: the background's in the scene, a track's in its box's frame."""
-    kept: list[tuple[int, Discs]] = []  # by owner
-    covered, marked = [np.zeros(look.depth.shape, np.bool_) for look in looks], np.zeros(len(looks), np.int64)
+    kept: dict[int, list[Discs]] = {}
+    covered = [np.zeros(look.depth.shape, np.bool_) for look in looks]
+    held_against = [dict[int, int]() for _ in looks]  # how many of an owner's discs each photo was
     for band in range(len(BANDS_M) + 2):
         for i, look in enumerate(looks):
             depth = look.discs.spacing * look.intrinsics[0, 0]
             mine = np.where(look.late, len(BANDS_M) + 1, np.searchsorted(BANDS_M, depth)) == band
             if not mine.any():
                 continue
-            for owner, part in kept[marked[i] :]:
+            for owner, parts in kept.items():
                 pose = np.eye(4) if owner == BACKGROUND else look.scene_from_box.get(owner)
-                if pose is not None:
-                    camera_from_part = np.ascontiguousarray(np.linalg.inv(look.scene_from_camera) @ pose)
-                    disc = part.points, part.across, part.down, part.spacing
-                    _mark_covered(*disc, camera_from_part, look.intrinsics, look.depth, covered[i])
-            marked[i] = len(kept)
+                if pose is None:
+                    continue
+                photo = np.ascontiguousarray(np.linalg.inv(look.scene_from_camera) @ pose), look.intrinsics, look.depth
+                first, known = 0, held_against[i].get(owner, 0)
+                for part in parts:
+                    later = slice(max(known - first, 0), None)
+                    disc = part.points[later], part.across[later], part.down[later], part.spacing[later]
+                    _mark_covered(*disc, *photo, covered[i])
+                    first += len(part.points)
+                held_against[i][owner] = first
             rows, columns = look.discs.pixels.T
             new = np.flatnonzero(mine & ~covered[i][rows, columns])
             for owner in np.unique(look.owner[new]):
                 part = look.discs.take(new[look.owner[new] == owner])
                 if owner != BACKGROUND:
                     part = part.moved(np.linalg.inv(look.scene_from_box[int(owner)]).astype(np.float64))
-                kept.append((int(owner), part))
-    owners = sorted({owner for owner, _ in kept})
-    return {mine: concatenate_discs([part for owner, part in kept if owner == mine]) for mine in owners}
+                _append(kept.setdefault(int(owner), []), part)
+    return {owner: concatenate_discs(parts) for owner, parts in sorted(kept.items())}
+
+
+def _append(parts: list[Discs], part: Discs) -> None:
+    """Keeps the parts few and each disc copied few times: a part joins the one before unless that is twice as large."""
+    while parts and len(parts[-1].points) < 2 * len(part.points):
+        part = concatenate_discs([parts.pop(), part])
+    parts.append(part)
 
 
 def with_mirror_image(discs: Discs) -> Discs:
