@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from factory.stages.scene_file import write_scene
 from tasks.render.fit.corrections import apply_exposure, corrected_pose
-from tasks.render.fit.losses import photo_target, ssim
+from tasks.render.fit.losses import photo_target, similarity
 from tasks.render.fit.on_torch import TorchBackend
 from tasks.render.fit.reconstruct import (
     draw_photo,
@@ -118,7 +118,7 @@ def scores(pictures: list[F32], photos: list[Photo]) -> str:
     """Mean PSNR and SSIM."""
     targets = [photo_target(p.rgb) for p in photos]
     clipped = [np.clip(image, 0.0, 1.0) for image in pictures]
-    both = [(psnr(image, t.rgb), ssim(image, t)) for image, t in zip(clipped, targets)]
+    both = [(psnr(image, t.rgb), float(similarity(image, t).mean())) for image, t in zip(clipped, targets)]
     return "{:.2f} / {:.3f}".format(*np.mean(both, axis=0))
 
 

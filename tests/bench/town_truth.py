@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.fit.losses import photo_target, ssim
+from tasks.render.fit.losses import photo_target, similarity
 from tasks.render.fit.reconstruct import pixel_classes
 from tasks.render.fit.state import Road
 from tasks.render.scene.asset import RenderAsset, psnr
@@ -47,7 +47,7 @@ class Compared:
         target = photo_target(
             np.rint(255.0 * self.truth).astype(np.uint8), None if self.inside is None else ~self.inside
         )
-        return ssim(self.picture, target)
+        return float(similarity(self.picture, target)[target.counted].mean())
 
 
 def beside(photo: Photo, left_m: float = 0.0, left_rad: float = 0.0) -> Photo:

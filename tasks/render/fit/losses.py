@@ -175,30 +175,27 @@ def _compare(
 
 
 def _compared(rgb: F32, target: Target, ssim_weight: float) -> tuple[Array, F32, F32]:
-    """What `_compare` returns, and fills, of a picture (H, W, 3)."""
+    """What `_compare` returns, and fills, of a picture (H, W, 3). Raises ValueError for one of another size."""
+    if rgb.shape != (*target.counted.shape, CHANNELS):  # kernels do not look
+        raise ValueError(f"loss: a picture of {rgb.shape} beside a photo of {target.counted.shape}")
     picture = _padded(rgb)
     alike, by = np.empty_like(picture), np.empty_like(picture)
     with_photo = picture, target.photo, target.mean, target.variance, target.share
-    totals = _compare(*with_photo, np.float32(ssim_weight), alike, by)
-    return totals, *(np.ascontiguousarray(_inside(filled, rgb.shape[1])) for filled in (alike, by))
+    return _compare(*with_photo, np.float32(ssim_weight), alike, by), alike, by
 
 
 def similarity(rgb: F32, target: Target) -> F32:
-    """Structural similarity of each pixel and channel (H, W, 3) of a picture."""
-    return _compared(rgb, target, 1.0)[1]
-
-
-def ssim(rgb: F32, target: Target) -> float:
-    """Mean structural similarity over the pixels that say something, and channels."""
-    return float(_compared(rgb, target, 1.0)[0][0])
+    """Structural similarity of each pixel and channel (H, W, 3) of a picture. Raises ValueError as `photo_loss`."""
+    return np.ascontiguousarray(_inside(_compared(rgb, target, 1.0)[1], rgb.shape[1]))
 
 
 def photo_loss(rgb: F32, target: Target, ssim_weight: float) -> tuple[float, F32, float]:
     """(1 - w) L1 + w (1 - SSIM) of a picture (H, W, 3), its gradient (H, W, 3), and the mean square by which what of it
-    lies between 0 and 1 is off, whether a pixel says something or not."""
-    (alike, apart, squares), _, gradient = _compared(rgb, target, ssim_weight)
+    lies between 0 and 1 is off, whether a pixel says something or not. Raises ValueError for a picture of another size
+    than the photo's."""
+    (alike, apart, squares), _, by = _compared(rgb, target, ssim_weight)
     loss = (1.0 - ssim_weight) * float(apart) + ssim_weight * (1.0 - float(alike))
-    return loss, gradient, float(squares) / rgb.size
+    return loss, np.ascontiguousarray(_inside(by, rgb.shape[1])), float(squares) / rgb.size
 
 
 def opaque_loss(alpha: F32, ground: Bools, weight: float) -> tuple[float, F32]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.render.fit.losses import opaque_loss, photo_loss, photo_target, ssim
+from tasks.render.fit.losses import opaque_loss, photo_loss, photo_target, similarity
 
 RNG = np.random.default_rng(0)
 PHOTO = RNG.integers(0, 256, (17, 23, 3)).astype(np.uint8)
@@ -32,8 +32,10 @@ def slow_ssim(x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np
 def test_ssim_is_what_its_definition_says() -> None:
     target = photo_target(PHOTO)
     expected = slow_ssim(PICTURE.astype(np.float64), PHOTO / 255.0, np.ones(PHOTO.shape[:2]))
-    assert ssim(PICTURE, target) == pytest.approx(expected, abs=1e-5)
-    assert ssim(target.rgb, target) == pytest.approx(1.0, abs=1e-5)
+    assert 1.0 - photo_loss(PICTURE, target, 1.0)[0] == pytest.approx(expected, abs=1e-5)
+    assert similarity(PICTURE, target).mean() == pytest.approx(expected, abs=1e-5)
+    with pytest.raises(ValueError, match=r"a picture of \(17, 22, 3\) beside a photo of \(17, 23\)"):
+        photo_loss(PICTURE[:, 1:], target, 1.0)
 
 
 def test_ssim_gradient_agrees_with_finite_differences() -> None:
