@@ -301,7 +301,7 @@ def _resumed(begun: Path, start: FitState) -> FitState:
         return start
 
 
-ASSET_VERSION = 14  # raised by hand when the same sensors give another scene, or it is kept otherwise
+ASSET_VERSION = 15  # raised by hand when the same sensors give another scene, or it is kept otherwise
 PARALLAX_SHARE = 0.9  # without lidar, the least share of photos with another one close enough for stereo
 
 
